@@ -1,0 +1,62 @@
+"""The reward contract: what goes in, what comes out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from scene_envs.scene import SceneBatch
+
+if TYPE_CHECKING:
+    from scene_envs.physics import PhysicsPool
+
+
+@dataclass(frozen=True)
+class RewardContext:
+    """What a reward may use beside the scenes.
+
+    Attributes:
+        prompts: one per scene when the prior is conditional, else None.
+        pool: worker processes for physics; None means compute in this process.
+        seed: for rewards that draw random numbers.
+    """
+
+    prompts: tuple[str, ...] | None = None
+    pool: PhysicsPool | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class RewardOutput:
+    """Scores of B scenes with N slots.
+
+    Attributes:
+        value: (B,) float, larger is better; ignored where ``valid`` is False.
+        per_object: (B, N) float credit per slot, or None.
+        terms: named (B,) floats worth logging.
+        valid: (B,) bool, or None when every row is valid. Invalid rows leave all statistics.
+        object_flags: named (B, N) bools, such as ``"feasible"``.
+    """
+
+    value: Tensor
+    per_object: Tensor | None = None
+    terms: Mapping[str, Tensor] = field(default_factory=dict)
+    valid: Tensor | None = None
+    object_flags: Mapping[str, Tensor] = field(default_factory=dict)
+
+    @property
+    def is_valid(self) -> Tensor:
+        """(B,) bool, with None spelled out, and rows whose value is not finite excluded."""
+        finite = torch.isfinite(self.value)
+        return finite if self.valid is None else self.valid & finite
+
+
+@runtime_checkable
+class Reward(Protocol):
+    """Anything callable as ``(SceneBatch, RewardContext) -> RewardOutput``."""
+
+    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput: ...

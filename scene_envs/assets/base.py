@@ -1,0 +1,118 @@
+"""What an asset is: meshes, convex parts, mass properties."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_envs.errors import InvalidInputError, unknown_name
+
+if TYPE_CHECKING:
+    import trimesh
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ConvexPart:
+    """One convex piece of collision geometry in the asset frame (m).
+
+    Attributes:
+        vertices: (V, 3) float64 corners of the hull.
+        faces: (F, 3) int64 triangles, outward by the right-hand rule.
+    """
+
+    vertices: Array
+    faces: NDArray[np.int64]
+
+    @cached_property
+    def bounds(self) -> Array:
+        """(2, 3): lowest and highest corner, m."""
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+
+@dataclass(frozen=True, eq=False)
+class Asset:
+    """One model of the library. Frame: z up, base at z = 0 unless the notes of its recipe say otherwise.
+
+    Attributes:
+        name: identifier, such as ``"steamer_lid"``.
+        display_name: what prompts call it, such as ``"steamer lid"``.
+        plural: plural of the display name.
+        mass: kg; 0 for static assets.
+        center_of_mass: (3,) m in the asset frame.
+        inertia: (3, 3) kg m^2 about the centre of mass, asset axes.
+        visual: coloured mesh for pictures (m).
+        fine: convex parts that keep hollows hollow.
+        coarse: fewer convex parts, used where the verdict is the same.
+        color: (r, g, b) in 0..255, the class colour of semantic renders.
+        static: True for tables, shelves and floors.
+    """
+
+    name: str
+    display_name: str
+    plural: str
+    mass: float
+    center_of_mass: Array
+    inertia: Array
+    visual: trimesh.Trimesh
+    fine: tuple[ConvexPart, ...]
+    coarse: tuple[ConvexPart, ...]
+    color: tuple[int, int, int]
+    static: bool = False
+
+    @property
+    def article(self) -> str:
+        """The indefinite article of the display name."""
+        return "an" if self.display_name[0] in "aeiou" else "a"
+
+    @cached_property
+    def bounds(self) -> Array:
+        """(2, 3): lowest and highest corner of the fine parts, m."""
+        corners = np.stack([part.bounds for part in self.fine])
+        return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
+
+
+@dataclass(frozen=True, eq=False)
+class AssetLibrary:
+    """An ordered set of assets; the order defines the categories of a scene type.
+
+    >>> from scene_envs.assets import get_library
+    >>> library = get_library(("teacup", "teapot"))
+    >>> len(library), library[1].display_name
+    (2, 'teapot')
+    """
+
+    assets: tuple[Asset, ...]
+    _index: dict[str, int] = field(init=False, repr=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for index, asset in enumerate(self.assets):
+            if asset.name in self._index:
+                raise InvalidInputError(f"asset name {asset.name!r} appears twice in a library; names must be unique")
+            self._index[asset.name] = index
+
+    def __len__(self) -> int:
+        return len(self.assets)
+
+    def __iter__(self) -> Iterator[Asset]:
+        return iter(self.assets)
+
+    def __getitem__(self, key: int | str) -> Asset:
+        return self.assets[self.index(key)] if isinstance(key, str) else self.assets[key]
+
+    def index(self, name: str) -> int:
+        """Category of the asset called ``name``."""
+        if name not in self._index:
+            raise unknown_name("asset", name, self._index)
+        return self._index[name]
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Asset names in category order."""
+        return tuple(asset.name for asset in self.assets)

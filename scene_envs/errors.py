@@ -1,0 +1,58 @@
+"""The one exception family: every message names the value, the place and the fix."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class SceneEnvsError(Exception):
+    """Base of every error that SceneEnvs raises on purpose."""
+
+
+class InvalidInputError(SceneEnvsError, ValueError):
+    """A value given by the user is outside what the call accepts."""
+
+
+class UnknownNameError(SceneEnvsError, KeyError):
+    """A name was asked for that no registry knows."""
+
+    def __str__(self) -> str:  # KeyError would print the repr of the message
+        return str(self.args[0]) if self.args else ""
+
+
+class CorruptFileError(SceneEnvsError):
+    """A file exists but cannot be read as what it should be."""
+
+
+class MissingDependencyError(SceneEnvsError, ImportError):
+    """An optional package is needed and is not installed."""
+
+
+class PhysicsError(SceneEnvsError):
+    """A physics computation could not be carried out."""
+
+
+class RewardError(SceneEnvsError):
+    """A reward broke its contract."""
+
+
+class TrainingError(SceneEnvsError):
+    """A training run cannot go on; what was done so far is on disk."""
+
+
+def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
+    """Build the error for an unknown ``kind`` called ``name``, offering the nearest known name.
+
+    Args:
+        kind: what was looked up, in words a user knows ("scene type", "reward", "prior").
+        name: the name that was asked for.
+        known: all names that would have worked.
+
+    >>> str(unknown_name("reward", "object_cuont", ["object_count", "feasible_objects"]))
+    "unknown reward 'object_cuont'; did you mean 'object_count'? Known: feasible_objects, object_count."
+    """
+    names = sorted(known)
+    near = difflib.get_close_matches(name, names, n=1, cutoff=0.4)
+    hint = f"; did you mean {near[0]!r}?" if near else "."
+    return UnknownNameError(f"unknown {kind} {name!r}{hint} Known: {', '.join(names) or '(none)'}.")

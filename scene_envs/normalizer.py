@@ -1,0 +1,105 @@
+"""Per-feature affine normalisation of scene tensors to [-1, 1]."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from scene_envs.errors import InvalidInputError
+
+_ZERO_RANGE = 1e-6
+"""Features whose range over the data is below this (m, or rotation entries) count as constant."""
+
+
+@dataclass(frozen=True)
+class Normalizer:
+    """The map ``x' = x * scale + min`` per feature, with constant features kept exact.
+
+    A feature whose range over the data is zero has ``scale = 0``: it is 0 when normalised and comes
+    back as the constant it was, whatever value a sampler produced for it.
+
+    Attributes:
+        scale: (D,) float32; 0 marks a constant feature.
+        min: (D,) float32 offset of the normalised value.
+        input_min: (D,) float32, smallest raw value seen (metres for translations).
+        input_max: (D,) float32, largest raw value seen.
+
+    >>> data = torch.tensor([[[0.0, 5.0], [2.0, 5.0]]])
+    >>> normalizer = Normalizer.fit(data)
+    >>> normalizer.normalize(data)
+    tensor([[[-1.,  0.],
+             [ 1.,  0.]]])
+    >>> bool((normalizer.unnormalize(torch.tensor([0.5, 0.3])) == torch.tensor([1.5, 5.0])).all())
+    True
+    """
+
+    scale: Tensor
+    min: Tensor
+    input_min: Tensor
+    input_max: Tensor
+
+    @classmethod
+    def fit(cls, data: Tensor) -> Normalizer:
+        """Fit on raw scene tensors ``data`` (..., D)."""
+        flat = data.reshape(-1, data.shape[-1]).float()
+        return cls.from_range(flat.amin(dim=0), flat.amax(dim=0))
+
+    @classmethod
+    def from_range(cls, input_min: Tensor, input_max: Tensor) -> Normalizer:
+        """The normalizer that maps [``input_min``, ``input_max``] (D,) to [-1, 1]."""
+        span = input_max - input_min
+        constant = span < _ZERO_RANGE
+        safe = torch.where(constant, torch.ones_like(span), span)
+        scale = torch.where(constant, torch.zeros_like(span), 2.0 / safe)
+        offset = torch.where(constant, torch.zeros_like(span), -1.0 - input_min * (2.0 / safe))
+        return cls(scale.float(), offset.float(), input_min.float(), input_max.float())
+
+    @property
+    def is_constant(self) -> Tensor:
+        """(D,) bool: features that never vary."""
+        return self.scale == 0
+
+    def normalize(self, raw: Tensor) -> Tensor:
+        """Raw (..., D) to normalised (..., D)."""
+        self._check(raw)
+        return raw * self.scale.to(raw) + self.min.to(raw)
+
+    def unnormalize(self, normalised: Tensor) -> Tensor:
+        """Normalised (..., D) to raw (..., D); constant features take their constant."""
+        self._check(normalised)
+        constant = self.is_constant.to(normalised.device)
+        scale = self.scale.to(normalised)
+        raw = (normalised - self.min.to(normalised)) / torch.where(constant, torch.ones_like(scale), scale)
+        return torch.where(constant, self.input_min.to(normalised), raw)
+
+    def _check(self, x: Tensor) -> None:
+        if x.shape[-1] != self.scale.shape[0]:
+            raise InvalidInputError(
+                f"the normalizer was fitted on {self.scale.shape[0]} features, the tensor has {x.shape[-1]} "
+                f"(shape {tuple(x.shape)}); were they made for the same scene type?"
+            )
+
+    def state(self) -> dict[str, Any]:
+        """JSON-able state in the layout of the published ``normalizer_state``."""
+        return {
+            "params": {
+                "scale": self.scale.tolist(),
+                "min": self.min.tolist(),
+                "input_stats": {"min": self.input_min.tolist(), "max": self.input_max.tolist()},
+            },
+            "is_fitted": True,
+        }
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any]) -> Normalizer:
+        """Inverse of :meth:`state`."""
+        try:
+            params = state["params"]
+            stats = params["input_stats"]
+            vectors = [params["scale"], params["min"], stats["min"], stats["max"]]
+        except (KeyError, TypeError) as error:
+            raise InvalidInputError(f"normalizer_state lacks {error}; it needs params.scale, .min, .input_stats") from error
+        return cls(*(torch.tensor(v, dtype=torch.float32) for v in vectors))

@@ -1,0 +1,23 @@
+"""Gymnasium registration of the environment family."""
+
+from __future__ import annotations
+
+import gymnasium
+
+
+def register_envs() -> None:
+    """Register every SceneEnvs environment with Gymnasium (idempotent)."""
+    if "SceneEnvs/Denoising-v0" in gymnasium.registry:
+        return
+    gymnasium.register(
+        id="SceneEnvs/Denoising-v0",
+        entry_point="scene_envs.denoising_envs:DenoisingEnv",
+        vector_entry_point="scene_envs.denoising_envs:DenoisingVectorEnv",
+        disable_env_checker=True,
+        order_enforce=True,
+    )
+    gymnasium.register(
+        id="SceneEnvs/Search-v0",
+        entry_point="scene_envs.search:SearchEnv",
+        disable_env_checker=True,
+    )

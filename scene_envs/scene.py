@@ -1,0 +1,238 @@
+"""The one data type that crosses module boundaries: a batch of scenes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.normalizer import Normalizer
+from scene_envs.rotations import project_to_so3
+from scene_envs.scene_types import SceneType, get_scene_type
+
+POSE = slice(0, 12)
+TRANSLATION = slice(0, 3)
+ROTATION = slice(3, 12)
+CATEGORY = slice(12, None)
+
+
+class SceneBatch:
+    """B scenes of N slots each, with their scene type.
+
+    A slot is translation (m, world frame) | rotation matrix row-major | one-hot over C assets + empty last.
+    Empty slots are zeros but for their last entry. Slots are a set: their order means nothing.
+
+    Args:
+        tensor: (B, N, 3 + 9 + C + 1) float32, raw (not normalised) and finite.
+        scene_type: the scene type or its name.
+
+    Raises:
+        InvalidInputError: wrong shape, or a value that is not finite (its scene, slot and feature are named).
+
+    >>> batch = SceneBatch.empty("dimsum_table", 2)
+    >>> len(batch), batch.counts.tolist(), batch.names()[0][:1]
+    (2, [1, 1], ['cafe_table'])
+    """
+
+    def __init__(self, tensor: Tensor, scene_type: str | SceneType) -> None:
+        self.scene_type = get_scene_type(scene_type)
+        _check_scene_tensor(tensor, self.scene_type)
+        self._tensor = tensor.to(torch.float32)
+
+    # -- construction -------------------------------------------------------------------------
+
+    @classmethod
+    def from_parts(
+        cls, translations: Tensor, rotations: Tensor, categories: Tensor, scene_type: str | SceneType
+    ) -> SceneBatch:
+        """From translations (B, N, 3) m, rotations (B, N, 3, 3) and categories (B, N) int, C meaning empty."""
+        scene_type = get_scene_type(scene_type)
+        empty = scene_type.num_assets
+        if categories.numel() and not (0 <= int(categories.min()) and int(categories.max()) <= empty):
+            raise InvalidInputError(
+                f"categories must lie in 0..{empty} for {scene_type.name!r} ({empty} is empty), "
+                f"got {int(categories.min())}..{int(categories.max())}"
+            )
+        present = (categories != empty).unsqueeze(-1)
+        one_hot = torch.nn.functional.one_hot(categories.long(), empty + 1).to(torch.float32)
+        pose = torch.cat([translations.float(), rotations.float().flatten(-2)], dim=-1) * present
+        return cls(torch.cat([pose, one_hot], dim=-1), scene_type)
+
+    @classmethod
+    def from_tensor(
+        cls, tensor: Tensor, scene_type: str | SceneType, *, normalised: Normalizer | None = None
+    ) -> SceneBatch:
+        """From a (B, N, D) tensor such as a sampler's output.
+
+        Rotations are projected to SO(3) by SVD and categories are the arg-max; empty slots become exact.
+
+        Args:
+            tensor: (B, N, D) floats.
+            scene_type: the scene type or its name.
+            normalised: the normalizer ``tensor`` was normalised with; None when it is raw.
+        """
+        scene_type = get_scene_type(scene_type)
+        _check_scene_tensor(tensor, scene_type)
+        categories = tensor[..., CATEGORY].argmax(dim=-1)
+        raw = tensor.float() if normalised is None else normalised.unnormalize(tensor.float())
+        rotations = project_to_so3(raw[..., ROTATION].unflatten(-1, (3, 3)))
+        return cls.from_parts(raw[..., TRANSLATION], rotations, categories, scene_type)
+
+    @classmethod
+    def empty(cls, scene_type: str | SceneType, count: int, slots: int | None = None) -> SceneBatch:
+        """``count`` scenes that hold the fixed welded objects and nothing else."""
+        scene_type = get_scene_type(scene_type)
+        slots = scene_type.slots if slots is None else slots
+        translations = torch.zeros(count, slots, 3)
+        rotations = torch.eye(3).expand(count, slots, 3, 3).clone()
+        categories = torch.full((count, slots), scene_type.num_assets)
+        for slot, fixed in enumerate(scene_type.fixed):
+            translations[:, slot] = torch.tensor(fixed.translation)
+            rotations[:, slot] = torch.tensor(fixed.rotation).reshape(3, 3)
+            categories[:, slot] = scene_type.assets.index(fixed.asset)
+        return cls.from_parts(translations, rotations, categories, scene_type)
+
+    @classmethod
+    def concatenate(cls, batches: Sequence[SceneBatch]) -> SceneBatch:
+        """One batch from several of the same scene type and number of slots."""
+        if not batches:
+            raise InvalidInputError("concatenate needs at least one SceneBatch, got none")
+        names = {batch.scene_type.name for batch in batches}
+        if len(names) > 1:
+            raise InvalidInputError(f"cannot concatenate scenes of different types: {sorted(names)}")
+        return cls(torch.cat([batch.tensor for batch in batches]), batches[0].scene_type)
+
+    # -- views ----------------------------------------------------------------------------------
+
+    @property
+    def tensor(self) -> Tensor:
+        """(B, N, D) float32, raw."""
+        return self._tensor
+
+    @property
+    def translations(self) -> Tensor:
+        """(B, N, 3) m, world frame."""
+        return self._tensor[..., TRANSLATION]
+
+    @property
+    def rotations(self) -> Tensor:
+        """(B, N, 3, 3), asset frame to world frame; all zeros in empty slots."""
+        return self._tensor[..., ROTATION].unflatten(-1, (3, 3))
+
+    @property
+    def categories(self) -> Tensor:
+        """(B, N) int64; C means empty."""
+        return self._tensor[..., CATEGORY].argmax(dim=-1)
+
+    @property
+    def is_empty(self) -> Tensor:
+        """(B, N) bool."""
+        return self.categories == self.scene_type.num_assets
+
+    @property
+    def is_welded(self) -> Tensor:
+        """(B, N) bool: slots that hold welded assets."""
+        welded = torch.tensor(self.scene_type.welded_categories, device=self._tensor.device, dtype=torch.long)
+        return torch.isin(self.categories, welded)
+
+    @property
+    def is_free(self) -> Tensor:
+        """(B, N) bool: neither empty nor welded."""
+        return ~(self.is_empty | self.is_welded)
+
+    @property
+    def counts(self) -> Tensor:
+        """(B,) int64: objects per scene, welded ones included."""
+        return (~self.is_empty).sum(dim=-1)
+
+    @property
+    def in_workspace(self) -> Tensor:
+        """(B, N) bool: the object's frame lies in the workspace (False for empty slots)."""
+        low, high = (torch.tensor(c, device=self._tensor.device) for c in self.scene_type.workspace)
+        inside = ((self.translations >= low) & (self.translations <= high)).all(dim=-1)
+        return inside & ~self.is_empty
+
+    def names(self) -> list[list[str]]:
+        """Asset names of the non-empty slots, per scene, in slot order."""
+        assets, empty = self.scene_type.assets, self.scene_type.num_assets
+        return [[assets[c] for c in row if c != empty] for row in self.categories.tolist()]
+
+    def to_tensor(self, *, normalised: Normalizer | None = None) -> Tensor:
+        """(B, N, D) float32; raw, or normalised to [-1, 1] when a normalizer is given."""
+        return self._tensor if normalised is None else normalised.normalize(self._tensor)
+
+    def to(self, device: str | torch.device) -> SceneBatch:
+        """The same scenes on another torch device."""
+        return SceneBatch(self._tensor.to(device), self.scene_type)
+
+    def with_slots(self, slots: int) -> SceneBatch:
+        """The same scenes with more (empty) slots, or with fewer when the dropped ones are empty."""
+        if slots < self._tensor.shape[1]:
+            if bool((~self.is_empty[:, slots:]).any()):
+                raise InvalidInputError(f"cannot drop to {slots} slots: objects are in the dropped ones")
+            return SceneBatch(self._tensor[:, :slots], self.scene_type)
+        extra = torch.zeros(len(self), slots - self._tensor.shape[1], self.scene_type.features)
+        extra[..., -1] = 1.0
+        return SceneBatch(torch.cat([self._tensor, extra.to(self._tensor)], dim=1), self.scene_type)
+
+    def with_poses(self, translations: Tensor, rotations: Tensor) -> SceneBatch:
+        """The same objects at new poses; (B, N, 3) m and (B, N, 3, 3)."""
+        return SceneBatch.from_parts(translations, rotations, self.categories, self.scene_type)
+
+    def __len__(self) -> int:
+        return self._tensor.shape[0]
+
+    def __getitem__(self, index: int | slice | Sequence[int] | Tensor) -> SceneBatch:
+        """A sub-batch; an integer keeps the batch dimension."""
+        if isinstance(index, int):
+            if not -len(self) <= index < len(self):
+                raise IndexError(f"scene {index} of a batch of {len(self)}")
+            index = [index]
+        return SceneBatch(self._tensor[index], self.scene_type)
+
+    def __repr__(self) -> str:
+        return f"SceneBatch({self.scene_type.name!r}, {tuple(self._tensor.shape)})"
+
+    # -- files ----------------------------------------------------------------------------------
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write to one ``.safetensors`` file, atomically."""
+        from safetensors.torch import save_file
+
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(path.name + ".partial")
+        save_file({"scenes": self._tensor.cpu().contiguous()}, partial, {"scene_type": self.scene_type.name})
+        os.replace(partial, path)
+        return path
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> SceneBatch:
+        """Read a file written by :meth:`save`."""
+        from safetensors import SafetensorError, safe_open
+
+        try:
+            with safe_open(path, "pt") as file:
+                metadata = file.metadata() or {}
+                return cls(file.get_tensor("scenes"), metadata["scene_type"])
+        except FileNotFoundError:
+            raise InvalidInputError(f"no scene file at {str(path)!r}") from None
+        except (SafetensorError, KeyError) as error:
+            raise CorruptFileError(f"{str(path)!r} is not a scene file written by SceneBatch.save: {error}") from error
+
+
+def _check_scene_tensor(tensor: Tensor, scene_type: SceneType) -> None:
+    if tensor.ndim != 3 or tensor.shape[-1] != scene_type.features:
+        raise InvalidInputError(
+            f"scenes of {scene_type.name!r} are (B, N, {scene_type.features}) tensors, got shape {tuple(tensor.shape)}"
+        )
+    if not bool(torch.isfinite(tensor).all()):
+        scene, slot, feature = torch.nonzero(~torch.isfinite(tensor))[0].tolist()
+        raise InvalidInputError(
+            f"scene tensor holds {tensor[scene, slot, feature].item()} at scene {scene}, slot {slot}, "
+            f"feature {feature}; all values must be finite"
+        )
