@@ -1,0 +1,160 @@
+"""Coloured visual meshes from a few numbers: lathes, tubes, boxes, planks.
+
+A surface carries vertex colours and vertex normals; faces of different colour never share a vertex.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike
+
+from scene_envs.assets.base import Array
+from scene_envs.assets.shapes import Profile, circle
+
+Color = tuple[int, int, int]
+"""(r, g, b) in 0..255."""
+
+_SMOOTH = np.cos(np.radians(40.0))
+"""Spans of a profile that meet at less than 40 degrees are shaded as one curved surface."""
+
+
+def surface(vertices: ArrayLike, faces: ArrayLike, color: Color, normals: ArrayLike | None = None) -> trimesh.Trimesh:
+    """One mesh of one colour; normals (V, 3) default to those of the faces around a vertex."""
+    vertices = np.asarray(vertices, dtype=np.float64)
+    colors = np.tile(np.array([*color, 255], dtype=np.uint8), (len(vertices), 1))
+    mesh = trimesh.Trimesh(vertices, np.asarray(faces), vertex_normals=normals, vertex_colors=colors, process=False)
+    mesh.vertex_normals  # noqa: B018  (computed here, so that joining keeps them)
+    return mesh
+
+
+def join(*meshes: trimesh.Trimesh) -> trimesh.Trimesh:
+    """One mesh of several; colours and normals are kept."""
+    joined = trimesh.Trimesh(
+        vertices=np.concatenate([mesh.vertices for mesh in meshes]),
+        faces=np.concatenate(
+            [mesh.faces + start for mesh, start in zip(meshes, _starts(meshes), strict=True)],
+        ),
+        vertex_normals=np.concatenate([mesh.vertex_normals for mesh in meshes]),
+        vertex_colors=np.concatenate([_colors(mesh) for mesh in meshes]),
+        process=False,
+    )
+    return joined
+
+
+def _colors(mesh: trimesh.Trimesh) -> Any:
+    visual: Any = mesh.visual
+    return visual.vertex_colors
+
+
+def _starts(meshes: Sequence[trimesh.Trimesh]) -> list[int]:
+    return [0, *np.cumsum([len(mesh.vertices) for mesh in meshes[:-1]]).tolist()]
+
+
+def lathe(
+    profile: Profile, colors: Color | Sequence[Color], *, segments: int = 48, phase: float = 0.0, flat: bool = False
+) -> trimesh.Trimesh:
+    """Revolve an open or closed polyline of P points about z.
+
+    Args:
+        profile: points (r, z), m. The outside is on the right when walking along it: go up on the outside of
+            a vessel, down on its inside.
+        colors: one colour, or one per span (P - 1).
+        segments: facets around.
+        phase: angle of the first corner, rad.
+        flat: facets stay visible (square dishes).
+    """
+    points = np.asarray(profile, dtype=np.float64)
+    steps = np.diff(points, axis=0)
+    steps /= np.linalg.norm(steps, axis=1, keepdims=True)
+    spans = np.stack([steps[:, 1], -steps[:, 0]], axis=1)  # outward 2-D normals
+    palette = [colors] * len(spans) if isinstance(colors[0], int) else list(colors)
+    meshes = []
+    for index, normal in enumerate(spans):
+        ends = []
+        for neighbour in (index - 1, index + 1):
+            smooth = 0 <= neighbour < len(spans) and float(normal @ spans[neighbour]) > _SMOOTH
+            ends.append(normal + spans[neighbour] if smooth else normal)
+        meshes.append(_span(points[index], points[index + 1], ends, palette[index], segments, phase, flat))  # type: ignore[arg-type]
+    return join(*meshes)
+
+
+def _span(
+    low: Array, high: Array, normals: Sequence[Array], color: Color, segments: int, phase: float, flat: bool
+) -> trimesh.Trimesh:
+    unit = circle(segments, phase)
+    corners = [np.column_stack([r * unit, np.full(segments, z)]) for r, z in (low, high)]
+    here, there = np.arange(segments), (np.arange(segments) + 1) % segments
+    if flat:
+        quads = np.stack([corners[0], corners[0][there], corners[1][there], corners[1]], axis=1).reshape(-1, 3)
+        first = 4 * here
+        faces = np.concatenate(
+            [np.stack([first, first + 1, first + 2], axis=1), np.stack([first, first + 2, first + 3], axis=1)]
+        )
+        return surface(quads, faces, color)
+    faces = np.concatenate(
+        [np.stack([here, there, segments + there], axis=1), np.stack([here, segments + there, segments + here], axis=1)]
+    )
+    radial = [np.column_stack([n[0] * unit, np.full(segments, n[1])]) / np.linalg.norm(n) for n in normals]
+    degenerate = np.array([low[0] == 0.0, high[0] == 0.0])
+    keep = np.repeat(~degenerate[::-1], segments)  # a span that starts or ends on the axis has half as many triangles
+    return surface(np.concatenate(corners), faces[keep], color, np.concatenate(radial))
+
+
+def box_surface(size: tuple[float, float, float], base: tuple[float, float, float], color: Color) -> trimesh.Trimesh:
+    """An axis-aligned box; ``base`` is the centre of its bottom face."""
+    mesh = trimesh.creation.box(size)
+    mesh.apply_translation((base[0], base[1], base[2] + size[2] / 2))
+    return surface(mesh.triangles.reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3), color)
+
+
+def tube(path: ArrayLike, radii: float | Sequence[float], color: Color, *, sides: int = 12) -> trimesh.Trimesh:
+    """A round tube along a path (P, 3) in the x-z plane, with flat end caps; ``radii`` one, or one per point."""
+    points = np.asarray(path, dtype=np.float64)
+    size = np.broadcast_to(np.asarray(radii, dtype=np.float64), (len(points),))
+    tangents = np.gradient(points, axis=0)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    across = np.stack([tangents[:, 2], np.zeros(len(points)), -tangents[:, 0]], axis=1)
+    unit = circle(sides)
+    spokes = across[:, None] * unit[None, :, :1] + np.array([0.0, 1.0, 0.0]) * unit[None, :, 1:]  # (P, sides, 3)
+    vertices = points[:, None] + size[:, None, None] * spokes
+    grid = np.arange(len(points) * sides).reshape(len(points), sides)
+    a, b = grid[:-1], np.roll(grid[:-1], -1, axis=1)
+    d, c = grid[1:], np.roll(grid[1:], -1, axis=1)
+    faces = np.concatenate([np.stack([a, b, c], axis=-1).reshape(-1, 3), np.stack([a, c, d], axis=-1).reshape(-1, 3)])
+    body = surface(vertices.reshape(-1, 3), faces, color, spokes.reshape(-1, 3))
+    fan = np.stack([np.zeros(sides - 2, int), np.arange(1, sides - 1), np.arange(2, sides)], axis=1)
+    caps = [surface(vertices[0], fan[:, ::-1], color), surface(vertices[-1], fan, color)]
+    return join(body, *caps)
+
+
+def planks(radius: float, z: float, colors: Sequence[Color], *, count: int) -> trimesh.Trimesh:
+    """A round board seen from above: ``count`` strips along y in turning colours."""
+    edges = np.linspace(-radius, radius, count + 1)
+    strips = []
+    for index, (left, right) in enumerate(pairwise(edges)):
+        x = np.linspace(left, right, 9)
+        y = np.sqrt(np.maximum(radius**2 - x**2, 0.0))
+        vertices = np.stack([np.stack([x, -y], axis=1), np.stack([x, y], axis=1)], axis=1).reshape(-1, 2)
+        first = 2 * np.arange(len(x) - 1)
+        faces = np.concatenate(
+            [np.stack([first, first + 2, first + 3], axis=1), np.stack([first, first + 3, first + 1], axis=1)]
+        )
+        up = np.tile([0.0, 0.0, 1.0], (len(vertices), 1))
+        color = colors[index % len(colors)]
+        strips.append(surface(np.column_stack([vertices, np.full(len(vertices), z)]), faces, color, up))
+    return join(*strips)
+
+
+def arc(points: Sequence[tuple[float, float, float]], samples: int = 24) -> Array:
+    """(samples, 3): a smooth curve through the points, for the visual of handles and spouts."""
+    from scipy.interpolate import make_interp_spline
+
+    knots = np.asarray(points, dtype=np.float64)
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(knots, axis=0), axis=1))])
+    spline = make_interp_spline(length, knots, k=min(3, len(knots) - 1))
+    return np.asarray(spline(np.linspace(0.0, length[-1], samples)))
