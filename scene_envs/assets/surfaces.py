@@ -101,7 +101,7 @@ def _span(
     )
     radial = [np.column_stack([n[0] * unit, np.full(segments, n[1])]) / np.linalg.norm(n) for n in normals]
     degenerate = np.array([low[0] == 0.0, high[0] == 0.0])
-    keep = np.repeat(~degenerate[::-1], segments)  # a span that starts or ends on the axis has half as many triangles
+    keep = np.repeat(~degenerate, segments)  # a span that starts or ends on the axis has half as many triangles
     return surface(np.concatenate(corners), faces[keep], color, np.concatenate(radial))
 
 
