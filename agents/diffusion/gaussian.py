@@ -1,0 +1,143 @@
+"""The Gaussian diffusion process: forward noising, preconditioning, reverse posterior, training loss."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from agents.diffusion.schedules import NoiseSchedule
+from scene_envs.errors import unknown_name
+
+PREDICTIONS = ("karras", "epsilon", "x0", "v")
+"""What a network may predict; see :meth:`GaussianProcess.x0_from_output`."""
+
+
+@dataclass(frozen=True)
+class Preconditioning:
+    """Per-feature first and second moments of normalised data.
+
+    Attributes:
+        mean: (D,) mean.
+        std: (D,) standard deviation, floored away from zero.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    @classmethod
+    def fit(cls, data: Tensor, floor: float = 0.05) -> Preconditioning:
+        """Moments of normalised scenes (..., D)."""
+        flat = data.reshape(-1, data.shape[-1]).double()
+        return cls(flat.mean(dim=0).float(), flat.std(dim=0).clamp(min=floor).float())
+
+
+class GaussianProcess:
+    """Variance-preserving Gaussian diffusion, x_t = alpha_t x_0 + sigma_t eps with alpha_t^2 + sigma_t^2 = 1.
+
+    Args:
+        schedule: signal rates for t = 0..T.
+        prediction: what the network's output means (one of :data:`PREDICTIONS`).
+        preconditioning: data moments, used by ``"karras"``.
+
+    All timesteps ``t`` are int64 tensors of shape (B,) or (); chains run in float32.
+    """
+
+    def __init__(self, schedule: NoiseSchedule, prediction: str, preconditioning: Preconditioning) -> None:
+        if prediction not in PREDICTIONS:
+            raise unknown_name("prediction", prediction, PREDICTIONS)
+        self.schedule = schedule
+        self.prediction = prediction
+        self.preconditioning = preconditioning
+        self.alpha = schedule.alpha_bar.sqrt().float()  # (T + 1,)
+        self.sigma = (1.0 - schedule.alpha_bar).sqrt().float()  # (T + 1,)
+
+    # -- forward --------------------------------------------------------------------------------
+
+    def rates(self, t: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
+        """alpha_t and sigma_t, shaped to broadcast against ``like`` (B, N, D)."""
+        alpha, sigma = self.alpha.to(like.device)[t], self.sigma.to(like.device)[t]
+        while alpha.ndim < like.ndim and alpha.ndim > 0:
+            alpha, sigma = alpha.unsqueeze(-1), sigma.unsqueeze(-1)
+        return alpha, sigma
+
+    def add_noise(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
+        """A sample of q(x_t | x_0) (Ho et al. 2020, Eq. 4)."""
+        alpha, sigma = self.rates(t, x0)
+        return alpha * x0 + sigma * noise
+
+    # -- what the network sees and says ---------------------------------------------------------
+
+    def network_input(self, x_t: Tensor, t: Tensor) -> Tensor:
+        """x_t scaled to unit variance per feature (Karras et al. 2022, c_in); raw for other predictions."""
+        if self.prediction != "karras":
+            return x_t
+        alpha, sigma = self.rates(t, x_t)
+        mean, std = self._moments(x_t)
+        return (x_t - alpha * mean) / (alpha**2 * std**2 + sigma**2).sqrt()
+
+    def x0_from_output(self, x_t: Tensor, t: Tensor, output: Tensor) -> Tensor:
+        """The denoised scene x_0 that a network output stands for.
+
+        ``karras``: skip and output scaling of Karras et al. (2022), Table 1, in variance-preserving
+        coordinates and with per-feature moments; ``epsilon``: predicted noise; ``v``: Salimans and Ho (2022).
+        """
+        alpha, sigma = self.rates(t, x_t)
+        if self.prediction == "karras":
+            mean, std = self._moments(x_t)
+            variance = alpha**2 * std**2 + sigma**2
+            skip = alpha * std**2 / variance
+            return mean + skip * (x_t - alpha * mean) + sigma * std / variance.sqrt() * output
+        if self.prediction == "epsilon":
+            return (x_t - sigma * output) / alpha
+        if self.prediction == "v":
+            return alpha * x_t - sigma * output
+        return output
+
+    def target(self, x0: Tensor, x_t: Tensor, t: Tensor, noise: Tensor) -> Tensor:
+        """The regression target whose plain mean square is the training loss."""
+        alpha, sigma = self.rates(t, x0)
+        if self.prediction == "karras":
+            mean, std = self._moments(x0)
+            variance = alpha**2 * std**2 + sigma**2
+            skip = alpha * std**2 / variance
+            residual = x0 - mean - skip * (x_t - alpha * mean)
+            return residual * variance.sqrt() / (sigma * std)
+        if self.prediction == "epsilon":
+            return noise
+        if self.prediction == "v":
+            return alpha * noise - sigma * x0
+        return x0
+
+    # -- reverse --------------------------------------------------------------------------------
+
+    def posterior(self, x_t: Tensor, x0: Tensor, t: int, previous: int) -> tuple[Tensor, Tensor]:
+        """q(x_s | x_t, x_0) for a stride t -> s (Ho et al. 2020, Eqs. 6-7, for any s < t).
+
+        Returns:
+            mean (B, N, D) and std, a () tensor that is 0 when ``previous`` is 0.
+        """
+        alpha_bar = self.schedule.alpha_bar
+        a_t, a_s = alpha_bar[t], alpha_bar[previous]
+        a_ts = a_t / a_s
+        beta = 1.0 - a_ts
+        x0_weight = (a_s.sqrt() * beta / (1.0 - a_t)).item()
+        xt_weight = (a_ts.sqrt() * (1.0 - a_s) / (1.0 - a_t)).item()
+        std = ((1.0 - a_s) / (1.0 - a_t) * beta).sqrt().float()
+        return x0_weight * x0 + xt_weight * x_t, std.to(x_t.device)
+
+    def _moments(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        return self.preconditioning.mean.to(like), self.preconditioning.std.to(like)
+
+
+def lognormal_timesteps(schedule: NoiseSchedule, mean: float, std: float) -> Tensor:
+    """(T + 1,) probabilities of drawing each timestep so that ln(noise-to-signal) ~ N(mean, std^2).
+
+    The law of Karras et al. (2022), Table 1, carried to a discrete schedule: the density at each level
+    times the width of the level. t = 0 has probability 0.
+    """
+    log_sigma = schedule.noise_to_signal[1:].log()
+    width = torch.gradient(log_sigma)[0]
+    weight = torch.exp(-0.5 * ((log_sigma - mean) / std) ** 2) * width
+    return torch.cat([torch.zeros(1, dtype=weight.dtype), weight / weight.sum()])

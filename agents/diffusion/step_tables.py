@@ -1,0 +1,60 @@
+"""Explicit reverse steps: which timesteps a chain visits, and where each step lands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from scene_envs.errors import InvalidInputError
+
+
+@dataclass(frozen=True)
+class StepTable:
+    """Reverse steps as (t, t_prev) pairs.
+
+    Attributes:
+        timesteps: (S,) int64, strictly decreasing, within 1..T.
+        previous: (S,) int64, where each step lands; the last is 0, clean data.
+
+    >>> table = StepTable.spaced(1000, 4)
+    >>> table.timesteps.tolist(), table.previous.tolist()
+    ([1000, 667, 334, 1], [667, 334, 1, 0])
+    """
+
+    timesteps: Tensor
+    previous: Tensor
+
+    def __post_init__(self) -> None:
+        t, previous = self.timesteps, self.previous
+        chained = t.shape == previous.shape and len(t) > 0 and bool((t[1:] == previous[:-1]).all())
+        if not chained or int(previous[-1]) != 0 or not bool((t > previous).all()):
+            raise InvalidInputError(
+                f"a step table must decrease, chain and end at 0, got {t.tolist()} -> {previous.tolist()}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.timesteps)
+
+    @classmethod
+    def spaced(cls, num_timesteps: int, num_steps: int) -> StepTable:
+        """``num_steps`` steps evenly spaced over 1..T, both ends included; any number from 1 to T.
+
+        Args:
+            num_timesteps: T of the schedule.
+            num_steps: S; need not divide T.
+        """
+        if not 1 <= num_steps <= num_timesteps:
+            raise InvalidInputError(f"num_steps={num_steps} is outside 1..{num_timesteps}, the prior's timesteps")
+        if num_steps == 1:
+            t = torch.tensor([num_timesteps])
+        else:
+            t = torch.linspace(num_timesteps, 1, num_steps, dtype=torch.float64).round().long()
+        return cls(t, torch.cat([t[1:], torch.zeros(1, dtype=torch.int64)]))
+
+    @classmethod
+    def from_timesteps(cls, timesteps: list[int]) -> StepTable:
+        """From the timesteps alone, in decreasing order; the last step lands on 0."""
+        t = torch.tensor(timesteps, dtype=torch.int64)
+        return cls(t, torch.cat([t[1:], torch.zeros(1, dtype=torch.int64)]))

@@ -1,0 +1,5 @@
+"""Denoiser networks."""
+
+from agents.networks.flux import FluxConfig, FluxDenoiser
+
+__all__ = ["FluxConfig", "FluxDenoiser"]

@@ -1,0 +1,357 @@
+"""A scene prior: a trained denoiser with its process, layout and normalizer."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal, overload
+
+import torch
+from torch import Generator, Tensor, nn
+
+from agents.diffusion import GaussianProcess, Preconditioning, StepTable, lognormal_timesteps, make_schedule
+from agents.networks import FluxConfig, FluxDenoiser
+from agents.prior_files import read_prior, write_prior
+from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.normalizer import Normalizer
+from scene_envs.protocols import StepTableLike
+from scene_envs.scene import TRANSLATION, SceneBatch
+from scene_envs.scene_types import SceneType, get_scene_type
+
+
+@dataclass(frozen=True)
+class PriorConfig:
+    """What a prior is made of.
+
+    Attributes:
+        scene_type: name of its scene type.
+        slots: slots per scene that it was trained on.
+        network: size of its denoiser.
+        schedule: noise schedule, ``"karras"``, ``"linear"`` or ``"cosine"``.
+        prediction: ``"karras"``, ``"epsilon"``, ``"x0"`` or ``"v"``.
+        num_timesteps: T of the schedule.
+        noise_mean: mean of ln(noise-to-signal) over training timesteps.
+        noise_std: its standard deviation.
+        translation_weight: weight of x, y, z in the pretraining loss, other features having 1.
+    """
+
+    scene_type: str
+    slots: int
+    network: FluxConfig
+    schedule: str = "karras"
+    prediction: str = "karras"
+    num_timesteps: int = 1000
+    noise_mean: float = -2.0
+    noise_std: float = 1.9
+    translation_weight: float = 3.0
+
+
+class Denoiser(nn.Module):
+    """A network inside its process: x_t (B, N, D) and t (B,) to the denoised scene x_0 (B, N, D)."""
+
+    def __init__(self, network: nn.Module, process: GaussianProcess) -> None:
+        super().__init__()
+        self.network = network
+        self.process = process
+
+    def output(self, x_t: Tensor, t: Tensor) -> Tensor:
+        """The raw network output (B, N, D), in the units of ``process.target``."""
+        process = self.process
+        alpha, sigma = process.rates(t, x_t)
+        level = (process.sigma[t.cpu()] / process.alpha[t.cpu()]).to(x_t.device)
+        result: Tensor = self.network(process.network_input(x_t, t), x_t / alpha, level)
+        return result
+
+    def forward(self, x_t: Tensor, t: Tensor) -> Tensor:
+        """The denoised scene x_0 (B, N, D), normalised."""
+        return self.process.x0_from_output(x_t, t, self.output(x_t, t))
+
+
+class ScenePrior(nn.Module):
+    """A trained denoiser with its schedule, layout and normalizer. Tensors x are normalised scenes (B, N, D).
+
+    Fixed welded objects and constant features are *known*: clamped to their values while sampling and left
+    out of the loss and of every log-probability.
+
+    >>> prior = tiny_prior("dimsum_table")
+    >>> prior.sample(2, num_steps=3, seed=0)
+    SceneBatch('dimsum_table', (2, 34, 20))
+    """
+
+    conditional = False
+
+    def __init__(
+        self,
+        config: PriorConfig,
+        normalizer: Normalizer,
+        preconditioning: Preconditioning,
+        card: dict[str, Any] | None = None,
+    ) -> None:
+        super().__init__()
+        self.config = config
+        self.scene_type: SceneType = get_scene_type(config.scene_type)
+        if config.network.features != self.scene_type.features:
+            raise InvalidInputError(
+                f"the network reads {config.network.features} features, "
+                f"{config.scene_type!r} has {self.scene_type.features}"
+            )
+        self.normalizer = normalizer
+        self.preconditioning = preconditioning
+        self.card = card or {}
+        schedule = make_schedule(config.schedule, config.num_timesteps)
+        self.process = GaussianProcess(schedule, config.prediction, preconditioning)
+        self.denoiser = Denoiser(FluxDenoiser(config.network), self.process)
+        self._timestep_weights = lognormal_timesteps(schedule, config.noise_mean, config.noise_std)
+        fixed = SceneBatch.empty(self.scene_type, 1, len(self.scene_type.fixed) or 1)
+        self.register_buffer("_fixed", normalizer.normalize(fixed.tensor[0]), persistent=False)
+
+    # -- files ----------------------------------------------------------------------------------
+
+    @classmethod
+    def load(cls, name: str | os.PathLike[str] | ScenePrior) -> ScenePrior:
+        """A shipped prior by name, or one from a prior or run directory; in evaluation mode."""
+        if isinstance(name, ScenePrior):
+            return name
+        state, tensors = read_prior(name)
+        try:
+            fields = dict(state["prior"])
+            fields["network"] = FluxConfig(**fields["network"])
+            moments = (torch.tensor(state["preconditioning"][key]) for key in ("mean", "std"))
+            normalizer = Normalizer.from_state(state["normalizer_state"])
+            prior = cls(PriorConfig(**fields), normalizer, Preconditioning(*moments), state.get("card"))
+            prior.denoiser.network.load_state_dict(tensors)
+        except (KeyError, TypeError) as error:
+            raise CorruptFileError(f"the configuration of the prior {str(name)!r} is not one of ours: {error}") from error
+        except RuntimeError as error:
+            raise CorruptFileError(f"the weights of the prior {str(name)!r} do not fit its network: {error}") from error
+        return prior.eval()
+
+    def save(self, directory: str | os.PathLike[str]) -> Path:
+        """Write ``config.json`` and ``model.safetensors`` into ``directory``."""
+        moments = {"mean": self.preconditioning.mean.tolist(), "std": self.preconditioning.std.tolist()}
+        state = {
+            "prior": asdict(self.config),
+            "preconditioning": moments,
+            "normalizer_state": self.normalizer.state(),
+            "card": self.card,
+        }
+        return write_prior(directory, state, self.denoiser.network.state_dict())
+
+    # -- the reverse chain ----------------------------------------------------------------------
+
+    def step_table(self, num_steps: int) -> StepTable:
+        """The reverse steps of a chain of ``num_steps``, any number in 1..T."""
+        return StepTable.spaced(self.config.num_timesteps, num_steps)
+
+    def known(self, slots: int) -> Tensor:
+        """(slots, D) bool: entries that are clamped (fixed welded slots, constant features)."""
+        known = self.normalizer.is_constant.to(self._fixed.device).expand(slots, -1).clone()
+        known[: len(self.scene_type.fixed)] = True
+        return known
+
+    def clamp(self, x: Tensor) -> Tensor:
+        """``x`` (B, N, D) with its known entries set to their values."""
+        count = len(self.scene_type.fixed)
+        x = torch.where(self.normalizer.is_constant.to(x.device), torch.zeros_like(x), x)
+        if count:
+            x = torch.cat([self._fixed[:count].to(x).expand(x.shape[0], -1, -1), x[:, count:]], dim=1)
+        return x
+
+    def initial(self, count: int, slots: int, generator: Generator | None = None) -> Tensor:
+        """x_T (count, slots, D): standard normal with the known entries clamped."""
+        noise = torch.randn(count, slots, self.scene_type.features, generator=generator, device=self._fixed.device)
+        return self.clamp(noise)
+
+    def posterior(self, x_t: Tensor, step: int, table: StepTableLike) -> tuple[Tensor, Tensor]:
+        """Mean (B, N, D) and std (N, D) of x_{t-1} given x_t; differentiable in the network's parameters.
+
+        The std is 0 on known entries, and everywhere at the last step, which is deterministic.
+        """
+        t, previous = int(table.timesteps[step]), int(table.previous[step])
+        x0 = self.denoiser(x_t, torch.full((x_t.shape[0],), t, device=x_t.device))
+        mean, std = self.process.posterior(x_t, x0, t, previous)
+        std_map = std * (~self.known(x_t.shape[1])).to(x_t.dtype)
+        return self.clamp(mean), std_map
+
+    @torch.no_grad()
+    def sample_tensor(
+        self, count: int, *, num_steps: int = 50, slots: int | None = None, generator: Generator | None = None
+    ) -> Tensor:
+        """``count`` denoised scenes x_0 (count, slots, D), normalised, from one batch."""
+        table = self.step_table(num_steps)
+        x = self.initial(count, self.config.slots if slots is None else slots, generator)
+        for step in range(len(table)):
+            mean, std = self.posterior(x, step, table)
+            noise = torch.randn(x.shape, generator=generator, device=x.device)
+            x = mean + std * noise
+        return x
+
+    def sample(
+        self, count: int, *, num_steps: int = 50, slots: int | None = None, seed: int = 0, batch_size: int = 64
+    ) -> SceneBatch:
+        """``count`` scenes by ancestral sampling (Ho et al. 2020, Algorithm 2) over ``num_steps`` strides.
+
+        Args:
+            count: number of scenes.
+            num_steps: denoiser evaluations per scene, 1..T.
+            slots: slots per scene; more than trained is allowed.
+            seed: of the torch generator; the same seed and batch size give the same scenes.
+            batch_size: scenes denoised at once.
+        """
+        if count < 1:
+            raise InvalidInputError(f"count={count}: ask for at least one scene")
+        generator = Generator(self._fixed.device).manual_seed(seed)
+        chunks = [
+            self.sample_tensor(size, num_steps=num_steps, slots=slots, generator=generator)
+            for size in _chunk_sizes(count, batch_size)
+        ]
+        return self.decode(torch.cat(chunks))
+
+    def decode(self, x: Tensor) -> SceneBatch:
+        """Scenes from normalised x_0 (B, N, D); known entries take their exact values."""
+        return SceneBatch.from_tensor(self.clamp(x), self.scene_type, normalised=self.normalizer)
+
+    def encode(self, batch: SceneBatch) -> Tensor:
+        """Normalised x_0 (B, N, D) of scenes whose first slots hold the fixed welded objects."""
+        return self.clamp(batch.to_tensor(normalised=self.normalizer))
+
+    @torch.no_grad()
+    def inpaint(
+        self,
+        batch: SceneBatch,
+        mask: Tensor,
+        *,
+        num_steps: int = 50,
+        generators: Sequence[Generator] | None = None,
+        seed: int = 0,
+    ) -> SceneBatch:
+        """Regenerate masked slots given the others, by clamping (Lugmayr et al. 2022, Eq. 8, no resampling).
+
+        Args:
+            batch: scenes to change.
+            mask: (B, N) bool, True where a slot is regenerated; fixed welded slots never are.
+            num_steps: denoiser evaluations.
+            generators: one per scene, so that a scene's result does not depend on its neighbours' noise.
+            seed: used to make the generators when none are given.
+
+        Returns:
+            Scenes whose unmasked slots are bit-identical to those of ``batch``.
+        """
+        if mask.shape != batch.tensor.shape[:2] or mask.dtype != torch.bool:
+            raise InvalidInputError(
+                f"mask must be bool of shape {tuple(batch.tensor.shape[:2])}, got {mask.dtype} {tuple(mask.shape)}"
+            )
+        if generators is None:
+            generators = [Generator().manual_seed(seed + i) for i in range(len(batch))]
+        if len(generators) != len(batch):
+            raise InvalidInputError(f"{len(generators)} generators for {len(batch)} scenes; give one per scene")
+        known_x0 = self.encode(batch)
+        keep = ~mask.unsqueeze(-1)
+        shape = known_x0.shape[1:]
+
+        def noise() -> Tensor:
+            return torch.stack([torch.randn(shape, generator=g) for g in generators]).to(known_x0.device)
+
+        table = self.step_table(num_steps)
+        x = self.clamp(noise())
+        for step in range(len(table)):
+            t = table.timesteps[step].to(known_x0.device)
+            noisy_known = self.process.add_noise(known_x0, t, noise())
+            x = self.clamp(torch.where(keep, noisy_known, x))
+            mean, std = self.posterior(x, step, table)
+            x = mean + std * noise()
+        regenerated = self.decode(x)
+        changed = mask.clone()
+        changed[:, : len(self.scene_type.fixed)] = False
+        return SceneBatch(torch.where(changed.unsqueeze(-1), regenerated.tensor, batch.tensor), self.scene_type)
+
+    def complete(self, batch: SceneBatch, *, num_steps: int = 50, seed: int = 0) -> SceneBatch:
+        """Fill the empty slots of ``batch``, keeping its objects."""
+        return self.inpaint(batch, batch.is_empty, num_steps=num_steps, seed=seed)
+
+    # -- the training loss ----------------------------------------------------------------------
+
+    def draw_timesteps(self, count: int, generator: Generator | None = None) -> Tensor:
+        """(count,) int64 training timesteps, ln(noise-to-signal) being normal."""
+        return torch.multinomial(self._timestep_weights, count, replacement=True, generator=generator)
+
+    @overload
+    def pretraining_loss(
+        self, x0: Tensor, generator: Generator | None = ..., reduction: Literal["mean", "none"] = ...
+    ) -> Tensor: ...
+
+    @overload
+    def pretraining_loss(
+        self, x0: Tensor, generator: Generator | None = ..., reduction: str = ..., t: Tensor | None = ...
+    ) -> Tensor: ...
+
+    def pretraining_loss(
+        self, x0: Tensor, generator: Generator | None = None, reduction: str = "mean", t: Tensor | None = None
+    ) -> Tensor:
+        """Weighted mean square of the network's error, over entries that are not known.
+
+        Args:
+            x0: (B, N, D) normalised scenes.
+            generator: source of timesteps and noise (CPU).
+            reduction: ``"mean"`` over scenes, or ``"none"`` for (B,); always the mean over entries.
+            t: (B,) timesteps, drawn when None.
+        """
+        if t is None:
+            t = self.draw_timesteps(x0.shape[0], generator).to(x0.device)
+        noise = torch.randn(x0.shape, generator=generator).to(x0.device)
+        x_t = self.clamp(self.process.add_noise(x0, t, noise))
+        error = self.denoiser.output(x_t, t) - self.process.target(x0, x_t, t, noise)
+        weight = self.loss_weight(x0.shape[1])
+        per_scene = (error.square() * weight).sum(dim=(1, 2)) / weight.sum()
+        return per_scene.mean() if reduction == "mean" else per_scene
+
+    def loss_weight(self, slots: int) -> Tensor:
+        """(slots, D) weights of the pretraining loss; 0 on known entries."""
+        weight = (~self.known(slots)).float()
+        weight[:, TRANSLATION] *= self.config.translation_weight
+        return weight
+
+
+def _chunk_sizes(total: int, size: int) -> Iterator[int]:
+    while total > 0:
+        yield min(size, total)
+        total -= size
+
+
+@dataclass
+class _TinyRange:
+    """Raw feature ranges of an untrained prior: the workspace, yaw-only rotations, any category."""
+
+    scene_type: SceneType
+    low: Tensor = field(init=False)
+    high: Tensor = field(init=False)
+
+    def __post_init__(self) -> None:
+        zeros, ones = torch.zeros(9), torch.tensor([1.0, 1, 0, 1, 1, 0, 0, 0, 1])
+        lowest, highest = (torch.tensor(c) for c in self.scene_type.workspace)
+        flags = torch.ones(self.scene_type.num_assets + 1)
+        yaw_low = torch.tensor([-1.0, -1, 0, -1, -1, 0, 0, 0, 0])
+        self.low = torch.cat([lowest, zeros + yaw_low, 0 * flags])
+        self.high = torch.cat([highest, ones, flags])
+
+
+def tiny_prior(scene_type: str | SceneType = "dimsum_table", seed: int = 0, slots: int | None = None) -> ScenePrior:
+    """An untrained prior with a very small network and random weights, for tests and examples."""
+    scene_type = get_scene_type(scene_type)
+    ranges = _TinyRange(scene_type)
+    features = scene_type.features
+    config = PriorConfig(
+        scene_type.name,
+        scene_type.slots if slots is None else slots,
+        FluxConfig(features=features, hidden=32, depth=2, heads=2),
+    )
+    moments = Preconditioning(torch.zeros(features), torch.full((features,), 0.5))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        prior = ScenePrior(config, Normalizer.from_range(ranges.low, ranges.high), moments)
+        for parameter in prior.parameters():
+            if not bool(parameter.any()):
+                nn.init.normal_(parameter, std=0.02)
+    return prior.eval()
