@@ -133,20 +133,27 @@ def tube(path: ArrayLike, radii: float | Sequence[float], color: Color, *, sides
 
 
 def planks(radius: float, z: float, colors: Sequence[Color], *, count: int) -> trimesh.Trimesh:
-    """A round board seen from above: ``count`` strips along y in turning colours."""
+    """A round board seen from above: ``count`` strips along y in turning colours.
+
+    The strips are cut into compact cells, because software renderers walk the bounding box of each triangle.
+    """
     edges = np.linspace(-radius, radius, count + 1)
+    rows = 2 * count
+    along = np.linspace(-1.0, 1.0, rows + 1)
     strips = []
     for index, (left, right) in enumerate(pairwise(edges)):
-        x = np.linspace(left, right, 9)
-        y = np.sqrt(np.maximum(radius**2 - x**2, 0.0))
-        vertices = np.stack([np.stack([x, -y], axis=1), np.stack([x, y], axis=1)], axis=1).reshape(-1, 2)
-        first = 2 * np.arange(len(x) - 1)
+        x = np.linspace(left, right, 7)
+        reach = np.sqrt(np.maximum(radius**2 - x**2, 0.0))
+        vertices = np.stack(
+            [np.repeat(x, rows + 1), np.outer(reach, along).ravel(), np.full(len(x) * (rows + 1), z)], axis=1
+        )
+        corner = (np.arange(len(x) - 1)[:, None] * (rows + 1) + np.arange(rows)).ravel()
+        across = corner + rows + 1
         faces = np.concatenate(
-            [np.stack([first, first + 2, first + 3], axis=1), np.stack([first, first + 3, first + 1], axis=1)]
+            [np.stack([corner, across, across + 1], axis=1), np.stack([corner, across + 1, corner + 1], axis=1)]
         )
         up = np.tile([0.0, 0.0, 1.0], (len(vertices), 1))
-        color = colors[index % len(colors)]
-        strips.append(surface(np.column_stack([vertices, np.full(len(vertices), z)]), faces, color, up))
+        strips.append(surface(vertices, faces, colors[index % len(colors)], up))
     return join(*strips)
 
 

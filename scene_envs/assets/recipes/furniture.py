@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from scene_envs.assets.library import Model, asset_recipe
 from scene_envs.assets.shapes import solid
 from scene_envs.assets.surfaces import join, lathe, planks
@@ -20,7 +22,11 @@ def cafe_table() -> Model:
     bevel = _TOP_RADIUS - 0.004
     visual = join(
         planks(bevel, 0.0, _OAK, count=9),
-        lathe([(0.04, -0.03), (_TOP_RADIUS, -0.03), (_TOP_RADIUS, -0.004), (bevel, 0.0)], _EDGE, segments=96),
+        lathe(
+            [*((r, -0.03) for r in np.linspace(0.04, _TOP_RADIUS, 10)), (_TOP_RADIUS, -0.004), (bevel, 0.0)],
+            _EDGE,
+            segments=96,
+        ),
         lathe([(0.04, 0.03 - _HEIGHT), (0.04, -0.03)], _IRON, segments=24),
         lathe([(0.0, -_HEIGHT), (0.27, -_HEIGHT), (0.27, 0.015 - _HEIGHT), (0.04, 0.03 - _HEIGHT)], _IRON),
     )
