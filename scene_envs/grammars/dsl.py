@@ -1,0 +1,174 @@
+"""The words of a grammar: objects, stacks, choices and repetitions, each of which draws towers.
+
+A *tower* is what stands on a support: one object, or a stack of objects on the same vertical axis.
+Nodes say what is there (the structure); a :class:`~scene_envs.grammars.surface.Gaussian` says where.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import accumulate
+from typing import Protocol
+
+import numpy as np
+
+from scene_envs.errors import InvalidInputError
+from scene_envs.grammars.surface import Gaussian
+
+
+@dataclass(frozen=True)
+class Tower:
+    """Objects on one vertical axis, bottom first.
+
+    Attributes:
+        assets: asset names from the bottom up.
+        step: height (m) between the frames of neighbours.
+        where: the distribution of the axis.
+    """
+
+    assets: tuple[str, ...]
+    where: Gaussian
+    step: float = 0.0
+
+
+class Node(Protocol):
+    """Anything that draws towers."""
+
+    def draw(self, rng: np.random.Generator, reasons: Counter[str]) -> list[Tower]:
+        """Draw towers; count in ``reasons`` why draws were thrown away."""
+        ...
+
+
+@dataclass(frozen=True)
+class Object:
+    """One object at a distribution of places."""
+
+    asset: str
+    where: Gaussian
+
+    def draw(self, rng: np.random.Generator, reasons: Counter[str]) -> list[Tower]:
+        return [Tower((self.asset,), self.where)]
+
+
+@dataclass(frozen=True)
+class Stack:
+    """A stack that grows by chance: after each ``base``, one of ``then``.
+
+    Attributes:
+        base: the asset that carries others.
+        then: weights of what comes next: ``base`` (go on), another asset (ends the stack), or None (ends it).
+        step: height (m) by which each level rises.
+        where: the distribution of the stack's axis.
+        at_most: objects in the stack, at most; drawn again when it grows higher.
+    """
+
+    base: str
+    then: Mapping[str | None, float]
+    step: float
+    where: Gaussian
+    at_most: int = 10
+
+    @cached_property
+    def _next(self) -> tuple[list[str | None], list[float]]:
+        return list(self.then), list(accumulate(self.then.values()))
+
+    def draw(self, rng: np.random.Generator, reasons: Counter[str]) -> list[Tower]:
+        options, cumulative = self._next
+        while True:
+            assets = [self.base]
+            following: str | None = self.base
+            while following == self.base and len(assets) <= self.at_most:
+                following = options[bisect_right(cumulative, rng.random() * cumulative[-1])]
+                if following is not None:
+                    assets.append(following)
+            if len(assets) <= self.at_most:
+                return [Tower(tuple(assets), self.where, self.step)]
+            reasons[f"stack of {self.base} above {self.at_most}"] += 1
+
+
+@dataclass(frozen=True)
+class Group:
+    """All of several nodes, in order."""
+
+    members: tuple[Node, ...]
+
+    def __init__(self, *members: Node) -> None:
+        object.__setattr__(self, "members", members)
+
+    def draw(self, rng: np.random.Generator, reasons: Counter[str]) -> list[Tower]:
+        return [tower for member in self.members for tower in member.draw(rng, reasons)]
+
+
+NOTHING = Group()
+"""No object at all, for use in a choice."""
+
+
+@dataclass(frozen=True)
+class OneOf:
+    """Exactly one of several (weight, node) options; weights need not sum to one."""
+
+    options: tuple[tuple[float, Node], ...]
+
+    def __init__(self, *options: tuple[float, Node]) -> None:
+        if not options or any(weight < 0 for weight, _ in options) or sum(weight for weight, _ in options) <= 0:
+            raise InvalidInputError(f"OneOf needs weights >= 0 with a positive sum, got {[w for w, _ in options]}")
+        object.__setattr__(self, "options", options)
+
+    @cached_property
+    def _cumulative(self) -> list[float]:
+        return list(accumulate(weight for weight, _ in self.options))
+
+    def draw(self, rng: np.random.Generator, reasons: Counter[str]) -> list[Tower]:
+        index = bisect_right(self._cumulative, rng.random() * self._cumulative[-1])
+        return self.options[index][1].draw(rng, reasons)
+
+
+@dataclass(frozen=True)
+class Geometric:
+    """P(n) proportional to (1 - p)^(n - low) for n = low..high; with chance 1 - ``present``, n = 0.
+
+    >>> counts = [Geometric(0.5, 1, 2, present=0.9).draw(np.random.default_rng(seed)) for seed in range(200)]
+    >>> sorted(set(counts))
+    [0, 1, 2]
+    """
+
+    p: float
+    low: int
+    high: int
+    present: float = 1.0
+
+    @cached_property
+    def _cumulative(self) -> list[float]:
+        return list(accumulate((1.0 - self.p) ** n for n in range(self.high - self.low + 1)))
+
+    def draw(self, rng: np.random.Generator) -> int:
+        """One count."""
+        if rng.random() >= self.present:
+            return 0
+        return self.low + bisect_right(self._cumulative, rng.random() * self._cumulative[-1])
+
+
+@dataclass(frozen=True)
+class Repeat:
+    """A node several times, drawn again until every condition in ``such_that`` holds.
+
+    Because nodes are independent, drawing only this node again gives the same distribution as
+    rejecting the whole scene.
+    """
+
+    node: Node
+    count: Geometric
+    such_that: Mapping[str, Callable[[Sequence[Tower]], bool]] = field(default_factory=dict)
+
+    def draw(self, rng: np.random.Generator, reasons: Counter[str]) -> list[Tower]:
+        for _ in range(100_000):
+            towers = [tower for _ in range(self.count.draw(rng)) for tower in self.node.draw(rng, reasons)]
+            failed = next((name for name, holds in self.such_that.items() if not holds(towers)), None)
+            if failed is None:
+                return towers
+            reasons[failed] += 1
+        raise InvalidInputError(f"a grammar's condition {failed!r} did not hold in 100,000 draws; it cannot be met")
