@@ -1,0 +1,321 @@
+"""The denoising MDP (Black et al. 2024, Sec. 4.2): one batched pure-torch core, which every face wraps.
+
+State (x_t, t), action x_{t-1}, transition the identity, reward at t = 0 only. In ``noise`` mode the action is
+the noise of the prior's own reverse step instead, so that actions from N(0, I) reproduce the prior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from scene_envs.env_errors import ResetNeededError
+from scene_envs.env_reward import RewardScorer, Score
+from scene_envs.env_spaces import (
+    STATE_BOUND,
+    check_action,
+    check_slots,
+    occupied,
+    prior_device,
+    resolve_scene_and_prior,
+)
+from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.scene import SceneBatch
+from scene_envs.scene_types import SceneType
+
+ACTION_MODES = ("next_sample", "noise")
+
+BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
+IntArray = np.ndarray[Any, np.dtype[np.int64]]
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What one step gave the B episodes of a core.
+
+    Attributes:
+        reward: (B,) float32; 0 before the last step and where ``valid`` is False.
+        valid: (B,) bool; False where the reward could not score the finished scene.
+        terminated: (B,) bool, on the CPU.
+        terms: named (B,) float32 of the reward; 0 before the last step.
+        score: the full verdict, when all B episodes ended in this step; else None.
+    """
+
+    reward: Tensor
+    valid: Tensor
+    terminated: BoolArray
+    terms: dict[str, Tensor]
+    score: Score | None = None
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """B whole episodes of S steps.
+
+    Attributes:
+        scenes: (S + 1, B, N, D) float32 normalised, from x_T to x_0.
+        actions: (S, B, N, D) float32 as given by the policy.
+        timesteps: (S,) int64; ``scenes[i]`` is at ``timesteps[i]``, the last scene at 0.
+        reward: (B,) float32; 0 where not valid.
+        valid: (B,) bool.
+        score: value, terms, credit and flags per object.
+        batch: the finished scenes x_0.
+    """
+
+    scenes: Tensor
+    actions: Tensor
+    timesteps: Tensor
+    reward: Tensor
+    valid: Tensor
+    score: Score
+    batch: SceneBatch
+
+
+class DenoisingCore:
+    """B denoising episodes side by side, which may be at different steps.
+
+    Known entries (fixed welded slots, constant features) are clamped to their values after every action, and
+    scenes are kept within ±10. An episode's x_T comes from its own NumPy generator, so it does not depend on
+    the size of the batch.
+
+    Args:
+        num_envs: B.
+        scene: scene type or its name.
+        reward: name, mapping, function or reward object.
+        num_steps: S, denoising steps per episode.
+        prior: name, path or prior; None means the shipped prior of the scene type.
+        slots: N; None means the scene type's.
+        action_mode: ``"next_sample"`` or ``"noise"``.
+        max_action: actions are clipped to ±max_action.
+        workers: physics worker processes.
+
+    Raises:
+        InvalidInputError, UnknownNameError: an argument is outside what is accepted.
+    """
+
+    def __init__(
+        self,
+        num_envs: int,
+        *,
+        scene: str | SceneType = "dimsum_table",
+        reward: Any = "object_count",
+        num_steps: int = 50,
+        prior: Any = None,
+        slots: int | None = None,
+        action_mode: str = "next_sample",
+        max_action: float = 10.0,
+        workers: int = 0,
+    ) -> None:
+        if not isinstance(num_envs, int) or num_envs < 1:
+            raise InvalidInputError(f"num_envs={num_envs!r}: at least one environment is needed")
+        if action_mode not in ACTION_MODES:
+            raise unknown_name("action mode", str(action_mode), ACTION_MODES)
+        if not (np.isfinite(max_action) and max_action > 0):
+            raise InvalidInputError(f"max_action={max_action!r} must be positive and finite")
+        self.num_envs = num_envs
+        self.scene_type, self.prior = resolve_scene_and_prior(scene, prior)
+        self.slots = check_slots(self.scene_type, slots)
+        self.action_mode = action_mode
+        self.max_action = float(max_action)
+        self.table = self.prior.step_table(num_steps)
+        self.num_steps = len(self.table)
+        self.device = prior_device(self.prior)
+        self.scorer = RewardScorer(reward, workers)
+        self.term_names = self.scorer.probe(SceneBatch.empty(self.scene_type, 1, self.slots))
+        # timestep of step i, with the clean scene's 0 at the end
+        self._schedule = np.append(self.table.timesteps.cpu().numpy(), 0).astype(np.int64)
+        self._steps: IntArray = np.full(num_envs, -1, dtype=np.int64)  # -1: never reset
+        self._x = torch.zeros(num_envs, self.slots, self.features, device=self.device)
+
+    @property
+    def features(self) -> int:
+        """D."""
+        return self.scene_type.features
+
+    @property
+    def x(self) -> Tensor:
+        """(B, N, D) current normalised scenes; never written in place."""
+        return self._x
+
+    @property
+    def steps(self) -> IntArray:
+        """(B,) steps taken in each episode."""
+        return self._steps.copy()
+
+    @property
+    def timesteps(self) -> IntArray:
+        """(B,) current diffusion timesteps, 0 when finished."""
+        return self._schedule[self._steps]
+
+    @property
+    def first_timestep(self) -> int:
+        """T, the timestep every episode starts at."""
+        return int(self._schedule[0])
+
+    @property
+    def finished(self) -> BoolArray:
+        """(B,) bool: episodes at t = 0."""
+        return self._steps == self.num_steps
+
+    def scenes(self) -> SceneBatch:
+        """The current scenes, decoded: rotations in SO(3), arg-max categories."""
+        return SceneBatch.from_tensor(self._x, self.scene_type, normalised=self.prior.normalizer)
+
+    def object_mask(self) -> Tensor:
+        """(B, N) int8: slots whose arg-max category is not empty."""
+        return occupied(self._x)
+
+    def observation(self) -> dict[str, Tensor]:
+        """``scene`` (B, N, D) float32, ``timestep`` (B, 1) int64, ``object_mask`` (B, N) int8; all fresh tensors.
+
+        Prompt tokens join here when a prior reads prompts.
+        """
+        return {
+            "scene": self._x.clone(),
+            "timestep": torch.from_numpy(self.timesteps).unsqueeze(-1).to(self.device),
+            "object_mask": occupied(self._x),
+        }
+
+    def info(self, result: StepResult | None = None) -> dict[str, np.ndarray]:
+        """(B,) numbers: step, timestep, objects, reward_valid and ``term_<name>`` for each term of the reward.
+
+        Args:
+            result: of the step just taken; None after a reset.
+        """
+        terms = result.terms if result is not None else dict.fromkeys(self.term_names)
+        valid = np.ones(self.num_envs, np.int64) if result is None else result.valid.cpu().numpy().astype(np.int64)
+        info = {
+            "step": self.steps,
+            "timestep": self.timesteps,
+            "objects": occupied(self._x).sum(dim=-1).cpu().numpy(),
+            "reward_valid": valid,
+        }
+        for name, term in terms.items():
+            info[f"term_{name}"] = np.zeros(self.num_envs) if term is None else term.cpu().numpy().astype(np.float64)
+        return info
+
+    # -- transitions ----------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def reset(self, rngs: Sequence[np.random.Generator], mask: BoolArray | None = None) -> None:
+        """Start new episodes.
+
+        Args:
+            rngs: one NumPy generator per environment; each reset environment draws one seed from its own.
+            mask: (B,) bool, which environments; None means all.
+        """
+        rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
+        if len(rows) == 0:
+            return
+        start = torch.cat([self._draw_start(rngs[row]) for row in rows.tolist()])
+        self._x = _replace_rows(self._x, rows, start)
+        self._steps[rows] = 0
+
+    def _draw_start(self, rng: np.random.Generator) -> Tensor:
+        generator = torch.Generator(self.device).manual_seed(int(rng.integers(2**63)))
+        return self.prior.initial(1, self.slots, generator).clamp(-STATE_BOUND, STATE_BOUND)
+
+    @torch.no_grad()
+    def step(self, action: Any, active: BoolArray | None = None) -> StepResult:
+        """Take one denoising step in every active environment.
+
+        Args:
+            action: (B, N, D) array or tensor; values beyond ±max_action are clipped.
+            active: (B,) bool; None means all. Rows of inactive environments are ignored but must be finite.
+
+        Raises:
+            ResetNeededError: an active episode has ended or never began.
+            InvalidInputError: the action has the wrong shape or is not finite.
+        """
+        shape = (self.num_envs, self.slots, self.features)
+        given = check_action(action, shape, ("environment", "slot", "feature")).to(self.device)
+        rows = np.arange(self.num_envs) if active is None else np.flatnonzero(active)
+        self._check_running(rows)
+        given = given.clamp(-self.max_action, self.max_action)
+        for step in np.unique(self._steps[rows]):
+            group = rows[self._steps[rows] == step]
+            moved = self._transition(_take_rows(self._x, group), _take_rows(given, group), int(step))
+            self._x = _replace_rows(self._x, group, moved)
+        self._steps[rows] += 1
+        return self._judge(rows[self.finished[rows]])
+
+    def _transition(self, x_t: Tensor, action: Tensor, step: int) -> Tensor:
+        if self.action_mode == "noise":
+            mean, std = self.prior.posterior(x_t, step, self.table)
+            action = mean + std * action
+        return self.prior.clamp(action).clamp(-STATE_BOUND, STATE_BOUND)
+
+    def _check_running(self, rows: IntArray) -> None:
+        stopped = rows[(self._steps[rows] < 0) | (self._steps[rows] >= self.num_steps)]
+        if len(stopped):
+            fresh = bool((self._steps[stopped] < 0).any())
+            what = "was never reset" if fresh else f"ended after its {self.num_steps} steps"
+            raise ResetNeededError(f"the episode of environment {int(stopped[0])} {what}; call reset() first")
+
+    def _judge(self, ended: IntArray) -> StepResult:
+        count, device = self.num_envs, self.device
+        reward = torch.zeros(count, device=device)
+        valid = torch.ones(count, dtype=torch.bool, device=device)
+        terms = {name: torch.zeros(count, device=device) for name in self.term_names}
+        terminated = np.zeros(count, dtype=np.bool_)
+        if len(ended) == 0:
+            return StepResult(reward, valid, terminated, terms)
+        terminated[ended] = True
+        batch = self.scenes() if len(ended) == count else self.scenes()[torch.from_numpy(ended)]
+        score = self.scorer(batch)
+        reward = _replace_rows(reward, ended, score.value.to(device))
+        valid = _replace_rows(valid, ended, score.valid.to(device))
+        for name in terms.keys() & score.terms.keys():
+            terms[name] = _replace_rows(terms[name], ended, score.terms[name].to(device))
+        return StepResult(reward, valid, terminated, terms, score if len(ended) == count else None)
+
+    # -- whole trajectories ---------------------------------------------------------------------
+
+    @torch.no_grad()
+    def collect(self, policy: Callable[[Tensor, int], Tensor], rngs: Sequence[np.random.Generator]) -> Trajectories:
+        """Reset every environment and run ``policy`` to the end; the same episodes as single steps give.
+
+        Args:
+            policy: ``(x_t (B, N, D), step) -> action (B, N, D)``; ``step`` indexes ``self.table``.
+            rngs: one NumPy generator per environment, for x_T.
+        """
+        self.reset(rngs)
+        scenes, actions = [self._x], []
+        for step in range(self.num_steps):
+            action = policy(self._x, step)
+            result = self.step(action)
+            scenes.append(self._x)
+            actions.append(action.detach())
+        assert result.score is not None
+        return Trajectories(
+            scenes=torch.stack(scenes),
+            actions=torch.stack(actions),
+            timesteps=torch.from_numpy(self._schedule[:-1].copy()),
+            reward=result.reward,
+            valid=result.valid,
+            score=result.score,
+            batch=self.scenes(),
+        )
+
+    def close(self) -> None:
+        """Stop physics workers, if any."""
+        self.scorer.close()
+
+
+def _take_rows(x: Tensor, rows: IntArray) -> Tensor:
+    """``x[rows]`` without a copy when ``rows`` are all of them."""
+    return x if len(rows) == x.shape[0] else x[torch.from_numpy(rows).to(x.device)]
+
+
+def _replace_rows(x: Tensor, rows: IntArray, values: Tensor) -> Tensor:
+    """A new tensor: ``x`` with ``rows`` (ascending) set to ``values``."""
+    if len(rows) == x.shape[0]:
+        return values
+    changed = x.clone()
+    changed[torch.from_numpy(rows).to(x.device)] = values
+    return changed

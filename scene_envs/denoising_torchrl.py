@@ -1,0 +1,138 @@
+"""The torchrl face of the denoising MDP: batched tensors in and out. Training uses this one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from gymnasium.utils import seeding
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from scene_envs.denoising import DenoisingCore, StepResult, Trajectories
+from scene_envs.env_spaces import STATE_BOUND
+from scene_envs.scene_types import SceneType
+
+
+class DenoisingTorchRLEnv(EnvBase):
+    """B denoising episodes as a batch-locked torchrl environment; its page is ``DenoisingEnv``'s.
+
+    Keys: ``scene`` (B, N, D) float32, ``timestep`` (B, 1) int64, ``object_mask`` (B, N) int8, ``valid`` (B, 1) bool
+    (False where the reward could not score the finished scene, whose reward is then 0), ``action`` (B, N, D),
+    ``reward``, ``terminated``, ``truncated`` and ``done`` (B, 1). Everything lives on the prior's device.
+
+    With the same seed, ``reset`` and ``step`` give bit for bit what ``DenoisingVectorEnv`` gives; :meth:`collect`
+    gives the same episodes without a tensordict per step.
+
+    Args:
+        num_envs: B.
+        scene, reward, num_steps, prior, slots, action_mode, max_action, workers: as for ``DenoisingEnv``.
+
+    >>> from agents.prior import tiny_prior
+    >>> env = DenoisingTorchRLEnv(2, prior=tiny_prior(), reward="object_count", num_steps=3)
+    >>> env.rollout(3)["next", "terminated"].squeeze(-1).tolist()
+    [[False, False, True], [False, False, True]]
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scene: str | SceneType = "dimsum_table",
+        reward: Any = "object_count",
+        num_steps: int = 50,
+        prior: Any = None,
+        slots: int | None = None,
+        action_mode: str = "next_sample",
+        max_action: float = 10.0,
+        workers: int = 0,
+    ) -> None:
+        core = DenoisingCore(
+            num_envs,
+            scene=scene,
+            reward=reward,
+            num_steps=num_steps,
+            prior=prior,
+            slots=slots,
+            action_mode=action_mode,
+            max_action=max_action,
+            workers=workers,
+        )
+        super().__init__(device=core.device, batch_size=torch.Size([num_envs]))
+        self.core = core
+        self._rngs = [seeding.np_random()[0] for _ in range(num_envs)]
+        self._make_specs()
+
+    def _make_specs(self) -> None:
+        core, batch, device = self.core, self.batch_size, self.device
+        scene_shape = (*batch, core.slots, core.features)
+        self.observation_spec = Composite(
+            {
+                "scene": Bounded(-STATE_BOUND, STATE_BOUND, scene_shape, device, torch.float32),
+                "timestep": Bounded(0, core.first_timestep, (*batch, 1), device, torch.int64),
+                "object_mask": Binary(core.slots, (*batch, core.slots), device, torch.int8),
+                "valid": Binary(1, (*batch, 1), device, torch.bool),
+            },
+            shape=batch,
+            device=device,
+        )
+        self.action_spec = Bounded(-core.max_action, core.max_action, scene_shape, device, torch.float32)
+        self.reward_spec = Unbounded((*batch, 1), device, torch.float32)
+        flag = Binary(1, (*batch, 1), device, torch.bool)
+        self.done_spec = Composite(
+            {"done": flag, "terminated": flag.clone(), "truncated": flag.clone()}, shape=batch, device=device
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Environment i gets the generator of ``seed + i``, as in the vector environment."""
+        if seed is None:
+            self._rngs = [seeding.np_random()[0] for _ in range(self.core.num_envs)]
+        else:
+            self._rngs = [seeding.np_random(int(seed) + i)[0] for i in range(self.core.num_envs)]
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        flags = None if tensordict is None else tensordict.get("_reset", None)
+        mask = None if flags is None else flags.reshape(self.core.num_envs).cpu().numpy()
+        self.core.reset(self._rngs, mask)
+        return self._observe(None)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        result = self.core.step(tensordict["action"])
+        observed = self._observe(result)
+        observed["reward"] = result.reward.unsqueeze(-1)
+        return observed
+
+    def _observe(self, result: StepResult | None) -> TensorDict:
+        finished = torch.from_numpy(self.core.finished).unsqueeze(-1).to(self.core.device)
+        valid = torch.ones_like(finished) if result is None else result.valid.unsqueeze(-1)
+        fields = {
+            **self.core.observation(),
+            "valid": valid,
+            "done": finished,
+            "terminated": finished.clone(),
+            "truncated": torch.zeros_like(finished),
+        }
+        return TensorDict(fields, batch_size=self.batch_size, device=self.device)
+
+    def collect(self, policy: Callable[[Tensor, int], Tensor]) -> Trajectories:
+        """Reset, then run ``policy`` to the end of all episodes: what training calls.
+
+        Args:
+            policy: ``(x_t (B, N, D), step) -> action (B, N, D)``. Called without gradients.
+
+        >>> from agents.prior import tiny_prior
+        >>> prior = tiny_prior()
+        >>> env = DenoisingTorchRLEnv(2, prior=prior, reward="object_count", num_steps=3, action_mode="noise")
+        >>> trajectories = env.collect(lambda x, step: torch.randn_like(x))
+        >>> tuple(trajectories.scenes.shape), tuple(trajectories.reward.shape)
+        ((4, 2, 34, 20), (2,))
+        """
+        return self.core.collect(policy, self._rngs)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Stop physics workers, if any."""
+        self.core.close()
+        if not self.is_closed:
+            super().close(raise_if_closed=raise_if_closed)

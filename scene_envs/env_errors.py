@@ -1,0 +1,11 @@
+"""Errors of the environments that Gymnasium has a name for too."""
+
+from __future__ import annotations
+
+import gymnasium.error
+
+from scene_envs.errors import SceneEnvsError
+
+
+class ResetNeededError(SceneEnvsError, gymnasium.error.ResetNeeded):
+    """``step`` was called before ``reset``, or after the end of an episode."""

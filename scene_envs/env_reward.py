@@ -1,0 +1,76 @@
+"""How the environments ask a reward for its verdict: one object, shared by denoising and search."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from scene_envs.errors import InvalidInputError
+from scene_envs.protocols import resolve_reward, reward_context
+from scene_envs.scene import SceneBatch
+
+
+@dataclass(frozen=True)
+class Score:
+    """A reward's verdict on B scenes with N slots; every row is finite.
+
+    Attributes:
+        value: (B,) float32; 0 where ``valid`` is False.
+        valid: (B,) bool.
+        terms: named (B,) float32; 0 where not finite.
+        per_object: (B, N) float credit per slot, or None.
+        object_flags: named (B, N) bool.
+    """
+
+    value: Tensor
+    valid: Tensor
+    terms: Mapping[str, Tensor] = field(default_factory=dict)
+    per_object: Tensor | None = None
+    object_flags: Mapping[str, Tensor] = field(default_factory=dict)
+
+
+class RewardScorer:
+    """Resolves a reward once and scores batches of scenes with it.
+
+    Args:
+        reward: a registered name, a mapping with its settings, a function or a reward object.
+        workers: physics worker processes; 0 computes in this process. Started at the first scoring.
+    """
+
+    def __init__(self, reward: Any, workers: int = 0) -> None:
+        if not isinstance(workers, int) or workers < 0:
+            raise InvalidInputError(f"workers={workers!r}: give a number of processes, 0 for none")
+        self.reward = resolve_reward(reward)
+        self.workers = workers
+        self._pool: Any = None
+
+    def __call__(self, batch: SceneBatch) -> Score:
+        """Score ``batch``; rows that the reward could not score come back invalid with value 0."""
+        context = reward_context(pool=self._physics_pool())
+        output = import_module("rewards").evaluate_reward(self.reward, batch, context)
+        valid = output.is_valid
+        value = torch.where(valid, output.value, torch.zeros_like(output.value)).float()
+        terms = {name: torch.nan_to_num(term.float(), 0.0, 0.0, 0.0) for name, term in output.terms.items()}
+        return Score(value, valid, terms, output.per_object, output.object_flags)
+
+    def probe(self, empty: SceneBatch) -> tuple[str, ...]:
+        """Names of the terms this reward reports, found by scoring one empty scene in this process."""
+        context = reward_context(pool=None)
+        output = import_module("rewards").evaluate_reward(self.reward, empty, context)
+        return tuple(sorted(output.terms))
+
+    def _physics_pool(self) -> Any:
+        if self._pool is None and self.workers > 0:
+            self._pool = import_module("scene_envs.physics").PhysicsPool(workers=self.workers)
+        return self._pool
+
+    def close(self) -> None:
+        """Stop the worker processes; they start again when needed."""
+        if self._pool is not None:
+            self._pool.close()
+            self._pool = None

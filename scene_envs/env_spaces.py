@@ -1,0 +1,117 @@
+"""Spaces of the environments, and the checks on what users put into them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from torch import Tensor
+
+from scene_envs.errors import InvalidInputError
+from scene_envs.protocols import PriorLike, resolve_prior
+from scene_envs.scene import CATEGORY, SceneBatch
+from scene_envs.scene_types import SceneType, get_scene_type
+
+STATE_BOUND = 10.0
+"""Normalised scenes are kept within ±10. Data lies in [-1, 1] and no float32 normal draw exceeds 6.8."""
+
+
+def resolve_scene_and_prior(scene: str | SceneType, prior: Any) -> tuple[SceneType, PriorLike]:
+    """The scene type, and its prior: the given one, or the shipped one of the scene type's name."""
+    scene_type = get_scene_type(scene)
+    resolved = resolve_prior(scene_type.name if prior is None else prior)
+    if not isinstance(resolved, PriorLike):
+        raise InvalidInputError(f"prior={prior!r} is not a prior; give a name, a path or a ScenePrior")
+    if resolved.scene_type.name != scene_type.name:
+        raise InvalidInputError(
+            f"the prior makes scenes of {resolved.scene_type.name!r}, the environment asks for {scene_type.name!r}; "
+            f"pass scene={resolved.scene_type.name!r} or another prior"
+        )
+    if resolved.conditional:
+        raise InvalidInputError(
+            "this prior reads prompts and the v0 environments have none; use an unconditional prior"
+        )
+    return scene_type, resolved
+
+
+def check_slots(scene_type: SceneType, slots: int | None) -> int:
+    """The number of slots per scene, defaulting to the scene type's."""
+    if slots is None:
+        return scene_type.slots
+    smallest = len(scene_type.fixed) + 1
+    if not isinstance(slots, int) or slots < smallest:
+        raise InvalidInputError(f"slots={slots!r}: scenes of {scene_type.name!r} need at least {smallest} slots")
+    return slots
+
+
+def prior_device(prior: PriorLike) -> torch.device:
+    """Where the prior's weights are; CPU for a prior that has none."""
+    parameters: Iterable[Tensor] = prior.parameters() if hasattr(prior, "parameters") else ()
+    return next((p.device for p in parameters), torch.device("cpu"))
+
+
+def scene_box(bound: float, slots: int, features: int) -> spaces.Box:
+    """Box(-bound, bound, (N, D), float32)."""
+    return spaces.Box(-bound, bound, (slots, features), np.float32)
+
+
+def occupied(x: Tensor) -> Tensor:
+    """(B, N) int8: 1 where the arg-max category of normalised or raw scenes (B, N, D) is not *empty*."""
+    category = x[..., CATEGORY]
+    return (category.argmax(dim=-1) != category.shape[-1] - 1).to(torch.int8)
+
+
+def check_action(action: Any, shape: tuple[int, ...], axes: tuple[str, ...]) -> Tensor:
+    """``action`` as a finite float32 tensor of ``shape``.
+
+    Args:
+        action: anything array-like.
+        shape: what is required.
+        axes: names of the dimensions, for the message.
+
+    Raises:
+        InvalidInputError: wrong shape, or a value that is not finite (the first one is named).
+    """
+    try:
+        tensor = action if isinstance(action, Tensor) else torch.from_numpy(np.asarray(action, dtype=np.float32))
+    except (TypeError, ValueError) as error:
+        raise InvalidInputError(f"the action is not an array of numbers of shape {shape}: {error}") from error
+    tensor = tensor.detach().float()
+    if tuple(tensor.shape) != shape:
+        raise InvalidInputError(
+            f"the action has shape {tuple(tensor.shape)}, it must be {shape}, that is ({', '.join(axes)})"
+        )
+    finite = torch.isfinite(tensor)
+    if not bool(finite.all()):
+        index = torch.nonzero(~finite)[0].tolist()
+        place = ", ".join(f"{axis} {i}" for axis, i in zip(axes, index, strict=True))
+        raise InvalidInputError(f"the action holds {tensor[tuple(index)].item()} at {place}; all values must be finite")
+    return tensor
+
+
+def check_render_mode(render_mode: str | None) -> str | None:
+    """``None`` or ``"rgb_array"``."""
+    if render_mode not in (None, "rgb_array"):
+        raise InvalidInputError(f"render_mode={render_mode!r} is not supported; use 'rgb_array' or None")
+    return render_mode
+
+
+def check_reset_mask(options: dict[str, Any] | None, count: int) -> np.ndarray:
+    """The (B,) bool ``reset_mask`` of Gymnasium's vector reset options; all True when it is not given."""
+    mask = (options or {}).get("reset_mask")
+    if mask is None:
+        return np.ones(count, np.bool_)
+    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != (count,) or not mask.any():
+        raise InvalidInputError(
+            f"options['reset_mask'] must be a bool array of shape ({count},) with at least one True, got {mask!r}"
+        )
+    return mask
+
+
+def picture(batch: SceneBatch) -> np.ndarray:
+    """(B, H, W, 3) uint8 pictures (loads the renderer)."""
+    return import_module("scene_envs.render").render(batch, style="picture")  # type: ignore[no-any-return]

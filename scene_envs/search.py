@@ -1,0 +1,288 @@
+"""Gymnasium face of the search MDP: choose among inpaintings of a scene until it is good."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from scene_envs.env_errors import ResetNeededError
+from scene_envs.env_spaces import STATE_BOUND, check_render_mode, occupied, picture, scene_box
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import SceneBatch
+from scene_envs.scene_types import SceneType
+from scene_envs.search_problem import SearchProblem
+from scene_envs.search_state import SearchState
+
+Observation = dict[str, np.ndarray]
+
+
+class SearchEnv(gym.Env[Any, Any]):
+    """Inference-time search over partial scenes as an environment.
+
+    ## Description
+
+    A state is a scene with a mask that says which of its slots are to be regenerated: the objects that the
+    objective blames, and the empty slots. An action chooses one of `branching` inpaintings of those slots by the
+    scene prior (Pfaff et al. 2025, inference-time search). Good choices keep what works and replace what does not.
+
+    Planners use the state directly. It is immutable and picklable and holds no simulator: `clone_state`,
+    `restore_state`, `legal_actions`, `action_masks`, `expand`, `expand_batch`, `evaluate`, `best_state`. The random
+    numbers of a child are a function of the root's seed and the child's path, so a tree is the same whatever the
+    order of its expansion. Batches of different sizes may differ in the network's rounding, by about 1e-6.
+
+    ## Action Space
+
+    `Discrete(branching)`: which inpainting. All are legal until `max_depth`.
+
+    ## Observation Space
+
+    `Dict` of
+
+    | key | space | meaning |
+    |---|---|---|
+    | `scene` | `Box(-10, 10, (N, D), float32)` | the scene, normalised |
+    | `object_mask` | `MultiBinary(N)` | slots that are not *empty* |
+    | `regenerate` | `MultiBinary(N)` | slots that the next action regenerates |
+    | `depth` | `Box(0, max_depth, (1,), int64)` | actions taken |
+    | `value` | `Box(0, 1, (1,), float32)` | Φ of the scene |
+
+    `info` holds the same numbers at every reset and step: `depth`, `value` (Φ), `objective` (raw), `reward_valid`
+    (0 or 1), `objects` (slots that are not empty, welded ones included), `regenerate` (slots in the mask),
+    `best_value` (highest Φ since the reset) and `nfe` (denoiser evaluations since the reset, planner's ones
+    included).
+
+    ## Rewards
+
+    Φ(s') - Φ(s), with Φ the objective's value divided by the number of free slots (or by `objective_scale`),
+    clipped to [0, 1]. The rewards of an episode add up to Φ(end) - Φ(root). Where the objective could not score the
+    child, Φ is that of the parent, the reward is 0 and `info["reward_valid"]` is 0.
+
+    ## Starting State
+
+    A sample of the prior, from a seed that `self.np_random` draws. `reset(options={"state": state})` starts from a
+    given `SearchState` instead, and `options={"scene": batch}` from a given scene.
+
+    ## Episode End
+
+    `terminated` at depth `max_depth`. Never `truncated`.
+
+    ## Arguments
+
+    ```python
+    import gymnasium as gym
+
+    env = gym.make("scene_envs:SceneEnvs/Search-v0", scene="dimsum_table", objective="feasible_objects", branching=4)
+    ```
+
+    | argument | default | meaning |
+    |---|---|---|
+    | `scene` | `"dimsum_table"` | scene type |
+    | `objective` | `"feasible_objects"` | any reward: name, mapping, function or object |
+    | `branching` | `4` | inpaintings to choose from |
+    | `max_depth` | `10` | actions per episode |
+    | `num_steps` | `50` | denoising steps per inpainting |
+    | `prior` | `None` | name, path or prior; `None` is the shipped prior of the scene type |
+    | `slots` | `None` | slots per scene; `None` is the scene type's number, more is allowed |
+    | `mask` | `"infeasible"` | mask generator: `"infeasible"` (blamed objects, empty slots), `"random"`, a function |
+    | `objective_scale` | `None` | objective value at which Φ = 1; `None` is the number of free slots |
+    | `workers` | `0` | processes for physics in the objective; 0 computes in this one |
+    | `render_mode` | `None` | `"rgb_array"` renders the current scene |
+
+    ## Vectorized environment
+
+    `gym.make_vec("scene_envs:SceneEnvs/Search-v0", num_envs=4, ...)` runs copies one after another. A planner is
+    better served by `expand_batch`, which denoises many children in one batch.
+
+    ## Version History
+
+    * v0: initial version.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012  (declared so by gym.Env)
+
+    def __init__(
+        self,
+        scene: str | SceneType = "dimsum_table",
+        objective: Any = "feasible_objects",
+        branching: int = 4,
+        max_depth: int = 10,
+        num_steps: int = 50,
+        prior: Any = None,
+        slots: int | None = None,
+        mask: Any = "infeasible",
+        objective_scale: float | None = None,
+        workers: int = 0,
+        render_mode: str | None = None,
+    ) -> None:
+        self.render_mode = check_render_mode(render_mode)
+        self.problem = SearchProblem(
+            scene=scene,
+            objective=objective,
+            branching=branching,
+            max_depth=max_depth,
+            num_steps=num_steps,
+            prior=prior,
+            slots=slots,
+            mask=mask,
+            objective_scale=objective_scale,
+            workers=workers,
+        )
+        slot_count = self.problem.slots
+        self.observation_space = spaces.Dict(
+            {
+                "scene": scene_box(STATE_BOUND, slot_count, self.problem.scene_type.features),
+                "object_mask": spaces.MultiBinary(slot_count),
+                "regenerate": spaces.MultiBinary(slot_count),
+                "depth": spaces.Box(0, max_depth, (1,), np.int64),
+                "value": spaces.Box(0.0, 1.0, (1,), np.float32),
+            }
+        )
+        self.action_space = spaces.Discrete(branching)
+        self._state: SearchState | None = None
+        self._best: SearchState | None = None
+        self._nfe_at_reset = 0
+
+    # -- the Gymnasium interface ----------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start from a sample of the prior.
+
+        Args:
+            seed: of ``self.np_random``, which draws the seed of the tree.
+            options: ``{"state": SearchState}`` or ``{"scene": SceneBatch of 1}`` to start from.
+        """
+        super().reset(seed=seed)
+        options = options or {}
+        self._nfe_at_reset = self.problem.evaluations
+        tree_seed = int(self.np_random.integers(2**63))
+        if "state" in options:
+            self._state = self._check_state(options["state"])
+        else:
+            self._state = self.problem.root(tree_seed, options.get("scene"))
+        self._best = self._state
+        return self._observe(self._state)
+
+    def step(self, action: int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Move to the chosen inpainting.
+
+        Raises:
+            InvalidInputError: no such action.
+            ResetNeededError: the episode has ended or never began.
+        """
+        parent = self.state
+        if parent.depth >= self.problem.max_depth:
+            raise ResetNeededError(f"the episode ended at max_depth={self.problem.max_depth}; call reset() first")
+        self._state = self.expand(parent, action)
+        observation, info = self._observe(self._state)
+        terminated = self._state.depth >= self.problem.max_depth
+        return observation, self._state.value - parent.value, terminated, False, info
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """(H, W, 3) uint8 picture of the current scene, or None without a render mode."""
+        return picture(self.scene())[0] if self.render_mode else None
+
+    def close(self) -> None:
+        """Stop physics workers, if any."""
+        self.problem.close()
+
+    # -- the planner's interface ----------------------------------------------------------------
+
+    @property
+    def state(self) -> SearchState:
+        """The current state."""
+        if self._state is None:
+            raise ResetNeededError("the search has no state yet; call reset() first")
+        return self._state
+
+    def clone_state(self) -> SearchState:
+        """The current state; it is immutable, so this is no copy."""
+        return self.state
+
+    def restore_state(self, state: SearchState) -> None:
+        """Make ``state`` the current one. The best state and the NFE count go on."""
+        self._state = self._check_state(state)
+        self._remember([self._state])
+
+    def legal_actions(self, state: SearchState | None = None) -> list[int]:
+        """Actions of ``state`` (default: the current one); none at ``max_depth``."""
+        return self.problem.legal_actions(self.state if state is None else state)
+
+    def action_masks(self) -> np.ndarray:
+        """(branching,) bool, the legal actions of the current state, as maskable agents ask for them."""
+        return np.isin(np.arange(self.problem.branching), self.legal_actions())
+
+    def expand(self, state: SearchState, action: int) -> SearchState:
+        """The child of ``state`` under ``action``; the current state stays."""
+        return self.expand_batch([(state, action)])[0]
+
+    def expand_batch(self, pairs: Sequence[tuple[SearchState, int]]) -> list[SearchState]:
+        """The children of (state, action) pairs, denoised as one batch; the current state stays."""
+        children = self.problem.expand_batch(pairs)
+        self._remember(children)
+        return children
+
+    def evaluate(self, state: SearchState | None = None) -> float:
+        """Φ of ``state`` (default: the current one), in [0, 1]; it was computed when the state was made."""
+        return (self.state if state is None else state).value
+
+    def best_state(self) -> SearchState:
+        """The state of highest Φ seen since the reset, by steps or by expansion; the earliest among equals."""
+        if self._best is None:
+            raise ResetNeededError("the search has no state yet; call reset() first")
+        return self._best
+
+    def scene(self, state: SearchState | None = None) -> SceneBatch:
+        """The scene of ``state`` (default: the current one), as a batch of one."""
+        state = self.state if state is None else state
+        return SceneBatch(state.scene.unsqueeze(0), self.problem.scene_type)
+
+    @property
+    def nfe(self) -> int:
+        """Denoiser evaluations since the reset."""
+        return self.problem.evaluations - self._nfe_at_reset
+
+    # -- helpers --------------------------------------------------------------------------------
+
+    def _check_state(self, state: Any) -> SearchState:
+        if not isinstance(state, SearchState):
+            raise InvalidInputError(
+                f"a SearchState is needed, as clone_state() or expand() gives, not {type(state).__name__}"
+            )
+        shape = (self.problem.slots, self.problem.scene_type.features)
+        if tuple(state.scene.shape) != shape:
+            raise InvalidInputError(f"the state's scene has shape {tuple(state.scene.shape)}, here scenes are {shape}")
+        return state
+
+    def _remember(self, states: Sequence[SearchState]) -> None:
+        for state in states:
+            if state.valid and (self._best is None or not self._best.valid or state.value > self._best.value):
+                self._best = state
+
+    def _observe(self, state: SearchState) -> tuple[Observation, dict[str, Any]]:
+        scene = self.scene(state)
+        normalised = scene.to_tensor(normalised=self.problem.prior.normalizer)[0].clamp(-STATE_BOUND, STATE_BOUND)
+        present = occupied(scene.tensor)[0].numpy()
+        observation = {
+            "scene": normalised.numpy(),
+            "object_mask": present,
+            "regenerate": state.mask.numpy().astype(np.int8),
+            "depth": np.array([state.depth], np.int64),
+            "value": np.array([state.value], np.float32),
+        }
+        info = {
+            "depth": state.depth,
+            "value": state.value,
+            "objective": state.objective,
+            "reward_valid": int(state.valid),
+            "objects": int(present.sum()),
+            "regenerate": int(state.mask.sum()),
+            "best_value": self.best_state().value,
+            "nfe": self.nfe,
+        }
+        return observation, info

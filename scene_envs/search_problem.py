@@ -1,0 +1,160 @@
+"""The search MDP as pure functions of states: roots, children, values. No episode, no Gymnasium."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from scene_envs.env_reward import RewardScorer, Score
+from scene_envs.env_spaces import check_slots, resolve_scene_and_prior
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import SceneBatch
+from scene_envs.scene_types import SceneType
+from scene_envs.search_masks import resolve_mask_generator
+from scene_envs.search_state import NodeRandomness, SearchState
+
+
+class SearchProblem:
+    """Generates the tree of partial scenes (Pfaff et al. 2025, inference-time search by inpainting).
+
+    Every function of a state is deterministic. Noise and masks come from the state's own seed and path, so a
+    subtree does not depend on the order of expansion. Expanding in different batches may change the network's
+    rounding by about 1e-6, never the random numbers.
+
+    Args:
+        scene, objective, branching, max_depth, num_steps, prior, slots, mask, objective_scale, workers: as for
+            ``SearchEnv``.
+
+    Attributes:
+        evaluations: denoiser evaluations (NFE) spent so far, ``num_steps`` per generated scene.
+    """
+
+    def __init__(
+        self,
+        *,
+        scene: str | SceneType = "dimsum_table",
+        objective: Any = "feasible_objects",
+        branching: int = 4,
+        max_depth: int = 10,
+        num_steps: int = 50,
+        prior: Any = None,
+        slots: int | None = None,
+        mask: Any = "infeasible",
+        objective_scale: float | None = None,
+        workers: int = 0,
+    ) -> None:
+        for name, number in (("branching", branching), ("max_depth", max_depth), ("num_steps", num_steps)):
+            if not isinstance(number, int) or number < 1:
+                raise InvalidInputError(f"{name}={number!r} must be a whole number of at least 1")
+        self.scene_type, self.prior = resolve_scene_and_prior(scene, prior)
+        self.slots = check_slots(self.scene_type, slots)
+        self.branching, self.max_depth, self.num_steps = branching, max_depth, num_steps
+        self.prior.step_table(num_steps)  # says now, not later, that num_steps is more than the prior has
+        self.scale = float(self.slots - len(self.scene_type.fixed)) if objective_scale is None else objective_scale
+        if not (np.isfinite(self.scale) and self.scale > 0):
+            raise InvalidInputError(f"objective_scale={objective_scale!r} must be positive and finite")
+        self.mask_generator = resolve_mask_generator(mask)
+        self.scorer = RewardScorer(objective, workers)
+        self.evaluations = 0
+
+    # -- states ---------------------------------------------------------------------------------
+
+    def root(self, seed: int, scene: SceneBatch | None = None) -> SearchState:
+        """The root of ``seed``: ``scene`` (a batch of one), or a sample of the prior."""
+        source = NodeRandomness.at(seed, ())
+        if scene is None:
+            empty = SceneBatch.empty(self.scene_type, 1, self.slots)
+            everything = torch.ones(1, self.slots, dtype=torch.bool) & self._changeable()
+            scene = self._inpaint(empty, everything, [source.noise])
+        elif len(scene) != 1 or scene.tensor.shape[1] != self.slots or scene.scene_type.name != self.scene_type.name:
+            raise InvalidInputError(
+                f"the root must be one {self.scene_type.name!r} scene of {self.slots} slots, not {scene}"
+            )
+        return self._score(scene, [(seed, (), 0.0)])[0]
+
+    def expand_batch(self, pairs: Sequence[tuple[SearchState, int]]) -> list[SearchState]:
+        """The children of (state, action) pairs, generated as one batch and scored as one batch.
+
+        Raises:
+            InvalidInputError: an action is not in 0..branching-1, or a state is at ``max_depth``.
+        """
+        if not pairs:
+            return []
+        for state, action in pairs:
+            self._check_legal(state, action)
+        paths = [(*state.path, int(action)) for state, action in pairs]
+        parents = SceneBatch(torch.stack([state.scene for state, _ in pairs]), self.scene_type)
+        masks = torch.stack([state.mask for state, _ in pairs])
+        noises = [NodeRandomness.at(state.seed, path).noise for (state, _), path in zip(pairs, paths, strict=True)]
+        children = self._inpaint(parents, masks, noises)
+        origins = [(state.seed, path, state.value) for (state, _), path in zip(pairs, paths, strict=True)]
+        return self._score(children, origins)
+
+    def expand(self, state: SearchState, action: int) -> SearchState:
+        """The child of ``state`` under ``action``."""
+        return self.expand_batch([(state, action)])[0]
+
+    def legal_actions(self, state: SearchState) -> list[int]:
+        """All inpaintings, or none at ``max_depth``."""
+        return [] if state.depth >= self.max_depth else list(range(self.branching))
+
+    def _check_legal(self, state: SearchState, action: int) -> None:
+        if not isinstance(action, (int, np.integer)) or not 0 <= action < self.branching:
+            raise InvalidInputError(f"action={action!r}: choose one of the inpaintings 0..{self.branching - 1}")
+        if state.depth >= self.max_depth:
+            raise InvalidInputError(
+                f"the state at path {state.path} is at max_depth={self.max_depth}: it has no children"
+            )
+
+    # -- generation and scoring -----------------------------------------------------------------
+
+    def _changeable(self) -> Tensor:
+        """(N,) bool: slots that may be regenerated, all but those of fixed welded objects."""
+        changeable = torch.ones(self.slots, dtype=torch.bool)
+        changeable[: len(self.scene_type.fixed)] = False
+        return changeable
+
+    def _inpaint(self, batch: SceneBatch, masks: Tensor, noises: list[torch.Generator]) -> SceneBatch:
+        self.evaluations += self.num_steps * len(batch)
+        return self.prior.inpaint(batch, masks, num_steps=self.num_steps, generators=noises)
+
+    def _score(self, batch: SceneBatch, origins: Sequence[tuple[int, tuple[int, ...], float]]) -> list[SearchState]:
+        """States of ``batch``, given each one's (seed, path, value of the parent)."""
+        score = self.scorer(batch)
+        return [self._state(batch[i], _row(score, i), *origin) for i, origin in enumerate(origins)]
+
+    def _state(
+        self, scene: SceneBatch, score: Score, seed: int, path: tuple[int, ...], parent_value: float
+    ) -> SearchState:
+        valid, objective = bool(score.valid[0]), float(score.value[0])
+        mask = self.mask_generator(scene, score, NodeRandomness.at(seed, path).mask)
+        return SearchState(
+            scene=scene.tensor[0].clone(),
+            mask=mask & self._changeable() & ~scene.is_welded[0],
+            depth=len(path),
+            path=path,
+            seed=seed,
+            value=float(np.clip(objective / self.scale, 0.0, 1.0)) if valid else parent_value,
+            objective=objective,
+            valid=valid,
+        )
+
+    def close(self) -> None:
+        """Stop physics workers, if any."""
+        self.scorer.close()
+
+
+def _row(score: Score, index: int) -> Score:
+    """One row of a score, as a batch of one."""
+    row = slice(index, index + 1)
+    return Score(
+        score.value[row],
+        score.valid[row],
+        {name: term[row] for name, term in score.terms.items()},
+        None if score.per_object is None else score.per_object[row],
+        {name: flag[row] for name, flag in score.object_flags.items()},
+    )
