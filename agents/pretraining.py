@@ -41,7 +41,6 @@ class PretrainConfig:
         learning_rate: peak learning rate.
         final_learning_rate: where the cosine ends, as a fraction of the peak.
         warmup: steps of linear warm-up.
-        optimizer: ``"adamw"``, or ``"muon"`` (orthogonalised momentum on the blocks' matrices, AdamW elsewhere).
         weight_decay: decoupled weight decay.
         clip: largest gradient norm.
         ema: decay of the weight average that is evaluated and saved.
@@ -67,7 +66,6 @@ class PretrainConfig:
     learning_rate: float = 1e-3
     final_learning_rate: float = 0.01
     warmup: int = 100
-    optimizer: str = "adamw"
     weight_decay: float = 0.01
     clip: float = 1.0
     ema: float = 0.999
@@ -124,21 +122,6 @@ def learning_rate_at(step: int, config: PretrainConfig) -> float:
     return config.learning_rate * (config.final_learning_rate + (1 - config.final_learning_rate) * cosine)
 
 
-def make_optimizers(network: nn.Module, config: PretrainConfig) -> list[torch.optim.Optimizer]:
-    """The optimisers of one run; all follow the same learning-rate curve."""
-    matrices = [p for name, p in network.named_parameters() if p.ndim == 2 and "blocks." in name]
-    if config.optimizer == "adamw":
-        return [torch.optim.AdamW(network.parameters(), betas=(0.9, 0.99), weight_decay=config.weight_decay)]
-    if config.optimizer == "muon":
-        chosen = {id(p) for p in matrices}
-        others = [p for p in network.parameters() if id(p) not in chosen]
-        return [
-            torch.optim.Muon(matrices, weight_decay=config.weight_decay, adjust_lr_fn="match_rms_adamw"),
-            torch.optim.AdamW(others, betas=(0.9, 0.99), weight_decay=config.weight_decay),
-        ]
-    raise InvalidInputError(f"optimizer={config.optimizer!r} is not known; use 'adamw' or 'muon'")
-
-
 def build_prior(config: PretrainConfig, raw: Tensor, normalizer: Normalizer) -> ScenePrior:
     """A fresh prior whose preconditioning is fitted to the raw scenes (M, N, D)."""
     scene_type = get_scene_type(config.scene)
@@ -173,7 +156,9 @@ class Pretrainer:
         self.prior = prior.to(config.device).train()
         self.network = prior.denoiser.network
         self.average = WeightAverage(self.network, config.ema)
-        self.optimizers = make_optimizers(self.network, config)
+        self.optimizer = torch.optim.AdamW(
+            self.network.parameters(), betas=(0.9, 0.99), weight_decay=config.weight_decay
+        )
         self.generator = Generator().manual_seed(config.seed)
         self.step = 0
         self.seconds = 0.0
@@ -229,13 +214,12 @@ class Pretrainer:
             )
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), config.clip)
-        for optimizer in self.optimizers:
-            for group in optimizer.param_groups:
-                group["lr"] = learning_rate_at(self.step, config)
-            optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate_at(self.step, config)
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
         self.average.update(self.network)
-        return float(loss), float(norm)
+        return float(loss.detach()), float(norm)
 
     def _evaluate(self) -> float:
         with self._averaged():
@@ -256,7 +240,7 @@ class Pretrainer:
                 "network": self.network.state_dict(),
                 "average": self.average.tensors,
                 "average_updates": self.average.updates,
-                "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
+                "optimizer": self.optimizer.state_dict(),
                 "generator": self.generator.get_state(),
                 "step": self.step,
                 "seconds": self.seconds,
@@ -270,8 +254,7 @@ class Pretrainer:
         self.network.load_state_dict(state["network"])
         self.average.tensors = state["average"]
         self.average.updates = state["average_updates"]
-        for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
-            optimizer.load_state_dict(saved)
+        self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"])
         self.step, self.seconds = state["step"], state["seconds"]
         self.evaluations = state["evaluations"]

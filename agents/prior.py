@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any
 
 import torch
 from torch import Generator, Tensor, nn
 
-from agents.diffusion import GaussianProcess, Preconditioning, StepTable, lognormal_timesteps, make_schedule
+from agents.diffusion import (
+    GaussianProcess,
+    Preconditioning,
+    ResidualVariance,
+    StepTable,
+    lognormal_timesteps,
+    make_schedule,
+)
 from agents.networks import FluxConfig, FluxDenoiser
 from agents.prior_files import read_prior, write_prior
 from scene_envs.errors import CorruptFileError, InvalidInputError
@@ -19,6 +26,8 @@ from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
 from scene_envs.scene import TRANSLATION, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
+
+_LEVELS, _RESIDUAL = "residual.timesteps", "residual.variance"
 
 
 @dataclass(frozen=True)
@@ -43,8 +52,8 @@ class PriorConfig:
     schedule: str = "karras"
     prediction: str = "karras"
     num_timesteps: int = 1000
-    noise_mean: float = -2.0
-    noise_std: float = 1.9
+    noise_mean: float = -1.8
+    noise_std: float = 2.1
     translation_weight: float = 3.0
 
 
@@ -59,7 +68,7 @@ class Denoiser(nn.Module):
     def output(self, x_t: Tensor, t: Tensor) -> Tensor:
         """The raw network output (B, N, D), in the units of ``process.target``."""
         process = self.process
-        alpha, sigma = process.rates(t, x_t)
+        alpha, _ = process.rates(t, x_t)
         level = (process.sigma[t.cpu()] / process.alpha[t.cpu()]).to(x_t.device)
         result: Tensor = self.network(process.network_input(x_t, t), x_t / alpha, level)
         return result
@@ -88,6 +97,7 @@ class ScenePrior(nn.Module):
         normalizer: Normalizer,
         preconditioning: Preconditioning,
         card: dict[str, Any] | None = None,
+        residual: ResidualVariance | None = None,
     ) -> None:
         super().__init__()
         self.config = config
@@ -100,9 +110,11 @@ class ScenePrior(nn.Module):
         self.normalizer = normalizer
         self.preconditioning = preconditioning
         self.card = card or {}
+        self.residual = residual
         schedule = make_schedule(config.schedule, config.num_timesteps)
         self.process = GaussianProcess(schedule, config.prediction, preconditioning)
         self.denoiser = Denoiser(FluxDenoiser(config.network), self.process)
+        self._fixed: Tensor
         self._timestep_weights = lognormal_timesteps(schedule, config.noise_mean, config.noise_std)
         fixed = SceneBatch.empty(self.scene_type, 1, len(self.scene_type.fixed) or 1)
         self.register_buffer("_fixed", normalizer.normalize(fixed.tensor[0]), persistent=False)
@@ -120,10 +132,13 @@ class ScenePrior(nn.Module):
             fields["network"] = FluxConfig(**fields["network"])
             moments = (torch.tensor(state["preconditioning"][key]) for key in ("mean", "std"))
             normalizer = Normalizer.from_state(state["normalizer_state"])
-            prior = cls(PriorConfig(**fields), normalizer, Preconditioning(*moments), state.get("card"))
+            residual = ResidualVariance(tensors.pop(_LEVELS), tensors.pop(_RESIDUAL)) if _LEVELS in tensors else None
+            prior = cls(PriorConfig(**fields), normalizer, Preconditioning(*moments), state.get("card"), residual)
             prior.denoiser.network.load_state_dict(tensors)
         except (KeyError, TypeError) as error:
-            raise CorruptFileError(f"the configuration of the prior {str(name)!r} is not one of ours: {error}") from error
+            raise CorruptFileError(
+                f"the configuration of the prior {str(name)!r} is not one of ours: {error}"
+            ) from error
         except RuntimeError as error:
             raise CorruptFileError(f"the weights of the prior {str(name)!r} do not fit its network: {error}") from error
         return prior.eval()
@@ -137,7 +152,10 @@ class ScenePrior(nn.Module):
             "normalizer_state": self.normalizer.state(),
             "card": self.card,
         }
-        return write_prior(directory, state, self.denoiser.network.state_dict())
+        tensors = dict(self.denoiser.network.state_dict())
+        if self.residual is not None:
+            tensors |= {_LEVELS: self.residual.timesteps, _RESIDUAL: self.residual.variance}
+        return write_prior(directory, state, tensors)
 
     # -- the reverse chain ----------------------------------------------------------------------
 
@@ -171,7 +189,8 @@ class ScenePrior(nn.Module):
         """
         t, previous = int(table.timesteps[step]), int(table.previous[step])
         x0 = self.denoiser(x_t, torch.full((x_t.shape[0],), t, device=x_t.device))
-        mean, std = self.process.posterior(x_t, x0, t, previous)
+        residual = None if self.residual is None else self.residual.at(t)
+        mean, std = self.process.posterior(x_t, x0, t, previous, residual)
         std_map = std * (~self.known(x_t.shape[1])).to(x_t.dtype)
         return self.clamp(mean), std_map
 
@@ -202,7 +221,7 @@ class ScenePrior(nn.Module):
         """
         if count < 1:
             raise InvalidInputError(f"count={count}: ask for at least one scene")
-        generator = Generator(self._fixed.device).manual_seed(seed)
+        generator = Generator(str(self._fixed.device)).manual_seed(seed)
         chunks = [
             self.sample_tensor(size, num_steps=num_steps, slots=slots, generator=generator)
             for size in _chunk_sizes(count, batch_size)
@@ -277,16 +296,6 @@ class ScenePrior(nn.Module):
         """(count,) int64 training timesteps, ln(noise-to-signal) being normal."""
         return torch.multinomial(self._timestep_weights, count, replacement=True, generator=generator)
 
-    @overload
-    def pretraining_loss(
-        self, x0: Tensor, generator: Generator | None = ..., reduction: Literal["mean", "none"] = ...
-    ) -> Tensor: ...
-
-    @overload
-    def pretraining_loss(
-        self, x0: Tensor, generator: Generator | None = ..., reduction: str = ..., t: Tensor | None = ...
-    ) -> Tensor: ...
-
     def pretraining_loss(
         self, x0: Tensor, generator: Generator | None = None, reduction: str = "mean", t: Tensor | None = None
     ) -> Tensor:
@@ -307,6 +316,20 @@ class ScenePrior(nn.Module):
         per_scene = (error.square() * weight).sum(dim=(1, 2)) / weight.sum()
         return per_scene.mean() if reduction == "mean" else per_scene
 
+    @torch.no_grad()
+    def fit_residual(self, x0: Tensor, levels: int = 40, seed: int = 0) -> ResidualVariance:
+        """Measure the denoiser's error on normalised scenes ``x0`` (B, N, D) at ``levels`` timesteps, and keep it."""
+        generator = Generator().manual_seed(seed)
+        timesteps = StepTable.spaced(self.config.num_timesteps, levels).timesteps.flip(0)
+        rows = []
+        for t in timesteps:
+            noise = torch.randn(x0.shape, generator=generator).to(x0.device)
+            x_t = self.clamp(self.process.add_noise(x0, t, noise))
+            error = self.denoiser(x_t, t.to(x0.device).expand(len(x0))) - x0
+            rows.append(error[:, len(self.scene_type.fixed) :].square().mean(dim=(0, 1)).cpu())
+        self.residual = ResidualVariance(timesteps, torch.stack(rows))
+        return self.residual
+
     def loss_weight(self, slots: int) -> Tensor:
         """(slots, D) weights of the pretraining loss; 0 on known entries."""
         weight = (~self.known(slots)).float()
@@ -320,27 +343,18 @@ def _chunk_sizes(total: int, size: int) -> Iterator[int]:
         total -= size
 
 
-@dataclass
-class _TinyRange:
-    """Raw feature ranges of an untrained prior: the workspace, yaw-only rotations, any category."""
-
-    scene_type: SceneType
-    low: Tensor = field(init=False)
-    high: Tensor = field(init=False)
-
-    def __post_init__(self) -> None:
-        zeros, ones = torch.zeros(9), torch.tensor([1.0, 1, 0, 1, 1, 0, 0, 0, 1])
-        lowest, highest = (torch.tensor(c) for c in self.scene_type.workspace)
-        flags = torch.ones(self.scene_type.num_assets + 1)
-        yaw_low = torch.tensor([-1.0, -1, 0, -1, -1, 0, 0, 0, 0])
-        self.low = torch.cat([lowest, zeros + yaw_low, 0 * flags])
-        self.high = torch.cat([highest, ones, flags])
+def _workspace_normalizer(scene_type: SceneType) -> Normalizer:
+    """A normalizer made from the scene type alone: workspace, yaw-only rotations, one-hot categories."""
+    low, high = (torch.tensor(corner) for corner in scene_type.workspace)
+    yaw_low = torch.tensor([-1.0, -1, 0, -1, -1, 0, 0, 0, 0])
+    yaw_high = torch.tensor([1.0, 1, 0, 1, 1, 0, 0, 0, 1])
+    flags = torch.ones(scene_type.num_assets + 1)
+    return Normalizer.from_range(torch.cat([low, yaw_low, 0 * flags]), torch.cat([high, yaw_high, flags]))
 
 
 def tiny_prior(scene_type: str | SceneType = "dimsum_table", seed: int = 0, slots: int | None = None) -> ScenePrior:
     """An untrained prior with a very small network and random weights, for tests and examples."""
     scene_type = get_scene_type(scene_type)
-    ranges = _TinyRange(scene_type)
     features = scene_type.features
     config = PriorConfig(
         scene_type.name,
@@ -350,7 +364,7 @@ def tiny_prior(scene_type: str | SceneType = "dimsum_table", seed: int = 0, slot
     moments = Preconditioning(torch.zeros(features), torch.full((features,), 0.5))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        prior = ScenePrior(config, Normalizer.from_range(ranges.low, ranges.high), moments)
+        prior = ScenePrior(config, _workspace_normalizer(scene_type), moments)
         for parameter in prior.parameters():
             if not bool(parameter.any()):
                 nn.init.normal_(parameter, std=0.02)

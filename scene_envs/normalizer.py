@@ -101,5 +101,7 @@ class Normalizer:
             stats = params["input_stats"]
             vectors = [params["scale"], params["min"], stats["min"], stats["max"]]
         except (KeyError, TypeError) as error:
-            raise InvalidInputError(f"normalizer_state lacks {error}; it needs params.scale, .min, .input_stats") from error
+            raise InvalidInputError(
+                f"normalizer_state lacks {error}; it needs params.scale, .min, .input_stats"
+            ) from error
         return cls(*(torch.tensor(v, dtype=torch.float32) for v in vectors))

@@ -15,8 +15,15 @@ from scene_envs.scene_types import SceneType
 class RewardResult(Protocol):
     """What a reward returns; see ``rewards.RewardOutput``."""
 
-    value: Tensor  # (B,)
-    valid: Tensor | None  # (B,) bool
+    @property
+    def value(self) -> Tensor:
+        """(B,)."""
+        ...
+
+    @property
+    def is_valid(self) -> Tensor:
+        """(B,) bool."""
+        ...
 
 
 @runtime_checkable
@@ -29,8 +36,15 @@ class RewardLike(Protocol):
 class StepTableLike(Protocol):
     """Explicit reverse steps: step ``i`` goes from ``timesteps[i]`` to ``previous[i]`` (0 is clean data)."""
 
-    timesteps: Tensor  # (S,) int64, strictly decreasing, in 1..T
-    previous: Tensor  # (S,) int64, previous[-1] == 0
+    @property
+    def timesteps(self) -> Tensor:
+        """(S,) int64, strictly decreasing, in 1..T."""
+        ...
+
+    @property
+    def previous(self) -> Tensor:
+        """(S,) int64, where each step lands; the last is 0."""
+        ...
 
     def __len__(self) -> int: ...
 

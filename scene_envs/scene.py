@@ -52,7 +52,7 @@ class SceneBatch:
         """From translations (B, N, 3) m, rotations (B, N, 3, 3) and categories (B, N) int, C meaning empty."""
         scene_type = get_scene_type(scene_type)
         empty = scene_type.num_assets
-        if categories.numel() and not (0 <= int(categories.min()) and int(categories.max()) <= empty):
+        if categories.numel() and (int(categories.min()) < 0 or int(categories.max()) > empty):
             raise InvalidInputError(
                 f"categories must lie in 0..{empty} for {scene_type.name!r} ({empty} is empty), "
                 f"got {int(categories.min())}..{int(categories.max())}"

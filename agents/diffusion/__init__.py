@@ -1,6 +1,7 @@
 """Diffusion processes, noise schedules and step tables."""
 
 from agents.diffusion.gaussian import PREDICTIONS, GaussianProcess, Preconditioning, lognormal_timesteps
+from agents.diffusion.residual import ResidualVariance
 from agents.diffusion.schedules import NoiseSchedule, make_schedule
 from agents.diffusion.step_tables import StepTable
 
@@ -9,6 +10,7 @@ __all__ = [
     "GaussianProcess",
     "NoiseSchedule",
     "Preconditioning",
+    "ResidualVariance",
     "StepTable",
     "lognormal_timesteps",
     "make_schedule",

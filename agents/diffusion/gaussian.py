@@ -112,20 +112,32 @@ class GaussianProcess:
 
     # -- reverse --------------------------------------------------------------------------------
 
-    def posterior(self, x_t: Tensor, x0: Tensor, t: int, previous: int) -> tuple[Tensor, Tensor]:
-        """q(x_s | x_t, x_0) for a stride t -> s (Ho et al. 2020, Eqs. 6-7, for any s < t).
+    def posterior(
+        self, x_t: Tensor, x0: Tensor, t: int, previous: int, residual: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """p(x_s | x_t) for a stride t -> s, given the denoised scene (Ho et al. 2020, Eqs. 6-7, any s < t).
+
+        Args:
+            x_t: (B, N, D).
+            x0: (B, N, D) denoised scene.
+            t: where the stride starts.
+            previous: where it ends, s.
+            residual: (D,) or () expected squared error of ``x0``; None takes ``x0`` as exact (Ho et al.).
+                Given, the variance is the optimal one of Bao et al. (2022), Theorem 1.
 
         Returns:
-            mean (B, N, D) and std, a () tensor that is 0 when ``previous`` is 0.
+            mean (B, N, D) and std, () or (D,); 0 when ``previous`` is 0.
         """
         alpha_bar = self.schedule.alpha_bar
         a_t, a_s = alpha_bar[t], alpha_bar[previous]
         a_ts = a_t / a_s
         beta = 1.0 - a_ts
-        x0_weight = (a_s.sqrt() * beta / (1.0 - a_t)).item()
-        xt_weight = (a_ts.sqrt() * (1.0 - a_s) / (1.0 - a_t)).item()
-        std = ((1.0 - a_s) / (1.0 - a_t) * beta).sqrt().float()
-        return x0_weight * x0 + xt_weight * x_t, std.to(x_t.device)
+        x0_weight = float(a_s.sqrt() * beta / (1.0 - a_t))
+        xt_weight = float(a_ts.sqrt() * (1.0 - a_s) / (1.0 - a_t))
+        variance = (1.0 - a_s) / (1.0 - a_t) * beta
+        if residual is not None and previous > 0:
+            variance = variance + x0_weight**2 * residual.double().cpu()
+        return x0_weight * x0 + xt_weight * x_t, variance.sqrt().float().to(x_t.device)
 
     def _moments(self, like: Tensor) -> tuple[Tensor, Tensor]:
         return self.preconditioning.mean.to(like), self.preconditioning.std.to(like)

@@ -1,0 +1,1 @@
+"""What learns and what plans: priors, post-training, planning, evaluation, the command line."""
