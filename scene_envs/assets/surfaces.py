@@ -1,4 +1,4 @@
-"""Coloured visual meshes from a few numbers: lathes, tubes, boxes, planks.
+"""Coloured visual meshes from a few numbers: lathes, tubes, planks.
 
 A surface carries vertex colours and vertex normals; faces of different colour never share a vertex.
 """
@@ -105,14 +105,7 @@ def _span(
     return surface(np.concatenate(corners), faces[keep], color, np.concatenate(radial))
 
 
-def box_surface(size: tuple[float, float, float], base: tuple[float, float, float], color: Color) -> trimesh.Trimesh:
-    """An axis-aligned box; ``base`` is the centre of its bottom face."""
-    mesh = trimesh.creation.box(size)
-    mesh.apply_translation((base[0], base[1], base[2] + size[2] / 2))
-    return surface(mesh.triangles.reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3), color)
-
-
-def tube(path: ArrayLike, radii: float | Sequence[float], color: Color, *, sides: int = 12) -> trimesh.Trimesh:
+def tube(path: ArrayLike, radii: ArrayLike, color: Color, *, sides: int = 10) -> trimesh.Trimesh:
     """A round tube along a path (P, 3) in the x-z plane, with flat end caps; ``radii`` one, or one per point."""
     points = np.asarray(path, dtype=np.float64)
     size = np.broadcast_to(np.asarray(radii, dtype=np.float64), (len(points),))
@@ -132,17 +125,19 @@ def tube(path: ArrayLike, radii: float | Sequence[float], color: Color, *, sides
     return join(body, *caps)
 
 
-def planks(radius: float, z: float, colors: Sequence[Color], *, count: int) -> trimesh.Trimesh:
+def planks(
+    radius: float, z: float, colors: Sequence[Color], *, count: int, rows: int, columns: int = 6
+) -> trimesh.Trimesh:
     """A round board seen from above: ``count`` strips along y in turning colours.
 
-    The strips are cut into compact cells, because software renderers walk the bounding box of each triangle.
+    Each strip is cut into ``rows`` x ``columns`` compact cells, because software renderers walk the
+    bounding box of each triangle.
     """
     edges = np.linspace(-radius, radius, count + 1)
-    rows = 2 * count
     along = np.linspace(-1.0, 1.0, rows + 1)
     strips = []
     for index, (left, right) in enumerate(pairwise(edges)):
-        x = np.linspace(left, right, 7)
+        x = np.linspace(left, right, columns + 1)
         reach = np.sqrt(np.maximum(radius**2 - x**2, 0.0))
         vertices = np.stack(
             [np.repeat(x, rows + 1), np.outer(reach, along).ravel(), np.full(len(x) * (rows + 1), z)], axis=1
@@ -157,7 +152,7 @@ def planks(radius: float, z: float, colors: Sequence[Color], *, count: int) -> t
     return join(*strips)
 
 
-def arc(points: Sequence[tuple[float, float, float]], samples: int = 24) -> Array:
+def arc(points: Sequence[tuple[float, float, float]], samples: int = 16) -> Array:
     """(samples, 3): a smooth curve through the points, for the visual of handles and spouts."""
     from scipy.interpolate import make_interp_spline
 

@@ -9,8 +9,8 @@ from scene_envs.assets.shapes import solid
 from scene_envs.assets.surfaces import join, lathe, planks
 
 _TOP_RADIUS, _TOP_THICKNESS, _HEIGHT = 0.625, 0.03, 0.785
-_OAK = [(196, 148, 98), (187, 138, 88), (202, 155, 106), (181, 132, 84), (193, 144, 95)]
-_EDGE, _IRON = (150, 105, 64), (62, 60, 62)
+_WALNUT = [(142, 99, 68), (131, 90, 61), (149, 106, 74), (125, 85, 57), (137, 95, 65)]
+_EDGE, _IRON = (112, 75, 50), (62, 60, 62)
 
 
 @asset_recipe("cafe_table", display_name="table", mass=0.0, color=(139, 98, 66))
@@ -21,7 +21,8 @@ def cafe_table() -> Model:
     foot = solid([(0.27, -_HEIGHT), (0.27, 0.015 - _HEIGHT), (0.05, 0.03 - _HEIGHT)], 24)
     bevel = _TOP_RADIUS - 0.004
     visual = join(
-        planks(bevel, 0.0, _OAK, count=9),
+        planks(_TOP_RADIUS - 0.02, 0.0, _WALNUT, count=9, rows=14),
+        lathe([(bevel, -0.0005), (_TOP_RADIUS - 0.05, -0.0005)], _EDGE, segments=96),
         lathe(
             [*((r, -0.03) for r in np.linspace(0.04, _TOP_RADIUS, 10)), (_TOP_RADIUS, -0.004), (bevel, 0.0)],
             _EDGE,

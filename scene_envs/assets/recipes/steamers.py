@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from scene_envs.assets.library import Model, asset_recipe
 from scene_envs.assets.shapes import hull_of, ring, solid
-from scene_envs.assets.surfaces import Color, box_surface, join, lathe
+from scene_envs.assets.surfaces import Color, join, lathe, planks
 
 _RADIUS, _HEIGHT, _WALL = 0.12, 0.091, 0.009
 _FLOOR = (0.008, 0.014)
 _LID_HEIGHT, _LID_RIM, _LID_TOP, _LID_WALL = 0.06, 0.018, 0.042, 0.012
-_BAMBOO: Color = (222, 184, 120)
-_BAND: Color = (186, 139, 78)
-_INNER: Color = (232, 202, 148)
-_SLATS: tuple[Color, Color] = ((226, 192, 132), (204, 166, 104))
+_BAMBOO: Color = (233, 203, 148)
+_BAND: Color = (198, 154, 94)
+_INNER: Color = (238, 213, 164)
+_SLATS: tuple[Color, Color] = ((236, 208, 154), (218, 183, 124))
 
 
 @asset_recipe("steamer_bottom", display_name="steamer bottom", mass=0.35, color=(224, 172, 88))
@@ -27,16 +25,13 @@ def steamer_bottom() -> Model:
     basket = lathe(
         [
             (inner, 0.0), (_RADIUS, 0.0), (_RADIUS, low), (inset, low), (inset, high), (_RADIUS, high),
-            (_RADIUS, _HEIGHT), (inner, _HEIGHT), (inner, _FLOOR[1]), (0.0, _FLOOR[1]),
+            (_RADIUS, _HEIGHT), (inner, _HEIGHT), (inner, _FLOOR[1]),
         ],
-        [_BAND, _BAND, _BAND, _BAMBOO, _BAND, _BAND, _BAND, _INNER, _SLATS[1]],
+        [_BAND, _BAND, _BAND, _BAMBOO, _BAND, _BAND, _BAND, _INNER],
     )  # fmt: skip
     underside = lathe([(0.0, _FLOOR[0]), (inner, _FLOOR[0]), (inner, 0.0)], [_SLATS[1], _INNER])
-    slats = [
-        box_surface((0.013, 2 * (np.sqrt(inner**2 - (abs(x) + 0.0065) ** 2)), 0.0012), (x, 0.0, _FLOOR[1]), _SLATS[0])
-        for x in np.linspace(-0.096, 0.096, 13)
-    ]
-    return Model(join(basket, underside, *slats), [*wall, floor], [hull_of(wall)])
+    slats = planks(inner, _FLOOR[1] + 0.001, _SLATS, count=15, rows=6, columns=2)
+    return Model(join(basket, underside, slats), [*wall, floor], [hull_of(wall)])
 
 
 @asset_recipe("steamer_lid", display_name="steamer lid", mass=0.22, color=(120, 176, 84))

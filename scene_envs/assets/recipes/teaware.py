@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import numpy as np
+
 from scene_envs.assets.library import Model, asset_recipe
 from scene_envs.assets.shapes import hull_of, ring, rods, solid
 from scene_envs.assets.surfaces import Color, arc, join, lathe, tube
 
-_PORCELAIN: Color = (244, 242, 236)
-_INSIDE: Color = (214, 232, 226)
+_PORCELAIN: Color = (248, 246, 241)
+_INSIDE: Color = (226, 238, 232)
 _COBALT: Color = (48, 84, 150)
 _FOOT: Color = (206, 196, 180)
 
@@ -33,11 +35,11 @@ def teacup() -> Model:
         lathe(
             [
                 (0.0, 0.0), (0.028, 0.0), (0.029, 0.004), (0.0315, 0.012), (0.0355, 0.028), (0.0392, 0.048),
-                (0.0405, 0.056), (0.0416, 0.063), (0.0425, 0.0695), (0.0412, _CUP_HEIGHT), (0.0396, 0.0695),
+                (0.0401, 0.054), (0.0406, 0.0575), (0.0425, 0.0695), (0.0412, _CUP_HEIGHT), (0.0396, 0.0695),
                 (0.0375, 0.055), (0.033, 0.03), (0.0275, 0.012), (0.02, 0.007), (0.0, _CUP_FLOOR),
             ],
-            [_FOOT, _FOOT, *[_PORCELAIN] * 4, _COBALT, _PORCELAIN, _COBALT, _COBALT, *[_INSIDE] * 5],
-            segments=40,
+            [_FOOT, _FOOT, *[_PORCELAIN] * 4, _COBALT, *[_PORCELAIN] * 3, *[_INSIDE] * 5],
+            segments=36,
         ),
         tube(arc(_CUP_HANDLE), 0.0038, _PORCELAIN),
     )  # fmt: skip
@@ -64,7 +66,7 @@ def teapot() -> Model:
                 *[_PORCELAIN] * 3, *[_COBALT] * 5,
             ],
         ),
-        tube(arc([(0.060, 0.0, 0.040), *_POT_SPOUT]), [0.011 - 0.0055 * i / 23 for i in range(24)], _PORCELAIN),
+        tube(arc([(0.060, 0.0, 0.040), *_POT_SPOUT], 12), np.linspace(0.011, 0.0055, 12), _PORCELAIN),
         tube(arc(_POT_HANDLE), 0.0048, _PORCELAIN),
     )  # fmt: skip
     return Model(visual, [*body, *spout, *handle, knob], [hull_of(body), hull_of(spout), hull_of(handle), knob])

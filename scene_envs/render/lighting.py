@@ -1,0 +1,102 @@
+"""Soft shadows and contact shading from depth images: pure functions on frames."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_envs.render.stage import Frame
+
+Image = NDArray[np.float32]
+
+
+def camera_points(frame: Frame) -> Image:
+    """(H, W, 3): the visible point of each pixel in the camera frame (x right, y up, z backward), m."""
+    height, width = frame.depth.shape
+    x = ((np.arange(width, dtype=np.float32) + 0.5) * (2.0 / width) - 1.0) / frame.focal[0]
+    y = (1.0 - (np.arange(height, dtype=np.float32) + 0.5) * (2.0 / height)) / frame.focal[1]
+    depth = np.where(np.isfinite(frame.depth), frame.depth, 0.0).astype(np.float32)
+    return np.stack([x[None, :] * depth, y[:, None] * depth, -depth], axis=-1).astype(np.float32)
+
+
+def soft_shadow(frame: Frame, light: Frame, *, bias: float = 0.01, softness: float = 1.8, taps: int = 12) -> Image:
+    """(H, W) in 0..1: the part of the light that nearer objects hide, by percentage-closer filtering.
+
+    Args:
+        frame: what the camera saw.
+        light: the same scene seen from the light.
+        bias: m by which an occluder must be nearer to the light than the point.
+        softness: radius of the filter, pixels of ``light``.
+        taps: samples of the filter.
+    """
+    to_light = (light.view @ np.linalg.inv(frame.view)).astype(np.float32)
+    points = camera_points(frame) @ to_light[:3, :3].T + to_light[:3, 3]
+    distance = -points[..., 2]
+    safe = np.maximum(distance, 1e-6)
+    height, width = light.depth.shape
+    column = (points[..., 0] / safe * np.float32(light.focal[0]) + 1.0) * (0.5 * width) - 0.5
+    row = (1.0 - points[..., 1] / safe * np.float32(light.focal[1])) * (0.5 * height) - 0.5
+    hidden = np.zeros(frame.depth.shape, dtype=np.float32)
+    for dx, dy in _spiral(taps) * softness:
+        j = np.rint(column + dx).astype(np.int32).clip(0, width - 1)
+        i = np.rint(row + dy).astype(np.int32).clip(0, height - 1)
+        hidden += light.depth[i, j] < distance - bias
+    hidden *= np.isfinite(frame.depth) / np.float32(taps)
+    return hidden
+
+
+def contact_shade(frame: Frame, *, radius: float = 0.05, taps: int = 12, stride: int = 2) -> Image:
+    """(H, W) in 0..1: how much the surroundings within ``radius`` m close a point in (ambient occlusion).
+
+    Worked out for every ``stride``-th pixel of each axis and repeated; meant to be blurred.
+    """
+    points = camera_points(frame)[::stride, ::stride]
+    normals = _normals(points)
+    height, width = points.shape[:2]
+    depth = np.maximum(-points[..., 2], 1e-3)
+    reach_x = 0.5 * width * frame.focal[0] * radius / depth
+    reach_y = 0.5 * height * frame.focal[1] * radius / depth
+    rows, columns = np.mgrid[0:height, 0:width].astype(np.float32)
+    closed = np.zeros((height, width), dtype=np.float32)
+    for dx, dy in _spiral(taps):
+        j = np.rint(columns + dx * reach_x).astype(np.int32).clip(0, width - 1)
+        i = np.rint(rows + dy * reach_y).astype(np.int32).clip(0, height - 1)
+        offset = points[i, j] - points
+        square = np.einsum("hwk,hwk->hw", offset, offset) + 1e-8
+        rise = np.einsum("hwk,hwk->hw", offset, normals) / np.sqrt(square)
+        closed += np.maximum(rise - 0.12, 0.0) * (square < 4.0 * radius**2)
+    closed *= (points[..., 2] < 0) / np.float32(taps)
+    full = closed.repeat(stride, axis=0).repeat(stride, axis=1)
+    return full[: frame.depth.shape[0], : frame.depth.shape[1]]
+
+
+def blur(image: Image, size: int) -> Image:
+    """(H, W) averaged over windows of ``size`` pixels."""
+    from scipy.ndimage import uniform_filter
+
+    return np.asarray(uniform_filter(image, size), dtype=np.float32)
+
+
+def _normals(points: Image) -> Image:
+    """Normals of a point image, from the nearer of the two neighbours along each axis."""
+    along = [_shorter(np.diff(points, axis=axis), axis) for axis in (1, 0)]
+    normals = np.cross(along[1], along[0])
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    normals /= np.maximum(length, 1e-12)
+    facing = np.where(np.einsum("hwk,hwk->hw", normals, points) > 0, -1.0, 1.0)
+    return (normals * facing[..., None]).astype(np.float32)
+
+
+def _shorter(steps: Image, axis: int) -> Image:
+    """For each pixel the shorter of its backward and forward step: edges of objects are not crossed."""
+    first, last = np.take(steps, [0], axis=axis), np.take(steps, [-1], axis=axis)
+    backward, forward = np.concatenate([first, steps], axis=axis), np.concatenate([steps, last], axis=axis)
+    nearer = np.abs(backward[..., 2:]) <= np.abs(forward[..., 2:])
+    return np.where(nearer, backward, forward)
+
+
+def _spiral(taps: int) -> NDArray[np.float32]:
+    """(taps, 2): points spread evenly over the unit disc (sunflower)."""
+    index = np.arange(taps) + 0.5
+    radius, angle = np.sqrt(index / taps), index * np.pi * (3.0 - np.sqrt(5.0))
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1).astype(np.float32)

@@ -1,0 +1,116 @@
+"""Scenes to images."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from scene_envs.errors import InvalidInputError
+from scene_envs.render.cameras import LIGHT_DIRECTION, light_camera, picture_camera
+from scene_envs.render.lighting import blur, contact_shade, soft_shadow
+from scene_envs.render.stage import Frame, Stage, get_stage
+from scene_envs.rotations import matrix_to_quaternion
+from scene_envs.scene import SceneBatch
+from scene_envs.scene_types import Camera, SceneType
+
+Style = Literal["picture", "semantic"]
+
+_BACKDROP = np.array([[250.0, 249.0, 247.0], [226.0, 230.0, 235.0]], dtype=np.float32)
+_HIGHLIGHT = np.array([226.0, 52.0, 40.0], dtype=np.float32)
+_SEMANTIC_BACKGROUND = 255
+_SUPERSAMPLING = 2
+
+
+def render(
+    batch: SceneBatch,
+    *,
+    style: Style = "picture",
+    camera: Camera | None = None,
+    width: int | None = None,
+    height: int | None = None,
+    highlight: torch.Tensor | NDArray[np.bool_] | None = None,
+) -> NDArray[np.uint8]:
+    """Draw scenes in software; no display and no GPU are needed.
+
+    Args:
+        batch: B scenes.
+        style: ``"picture"`` is a lit three-quarter view with soft shadows; ``"semantic"`` is one flat colour per
+            category on white, seen by the camera of the scene type.
+        camera: replaces the camera of the style.
+        width: image width, pixels; the camera's by default.
+        height: image height, pixels; the camera's by default.
+        highlight: (B, N) bool, objects to draw in red (pictures only).
+
+    Returns:
+        (B, H, W, 3) uint8, RGB.
+
+    Raises:
+        InvalidInputError: unknown style, sizes below 1 pixel, or a highlight of another shape.
+        MissingDependencyError: PyBullet is not installed.
+    """
+    scene_type = batch.scene_type
+    if style not in ("picture", "semantic"):
+        raise InvalidInputError(f"unknown render style {style!r}; use 'picture' or 'semantic'")
+    if camera is None:
+        camera = scene_type.camera if style == "semantic" else picture_camera(scene_type)
+    width, height = camera.width if width is None else width, camera.height if height is None else height
+    if width < 1 or height < 1:
+        raise InvalidInputError(f"an image needs at least 1 x 1 pixels, got width={width}, height={height}")
+    marked = _as_mask(highlight, batch)
+    translations = batch.translations.detach().cpu().double().numpy()
+    categories = batch.categories.detach().cpu().numpy()
+    rotations = torch.where(batch.is_empty[..., None, None], torch.eye(3).to(batch.rotations), batch.rotations)
+    quaternions = matrix_to_quaternion(rotations.detach().cpu().double()).numpy()
+    stage = get_stage(scene_type.assets)
+    images = np.empty((len(batch), height, width, 3), dtype=np.uint8)
+    for index in range(len(batch)):
+        stage.place(translations[index], quaternions[index], categories[index])
+        if style == "semantic":
+            images[index] = _semantic(stage.look(camera, width, height), categories[index], scene_type)
+        else:
+            images[index] = _picture(stage, camera, width, height, scene_type, marked[index])
+    return images
+
+
+def _as_mask(highlight: torch.Tensor | NDArray[np.bool_] | None, batch: SceneBatch) -> NDArray[np.bool_]:
+    shape = tuple(batch.tensor.shape[:2])
+    if highlight is None:
+        return np.zeros(shape, dtype=bool)
+    mask = highlight.detach().cpu().numpy() if isinstance(highlight, torch.Tensor) else np.asarray(highlight)
+    if mask.shape != shape:
+        raise InvalidInputError(f"highlight marks objects of the batch, so its shape is {shape}; got {mask.shape}")
+    return mask.astype(bool)
+
+
+def _semantic(frame: Frame, categories: NDArray[np.int64], scene_type: SceneType) -> NDArray[np.uint8]:
+    colors = np.array([asset.color for asset in scene_type.library], dtype=np.uint8)
+    flat = np.full((*frame.slots.shape, 3), _SEMANTIC_BACKGROUND, dtype=np.uint8)
+    seen = frame.slots >= 0
+    flat[seen] = colors[categories[frame.slots[seen]]]
+    return flat
+
+
+def _picture(
+    stage: Stage, camera: Camera, width: int, height: int, scene_type: SceneType, marked: NDArray[np.bool_]
+) -> NDArray[np.uint8]:
+    scale = _SUPERSAMPLING
+    frame = stage.look(camera, scale * width, scale * height, LIGHT_DIRECTION)
+    lamp = light_camera(scene_type)
+    light = stage.look(lamp, lamp.width, lamp.height)
+    color = frame.color
+    if marked.any():
+        red = (frame.slots >= 0) & marked[np.maximum(frame.slots, 0)]
+        color = np.where(
+            red[..., None], 0.42 * color + 0.58 * _HIGHLIGHT * (color.mean(-1, keepdims=True) / 200.0), color
+        )
+    shadow = soft_shadow(frame, light)
+    shade = blur(contact_shade(frame), 2 * scale + 1)
+    lit = color * (1.0 - 0.42 * shadow[..., None]) * (1.0 - np.minimum(1.5 * shade, 0.6)[..., None])
+    ramp = np.linspace(0.0, 1.0, scale * height, dtype=np.float32)[:, None, None]
+    backdrop = _BACKDROP[0] * (1.0 - ramp) + _BACKDROP[1] * ramp
+    image = np.where((frame.slots >= 0)[..., None], lit, backdrop)
+    small = image.reshape(height, scale, width, scale, 3).mean(axis=(1, 3))
+    return np.rint(np.clip(small, 0.0, 255.0)).astype(np.uint8)
