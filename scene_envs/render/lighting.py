@@ -19,18 +19,42 @@ def camera_points(frame: Frame) -> Image:
     return np.stack([x[None, :] * depth, y[:, None] * depth, -depth], axis=-1).astype(np.float32)
 
 
-def soft_shadow(frame: Frame, light: Frame, *, bias: float = 0.01, softness: float = 1.8, taps: int = 12) -> Image:
+def surface_normals(frame: Frame, *, stride: int = 2) -> Image:
+    """(H, W, 3): unit normals in the camera frame, facing it; worked out at every ``stride``-th pixel and repeated.
+
+    A difference of neighbours takes the nearer of the two along each axis, so that edges of objects stay sharp.
+    """
+    points = camera_points(frame)[::stride, ::stride]
+    along = [_shorter(np.diff(points, axis=axis), axis) for axis in (1, 0)]
+    normals = np.cross(along[1], along[0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    facing = np.where(np.einsum("hwk,hwk->hw", normals, points) > 0, np.float32(-1.0), np.float32(1.0))
+    return _enlarge((normals * facing[..., None]).astype(np.float32), stride, frame.depth.shape)
+
+
+def soft_shadow(
+    frame: Frame,
+    light: Frame,
+    normals: Image,
+    *,
+    bias: float = 0.004,
+    lift: float = 0.008,
+    softness: float = 1.8,
+    taps: int = 12,
+) -> Image:
     """(H, W) in 0..1: the part of the light that nearer objects hide, by percentage-closer filtering.
 
     Args:
         frame: what the camera saw.
         light: the same scene seen from the light.
+        normals: (H, W, 3) of :func:`surface_normals`.
         bias: m by which an occluder must be nearer to the light than the point.
+        lift: m by which points are raised off their surface, against a surface shadowing itself.
         softness: radius of the filter, pixels of ``light``.
         taps: samples of the filter.
     """
     to_light = (light.view @ np.linalg.inv(frame.view)).astype(np.float32)
-    points = camera_points(frame) @ to_light[:3, :3].T + to_light[:3, 3]
+    points = (camera_points(frame) + np.float32(lift) * normals) @ to_light[:3, :3].T + to_light[:3, 3]
     distance = -points[..., 2]
     safe = np.maximum(distance, 1e-6)
     height, width = light.depth.shape
@@ -45,13 +69,12 @@ def soft_shadow(frame: Frame, light: Frame, *, bias: float = 0.01, softness: flo
     return hidden
 
 
-def contact_shade(frame: Frame, *, radius: float = 0.05, taps: int = 12, stride: int = 2) -> Image:
+def contact_shade(frame: Frame, normals: Image, *, radius: float = 0.05, taps: int = 12, stride: int = 2) -> Image:
     """(H, W) in 0..1: how much the surroundings within ``radius`` m close a point in (ambient occlusion).
 
     Worked out for every ``stride``-th pixel of each axis and repeated; meant to be blurred.
     """
-    points = camera_points(frame)[::stride, ::stride]
-    normals = _normals(points)
+    points, normals = camera_points(frame)[::stride, ::stride], normals[::stride, ::stride]
     height, width = points.shape[:2]
     depth = np.maximum(-points[..., 2], 1e-3)
     reach_x = 0.5 * width * frame.focal[0] * radius / depth
@@ -66,8 +89,7 @@ def contact_shade(frame: Frame, *, radius: float = 0.05, taps: int = 12, stride:
         rise = np.einsum("hwk,hwk->hw", offset, normals) / np.sqrt(square)
         closed += np.maximum(rise - 0.12, 0.0) * (square < 4.0 * radius**2)
     closed *= (points[..., 2] < 0) / np.float32(taps)
-    full = closed.repeat(stride, axis=0).repeat(stride, axis=1)
-    return full[: frame.depth.shape[0], : frame.depth.shape[1]]
+    return _enlarge(closed, stride, frame.depth.shape)
 
 
 def blur(image: Image, size: int) -> Image:
@@ -77,14 +99,8 @@ def blur(image: Image, size: int) -> Image:
     return np.asarray(uniform_filter(image, size), dtype=np.float32)
 
 
-def _normals(points: Image) -> Image:
-    """Normals of a point image, from the nearer of the two neighbours along each axis."""
-    along = [_shorter(np.diff(points, axis=axis), axis) for axis in (1, 0)]
-    normals = np.cross(along[1], along[0])
-    length = np.linalg.norm(normals, axis=-1, keepdims=True)
-    normals /= np.maximum(length, 1e-12)
-    facing = np.where(np.einsum("hwk,hwk->hw", normals, points) > 0, -1.0, 1.0)
-    return (normals * facing[..., None]).astype(np.float32)
+def _enlarge(image: Image, stride: int, shape: tuple[int, ...]) -> Image:
+    return image.repeat(stride, axis=0).repeat(stride, axis=1)[: shape[0], : shape[1]]
 
 
 def _shorter(steps: Image, axis: int) -> Image:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scene_envs.errors import InvalidInputError
 from scene_envs.render.cameras import LIGHT_DIRECTION, light_camera, picture_camera
-from scene_envs.render.lighting import blur, contact_shade, soft_shadow
+from scene_envs.render.lighting import blur, contact_shade, soft_shadow, surface_normals
 from scene_envs.render.stage import Frame, Stage, get_stage
 from scene_envs.rotations import matrix_to_quaternion
 from scene_envs.scene import SceneBatch
@@ -20,6 +20,8 @@ Style = Literal["picture", "semantic"]
 
 _BACKDROP = np.array([[250.0, 249.0, 247.0], [226.0, 230.0, 235.0]], dtype=np.float32)
 _HIGHLIGHT = np.array([226.0, 52.0, 40.0], dtype=np.float32)
+_SHADOW = np.array([0.40, 0.38, 0.34], dtype=np.float32)
+"""What a full shadow takes from red, green and blue."""
 _SEMANTIC_BACKGROUND = 255
 _SUPERSAMPLING = 2
 
@@ -106,9 +108,10 @@ def _picture(
         color = np.where(
             red[..., None], 0.42 * color + 0.58 * _HIGHLIGHT * (color.mean(-1, keepdims=True) / 200.0), color
         )
-    shadow = soft_shadow(frame, light)
-    shade = blur(contact_shade(frame), 2 * scale + 1)
-    lit = color * (1.0 - 0.42 * shadow[..., None]) * (1.0 - np.minimum(1.5 * shade, 0.6)[..., None])
+    normals = surface_normals(frame)
+    shadow = soft_shadow(frame, light, normals)[..., None]
+    shade = blur(contact_shade(frame, normals), 2 * scale + 1)[..., None]
+    lit = color * (1.0 - _SHADOW * shadow) * (1.0 - np.minimum(1.4 * shade, 0.55))
     ramp = np.linspace(0.0, 1.0, scale * height, dtype=np.float32)[:, None, None]
     backdrop = _BACKDROP[0] * (1.0 - ramp) + _BACKDROP[1] * ramp
     image = np.where((frame.slots >= 0)[..., None], lit, backdrop)

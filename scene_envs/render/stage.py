@@ -118,7 +118,7 @@ class Stage:
         projection = bullet.computeProjectionMatrixFOV(camera.fov_y, width / height, near, far)
         _, _, rgba, depth, bodies = bullet.getCameraImage(
             width, height, view, projection, renderer=bullet.ER_TINY_RENDERER, shadow=0, lightDirection=light,
-            lightColor=(1, 1, 1), lightAmbientCoeff=0.72, lightDiffuseCoeff=0.36, lightSpecularCoeff=0.12,
+            lightColor=(1, 1, 1), lightAmbientCoeff=0.70, lightDiffuseCoeff=0.36, lightSpecularCoeff=0.05,
             physicsClientId=self._client,
         )  # fmt: skip
         color = np.reshape(np.asarray(rgba), (height, width, 4))[..., :3].astype(np.float32)

@@ -9,10 +9,10 @@ from scene_envs.assets.surfaces import Color, join, lathe, planks
 _RADIUS, _HEIGHT, _WALL = 0.12, 0.091, 0.009
 _FLOOR = (0.008, 0.014)
 _LID_HEIGHT, _LID_RIM, _LID_TOP, _LID_WALL = 0.06, 0.018, 0.042, 0.012
-_BAMBOO: Color = (233, 203, 148)
-_BAND: Color = (198, 154, 94)
-_INNER: Color = (238, 213, 164)
-_SLATS: tuple[Color, Color] = ((236, 208, 154), (218, 183, 124))
+_BAMBOO: Color = (238, 203, 152)
+_BAND: Color = (203, 153, 96)
+_INNER: Color = (242, 213, 168)
+_SLATS: tuple[Color, Color] = ((240, 208, 158), (222, 183, 128))
 
 
 @asset_recipe("steamer_bottom", display_name="steamer bottom", mass=0.35, color=(224, 172, 88))
