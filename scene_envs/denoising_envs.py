@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from scene_envs.denoising import BoolArray, DenoisingCore, StepResult
-from scene_envs.env_spaces import STATE_BOUND, check_render_mode, check_reset_mask, picture, scene_box
+from scene_envs.env_spaces import STATE_BOUND, check_action, check_render_mode, check_reset_mask, picture, scene_box
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.scene_types import SceneType
 
@@ -162,8 +162,8 @@ class DenoisingEnv(gym.Env[Any, np.ndarray]):
             InvalidInputError: wrong shape, or a value that is not finite.
             ResetNeededError: the episode has ended.
         """
-        batched = np.asarray(action)[None]
-        result = self.core.step(batched)
+        checked = check_action(action, (self.core.slots, self.core.features), ("slot", "feature"))
+        result = self.core.step(checked.unsqueeze(0))
         observation, info = self._observe(result)
         return observation, float(result.reward[0]), bool(result.terminated[0]), False, info
 

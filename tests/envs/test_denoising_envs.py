@@ -12,8 +12,8 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode
 
 import scene_envs.env_spaces as env_spaces
-import scene_envs.env_reward  # noqa: F401
 from agents.prior import tiny_prior
+from scene_envs.denoising_envs import DenoisingEnv
 from scene_envs.env_errors import ResetNeededError
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
@@ -91,7 +91,7 @@ def test_single_face_names_bad_actions(prior, height):
     with pytest.raises(InvalidInputError, match="not an array of numbers"):
         env.step("left")
     with pytest.raises(InvalidInputError, match="render_mode='human'"):
-        gym.make(ID, prior=prior, reward=height, render_mode="human")
+        DenoisingEnv(prior=prior, reward=height, render_mode="human")
 
 
 @pytest.mark.parametrize("action_mode", MODES)
