@@ -1,0 +1,180 @@
+"""DDPO-SF and DDPO-IS as one torchrl loss: the score-function policy gradient of a reverse chain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from agents.post_training.policy import DenoisingPolicy
+from scene_envs.errors import InvalidInputError
+
+REDUCTIONS = ("sum", "mean")
+
+
+class DDPOSFLoss(LossModule):
+    """Denoising diffusion policy optimisation (Black et al. 2024), Eq. 3 (score function) or Eq. 4 (clipped).
+
+    For transitions (x_t, t, x_{t-1}) with advantage A, the loss is
+
+        - mean over valid rows of  weight(t) * A * log p(x_{t-1} | x_t)
+
+    where x_t and x_{t-1} are constants: the gradient is the score function's, and one step's graph can be freed
+    before the next is built, so memory does not grow with the length of the chain. Known entries, the
+    deterministic last step and steps of weight 0 have no part in it.
+
+    With ``clip_epsilon`` the surrogate is ``min(ratio * A, clip(ratio, 1 ± epsilon) * A)``, the ratio being that
+    of the *reduced* probabilities to the ones stored at sampling; before the first update the ratio is exactly 1.
+
+    The scale of the gradient, and so the meaning of any coefficient beside it, hangs on the reduction of
+    log p over the entries of a scene: ``"sum"`` (the log-probability itself) or ``"mean"`` (divided by the number
+    of random entries, as in the published code). It is always the mean over rows, never over steps.
+
+    Accepted keys (``set_keys``):
+        scene: (B, N, D) float, x_t. Default ``"scene"``.
+        timestep: (B, 1) int64, t. Default ``"timestep"``.
+        action: (B, N, D) float, x_{t-1}. Default ``"action"``.
+        advantage: (B,) or (B, 1) float, or (B, N) for credit per slot. Default ``"advantage"``.
+        sample_log_prob: (B, N) float, log-probability per slot at sampling; read when clipping, and optional
+            without. Default ``"slot_log_prob"``.
+        valid: (B,) or (B, 1) bool, optional; False rows are left out of the mean. Default ``"valid"``.
+
+    Args:
+        policy: what is optimised.
+        step_weights: (S,) weight of every step; None means 1 wherever the step is random.
+        reduction: ``"sum"`` or ``"mean"`` of log p over the random entries of a scene.
+        clip_epsilon: half-width of the ratio's clip, or None for the plain score function.
+
+    Returns (``forward``): ``loss_objective`` (), and detached ``log_ratio`` (), the largest |log ratio|, and
+    ``clip_fraction`` () when old log-probabilities are given.
+
+    >>> from agents.prior import tiny_prior
+    >>> policy = DenoisingPolicy(tiny_prior(), num_steps=4)
+    >>> scene = policy.prior.initial(2, 34)
+    >>> action, log_prob = policy.draw(scene, 1)
+    >>> transitions = TensorDict({"scene": scene, "timestep": policy.table.timesteps[1].expand(2, 1),
+    ...     "action": action, "advantage": torch.tensor([1.0, -1.0]), "slot_log_prob": log_prob}, [2])
+    >>> loss = DDPOSFLoss(policy)(transitions)
+    >>> sorted(loss.keys()), float(loss["log_ratio"])
+    (['clip_fraction', 'log_ratio', 'loss_objective'], 0.0)
+    >>> loss["loss_objective"].backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        scene: NestedKey = "scene"
+        timestep: NestedKey = "timestep"
+        action: NestedKey = "action"
+        advantage: NestedKey = "advantage"
+        sample_log_prob: NestedKey = "slot_log_prob"
+        valid: NestedKey = "valid"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_objective", "log_ratio", "clip_fraction"]  # noqa: RUF012  (torchrl reads lists)
+    policy: DenoisingPolicy
+    step_weights: Tensor
+
+    def __init__(
+        self,
+        policy: DenoisingPolicy,
+        *,
+        step_weights: Tensor | None = None,
+        reduction: str = "sum",
+        clip_epsilon: float | None = None,
+    ) -> None:
+        super().__init__()
+        if reduction not in REDUCTIONS:
+            raise InvalidInputError(f"reduction={reduction!r} is not known; use 'sum' or 'mean'")
+        if clip_epsilon is not None and not 0 < clip_epsilon < 1:
+            raise InvalidInputError(f"clip_epsilon={clip_epsilon} must lie between 0 and 1, or be None")
+        if step_weights is not None and step_weights.shape != (len(policy),):
+            raise InvalidInputError(
+                f"step_weights has shape {tuple(step_weights.shape)}, the chain {len(policy)} steps"
+            )
+        self.policy = policy
+        self.reduction = reduction
+        self.clip_epsilon = clip_epsilon
+        weights = torch.ones(len(policy)) if step_weights is None else step_weights.float()
+        self.register_buffer("step_weights", weights)
+        self._entries: dict[int, int] = {}
+
+    @property
+    def functional(self) -> bool:
+        """False: the policy's own parameters receive the gradient."""
+        return False
+
+    @property
+    def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
+        """Keys that must be present."""
+        keys = self.tensor_keys
+        return [keys.scene, keys.timestep, keys.action, keys.advantage]
+
+    def _forward_value_estimator_keys(self, **kwargs: object) -> None:
+        """This loss has no value estimator."""
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """The loss of a batch of transitions; rows may be at different steps.
+
+        Raises:
+            InvalidInputError: a timestep the policy does not visit, or clipping without old log-probabilities.
+        """
+        keys = self.tensor_keys
+        flat = tensordict.reshape(-1)
+        scene, action = flat.get(keys.scene).detach(), flat.get(keys.action).detach()
+        timestep = flat.get(keys.timestep).reshape(-1)
+        advantage = self._advantage(flat, scene.shape[:2])
+        old = flat.get(keys.sample_log_prob, None)
+        if old is None and self.clip_epsilon is not None:
+            raise InvalidInputError(f"clipping needs the log-probabilities at sampling under {keys.sample_log_prob!r}")
+        valid = flat.get(keys.valid, None)
+        kept = torch.ones_like(timestep, dtype=torch.bool) if valid is None else valid.reshape(-1)
+        total = scene.new_zeros(())
+        largest, clipped = scene.new_zeros(()), scene.new_zeros(())
+        for t in timestep.unique().tolist():
+            rows = timestep == t
+            step = self.policy.step_of(int(t))
+            log_prob = self.policy.log_prob(scene[rows], step, action[rows])  # (b, N)
+            earlier = None if old is None else old[rows].detach()
+            if earlier is not None:
+                largest = torch.maximum(largest, (log_prob.detach() - earlier).sum(dim=-1).abs().max())
+            objective, beyond = self._objective(log_prob, advantage[rows], earlier)
+            total = total + self.step_weights[step] * torch.where(kept[rows], objective, 0.0).sum()
+            clipped = clipped + torch.where(kept[rows], beyond, 0.0).sum()
+        count = kept.sum().clamp(min=1)
+        fields = {"loss_objective": -total / count}
+        if old is not None:
+            fields |= {"log_ratio": largest, "clip_fraction": clipped / count}
+        return TensorDict(fields, [])
+
+    def _objective(self, log_prob: Tensor, advantage: Tensor, old: Tensor | None) -> tuple[Tensor, Tensor]:
+        """(b,) objective and (b,) share of clipped terms, from (b, N) log-probabilities and advantages."""
+        entries = self._count_entries(log_prob.shape[1]) if self.reduction == "mean" else 1
+        if advantage.shape[1] == 1:  # credit per scene
+            log_prob = log_prob.sum(dim=1, keepdim=True)
+            old = None if old is None else old.sum(dim=1, keepdim=True)
+        log_prob = log_prob / entries
+        if self.clip_epsilon is None or old is None:
+            return (advantage * log_prob).sum(dim=1), torch.zeros_like(advantage[:, 0])
+        ratio = (log_prob - old / entries).exp()
+        bounded = ratio.clamp(1 - self.clip_epsilon, 1 + self.clip_epsilon)
+        surrogate = torch.minimum(ratio * advantage, bounded * advantage)
+        return surrogate.sum(dim=1), (ratio != bounded).float().mean(dim=1).detach()
+
+    def _advantage(self, flat: TensorDictBase, shape: torch.Size) -> Tensor:
+        advantage = flat.get(self.tensor_keys.advantage).detach()
+        advantage = advantage.reshape(shape[0], -1)
+        if advantage.shape[1] not in (1, shape[1]):
+            raise InvalidInputError(
+                f"the advantage has {advantage.shape[1]} values per scene; give one, or one per slot ({shape[1]})"
+            )
+        return advantage
+
+    def _count_entries(self, slots: int) -> int:
+        if slots not in self._entries:
+            self._entries[slots] = self.policy.random_entries(slots)
+        return self._entries[slots]

@@ -1,0 +1,99 @@
+"""Batches of whole denoising episodes under a policy, with the log-probabilities of their steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Generator, Tensor
+
+from agents.post_training.policy import DenoisingPolicy
+from scene_envs.denoising_torchrl import DenoisingTorchRLEnv
+from scene_envs.scene import SceneBatch
+
+STREAMS = ("start", "noise", "steps", "real", "bank", "guard")
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """B episodes of S steps.
+
+    Attributes:
+        scenes: (S + 1, B, N, D) normalised, x_T to x_0.
+        actions: (S, B, N, D).
+        slot_log_prob: (S, B, N) nats at sampling.
+        timesteps: (S,) int64.
+        reward: (B,); 0 where not valid.
+        valid: (B,) bool.
+        per_object: (B, N) credit per slot, or None.
+        terms: named (B,) parts of the reward.
+        batch: the finished scenes.
+    """
+
+    scenes: Tensor
+    actions: Tensor
+    slot_log_prob: Tensor
+    timesteps: Tensor
+    reward: Tensor
+    valid: Tensor
+    per_object: Tensor | None
+    terms: Mapping[str, Tensor]
+    batch: SceneBatch
+
+    def transitions(self, step: int, advantage: Tensor, rows: slice = slice(None)) -> TensorDict:
+        """The transitions of one step as ``DDPOSFLoss`` reads them."""
+        scene = self.scenes[step][rows]
+        return TensorDict(
+            {
+                "scene": scene,
+                "timestep": self.timesteps[step].expand(scene.shape[0], 1),
+                "action": self.actions[step][rows],
+                "slot_log_prob": self.slot_log_prob[step][rows],
+                "advantage": advantage[rows],
+                "valid": self.valid[rows],
+            },
+            [scene.shape[0]],
+        )
+
+
+def stream_seed(seed: int, stream: str, iteration: int = 0) -> int:
+    """A seed below 2^31 for one purpose in one iteration, so that a resumed run needs no generator's state."""
+    words = np.random.SeedSequence([seed, STREAMS.index(stream), iteration]).generate_state(1)
+    return int(words[0]) >> 1
+
+
+def collect(env: DenoisingTorchRLEnv, policy: DenoisingPolicy, *, seed: int, iteration: int = 0) -> Rollout:
+    """Run ``policy`` to the end of one episode in each of the environment's rows.
+
+    Args:
+        env: the torchrl face, in ``next_sample`` mode.
+        policy: draws x_{t-1}; must have the environment's number of steps.
+        seed: of the run; x_T and the chain's noise hang on it and on ``iteration`` alone.
+        iteration: which batch of the run this is.
+    """
+    with torch.random.fork_rng(devices=[]):  # set_seed touches the global generator
+        env.set_seed(stream_seed(seed, "start", iteration))
+    device = env.core.device
+    generator = Generator(device).manual_seed(stream_seed(seed, "noise", iteration))
+    log_probs: list[Tensor] = []
+
+    def act(x_t: Tensor, step: int) -> Tensor:
+        action, log_prob = policy.draw(x_t, step, generator)
+        log_probs.append(log_prob)
+        return action
+
+    result = env.collect(act)
+    return Rollout(
+        scenes=result.scenes,
+        actions=result.actions,
+        slot_log_prob=torch.stack(log_probs),
+        timesteps=result.timesteps.to(device),
+        reward=result.reward,
+        valid=result.valid,
+        per_object=result.score.per_object,
+        terms=result.score.terms,
+        batch=result.batch,
+    )

@@ -1,0 +1,91 @@
+"""What a run leaves on disk: configuration, log, metrics; each file whole or not at all."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from agents.checkpoints import load_checkpoint
+from agents.post_training.config import RESUMABLE, PostTrainConfig
+from scene_envs.errors import InvalidInputError, TrainingError
+
+CHECKPOINT_NAME = "checkpoint.pt"
+LOG_NAME = "log.csv"
+METRICS_NAME = "metrics.json"
+SCENES_NAME = "real_scenes.safetensors"
+
+
+def write_text(path: Path, text: str) -> None:
+    """Replace ``path`` atomically.
+
+    Raises:
+        TrainingError: the disk refused; what was there before is untouched.
+    """
+    partial = path.with_name(path.name + ".partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_text(text, encoding="utf-8")
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise TrainingError(f"could not write {str(path)!r} ({error}); free some space and run again") from error
+
+
+def write_config(directory: Path, config: PostTrainConfig) -> None:
+    """``config.yaml``, every field."""
+    import yaml
+
+    write_text(directory / "config.yaml", yaml.safe_dump(config.plain(), sort_keys=False))
+
+
+def write_metrics(directory: Path, metrics: Mapping[str, Any]) -> None:
+    """``metrics.json``; numbers that JSON lacks become null."""
+    write_text(directory / METRICS_NAME, json.dumps(_json_able(metrics), indent=1, allow_nan=False) + "\n")
+
+
+def write_log(directory: Path, history: Sequence[Mapping[str, float]]) -> None:
+    """``log.csv``, one row per iteration; the union of all columns."""
+    columns = list(dict.fromkeys(name for row in history for name in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(history)
+    write_text(directory / LOG_NAME, text.getvalue())
+
+
+def load_resumable(directory: Path, config: PostTrainConfig) -> dict[str, Any] | None:
+    """The checkpoint of an interrupted run of the same configuration, or None when there is none.
+
+    Raises:
+        CorruptFileError: the checkpoint is truncated.
+        InvalidInputError: the directory holds a run of another configuration.
+    """
+    path = directory / CHECKPOINT_NAME
+    if not path.exists():
+        return None
+    state = load_checkpoint(path)
+    before, now = state.get("config", {}), config.plain()
+    changed = [name for name in now if name not in RESUMABLE and before.get(name, now[name]) != now[name]]
+    if changed:
+        differences = "; ".join(f"{name} was {before[name]!r}, is {now[name]!r}" for name in changed)
+        raise InvalidInputError(
+            f"{str(directory)!r} holds a run with another configuration ({differences}); "
+            "give another output, or the same settings to resume it"
+        )
+    return state
+
+
+def _json_able(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _json_able(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_json_able(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
