@@ -171,10 +171,14 @@ def get_grammar(scene_type: str | SceneType | Grammar) -> Grammar:
     """A fresh grammar by its name (built-in grammars are called like their scene type)."""
     if isinstance(scene_type, Grammar):
         return scene_type
-    name = scene_type.name if isinstance(scene_type, SceneType) else scene_type
+    return grammar_factory(scene_type.name if isinstance(scene_type, SceneType) else scene_type)()
+
+
+def grammar_factory(name: str) -> Callable[[], Grammar]:
+    """The function registered as ``name``; raises UnknownNameError with the nearest known name."""
     if name not in _REGISTRY:
         raise unknown_name("grammar", name, _REGISTRY)
-    return _REGISTRY[name]()
+    return _REGISTRY[name]
 
 
 def list_grammars() -> list[str]:
