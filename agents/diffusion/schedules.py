@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -64,7 +65,7 @@ def cosine_alpha_bar(num_timesteps: int, offset: float = 0.008, max_beta: float 
     return torch.cat([torch.ones(1, dtype=torch.float64), torch.cumprod(1.0 - beta, dim=0)])
 
 
-_SCHEDULES = {"karras": karras_alpha_bar, "linear": linear_alpha_bar, "cosine": cosine_alpha_bar}
+_SCHEDULES: dict[str, Callable[[int], Tensor]] = {"karras": karras_alpha_bar, "linear": linear_alpha_bar, "cosine": cosine_alpha_bar}
 
 
 def make_schedule(name: str, num_timesteps: int = 1000) -> NoiseSchedule:

@@ -100,6 +100,7 @@ class FluxDenoiser(nn.Module):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
         octaves = math.pi * 2.0 ** torch.arange(config.frequencies, dtype=torch.float32)
+        self.octaves: Tensor
         self.register_buffer("octaves", octaves, persistent=False)
 
     def forward(self, x: Tensor, position: Tensor, noise_level: Tensor) -> Tensor:
