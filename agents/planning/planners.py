@@ -7,30 +7,37 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from agents.planning.tree import Tree
+from agents.planning.tree import Node, Tree
 from scene_envs.errors import InvalidInputError
 
 Progress = Callable[[int, float], None]
 """Called after every round with the expansions so far and the best value so far."""
 
 
-class SearchProblem(Protocol):
-    """What a planner needs; ``scene_envs.search.SearchEnv`` has it, and so may any deterministic tree."""
+_ROOT: tuple[int, ...] = ()
+
+
+class Searchable(Protocol):
+    """What a planner needs; ``scene_envs.search.SearchEnv`` has it, and so may any deterministic tree.
+
+    States are immutable. A state with an attribute ``valid`` that is False could not be scored: it is counted and
+    left out of the tree.
+    """
 
     def clone_state(self) -> Any:
-        """The current state: immutable, the root of the plan."""
+        """The current state, the root of the plan."""
         ...
 
     def legal_actions(self, state: Any) -> Sequence[int]:
         """Actions that can be expanded from ``state``; none at a leaf."""
         ...
 
-    def expand_batch(self, states: Sequence[Any], actions: Sequence[int]) -> Sequence[Any]:
-        """The state each action leads to from each state."""
+    def expand_batch(self, pairs: Sequence[tuple[Any, int]]) -> Sequence[Any]:
+        """The child of every (state, action) pair."""
         ...
 
-    def evaluate(self, states: Sequence[Any]) -> Sequence[float]:
-        """The objective of each state in [0, 1]; NaN where it could not be computed."""
+    def evaluate(self, state: Any) -> float:
+        """The objective of ``state``, in [0, 1]."""
         ...
 
 
@@ -86,7 +93,7 @@ class UCTPlanner:
         if self.parallel < 1:
             raise InvalidInputError(f"parallel must be at least 1, got {self.parallel}")
 
-    def plan(self, problem: SearchProblem, budget: int, progress: Progress | None = None) -> PlanResult:
+    def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions on the tree below the problem's current state."""
         _check_budget(budget)
         root = problem.clone_state()
@@ -96,11 +103,12 @@ class UCTPlanner:
             selected = _select_up_to(tree, min(self.parallel, budget - len(values)))
             if not selected:
                 break
-            states = problem.expand_batch([node.state for node, _ in selected], [action for _, action in selected])
-            for (node, action), state, value in zip(selected, states, problem.evaluate(states), strict=True):
-                values.append(float(value))
+            states = problem.expand_batch([(node.state, action) for node, action in selected])
+            for (node, action), state in zip(selected, states, strict=True):
+                value = _value(problem, state)
+                values.append(value)
                 if math.isfinite(value):
-                    tree.attach(node, action, state, float(value), problem.legal_actions(state))
+                    tree.attach(node, action, state, value, problem.legal_actions(state))
                 else:
                     tree.release(node, action)
             if progress is not None:
@@ -122,27 +130,33 @@ class BestOfPlanner:
 
     parallel: int = 16
 
-    def plan(self, problem: SearchProblem, budget: int, progress: Progress | None = None) -> PlanResult:
+    def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions, or as many as the root has actions."""
         _check_budget(budget)
         root = problem.clone_state()
         actions = list(problem.legal_actions(root))[:budget]
-        best_state, best_value, best_path = root, -math.inf, ()
+        best_state, best_value, best_path = root, -math.inf, _ROOT
         values: list[float] = []
         for start in range(0, len(actions), self.parallel):
             chunk = actions[start : start + self.parallel]
-            states = problem.expand_batch([root] * len(chunk), chunk)
-            for action, state, value in zip(chunk, states, problem.evaluate(states), strict=True):
-                values.append(float(value))
+            states = problem.expand_batch([(root, action) for action in chunk])
+            for action, state in zip(chunk, states, strict=True):
+                value = _value(problem, state)
+                values.append(value)
                 if value > best_value:
-                    best_state, best_value, best_path = state, float(value), (action,)
+                    best_state, best_value, best_path = state, value, (action,)
             if progress is not None:
                 progress(len(values), best_value)
         return PlanResult(best_state, best_value if values else math.nan, best_path, values)
 
 
-def _select_up_to(tree: Tree, count: int) -> list[tuple[Any, int]]:
-    selected = []
+def _value(problem: Searchable, state: Any) -> float:
+    """The objective of ``state``, NaN when it could not be scored."""
+    return float(problem.evaluate(state)) if getattr(state, "valid", True) else math.nan
+
+
+def _select_up_to(tree: Tree, count: int) -> list[tuple[Node, int]]:
+    selected: list[tuple[Node, int]] = []
     while len(selected) < count and (choice := tree.select()) is not None:
         selected.append(choice)
     return selected

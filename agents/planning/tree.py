@@ -9,7 +9,7 @@ from typing import Any
 
 
 def ucb1(mean: float, visits: int, parent_visits: int, exploration: float) -> float:
-    """UCB1 score ``mean + exploration * sqrt(ln(parent_visits) / visits)`` (Auer et al. 2002, Kocsis & Szepesvári 2006).
+    """UCB1: ``mean + exploration * sqrt(ln(parent_visits) / visits)`` (Auer 2002; Kocsis & Szepesvári 2006, Eq. 1).
 
     Args:
         mean: average value of the child, in [0, 1].

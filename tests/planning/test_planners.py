@@ -16,7 +16,7 @@ Path = tuple[int, ...]
 
 
 class ToyTree:
-    """States are paths; values come from a function of the path; ``calls`` counts expansions."""
+    """States are paths; values come from a function of the path; ``batches`` holds the sizes of the expansions."""
 
     def __init__(self, value, branching: int = 3, depth: int = 4, broken: frozenset[Path] = frozenset()) -> None:
         self.value, self.branching, self.depth, self.broken = value, branching, depth, broken
@@ -28,12 +28,12 @@ class ToyTree:
     def legal_actions(self, state: Path) -> Sequence[int]:
         return range(self.branching) if len(state) < self.depth else ()
 
-    def expand_batch(self, states: Sequence[Path], actions: Sequence[int]) -> list[Path]:
-        self.batches.append(len(states))
-        return [(*state, action) for state, action in zip(states, actions, strict=True)]
+    def expand_batch(self, pairs: Sequence[tuple[Path, int]]) -> list[Path]:
+        self.batches.append(len(pairs))
+        return [(*state, action) for state, action in pairs]
 
-    def evaluate(self, states: Sequence[Path]) -> list[float]:
-        return [math.nan if state in self.broken else self.value(state) for state in states]
+    def evaluate(self, state: Path) -> float:
+        return math.nan if state in self.broken else self.value(state)
 
     def all_paths(self) -> list[Path]:
         levels = range(1, self.depth + 1)
