@@ -89,19 +89,21 @@ def _span(
     unit = circle(segments, phase)
     corners = [np.column_stack([r * unit, np.full(segments, z)]) for r, z in (low, high)]
     here, there = np.arange(segments), (np.arange(segments) + 1) % segments
+    degenerate = np.array([low[0] == 0.0, high[0] == 0.0])
+    keep = np.repeat(~degenerate, segments)  # a span that starts or ends on the axis has half as many triangles
     if flat:
-        quads = np.stack([corners[0], corners[0][there], corners[1][there], corners[1]], axis=1).reshape(-1, 3)
+        quads = np.stack([corners[0], corners[0][there], corners[1][there], corners[1]], axis=1)
+        facing = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
+        facing /= np.linalg.norm(facing, axis=1, keepdims=True)
         first = 4 * here
         faces = np.concatenate(
             [np.stack([first, first + 1, first + 2], axis=1), np.stack([first, first + 2, first + 3], axis=1)]
         )
-        return surface(quads, faces, color)
+        return surface(quads.reshape(-1, 3), faces[keep], color, facing.repeat(4, axis=0))
     faces = np.concatenate(
         [np.stack([here, there, segments + there], axis=1), np.stack([here, segments + there, segments + here], axis=1)]
     )
     radial = [np.column_stack([n[0] * unit, np.full(segments, n[1])]) / np.linalg.norm(n) for n in normals]
-    degenerate = np.array([low[0] == 0.0, high[0] == 0.0])
-    keep = np.repeat(~degenerate, segments)  # a span that starts or ends on the axis has half as many triangles
     return surface(np.concatenate(corners), faces[keep], color, np.concatenate(radial))
 
 
