@@ -101,8 +101,11 @@ class DenoisingPolicy(TensorDictModuleBase):
         return int((self._std_maps(slots)[0] > 0).sum())
 
     def stds(self, slots: int) -> Tensor:
-        """(S,) sigma of every step, normalised units; 0 at the deterministic last one."""
-        return torch.stack([std.amax() for std in self._std_maps(slots)])
+        """(S,) smallest sigma of every step over its random entries, normalised units; 0 where none is random."""
+        smallest = [
+            std[std > 0].amin() if bool((std > 0).any()) else std.new_zeros(()) for std in self._std_maps(slots)
+        ]
+        return torch.stack(smallest)
 
     @torch.no_grad()
     def _std_maps(self, slots: int) -> list[Tensor]:

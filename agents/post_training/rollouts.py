@@ -12,6 +12,7 @@ from torch import Generator, Tensor
 
 from agents.post_training.policy import DenoisingPolicy
 from scene_envs.denoising_torchrl import DenoisingTorchRLEnv
+from scene_envs.errors import TrainingError
 from scene_envs.scene import SceneBatch
 
 STREAMS = ("start", "noise", "steps", "real", "bank", "guard")
@@ -82,6 +83,11 @@ def collect(env: DenoisingTorchRLEnv, policy: DenoisingPolicy, *, seed: int, ite
 
     def act(x_t: Tensor, step: int) -> Tensor:
         action, log_prob = policy.draw(x_t, step, generator)
+        if not bool(torch.isfinite(log_prob).all()):
+            raise TrainingError(
+                f"the prior gave values that are not finite at step {step} of iteration {iteration + 1}; "
+                "its weights are broken: go back to an earlier checkpoint or load the prior anew"
+            )
         log_probs.append(log_prob)
         return action
 

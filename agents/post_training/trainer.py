@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -87,7 +88,7 @@ class PostTrainer:
     def __init__(self, config: PostTrainConfig, *, prior: ScenePrior | None = None) -> None:
         self.config = config
         self.directory = Path(config.output)
-        self.prior = _private_copy(ScenePrior.load(config.prior if prior is None else prior)).to(config.device)
+        self.prior = deepcopy(ScenePrior.load(config.prior if prior is None else prior)).to(config.device).eval()
         self.slots = self.prior.config.slots if config.slots is None else config.slots
         self.policy = DenoisingPolicy(self.prior, config.num_steps, chunk=config.chunk)
         self.stds = self.policy.stds(self.slots).cpu()
@@ -358,12 +359,6 @@ class _judged_weights:
             with torch.no_grad():
                 for name, parameter in self.prior.named_parameters():
                     parameter.copy_(self.own[name])
-
-
-def _private_copy(prior: ScenePrior) -> ScenePrior:
-    copy = ScenePrior(prior.config, prior.normalizer, prior.preconditioning, dict(prior.card))
-    copy.load_state_dict(prior.state_dict())
-    return copy.eval()
 
 
 def _save_scenes(batch: SceneBatch, path: Path) -> None:

@@ -1,0 +1,235 @@
+"""Before and after: the same measures on fresh samples of two priors, their pictures, and the page about them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor
+
+from agents.post_training.curves import draw_curve
+from agents.post_training.report import Page, Picture, Section, Tile, write_report
+from agents.post_training.run_files import write_metrics
+from agents.post_training.trainer import PostTrainResult
+from agents.prior import ScenePrior
+from scene_envs.scene import SceneBatch
+
+if TYPE_CHECKING:
+    from scene_envs.physics import PhysicsPool
+
+_GALLERY, _COLUMNS, _TILE = 12, 3, (400, 300)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A prior's fresh samples and what physics says of them.
+
+    Attributes:
+        figures: ``objects`` (mean count, welded included), ``objects_sem`` (its standard error), ``feasible_objects``
+            (free, raw), ``feasible_fraction`` of free objects, ``ready_objects`` (free, after projection and
+            settling, feasible and in the workspace), ``ready_objects_sem``, ``ready_fraction``, ``scenes``,
+            ``invalid_scenes`` (physics failed: left out of feasible and ready figures), and the cheap realism figures.
+        raw: the samples as they came.
+        ready: the same, projected and settled.
+        is_ready: (B, N) bool, simulation-ready objects of ``ready``.
+    """
+
+    figures: dict[str, float]
+    raw: SceneBatch
+    ready: SceneBatch
+    is_ready: Tensor
+
+
+def measure_prior(
+    prior: ScenePrior, count: int, *, num_steps: int = 50, seed: int = 0, pool: PhysicsPool | None = None
+) -> Measured:
+    """Sample ``count`` scenes and measure all of them; none is chosen, none is dropped.
+
+    Args:
+        prior: the prior.
+        count: scenes.
+        num_steps: denoiser evaluations per scene.
+        seed: of the samples; the same seed for two priors starts both from the same noise.
+        pool: physics workers.
+    """
+    from agents.post_training.guard import realism
+    from scene_envs.physics import feasibility, make_ready
+
+    raw = prior.sample(count, num_steps=num_steps, seed=seed)
+    feasible = feasibility(raw, pool=pool)
+    ready = make_ready(raw, pool=pool)
+    counts = raw.counts.double()
+    free = raw.is_free.sum(dim=-1).double()
+    figures = {
+        "scenes": float(count),
+        "objects": float(counts.mean()),
+        "objects_sem": _standard_error(counts),
+        **_counted("feasible", feasible.counts, feasible.valid, free),
+        **_counted("ready", ready.counts, ready.valid, free),
+        "invalid_scenes": float((~(feasible.valid & ready.valid)).sum()),
+        **realism(raw),
+    }
+    return Measured(figures, raw, ready.batch, ready.ready)
+
+
+def write_comparison(
+    result: PostTrainResult, before: Measured, after: Measured, *, title: str, extra: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """Write ``curve.png``, ``before.png``, ``after.png``, ``report.html`` and ``metrics.json`` into the run directory.
+
+    Args:
+        result: the run.
+        before: samples of the base prior.
+        after: samples of the post-trained prior.
+        title: heading of the page.
+        extra: more entries for ``metrics.json``.
+
+    Returns:
+        What ``metrics.json`` holds: the run's metrics, ``before``, ``after`` and ``change`` (relative).
+    """
+    directory, config = result.directory, result.metrics["config"]
+    names = [name for name in ("objects", "feasible_objects", "ready_objects") if name in before.figures]
+    change = {name: _relative(before.figures[name], after.figures.get(name)) for name in names}
+    metrics = {"before": before.figures, "after": after.figures, "change": change, **result.metrics, **(extra or {})}
+    reward_name = _reward_name(config["reward"])
+    limit = result.metrics["guard"]["limit"]
+    curve = draw_curve(result.history, directory / "curve.png", reward_name=f"mean {reward_name}", limit=limit)
+    pictures = {
+        "before": draw_gallery(before.raw, directory / "before.png"),
+        "after": draw_gallery(after.raw, directory / "after.png"),
+        "before_ready": draw_gallery(before.ready, directory / "before_ready.png", before.is_ready),
+        "after_ready": draw_gallery(after.ready, directory / "after_ready.png", after.is_ready),
+    }
+    write_report(directory / "report.html", _page(title, metrics, curve, pictures, reward_name))
+    write_metrics(directory, metrics)
+    return metrics
+
+
+def draw_gallery(batch: SceneBatch, path: Path, is_ready: Tensor | None = None) -> Path:
+    """The first scenes of ``batch`` with their counts as a PNG; nothing is selected.
+
+    Args:
+        batch: the scenes.
+        path: where the picture goes.
+        is_ready: (B, N) bool; given, captions count these objects and the free ones that are not are red.
+    """
+    from scene_envs.render import gallery, render
+
+    shown = batch[: min(_GALLERY, len(batch))]
+    width, height = _TILE
+    if is_ready is None:
+        images = render(shown, width=width, height=height)
+        captions = [f"{count} objects" for count in shown.counts.tolist()]
+    else:
+        ready = is_ready[: len(shown)].cpu()
+        images = render(shown, width=width, height=height, highlight=shown.is_free.cpu() & ~ready)
+        free = shown.is_free.sum(dim=-1).tolist()
+        captions = [f"{good} of {total} ready" for good, total in zip(ready.sum(dim=-1).tolist(), free, strict=True)]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    gallery(images, columns=_COLUMNS, captions=captions).quantize(192).save(path, optimize=True)
+    return path
+
+
+def _page(title: str, metrics: Mapping[str, Any], curve: Path, pictures: Mapping[str, Path], reward_name: str) -> Page:
+    before, after, guard = metrics["before"], metrics["after"], metrics["guard"]
+    count = int(before["scenes"])
+    lead = (
+        f"{metrics['iterations']} iterations of DDPO-SF on {reward_name}, with the pretraining loss on real scenes as "
+        f"regularisation. All numbers are means over {count} fresh, seeded samples of each prior; none was selected."
+    )
+    tiles = [
+        _tile("objects per scene", "objects", before, after),
+        _tile("feasible as sampled", "feasible_objects", before, after),
+        _tile("simulation-ready", "ready_objects", before, after),
+        Tile("held-out loss", f"{guard['ratio']:.2f}×", f"of the base prior; limit {guard['limit']:g}×"),
+    ]
+    over = guard["over_optimised_from"]
+    verdict = (
+        f"The guard's limit was passed at iteration {over}; the prior kept is that of iteration {guard['best_iteration']}."
+        if over is not None
+        else f"The held-out loss stayed within its limit; the prior kept is that of iteration {guard['best_iteration']}."
+    )
+    sections = [
+        Section("The curve", verdict, [Picture(curve, f"Mean {reward_name} of each batch, and the guard.")]),
+        Section(
+            "As sampled",
+            "The first samples of each prior from the same noise, untouched.",
+            [Picture(pictures["before"], "Before"), Picture(pictures["after"], "After")],
+        ),
+        Section(
+            "Simulation-ready",
+            "The same samples, projected out of penetration and settled. Red objects are not ready: they still move, "
+            "penetrate, or have left the workspace.",
+            [Picture(pictures["before_ready"], "Before"), Picture(pictures["after_ready"], "After")],
+        ),
+        Section("Numbers", table=_rows(before, after)),
+    ]
+    return Page(title, lead, tiles, sections, metrics["config"])
+
+
+_LABELS = {
+    "objects": "objects per scene (welded included)",
+    "feasible_objects": "feasible free objects, as sampled",
+    "feasible_fraction": "their share of free objects",
+    "ready_objects": "simulation-ready free objects",
+    "ready_fraction": "their share of free objects ",
+    "workspace_fraction": "objects in the workspace, as sampled",
+    "height_error_table_mm": "height error on the table, median mm",
+    "height_error_stack_mm": "height error in stacks, median mm",
+    "invalid_scenes": "scenes whose physics failed",
+}
+
+
+def _rows(before: Mapping[str, float], after: Mapping[str, float]) -> list[tuple[str, ...]]:
+    rows: list[tuple[str, ...]] = [("", "before", "after", "change")]
+    for name, label in _LABELS.items():
+        if name in before and name in after:
+            change = _relative(before[name], after[name])
+            rows.append(
+                (label, _number(before, name), _number(after, name), "" if change is None else f"{change:+.0%}")
+            )
+    return rows
+
+
+def _number(figures: Mapping[str, float], name: str) -> str:
+    value = figures[name]
+    if name.endswith("_fraction"):
+        return f"{value:.1%}"
+    error = figures.get(name + "_sem")
+    return f"{value:.2f}" if error is None else f"{value:.2f} ± {error:.2f}"
+
+
+def _tile(label: str, name: str, before: Mapping[str, float], after: Mapping[str, float]) -> Tile:
+    if name not in before or name not in after:
+        return Tile(label, "–", "physics failed")
+    change = _relative(before[name], after[name])
+    note = f"from {before[name]:.1f}" + ("" if change is None else f", {change:+.0%}")
+    return Tile(label, f"{after[name]:.1f}", note)
+
+
+def _relative(before: float, after: float | None) -> float | None:
+    return None if after is None or before == 0 else after / before - 1.0
+
+
+def _counted(name: str, counts: Tensor, valid: Tensor, free: Tensor) -> dict[str, float]:
+    """Mean and standard error of ``counts`` over valid scenes, and their share of the free objects there."""
+    if not bool(valid.any()):
+        return {}
+    taken = counts[valid].double()
+    share = float(taken.sum() / free[valid].sum()) if float(free[valid].sum()) else 0.0
+    return {
+        f"{name}_objects": float(taken.mean()),
+        f"{name}_objects_sem": _standard_error(taken),
+        f"{name}_fraction": share,
+    }
+
+
+def _standard_error(values: Tensor) -> float:
+    return float(values.std(unbiased=True) / len(values) ** 0.5) if len(values) > 1 else 0.0
+
+
+def _reward_name(reward: Any) -> str:
+    name = reward.get("name", "reward") if isinstance(reward, Mapping) else reward
+    return str(name).replace("_", " ")

@@ -1,0 +1,64 @@
+"""The curve of a run as a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+REWARD_COLOR, GUARD_COLOR, FAINT = "#0f766e", "#b45309", "#99a3ad"
+
+
+def draw_curve(
+    history: Sequence[Mapping[str, float]], path: Path, *, reward_name: str, limit: float | None = None
+) -> Path:
+    """Reward and guard over iterations, as a PNG.
+
+    Args:
+        history: rows with ``iteration``, ``reward``, ``reward_std`` and, at checks, ``guard_ratio``.
+        path: where the picture goes.
+        reward_name: label of the upper axis.
+        limit: of the guard, drawn as a line.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    iteration = np.array([row["iteration"] for row in history])
+    reward = np.array([row["reward"] for row in history], dtype=float)
+    spread = np.array([row["reward_std"] for row in history], dtype=float)
+    checks = [(row["iteration"], row["guard_ratio"]) for row in history if "guard_ratio" in row]
+    figure = Figure(figsize=(8.4, 5.2), dpi=130, layout="constrained")
+    FigureCanvasAgg(figure)
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.4, 1.0))
+    upper.fill_between(iteration, reward - spread, reward + spread, color=REWARD_COLOR, alpha=0.12, linewidth=0)
+    upper.plot(iteration, reward, color=REWARD_COLOR, alpha=0.35, linewidth=1)
+    upper.plot(iteration, smooth(reward), color=REWARD_COLOR, linewidth=2.2)
+    upper.set_ylabel(reward_name)
+    if checks:
+        lower.plot([0, *(x for x, _ in checks)], [1.0, *(y for _, y in checks)], "o-", color=GUARD_COLOR, markersize=4)
+    if limit is not None:
+        lower.axhline(limit, color=FAINT, linestyle="--", linewidth=1)
+        lower.text(1.0, limit, f" limit {limit:g}×", color=FAINT, va="bottom", ha="right", fontsize=8,
+                   transform=lower.get_yaxis_transform())  # fmt: skip
+    lower.set_ylabel("held-out loss\nover base")
+    lower.set_xlabel("iteration")
+    for axes in (upper, lower):
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis="y", color="#e8ebee", linewidth=0.8)
+        axes.set_axisbelow(True)
+        axes.tick_params(labelsize=9)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+    return path
+
+
+def smooth(values: np.ndarray, window: int = 9) -> np.ndarray:
+    """Centred moving average over finite values, of the same length; the window shrinks at the ends.
+
+    >>> smooth(np.array([1.0, 2.0, 6.0]), window=3).tolist()
+    [1.5, 3.0, 4.0]
+    """
+    half = window // 2
+    parts = [values[max(0, i - half) : i + half + 1] for i in range(len(values))]
+    return np.array([np.nanmean(part) if np.isfinite(part).any() else np.nan for part in parts])

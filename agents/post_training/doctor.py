@@ -1,0 +1,219 @@
+"""Before a run: is there something to learn, can it be learned, and do the two gradients speak equally loud?"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from agents.post_training.config import PostTrainConfig
+from agents.post_training.gradients import accumulate_policy_gradient
+from agents.post_training.trainer import PostTrainer
+from agents.prior import ScenePrior
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from agents.post_training.rollouts import Rollout
+
+LOUD, QUIET = 30.0, 1 / 30.0
+"""Ratios of the two gradient norms beyond which the louder one drowns the other."""
+
+
+@dataclass(frozen=True)
+class StepRow:
+    """One step of the chain.
+
+    Attributes:
+        step: index in the step table.
+        timestep: where it starts.
+        std: its smallest sigma over random entries, normalised units.
+        weight: in the policy gradient; 0 leaves it out.
+        gradient_norm: of this step's policy gradient alone; 0 when left out.
+    """
+
+    step: int
+    timestep: int
+    std: float
+    weight: float
+    gradient_norm: float
+
+
+@dataclass(frozen=True)
+class DoctorReport:
+    """What the doctor found.
+
+    Attributes:
+        log_ratio: largest |log p_now - log p_sampling|; exactly 0 when sampler and loss agree.
+        steps: the sigma table.
+        reward_mean: over one batch.
+        reward_std: over one batch.
+        reward_min: over one batch.
+        reward_max: over one batch.
+        valid_fraction: of the batch.
+        policy_gradient_norm: of the score-function part.
+        pretraining_gradient_norm: of the regularisation, its coefficient included.
+        sampling_seconds: one batch of scenes with its rewards.
+        update_seconds: one update.
+        iterations: of the run, for the estimate of its length.
+        advice: what to change, in words; empty when all is well.
+    """
+
+    log_ratio: float
+    steps: list[StepRow]
+    reward_mean: float
+    reward_std: float
+    reward_min: float
+    reward_max: float
+    valid_fraction: float
+    policy_gradient_norm: float
+    pretraining_gradient_norm: float
+    sampling_seconds: float
+    update_seconds: float
+    iterations: int
+    advice: list[str] = field(default_factory=list)
+
+    @property
+    def healthy(self) -> bool:
+        """Whether there is nothing to change."""
+        return not self.advice
+
+    @property
+    def gradient_ratio(self) -> float:
+        """Policy gradient over regularisation; infinite without regularisation."""
+        if self.pretraining_gradient_norm == 0:
+            return float("inf")
+        return self.policy_gradient_norm / self.pretraining_gradient_norm
+
+    def metrics(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {**vars(self), "steps": [vars(row) for row in self.steps], "gradient_ratio": self.gradient_ratio}
+
+    def __rich__(self) -> RenderableType:
+        """One screen for a terminal."""
+        return _screen(self)
+
+
+def diagnose(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> DoctorReport:
+    """Examine a configuration with one batch of scenes; nothing is trained and nothing is written.
+
+    Args:
+        config: the run that is planned.
+        prior: in place of the one that ``config.prior`` names.
+    """
+    with TemporaryDirectory() as scratch:
+        bank = min(config.bank_size, config.guard_scenes + 4 * config.regularisation_batch)
+        trainer = PostTrainer(replace(config, output=str(Path(scratch) / "run"), bank_size=bank), prior=prior)
+        try:
+            return _examine(trainer)
+        finally:
+            trainer.close()
+
+
+def _examine(trainer: PostTrainer) -> DoctorReport:
+    trainer.directory.mkdir(parents=True)
+    trainer.prepare()
+    started = time.perf_counter()
+    rollout = trainer.rollout()
+    sampled = time.perf_counter()
+    advantage = trainer.advantage(rollout)
+    row = trainer.accumulate(rollout, advantage)
+    updated = time.perf_counter()
+    steps, largest = _step_rows(trainer, rollout, advantage)
+    valid = rollout.reward[rollout.valid].double()
+    some = len(valid) > 0
+    report = DoctorReport(
+        log_ratio=max(largest, row["log_ratio"]),
+        steps=steps,
+        reward_mean=float(valid.mean()) if some else float("nan"),
+        reward_std=float(valid.std(unbiased=False)) if some else float("nan"),
+        reward_min=float(valid.min()) if some else float("nan"),
+        reward_max=float(valid.max()) if some else float("nan"),
+        valid_fraction=float(rollout.valid.double().mean()),
+        policy_gradient_norm=row["policy_gradient_norm"],
+        pretraining_gradient_norm=row["pretraining_gradient_norm"],
+        sampling_seconds=sampled - started,
+        update_seconds=updated - sampled,
+        iterations=trainer.config.iterations,
+    )
+    return replace(report, advice=_advice(report, trainer.config))
+
+
+def _step_rows(trainer: PostTrainer, rollout: Rollout, advantage: torch.Tensor) -> tuple[list[StepRow], float]:
+    """The sigma table, and the largest log-ratio over the steps in the gradient."""
+    rows, largest = [], 0.0
+    timesteps = trainer.policy.table.timesteps.tolist()
+    for step, weight in enumerate(trainer.loss.step_weights.tolist()):
+        norm = 0.0
+        if weight > 0:
+            trainer.optimizer.zero_grad(set_to_none=True)
+            found = accumulate_policy_gradient(trainer.loss, rollout, advantage, [step])
+            norm, largest = found.norm, max(largest, found.log_ratio)
+        rows.append(StepRow(step, timesteps[step], float(trainer.stds[step]), weight, norm))
+    trainer.optimizer.zero_grad(set_to_none=True)
+    return rows, largest
+
+
+def _advice(report: DoctorReport, config: PostTrainConfig) -> list[str]:
+    advice = []
+    if report.log_ratio != 0:
+        advice.append(
+            f"The log-ratio before the first update is {report.log_ratio:.2g}, not 0: "
+            "sampler and loss disagree about the policy."
+        )
+    if report.valid_fraction < 1:
+        advice.append(f"{1 - report.valid_fraction:.0%} of the scenes have no valid reward; see the log for why.")
+    if report.valid_fraction > 0 and not report.reward_std > 0:
+        advice.append("All rewards are equal: there is nothing to learn from. Use a graded reward or more scenes.")
+    if config.regularisation > 0 and report.policy_gradient_norm > 0:
+        if report.gradient_ratio < QUIET:
+            advice.append(
+                f"Regularisation drowns the reward (ratio {report.gradient_ratio:.2g}): "
+                f"lower regularisation from {config.regularisation:g}, or change log_prob_reduction."
+            )
+        if report.gradient_ratio > LOUD:
+            advice.append(
+                f"The reward drowns the regularisation (ratio {report.gradient_ratio:.2g}): "
+                f"raise regularisation from {config.regularisation:g}, or expect the guard to stop you."
+            )
+    norms = sorted(row.gradient_norm for row in report.steps if row.weight > 0)
+    if norms and norms[0] >= 0 and norms[-1] > 20 * max(norms[len(norms) // 2], 1e-12):
+        worst = max(report.steps, key=lambda row: row.gradient_norm)
+        advice.append(
+            f"Step {worst.step} (sigma {worst.std:.3g}) has {norms[-1] / max(norms[len(norms) // 2], 1e-12):.0f}x the "
+            f"median gradient: raise min_std from {config.min_std:g} or set step_weighting=std."
+        )
+    return advice
+
+
+def _screen(report: DoctorReport) -> RenderableType:
+    from rich.columns import Columns
+    from rich.console import Group
+    from rich.panel import Panel
+    from rich.table import Table
+
+    table = Table("step", "t", "sigma", "weight", "|gradient|", box=None, header_style="bold", pad_edge=False)
+    for row in report.steps:
+        style = "" if row.weight > 0 else "dim"
+        norm = f"{row.gradient_norm:.3g}" if row.weight > 0 else "out"
+        table.add_row(str(row.step), str(row.timestep), f"{row.std:.4f}", f"{row.weight:.2f}", norm, style=style)
+    facts = Table(box=None, show_header=False, pad_edge=False)
+    length = report.iterations * (report.sampling_seconds + report.update_seconds) / 60
+    for name, value in (
+        ("log-ratio at the start", f"{report.log_ratio:.3g}"),
+        ("reward", f"{report.reward_mean:.3g} ± {report.reward_std:.3g}"),
+        ("reward range", f"{report.reward_min:.3g} … {report.reward_max:.3g}"),
+        ("valid scenes", f"{report.valid_fraction:.0%}"),
+        ("policy gradient", f"{report.policy_gradient_norm:.3g}"),
+        ("regularisation gradient", f"{report.pretraining_gradient_norm:.3g}"),
+        ("their ratio", f"{report.gradient_ratio:.3g}"),
+        ("one batch, one update", f"{report.sampling_seconds:.1f} s, {report.update_seconds:.1f} s"),
+        (f"{report.iterations} iterations", f"about {length:.0f} min"),
+    ):
+        facts.add_row(name, f"[bold]{value}")
+    advice = "\n".join(f"[yellow]• {line}" for line in report.advice) or "[green]Nothing to change."
+    return Panel(Group(Columns([table, facts], padding=(0, 6)), "", advice), title="post-training doctor", expand=False)
