@@ -5,12 +5,14 @@
 Every face runs the same chain as the bare loop: the prior's posterior, one normal draw a step, and the decoding and
 counting of the finished scenes. Times are CPU seconds of one thread, which a busy machine disturbs little; the bare
 loop is timed again in every round, and the table gives the median over rounds of face / bare. The single
-environment is compared with a bare loop of one scene.
+environment is compared with a bare loop of one scene. Freed memory is kept by the process: how often glibc gives it
+back to the kernel depends on what else is alive, and would swamp the differences that are looked for.
 """
 
 from __future__ import annotations
 
 import argparse
+import ctypes
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -85,10 +87,11 @@ def gymnasium_vector(prior: PriorLike, batch: int, steps: int) -> Callable[[], N
     """``DenoisingVectorEnv``, noise mode; one step of an episode is spent on the autoreset."""
     env = gym.make_vec(ENV_ID, num_envs=batch, prior=prior, num_steps=steps, action_mode="noise")
     env.reset(seed=0)
+    shape = env.action_space.shape or ()
 
     def run() -> None:
         for _ in range(steps):
-            env.step(torch.randn(batch, *env.single_action_space.shape).numpy())
+            env.step(torch.randn(shape).numpy())
 
     return run
 
@@ -96,13 +99,24 @@ def gymnasium_vector(prior: PriorLike, batch: int, steps: int) -> Callable[[], N
 def gymnasium_single(prior: PriorLike, steps: int) -> Callable[[], None]:
     """``DenoisingEnv``, noise mode, one scene."""
     env = gym.make(ENV_ID, prior=prior, num_steps=steps, action_mode="noise").unwrapped
+    shape = env.action_space.shape or ()
 
     def run() -> None:
         env.reset()
         for _ in range(steps):
-            env.step(torch.randn(*env.action_space.shape).numpy())
+            env.step(torch.randn(shape).numpy())
 
     return run
+
+
+def keep_freed_memory() -> None:
+    """Tell glibc, where there is one, neither to trim the heap nor to map large blocks separately."""
+    try:
+        libc = ctypes.CDLL("libc.so.6")
+        libc.mallopt(-1, 1 << 30)  # M_TRIM_THRESHOLD
+        libc.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD
+    except (OSError, AttributeError):
+        print("no glibc: times include the kernel's work for freed memory")
 
 
 def cpu_seconds(run: Callable[[], None]) -> float:
@@ -137,6 +151,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=10)
     parser.add_argument("--rounds", type=int, default=3)
     arguments = parser.parse_args()
+    keep_freed_memory()
     torch.set_num_threads(1)
     torch.manual_seed(0)
     if arguments.prior == "tiny":

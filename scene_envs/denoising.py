@@ -44,6 +44,7 @@ class StepResult:
         terminated: (B,) bool, on the CPU.
         terms: named (B,) float32 of the reward; 0 before the last step.
         score: the full verdict, when all B episodes ended in this step; else None.
+        batch: the B finished scenes, likewise.
     """
 
     reward: Tensor
@@ -51,6 +52,7 @@ class StepResult:
     terminated: BoolArray
     terms: dict[str, Tensor]
     score: Score | None = None
+    batch: SceneBatch | None = None
 
 
 @dataclass(frozen=True)
@@ -266,13 +268,16 @@ class DenoisingCore:
         if len(ended) == 0:
             return StepResult(reward, valid, terminated, terms)
         terminated[ended] = True
-        batch = self.scenes() if len(ended) == count else self.scenes()[torch.from_numpy(ended)]
+        together = len(ended) == count
+        batch = self.scenes() if together else self.scenes()[torch.from_numpy(ended)]
         score = self.scorer(batch)
         reward = _replace_rows(reward, ended, score.value.to(device))
         valid = _replace_rows(valid, ended, score.valid.to(device))
         for name in terms.keys() & score.terms.keys():
             terms[name] = _replace_rows(terms[name], ended, score.terms[name].to(device))
-        return StepResult(reward, valid, terminated, terms, score if len(ended) == count else None)
+        if not together:
+            return StepResult(reward, valid, terminated, terms)
+        return StepResult(reward, valid, terminated, terms, score, batch)
 
     # -- whole trajectories ---------------------------------------------------------------------
 
@@ -285,21 +290,23 @@ class DenoisingCore:
             rngs: one NumPy generator per environment, for x_T.
         """
         self.reset(rngs)
-        scenes, actions = [self._x], []
+        scenes = torch.empty(self.num_steps + 1, *self._x.shape, device=self.device)
+        actions = torch.empty(self.num_steps, *self._x.shape, device=self.device)
+        scenes[0] = self._x
         for step in range(self.num_steps):
             action = policy(self._x, step)
             result = self.step(action)
-            scenes.append(self._x)
-            actions.append(action.detach())
+            scenes[step + 1], actions[step] = self._x, action
         assert result.score is not None
+        assert result.batch is not None
         return Trajectories(
-            scenes=torch.stack(scenes),
-            actions=torch.stack(actions),
+            scenes=scenes,
+            actions=actions,
             timesteps=torch.from_numpy(self._schedule[:-1].copy()),
             reward=result.reward,
             valid=result.valid,
             score=result.score,
-            batch=self.scenes(),
+            batch=result.batch,
         )
 
     def close(self) -> None:
