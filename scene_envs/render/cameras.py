@@ -37,8 +37,8 @@ def _focus(scene_type: SceneType) -> tuple[NDArray[np.float64], float]:
     low, high = (np.array(corner) for corner in scene_type.workspace)
     extent = high - low
     center = 0.5 * (low + high)
-    center[2] = low[2] + 0.1 * extent[2]
-    return center, float(0.45 * np.hypot(extent[0], extent[1]))
+    center[2] = low[2] + 0.15 * extent[2]
+    return center, float(0.47 * np.hypot(extent[0], extent[1]))
 
 
 def _triple(vector: NDArray[np.float64]) -> tuple[float, float, float]:

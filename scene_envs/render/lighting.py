@@ -53,43 +53,45 @@ def soft_shadow(
         softness: radius of the filter, pixels of ``light``.
         taps: samples of the filter.
     """
+    seen = np.isfinite(frame.depth)
     to_light = (light.view @ np.linalg.inv(frame.view)).astype(np.float32)
-    points = (camera_points(frame) + np.float32(lift) * normals) @ to_light[:3, :3].T + to_light[:3, 3]
-    distance = -points[..., 2]
-    safe = np.maximum(distance, 1e-6)
+    points = (camera_points(frame)[seen] + np.float32(lift) * normals[seen]) @ to_light[:3, :3].T + to_light[:3, 3]
+    distance = -points[:, 2]
     height, width = light.depth.shape
-    column = (points[..., 0] / safe * np.float32(light.focal[0]) + 1.0) * (0.5 * width) - 0.5
-    row = (1.0 - points[..., 1] / safe * np.float32(light.focal[1])) * (0.5 * height) - 0.5
-    hidden = np.zeros(frame.depth.shape, dtype=np.float32)
+    column = (points[:, 0] / distance * np.float32(light.focal[0]) + 1.0) * (0.5 * width)
+    row = (1.0 - points[:, 1] / distance * np.float32(light.focal[1])) * (0.5 * height)
+    nearest = light.depth.ravel()
+    hidden = np.zeros(len(points), dtype=np.float32)
     for dx, dy in _spiral(taps) * softness:
-        j = np.rint(column + dx).astype(np.int32).clip(0, width - 1)
-        i = np.rint(row + dy).astype(np.int32).clip(0, height - 1)
-        hidden += light.depth[i, j] < distance - bias
-    hidden *= np.isfinite(frame.depth) / np.float32(taps)
-    return hidden
+        index = _pixel(row + dy, height) * width + _pixel(column + dx, width)
+        hidden += nearest[index] < distance - bias
+    shadow = np.zeros(frame.depth.shape, dtype=np.float32)
+    shadow[seen] = hidden / taps
+    return shadow
 
 
-def contact_shade(frame: Frame, normals: Image, *, radius: float = 0.05, taps: int = 12, stride: int = 2) -> Image:
+def contact_shade(frame: Frame, normals: Image, *, radius: float = 0.04, taps: int = 12, stride: int = 2) -> Image:
     """(H, W) in 0..1: how much the surroundings within ``radius`` m close a point in (ambient occlusion).
 
     Worked out for every ``stride``-th pixel of each axis and repeated; meant to be blurred.
     """
-    points, normals = camera_points(frame)[::stride, ::stride], normals[::stride, ::stride]
-    height, width = points.shape[:2]
-    depth = np.maximum(-points[..., 2], 1e-3)
-    reach_x = 0.5 * width * frame.focal[0] * radius / depth
-    reach_y = 0.5 * height * frame.focal[1] * radius / depth
-    rows, columns = np.mgrid[0:height, 0:width].astype(np.float32)
-    closed = np.zeros((height, width), dtype=np.float32)
+    grid = camera_points(frame)[::stride, ::stride]
+    height, width = grid.shape[:2]
+    rows, columns = np.nonzero(grid[..., 2] < 0)
+    surroundings = grid.reshape(-1, 3)
+    points, facing = grid[rows, columns], normals[::stride, ::stride][rows, columns]
+    reach_x = (0.5 * width * frame.focal[0] * radius / -points[:, 2]).astype(np.float32)
+    reach_y = (0.5 * height * frame.focal[1] * radius / -points[:, 2]).astype(np.float32)
+    closed = np.zeros(len(points), dtype=np.float32)
     for dx, dy in _spiral(taps):
-        j = np.rint(columns + dx * reach_x).astype(np.int32).clip(0, width - 1)
-        i = np.rint(rows + dy * reach_y).astype(np.int32).clip(0, height - 1)
-        offset = points[i, j] - points
-        square = np.einsum("hwk,hwk->hw", offset, offset) + 1e-8
-        rise = np.einsum("hwk,hwk->hw", offset, normals) / np.sqrt(square)
-        closed += np.maximum(rise - 0.12, 0.0) * (square < 4.0 * radius**2)
-    closed *= (points[..., 2] < 0) / np.float32(taps)
-    return _enlarge(closed, stride, frame.depth.shape)
+        index = _pixel(rows + 0.5 + dy * reach_y, height) * width + _pixel(columns + 0.5 + dx * reach_x, width)
+        offset = surroundings[index] - points
+        square = np.einsum("nk,nk->n", offset, offset) + np.float32(1e-8)
+        rise = np.einsum("nk,nk->n", offset, facing) / np.sqrt(square)
+        closed += np.maximum(rise - np.float32(0.12), 0.0) * (square < 4.0 * radius**2)
+    shade = np.zeros((height, width), dtype=np.float32)
+    shade[rows, columns] = closed / taps
+    return _enlarge(shade, stride, frame.depth.shape)
 
 
 def blur(image: Image, size: int) -> Image:
@@ -97,6 +99,11 @@ def blur(image: Image, size: int) -> Image:
     from scipy.ndimage import uniform_filter
 
     return np.asarray(uniform_filter(image, size), dtype=np.float32)
+
+
+def _pixel(position: NDArray[np.float32], size: int) -> NDArray[np.int32]:
+    """The pixel that holds ``position`` (in pixels from the border), clamped to the image."""
+    return np.clip(position, 0, size - 1).astype(np.int32)
 
 
 def _enlarge(image: Image, stride: int, shape: tuple[int, ...]) -> Image:

@@ -111,9 +111,16 @@ def _picture(
     normals = surface_normals(frame)
     shadow = soft_shadow(frame, light, normals)[..., None]
     shade = blur(contact_shade(frame, normals), 2 * scale + 1)[..., None]
-    lit = color * (1.0 - _SHADOW * shadow) * (1.0 - np.minimum(1.4 * shade, 0.55))
+    towards = np.clip(2.0 * normals @ _camera_direction(frame, LIGHT_DIRECTION), 0.0, 1.0)[..., None]
+    lit = color * (1.0 - _SHADOW * shadow * (0.4 + 0.6 * towards)) * (1.0 - np.minimum(1.25 * shade, 0.5))
     ramp = np.linspace(0.0, 1.0, scale * height, dtype=np.float32)[:, None, None]
     backdrop = _BACKDROP[0] * (1.0 - ramp) + _BACKDROP[1] * ramp
     image = np.where((frame.slots >= 0)[..., None], lit, backdrop)
     small = image.reshape(height, scale, width, scale, 3).mean(axis=(1, 3))
     return np.rint(np.clip(small, 0.0, 255.0)).astype(np.uint8)
+
+
+def _camera_direction(frame: Frame, direction: tuple[float, float, float]) -> NDArray[np.float32]:
+    """A world direction in the camera frame, of unit length."""
+    turned = frame.view[:3, :3] @ np.array(direction)
+    return (turned / np.linalg.norm(turned)).astype(np.float32)

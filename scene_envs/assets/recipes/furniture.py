@@ -21,12 +21,12 @@ def cafe_table() -> Model:
     foot = solid([(0.27, -_HEIGHT), (0.27, 0.015 - _HEIGHT), (0.05, 0.03 - _HEIGHT)], 24)
     bevel = _TOP_RADIUS - 0.004
     visual = join(
-        planks(_TOP_RADIUS - 0.02, 0.0, _WALNUT, count=9, rows=14),
-        lathe([(bevel, -0.0005), (_TOP_RADIUS - 0.05, -0.0005)], _EDGE, segments=96),
+        planks(_TOP_RADIUS - 0.02, 0.0, _WALNUT, count=9, rows=10, columns=3),
+        lathe([(bevel, -0.0005), (_TOP_RADIUS - 0.05, -0.0005)], _EDGE, segments=72),
         lathe(
             [*((r, -0.03) for r in np.linspace(0.04, _TOP_RADIUS, 10)), (_TOP_RADIUS, -0.004), (bevel, 0.0)],
             _EDGE,
-            segments=96,
+            segments=72,
         ),
         lathe([(0.04, 0.03 - _HEIGHT), (0.04, -0.03)], _IRON, segments=24),
         lathe([(0.0, -_HEIGHT), (0.27, -_HEIGHT), (0.27, 0.015 - _HEIGHT), (0.04, 0.03 - _HEIGHT)], _IRON),
