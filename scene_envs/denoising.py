@@ -65,8 +65,8 @@ class Trajectories:
         timesteps: (S,) int64; ``scenes[i]`` is at ``timesteps[i]``, the last scene at 0.
         reward: (B,) float32; 0 where not valid.
         valid: (B,) bool.
-        score: value, terms, credit and flags per object.
-        batch: the finished scenes x_0.
+        score: value, terms, credit and flags per object, on the prior's device.
+        batch: the finished scenes x_0, on the CPU.
     """
 
     scenes: Tensor
@@ -98,6 +98,13 @@ class DenoisingCore:
 
     Raises:
         InvalidInputError, UnknownNameError: an argument is outside what is accepted.
+
+    >>> from agents.prior import tiny_prior
+    >>> core = DenoisingCore(2, prior=tiny_prior(), num_steps=1, action_mode="noise")
+    >>> core.reset([np.random.default_rng(seed) for seed in (0, 1)])
+    >>> result = core.step(torch.zeros(2, 34, 20))
+    >>> result.terminated.tolist(), tuple(result.reward.shape), result.batch
+    ([True, True], (2,), SceneBatch('dimsum_table', (2, 34, 20)))
     """
 
     def __init__(
@@ -165,8 +172,8 @@ class DenoisingCore:
         return self._steps == self.num_steps
 
     def scenes(self) -> SceneBatch:
-        """The current scenes, decoded: rotations in SO(3), arg-max categories."""
-        return SceneBatch.from_tensor(self._x, self.scene_type, normalised=self.prior.normalizer)
+        """The current scenes, decoded and on the CPU: rotations in SO(3), arg-max categories."""
+        return SceneBatch.from_tensor(self._x.cpu(), self.scene_type, normalised=self.prior.normalizer)
 
     def object_mask(self) -> Tensor:
         """(B, N) int8: slots whose arg-max category is not empty."""
@@ -270,11 +277,11 @@ class DenoisingCore:
         terminated[ended] = True
         together = len(ended) == count
         batch = self.scenes() if together else self.scenes()[torch.from_numpy(ended)]
-        score = self.scorer(batch)
-        reward = _replace_rows(reward, ended, score.value.to(device))
-        valid = _replace_rows(valid, ended, score.valid.to(device))
+        score = self.scorer(batch).to(device)
+        reward = _replace_rows(reward, ended, score.value)
+        valid = _replace_rows(valid, ended, score.valid)
         for name in terms.keys() & score.terms.keys():
-            terms[name] = _replace_rows(terms[name], ended, score.terms[name].to(device))
+            terms[name] = _replace_rows(terms[name], ended, score.terms[name])
         if not together:
             return StepResult(reward, valid, terminated, terms)
         return StepResult(reward, valid, terminated, terms, score, batch)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from scene_envs.env_reward import RewardScorer, Score
-from scene_envs.env_spaces import check_slots, resolve_scene_and_prior
+from scene_envs.env_spaces import check_slots, prior_device, resolve_scene_and_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
@@ -31,6 +31,13 @@ class SearchProblem:
 
     Attributes:
         evaluations: denoiser evaluations (NFE) spent so far, ``num_steps`` per generated scene.
+
+    >>> from agents.prior import tiny_prior
+    >>> problem = SearchProblem(prior=tiny_prior(), objective="object_count", num_steps=2, max_depth=1)
+    >>> root = problem.root(seed=0)
+    >>> children = problem.expand_batch([(root, action) for action in problem.legal_actions(root)])
+    >>> [child.path for child in children], problem.evaluations
+    ([(0,), (1,), (2,), (3,)], 10)
     """
 
     def __init__(
@@ -52,6 +59,7 @@ class SearchProblem:
                 raise InvalidInputError(f"{name}={number!r} must be a whole number of at least 1")
         self.scene_type, self.prior = resolve_scene_and_prior(scene, prior)
         self.slots = check_slots(self.scene_type, slots)
+        self.device = prior_device(self.prior)
         self.branching, self.max_depth, self.num_steps = branching, max_depth, num_steps
         self.prior.step_table(num_steps)  # says now, not later, that num_steps is more than the prior has
         self.scale = float(self.slots - len(self.scene_type.fixed)) if objective_scale is None else objective_scale
@@ -120,12 +128,13 @@ class SearchProblem:
 
     def _inpaint(self, batch: SceneBatch, masks: Tensor, noises: list[torch.Generator]) -> SceneBatch:
         self.evaluations += self.num_steps * len(batch)
-        return self.prior.inpaint(batch, masks, num_steps=self.num_steps, generators=noises)
+        batch, masks = batch.to(self.device), masks.to(self.device)
+        return self.prior.inpaint(batch, masks, num_steps=self.num_steps, generators=noises).to("cpu")
 
     def _score(self, batch: SceneBatch, origins: Sequence[tuple[int, tuple[int, ...], float]]) -> list[SearchState]:
         """States of ``batch``, given each one's (seed, path, value of the parent)."""
         score = self.scorer(batch)
-        return [self._state(batch[i], _row(score, i), *origin) for i, origin in enumerate(origins)]
+        return [self._state(batch[i], score.row(i), *origin) for i, origin in enumerate(origins)]
 
     def _state(
         self, scene: SceneBatch, score: Score, seed: int, path: tuple[int, ...], parent_value: float
@@ -146,15 +155,3 @@ class SearchProblem:
     def close(self) -> None:
         """Stop physics workers, if any."""
         self.scorer.close()
-
-
-def _row(score: Score, index: int) -> Score:
-    """One row of a score, as a batch of one."""
-    row = slice(index, index + 1)
-    return Score(
-        score.value[row],
-        score.valid[row],
-        {name: term[row] for name, term in score.terms.items()},
-        None if score.per_object is None else score.per_object[row],
-        {name: flag[row] for name, flag in score.object_flags.items()},
-    )

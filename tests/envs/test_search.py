@@ -48,6 +48,15 @@ def test_two_environments_with_one_seed_live_the_same_life(prior, free_objects):
     assert a[2]
 
 
+def test_make_vec_runs_copies_with_their_own_seeds(prior, free_objects):
+    kwargs = {"prior": prior, "objective": free_objects, "branching": 3, "max_depth": 3, "num_steps": 2}
+    vector, single = gym.make_vec(ID, num_envs=2, **kwargs), gym.make(ID, **kwargs)
+    batched, _ = vector.reset(seed=3)
+    row, _ = single.reset(seed=4)
+    assert data_equivalence({key: value[1] for key, value in batched.items()}, row, exact=True)
+    assert vector.step(np.array([0, 2]))[1][1] == single.step(2)[1]
+
+
 def test_rewards_telescope_to_the_gain_in_phi(env):
     env.reset(seed=0)
     start = env.evaluate()
