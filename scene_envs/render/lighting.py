@@ -56,7 +56,7 @@ def soft_shadow(
     seen = np.isfinite(frame.depth)
     to_light = (light.view @ np.linalg.inv(frame.view)).astype(np.float32)
     points = (camera_points(frame)[seen] + np.float32(lift) * normals[seen]) @ to_light[:3, :3].T + to_light[:3, 3]
-    distance = -points[:, 2]
+    distance = np.maximum(-points[:, 2], np.float32(1e-3))  # objects may have flown past the lamp
     height, width = light.depth.shape
     column = (points[:, 0] / distance * np.float32(light.focal[0]) + 1.0) * (0.5 * width)
     row = (1.0 - points[:, 1] / distance * np.float32(light.focal[1])) * (0.5 * height)

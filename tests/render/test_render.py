@@ -1,0 +1,176 @@
+"""Pictures show the scene that was asked for."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from scene_envs.errors import InvalidInputError, MissingDependencyError
+from scene_envs.render import gallery, picture_camera, render
+from scene_envs.render.stage import get_stage, load_pybullet
+from scene_envs.rotations import yaw_matrix
+from scene_envs.scene import SceneBatch
+from scene_envs.scene_types import Camera, get_scene_type
+
+DIMSUM = get_scene_type("dimsum_table")
+
+
+def scene(*objects, slots=8):
+    """One scene with the table and ``objects`` (name, x, y, z, yaw)."""
+    translations, categories = torch.zeros(1, slots, 3), torch.full((1, slots), DIMSUM.num_assets)
+    yaws = torch.zeros(1, slots)
+    categories[0, 0] = DIMSUM.assets.index("cafe_table")
+    for slot, (name, x, y, z, yaw) in enumerate(objects, start=1):
+        categories[0, slot] = DIMSUM.assets.index(name)
+        translations[0, slot], yaws[0, slot] = torch.tensor([x, y, z]), yaw
+    return SceneBatch.from_parts(translations, yaw_matrix(yaws), categories, DIMSUM)
+
+
+def color(name):
+    return np.array(DIMSUM.library[name].color, dtype=np.uint8)
+
+
+def where(image, name):
+    """(row, column) of the pixels that show ``name`` in a semantic image."""
+    return np.argwhere((image == color(name)).all(axis=-1))
+
+
+@pytest.fixture(autouse=True)
+def _needs_pybullet():
+    pytest.importorskip("pybullet")
+
+
+def test_semantic_images_have_class_colors_and_nothing_else():
+    batch = scene(("teapot", 0.2, 0.1, 0, 0), ("dinner_plate", -0.3, 0.0, 0, 0))
+    image = render(batch, style="semantic")[0]
+    assert image.shape == (480, 640, 3)
+    assert image.dtype == np.uint8
+    found = {tuple(value) for value in np.unique(image.reshape(-1, 3), axis=0).tolist()}
+    assert found == {(255, 255, 255), *(DIMSUM.library[n].color for n in ("cafe_table", "teapot", "dinner_plate"))}
+
+
+def test_objects_appear_where_a_pinhole_camera_puts_them():
+    x, y = 0.3, -0.2
+    pixels = where(render(scene(("dinner_plate", x, y, 0.0, 0.4)), style="semantic")[0], "dinner_plate")
+    focal = 240.0 / np.tan(np.radians(22.5))  # pixels
+    depth = 1.7 - 0.011  # m, to the middle of the plate
+    # The camera looks down with -x up in the image, so +x is down and +y is right.
+    expected = [240.0 + focal * x / depth, 320.0 + focal * y / depth]
+    np.testing.assert_allclose(pixels.mean(axis=0) + 0.5, expected, atol=1.5)
+    diameter = pixels.max(axis=0) - pixels.min(axis=0) + 1
+    np.testing.assert_allclose(diameter, focal * 0.27 / 1.68, atol=2.5)
+
+
+def test_nearer_objects_hide_farther_ones():
+    image = render(scene(("teacup", 0, 0, 0, 0), ("serving_dish", 0, 0, 0.3, 0)), style="semantic")[0]
+    assert len(where(image, "serving_dish")) > 0
+    assert len(where(image, "teacup")) == 0
+
+
+def test_pictures_do_not_depend_on_slot_order_or_on_what_was_drawn_before():
+    batch = scene(("teapot", 0.2, 0.1, 0, 0.3), ("teapot", -0.2, 0.1, 0, 1.0), ("teacup", 0.0, -0.3, 0, 2.0))
+    first = render(batch, width=80, height=60)
+    render(scene(*[("teapot", 0.1 * k, 0.3, 0, 0) for k in range(5)]), width=16, height=12)
+    again = render(SceneBatch(batch.tensor.flip(1), DIMSUM), width=80, height=60)
+    np.testing.assert_array_equal(first, again)
+
+
+def test_batches_are_drawn_scene_by_scene():
+    scenes = [scene(("teapot", 0.2, 0.1, 0, 0)), scene(), scene(("teacup", 0.2, 0.1, 0, 0))]
+    together = render(SceneBatch.concatenate(scenes), width=64, height=48)
+    assert together.shape == (3, 48, 64, 3)
+    for index, single in enumerate(scenes):
+        np.testing.assert_array_equal(together[index], render(single, width=64, height=48)[0])
+
+
+def test_objects_cast_shadows_on_the_table():
+    steamers = [("steamer_bottom", 0.0, 0.0, 0.091 * k, 0) for k in range(3)]
+    with_stack, without = (render(s, width=160, height=120)[0].astype(int) for s in (scene(*steamers), scene()))
+    camera = picture_camera(DIMSUM)
+    semantic = render(scene(*steamers), style="semantic", camera=camera, width=160, height=120)[0]
+    on_table = (semantic == color("cafe_table")).all(axis=-1)
+    darker = (without - with_stack).min(axis=-1) > 12
+    assert (darker & on_table).sum() > 100
+
+
+def test_highlighted_objects_turn_red_and_others_keep_their_color():
+    batch = scene(("dinner_plate", 0.0, 0.3, 0, 0), ("dinner_plate", 0.0, -0.3, 0, 0))
+    mask = torch.zeros(1, 8, dtype=torch.bool)
+    mask[0, 1] = True
+    plain, marked = (render(batch, width=160, height=120, highlight=h)[0].astype(int) for h in (None, mask))
+    changed = np.argwhere((plain != marked).any(axis=-1))
+    assert len(changed) > 50
+    assert (np.ptp(changed, axis=0) < 60).all()  # one plate, not two
+    row, column = changed.mean(axis=0).astype(int)
+    red, green, blue = marked[row, column]
+    assert red > green + 40
+    assert red > blue + 40
+
+
+def test_bodies_are_kept_between_pictures():
+    stage = get_stage(DIMSUM.assets)
+    batch = scene(("teapot", 0.2, 0.1, 0, 0), ("teacup", 0.0, -0.3, 0, 0))
+    render(batch, width=16, height=12)
+    before = sum(map(len, stage._bodies))
+    for _ in range(3):
+        render(batch, width=16, height=12)
+    assert sum(map(len, stage._bodies)) == before
+
+
+def test_an_own_camera_is_used():
+    away = Camera(position=(0, 0, 1.7), target=(0, 0, 5.0), up=(1, 0, 0), width=20, height=10)
+    image = render(scene(), style="semantic", camera=away)
+    assert image.shape == (1, 10, 20, 3)
+    assert (image == 255).all()
+
+
+def test_an_empty_batch_gives_no_images():
+    assert render(SceneBatch.empty(DIMSUM, 0), width=20, height=10).shape == (0, 10, 20, 3)
+
+
+def test_wrong_arguments_are_named():
+    with pytest.raises(InvalidInputError, match="'sketch'"):
+        render(scene(), style="sketch")
+    with pytest.raises(InvalidInputError, match="width=0"):
+        render(scene(), width=0)
+    with pytest.raises(InvalidInputError, match=r"\(1, 8\); got \(1, 3\)"):
+        render(scene(), highlight=torch.zeros(1, 3, dtype=torch.bool))
+
+
+def test_missing_pybullet_is_said_clearly(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    with pytest.raises(MissingDependencyError, match="pip install pybullet"):
+        load_pybullet()
+
+
+def test_gallery_tiles_row_by_row_and_keeps_pixels():
+    images = np.stack([np.full((30, 40, 3), 10 * k, np.uint8) for k in range(5)])
+    page = np.asarray(gallery(images, columns=2, gap=6))
+    assert page.shape == (3 * 36 + 6, 2 * 46 + 6, 3)
+    np.testing.assert_array_equal(page[6:36, 52:92], images[1])
+    np.testing.assert_array_equal(page[42:72, 6:46], images[2])
+    assert (page[78:108, 52:92] == 255).all()
+
+
+def test_gallery_writes_captions_below_their_images():
+    images = np.full((2, 60, 80, 3), 255, np.uint8)
+    page = np.asarray(gallery(images, columns=2, captions=["one", ""], gap=4))
+    ink = np.argwhere((page < 128).all(axis=-1))
+    assert len(ink) > 0
+    assert ink[:, 0].min() >= 64  # below the image
+    assert ink[:, 1].max() < 84  # of the first one
+
+
+def test_gallery_says_what_is_wrong():
+    image = np.zeros((4, 4, 3), np.uint8)
+    with pytest.raises(InvalidInputError, match="at least one image"):
+        gallery([])
+    with pytest.raises(InvalidInputError, match="one size"):
+        gallery([image, np.zeros((4, 5, 3), np.uint8)])
+    with pytest.raises(InvalidInputError, match="2 captions, got 1"):
+        gallery([image, image], captions=["a"])
+    with pytest.raises(InvalidInputError, match="columns"):
+        gallery([image], columns=0)
