@@ -40,6 +40,7 @@ class RewardOutput:
         terms: named (B,) floats worth logging.
         valid: (B,) bool, or None when every row is valid. Invalid rows leave all statistics.
         object_flags: named (B, N) bools, such as ``"feasible"``.
+        problem: why the whole batch is invalid when the reward raised or broke its contract, else empty.
     """
 
     value: Tensor
@@ -47,6 +48,7 @@ class RewardOutput:
     terms: Mapping[str, Tensor] = field(default_factory=dict)
     valid: Tensor | None = None
     object_flags: Mapping[str, Tensor] = field(default_factory=dict)
+    problem: str = ""
 
     @property
     def is_valid(self) -> Tensor:

@@ -1,0 +1,190 @@
+"""Rewards made of rewards: weighted sum, product, gate, clip.
+
+Every part may be a name, a mapping, a function or a reward. A scene is valid when every part could score it.
+A part's value is a term under the part's name, and its own terms follow as ``"<part>.<term>"``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from rewards.base import Reward, RewardContext, RewardOutput
+from rewards.evaluation import evaluate_reward
+from rewards.registry import register_reward, resolve_reward, reward_name
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import SceneBatch
+
+
+@register_reward("weighted_sum")
+class WeightedSum:
+    """Sum of rewards, each times its weight.
+
+    ``per_object`` is the weighted sum of the parts' credits when all of them give one.
+
+    Args:
+        rewards: the parts.
+        weights: one number per part; all 1 by default.
+
+    >>> reward = WeightedSum(["object_count", "object_count"], weights=[1.0, 0.5])
+    >>> reward(SceneBatch.empty("dimsum_table", 1), RewardContext()).value
+    tensor([1.5000])
+    """
+
+    name: ClassVar[str] = "weighted_sum"
+
+    def __init__(self, rewards: Sequence[Any], weights: Sequence[float] | None = None) -> None:
+        self.rewards = _resolve_parts(self.name, rewards)
+        self.weights = tuple(1.0 for _ in self.rewards) if weights is None else tuple(float(w) for w in weights)
+        if len(self.weights) != len(self.rewards):
+            raise InvalidInputError(f"weighted_sum: {len(self.rewards)} rewards need as many weights, got {weights!r}")
+
+    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        """Score every part and add up."""
+        outputs = _score_parts(self.rewards, batch, context)
+        credits = [output.per_object for output in outputs.values() if output.per_object is not None]
+        per_object = self._add_up(credits) if len(credits) == len(outputs) else None
+        return _combine(self._add_up([output.value for output in outputs.values()]), outputs, per_object)
+
+    def _add_up(self, tensors: Sequence[Tensor]) -> Tensor:
+        return torch.stack([weight * tensor for weight, tensor in zip(self.weights, tensors, strict=True)]).sum(dim=0)
+
+    def __repr__(self) -> str:
+        return f"WeightedSum({list(self.rewards)}, weights={list(self.weights)})"
+
+
+@register_reward("product")
+class Product:
+    """Product of rewards; 0 as soon as one of them is 0.
+
+    Args:
+        rewards: the parts.
+
+    >>> Product(["object_count"])(SceneBatch.empty("dimsum_table", 1), RewardContext()).value
+    tensor([1.])
+    """
+
+    name: ClassVar[str] = "product"
+
+    def __init__(self, rewards: Sequence[Any]) -> None:
+        self.rewards = _resolve_parts(self.name, rewards)
+
+    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        """Score every part and multiply."""
+        outputs = _score_parts(self.rewards, batch, context)
+        return _combine(torch.stack([output.value for output in outputs.values()]).prod(dim=0), outputs)
+
+    def __repr__(self) -> str:
+        return f"Product({list(self.rewards)})"
+
+
+@register_reward("gate")
+@dataclass(frozen=True)
+class Gate:
+    """A reward that counts only where another one reaches a threshold.
+
+    Attributes:
+        reward: what is scored.
+        condition: the reward that opens the gate.
+        threshold: the gate is open where ``condition >= threshold``.
+        otherwise: the value where it is closed.
+
+    >>> gate = Gate("object_count", condition="object_count", threshold=2.0, otherwise=-1.0)
+    >>> gate(SceneBatch.empty("dimsum_table", 1), RewardContext()).value
+    tensor([-1.])
+    """
+
+    name: ClassVar[str] = "gate"
+    reward: Any
+    condition: Any
+    threshold: float
+    otherwise: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "reward", resolve_reward(self.reward))
+        object.__setattr__(self, "condition", resolve_reward(self.condition))
+
+    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        """Score both; credit per object is that of ``reward`` where the gate is open, else 0."""
+        outputs = _score_parts((self.reward, self.condition), batch, context)
+        scored, condition = outputs.values()
+        is_open = condition.value >= self.threshold
+        value = torch.where(is_open, scored.value, torch.full_like(scored.value, self.otherwise))
+        credit = None if scored.per_object is None else scored.per_object * is_open.unsqueeze(-1)
+        return _combine(value, outputs, credit, {"gate_open": is_open.float()})
+
+
+@register_reward("clip")
+@dataclass(frozen=True)
+class Clip:
+    """A reward kept between two bounds.
+
+    Attributes:
+        reward: what is scored.
+        low: smallest value; null for no bound.
+        high: largest value; null for no bound.
+
+    >>> Clip("object_count", high=0.5)(SceneBatch.empty("dimsum_table", 1), RewardContext()).value
+    tensor([0.5000])
+    """
+
+    name: ClassVar[str] = "clip"
+    reward: Any
+    low: float | None = None
+    high: float | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "reward", resolve_reward(self.reward))
+        if self.low is None and self.high is None:
+            raise InvalidInputError("clip: give low, high or both")
+        if self.low is not None and self.high is not None and self.low > self.high:
+            raise InvalidInputError(f"clip: low={self.low} is above high={self.high}")
+
+    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        """Score and clip; scenes beyond a bound give their objects no credit."""
+        outputs = _score_parts((self.reward,), batch, context)
+        (output,) = outputs.values()
+        value = output.value.clamp(self.low, self.high)
+        inside = (value == output.value).unsqueeze(-1)
+        return _combine(value, outputs, None if output.per_object is None else output.per_object * inside)
+
+
+def _resolve_parts(name: str, rewards: Sequence[Any]) -> tuple[Reward, ...]:
+    if isinstance(rewards, str | Mapping) or not len(rewards):
+        raise InvalidInputError(f"{name}: rewards={rewards!r} must be a list of at least one reward")
+    return tuple(resolve_reward(reward) for reward in rewards)
+
+
+def _score_parts(parts: Sequence[Reward], batch: SceneBatch, context: RewardContext) -> dict[str, RewardOutput]:
+    """Each part's checked output, under its name; a name that comes again gets a number."""
+    outputs: dict[str, RewardOutput] = {}
+    for part in parts:
+        name = label = reward_name(part)
+        number = 1
+        while label in outputs:
+            number += 1
+            label = f"{name}_{number}"
+        outputs[label] = evaluate_reward(part, batch, context, strict=True)
+    return outputs
+
+
+def _combine(
+    value: Tensor,
+    outputs: Mapping[str, RewardOutput],
+    per_object: Tensor | None = None,
+    own_terms: Mapping[str, Tensor] | None = None,
+) -> RewardOutput:
+    terms: dict[str, Tensor] = {}
+    flags: dict[str, Tensor] = {}
+    for label, output in outputs.items():
+        terms[label] = output.value
+        terms.update({f"{label}.{name}": term for name, term in output.terms.items()})
+        for name, flag in output.object_flags.items():
+            flags[name if name not in flags else f"{label}.{name}"] = flag
+    terms.update(own_terms or {})
+    valid = torch.stack([output.is_valid for output in outputs.values()]).all(dim=0)
+    return RewardOutput(value, per_object, terms, valid, flags)

@@ -1,0 +1,130 @@
+"""Calling a reward so that a bad one cannot spoil a run: every output is checked, a failure is invalid."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rewards.base import RewardContext, RewardOutput
+from rewards.registry import as_output, reward_name
+from scene_envs.errors import RewardError
+from scene_envs.scene import SceneBatch
+
+logger = logging.getLogger(__name__)
+
+_warned: set[tuple[int, str]] = set()
+_MOST_WARNINGS = 256
+
+
+def evaluate_reward(
+    reward: Any, batch: SceneBatch, context: RewardContext | None = None, *, strict: bool = False
+) -> RewardOutput:
+    """Score ``batch`` and check what comes back against the contract.
+
+    Args:
+        reward: a reward object, or a function of (batch, context); see :func:`rewards.resolve_reward` for names.
+        batch: B scenes of N slots.
+        context: what the reward may use; an empty one by default.
+        strict: raise on failure. Otherwise a reward that raises or breaks its contract gives NaN for every scene, all
+            of them invalid, with the reason in ``problem`` and in one warning per reward and reason.
+
+    Returns:
+        float32 values, credits and terms, and a bool ``valid`` (B,) that also excludes rows that are not finite.
+
+    Raises:
+        RewardError: the reward failed, and ``strict`` is set.
+
+    >>> evaluate_reward(lambda batch, context: batch.counts, SceneBatch.empty("dimsum_table", 2)).value
+    tensor([1., 1.])
+    """
+    try:
+        return _evaluate(reward, batch, RewardContext() if context is None else context)
+    except RewardError as error:
+        if strict:
+            raise
+        return _failed(reward, batch, str(error))
+
+
+def _evaluate(reward: Any, batch: SceneBatch, context: RewardContext) -> RewardOutput:
+    name = reward_name(reward)
+    version = batch.tensor._version
+    try:
+        with torch.no_grad():
+            output = as_output(reward(batch, context))
+    except RewardError:
+        raise
+    except Exception as error:
+        raise RewardError(f"reward {name!r} raised {type(error).__name__}: {error}") from error
+    if batch.tensor._version != version:
+        raise RewardError(f"reward {name!r} changed the scenes it was given; work on a clone of batch.tensor")
+    return _checked(name, output, batch)
+
+
+def _checked(name: str, output: Any, batch: SceneBatch) -> RewardOutput:
+    if not isinstance(output, RewardOutput):
+        raise RewardError(
+            f"reward {name!r} returned {type(output).__name__}; return a (B,) tensor or a rewards.RewardOutput"
+        )
+    scenes, slots = batch.tensor.shape[:2]
+    device = batch.tensor.device
+    rows, grid = (scenes,), (scenes, slots)
+    value = _floats(name, "value", output.value, rows, device)
+    credit = output.per_object
+    terms = _named(name, "terms", output.terms)
+    flags = _named(name, "object_flags", output.object_flags)
+    valid = torch.isfinite(value)
+    if output.valid is not None:
+        valid = valid & _bools(name, "valid", output.valid, rows, device)
+    return RewardOutput(
+        value,
+        None if credit is None else _floats(name, "per_object", credit, grid, device),
+        {key: _floats(name, f"terms[{key!r}]", term, rows, device) for key, term in terms.items()},
+        valid,
+        {key: _bools(name, f"object_flags[{key!r}]", flag, grid, device) for key, flag in flags.items()},
+        output.problem,
+    )
+
+
+def _floats(name: str, field: str, tensor: Any, shape: tuple[int, ...], device: torch.device) -> Tensor:
+    _check_tensor(name, field, tensor, shape, device)
+    if not tensor.is_floating_point():
+        raise RewardError(f"reward {name!r}: {field} has dtype {tensor.dtype}, expected a float; use .float()")
+    return tensor.detach().to(torch.float32)  # type: ignore[no-any-return]
+
+
+def _bools(name: str, field: str, tensor: Any, shape: tuple[int, ...], device: torch.device) -> Tensor:
+    _check_tensor(name, field, tensor, shape, device)
+    if tensor.dtype != torch.bool:
+        raise RewardError(f"reward {name!r}: {field} has dtype {tensor.dtype}, expected torch.bool")
+    return tensor  # type: ignore[no-any-return]
+
+
+def _check_tensor(name: str, field: str, tensor: Any, shape: tuple[int, ...], device: torch.device) -> None:
+    if not isinstance(tensor, Tensor):
+        raise RewardError(f"reward {name!r}: {field} is a {type(tensor).__name__}, expected a torch.Tensor")
+    if tuple(tensor.shape) != shape:
+        meaning = "(B,) = one number per scene" if len(shape) == 1 else "(B, N) = one entry per slot"
+        raise RewardError(f"reward {name!r}: {field} has shape {tuple(tensor.shape)}, expected {shape}, {meaning}")
+    if tensor.device != device:
+        raise RewardError(f"reward {name!r}: {field} is on {tensor.device}, the scenes are on {device}")
+
+
+def _named(name: str, field: str, tensors: Any) -> Mapping[str, Any]:
+    if not isinstance(tensors, Mapping) or not all(isinstance(key, str) for key in tensors):
+        raise RewardError(f"reward {name!r}: {field} must map names to tensors, got {type(tensors).__name__}")
+    return tensors
+
+
+def _failed(reward: Any, batch: SceneBatch, problem: str) -> RewardOutput:
+    key = (id(reward), problem)
+    if key not in _warned:
+        if len(_warned) >= _MOST_WARNINGS:
+            _warned.clear()
+        _warned.add(key)
+        logger.warning("%s. All %d scenes of this batch count as invalid.", problem.rstrip("."), len(batch))
+    nothing = torch.full((len(batch),), torch.nan, device=batch.tensor.device)
+    return RewardOutput(nothing, valid=torch.zeros_like(nothing, dtype=torch.bool), problem=problem)

@@ -1,0 +1,70 @@
+"""How many objects of a scene obey physics as they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from rewards.base import RewardContext, RewardOutput
+from rewards.registry import register_reward
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import SceneBatch
+
+
+@register_reward("feasible_objects")
+@dataclass(frozen=True)
+class FeasibleObjects:
+    """Number of free objects that neither penetrate another object nor move when simulated.
+
+    An object is feasible when no pair it is in is deeper than ``max_penetration`` and, with the penetrating objects
+    removed, it moves and turns less than the limits while simulated. Welded objects are not counted.
+
+    Attributes:
+        max_penetration: deepest allowed overlap with any other object, m.
+        max_displacement: largest allowed movement, m.
+        max_rotation: largest allowed rotation, rad.
+        duration: simulated time, s.
+    """
+
+    name: ClassVar[str] = "feasible_objects"
+    max_penetration: float = 1e-3
+    max_displacement: float = 1e-3
+    max_rotation: float = 1e-2
+    duration: float = 0.1
+
+    def __post_init__(self) -> None:
+        for setting in ("max_penetration", "max_displacement", "max_rotation", "duration"):
+            if not getattr(self, setting) > 0:
+                raise InvalidInputError(f"feasible_objects: {setting}={getattr(self, setting)} must be positive")
+
+    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        """Count feasible objects; rows that physics could not judge are invalid.
+
+        Terms: ``free_objects``; ``feasible_fraction`` of them (1 in a scene without free objects); ``deepest_mm``,
+        the deepest overlap. ``object_flags["feasible"]`` (B, N) marks the objects that count, ``per_object`` likewise.
+        """
+        from scene_envs.physics import feasibility
+
+        device = batch.tensor.device
+        result = feasibility(
+            batch,
+            max_penetration=self.max_penetration,
+            max_displacement=self.max_displacement,
+            max_rotation=self.max_rotation,
+            duration=self.duration,
+            pool=context.pool,
+        )
+        feasible = result.feasible.to(device)
+        count = feasible.sum(dim=-1).float()
+        free = batch.is_free.sum(dim=-1).float()
+        return RewardOutput(
+            value=count,
+            per_object=feasible.float(),
+            terms={
+                "free_objects": free,
+                "feasible_fraction": (count / free.clamp(min=1)).masked_fill(free == 0, 1.0),
+                "deepest_mm": 1e3 * result.depth.to(device).float().amax(dim=-1),
+            },
+            valid=result.valid.to(device),
+            object_flags={"feasible": feasible},
+        )

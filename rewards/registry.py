@@ -1,0 +1,302 @@
+"""Rewards by name: a decorator, installed plug-ins, and mappings as they stand in a config file."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from types import ModuleType
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from rewards.base import Reward, RewardContext, RewardOutput
+from scene_envs.errors import InvalidInputError, RewardError, unknown_name
+from scene_envs.scene import SceneBatch
+
+ENTRY_POINT_GROUP = "scene_envs.rewards"
+"""Packages offer rewards under this entry-point group; the entry's name is the reward's name."""
+
+Maker = TypeVar("Maker", bound=Callable[..., Any])
+
+_registry: dict[str, Callable[..., Any]] = {}
+_allowed_targets: list[str] = ["rewards"]
+
+
+@dataclass(frozen=True)
+class RewardInfo:
+    """One line of a listing.
+
+    Attributes:
+        name: what to write after ``reward=``.
+        summary: first sentence of its docstring.
+        parameters: settings and their defaults, as ``"name=default"``.
+        source: the module that defines it.
+    """
+
+    name: str
+    summary: str
+    parameters: tuple[str, ...]
+    source: str
+
+
+class FunctionReward:
+    """A bare function as a reward.
+
+    Args:
+        function: takes ``(batch)`` or ``(batch, context)``, then keyword settings; returns (B,) numbers or a
+            :class:`RewardOutput`.
+        name: its name in logs; the function's own by default.
+        **settings: keyword arguments passed on at every call.
+
+    >>> FunctionReward(lambda batch: batch.counts, name="count")(SceneBatch.empty("dimsum_table", 2), RewardContext())
+    RewardOutput(value=tensor([1., 1.]), per_object=None, terms={}, valid=None, object_flags={}, problem='')
+    """
+
+    def __init__(self, function: Callable[..., Any], name: str | None = None, **settings: Any) -> None:
+        self.function = function
+        self.name: str = name or getattr(function, "__name__", type(function).__name__)
+        self.settings = settings
+        self._takes_context = _accepts(function, 2, settings, self.name)
+
+    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        arguments = (batch, context) if self._takes_context else (batch,)
+        return as_output(self.function(*arguments, **self.settings))
+
+    def __repr__(self) -> str:
+        return f"FunctionReward({self.name!r})"
+
+
+def as_output(result: Any) -> Any:
+    """A bare tensor as a RewardOutput, whole numbers as floats; anything else as it is."""
+    if not isinstance(result, Tensor):
+        return result
+    return RewardOutput(result if result.is_floating_point() else result.to(torch.float32))
+
+
+def register_reward(name: str) -> Callable[[Maker], Maker]:
+    """Make a reward available under ``name`` to RL, search and the command line.
+
+    Decorates a reward class (built with the settings given beside its name), or a function taking ``(batch)`` or
+    ``(batch, context)`` and returning (B,) numbers or a :class:`RewardOutput`.
+
+    Raises:
+        InvalidInputError: the name is taken by another reward, or what is decorated cannot be called.
+
+    >>> @register_reward("doctest_low")
+    ... def low(batch, context):
+    ...     return -batch.translations[..., 2].sum(dim=-1)
+    >>> make_reward("doctest_low")
+    FunctionReward('doctest_low')
+    """
+    if not isinstance(name, str) or not name or not name.replace("_", "").isalnum():
+        raise InvalidInputError(f"reward name {name!r}: use letters, digits and underscores, such as 'open_space'")
+
+    def register(maker: Maker) -> Maker:
+        if not callable(maker):
+            raise InvalidInputError(f"reward {name!r}: {maker!r} cannot be called; decorate a class or a function")
+        taken = _registry.get(name)
+        if taken is not None and _origin(taken) != _origin(maker):
+            raise InvalidInputError(f"reward name {name!r} is taken by {_origin(taken)}; choose another name")
+        _registry[name] = maker
+        return maker
+
+    return register
+
+
+def list_rewards() -> list[str]:
+    """Names of all rewards, those of installed packages included, sorted. Imports no plug-in."""
+    return sorted({*_registry, *_plugins()})
+
+
+def reward_info(name: str) -> RewardInfo:
+    """What ``name`` is, for listings; imports its plug-in."""
+    maker = _find(name)
+    lines = (inspect.getdoc(maker) or "").split("\n\n")[0].split()
+    try:
+        parameters = list(inspect.signature(maker).parameters.values())
+    except (TypeError, ValueError):
+        parameters = []
+    if not inspect.isclass(maker):
+        parameters = [p for p in parameters if p.kind is p.KEYWORD_ONLY]
+    settings = tuple(f"{p.name}={p.default!r}" if p.default is not p.empty else p.name for p in parameters)
+    return RewardInfo(name, " ".join(lines), settings, maker.__module__)
+
+
+def make_reward(name: str, **settings: Any) -> Reward:
+    """The reward called ``name``, built with ``settings``.
+
+    Raises:
+        UnknownNameError: no such reward; the nearest known name is offered.
+        InvalidInputError: the reward does not take these settings.
+        RewardError: the plug-in that offers it cannot be imported.
+    """
+    return _build(_find(name), name, settings)
+
+
+def allow_reward_targets(package: str) -> None:
+    """Let ``{"_target_": "<package>.…"}`` mappings name classes and functions defined in ``package``.
+
+    The packages of installed plug-ins and ``rewards`` itself are allowed already. Anything else is refused, so that
+    a config file from elsewhere cannot run code of its choice.
+    """
+    if not all(part.isidentifier() for part in package.split(".")):
+        raise InvalidInputError(f"{package!r} is not a package name; give one such as 'my_package'")
+    if package not in _allowed_targets:
+        _allowed_targets.append(package)
+
+
+def resolve_reward(reward: Any) -> Reward:
+    """A reward object from whatever names one.
+
+    Args:
+        reward: a registered name; a mapping ``{"name": …, **settings}`` or ``{"_target_": "package.Class", …}``;
+            a function; a reward class; or a reward, which comes back as it is.
+
+    >>> resolve_reward({"name": "clip", "reward": "object_count", "high": 20.0})
+    Clip(reward=ObjectCount(), low=None, high=20.0)
+    """
+    if isinstance(reward, str):
+        return make_reward(reward)
+    if isinstance(reward, Mapping):
+        return _from_mapping({str(key): value for key, value in reward.items()})
+    if not callable(reward):
+        raise InvalidInputError(
+            f"reward={reward!r} is neither a name, a mapping with 'name' or '_target_', nor a callable; "
+            f"known names: {', '.join(list_rewards())}"
+        )
+    if inspect.isclass(reward):
+        return _build(reward, reward.__name__, {})
+    if inspect.isroutine(reward) or not _is_reward_object(reward):
+        return FunctionReward(reward)
+    return reward  # type: ignore[no-any-return]
+
+
+def reward_name(reward: Any) -> str:
+    """A short stable name of a reward, for logs and reports.
+
+    >>> reward_name("object_count"), reward_name(resolve_reward("object_count"))
+    ('object_count', 'object_count')
+    """
+    if isinstance(reward, str):
+        return reward
+    if isinstance(reward, Mapping):
+        return str(reward.get("name") or reward.get("_target_") or "reward")
+    name = getattr(reward, "name", None)
+    return name if isinstance(name, str) and name else getattr(reward, "__qualname__", type(reward).__qualname__)
+
+
+# -- looking up --------------------------------------------------------------------------------------
+
+
+def _plugins() -> dict[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group=ENTRY_POINT_GROUP)}
+
+
+def _find(name: str) -> Callable[..., Any]:
+    if name in _registry:
+        return _registry[name]
+    plugins = _plugins()
+    if name not in plugins:
+        raise unknown_name("reward", name, {*_registry, *plugins})
+    point = plugins[name]
+    package = point.dist.name if point.dist is not None else point.module
+    try:
+        loaded = point.load()
+    except Exception as error:
+        raise RewardError(
+            f"reward {name!r} of the installed package {package!r} cannot be loaded from {point.value!r}: "
+            f"{type(error).__name__}: {error}"
+        ) from error
+    if isinstance(loaded, ModuleType):  # its decorators have run
+        if name not in _registry:
+            raise RewardError(f"module {point.value!r} of package {package!r} registers no reward called {name!r}")
+    elif not callable(loaded):
+        raise RewardError(f"reward {name!r} of package {package!r}: {point.value!r} is not a class or a function")
+    else:
+        _registry.setdefault(name, loaded)
+    return _registry[name]
+
+
+def _from_mapping(settings: dict[str, Any]) -> Reward:
+    if "_target_" in settings:
+        target = settings.pop("_target_")
+        return _build(_find_target(target), target, settings)
+    if "name" not in settings:
+        raise InvalidInputError(
+            f"a reward mapping needs 'name' (or '_target_'), got keys {sorted(settings)}; "
+            "for example {'name': 'object_count'}"
+        )
+    return make_reward(settings.pop("name"), **settings)
+
+
+def _find_target(target: Any) -> Callable[..., Any]:
+    """The class or function ``target`` names, if an allowed package itself defines it."""
+    allowed = {*_allowed_targets, *(point.module.split(".")[0] for point in _plugins().values())}
+    module, _, attribute = str(target).rpartition(".")
+    if not _within(module, allowed):
+        raise InvalidInputError(
+            f"_target_ {target!r} is outside the packages rewards may come from ({', '.join(sorted(allowed))}); "
+            "call rewards.allow_reward_targets('your_package') first, or register the reward under a name"
+        )
+    try:
+        found = getattr(import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise InvalidInputError(f"_target_ {target!r} cannot be found: {error}") from error
+    if not callable(found) or not _within(getattr(found, "__module__", ""), allowed):
+        raise InvalidInputError(f"_target_ {target!r} is not a class or function defined in {module!r}")
+    return found  # type: ignore[no-any-return]
+
+
+def _within(module: str, packages: set[str]) -> bool:
+    return any(module == package or module.startswith(package + ".") for package in packages)
+
+
+# -- building ----------------------------------------------------------------------------------------
+
+
+def _build(maker: Callable[..., Any], name: str, settings: dict[str, Any]) -> Reward:
+    if not inspect.isclass(maker):
+        return FunctionReward(maker, name, **settings)
+    try:
+        inspect.signature(maker).bind(**settings)
+    except TypeError as error:
+        raise InvalidInputError(f"reward {name!r}: {error}; its settings are {_signature(maker)}") from error
+    reward = maker(**settings)
+    if not callable(reward):
+        raise RewardError(f"reward {name!r}: {maker.__qualname__} has no __call__(batch, context) method")
+    return reward  # type: ignore[no-any-return]
+
+
+def _signature(maker: Callable[..., Any]) -> str:
+    return str(inspect.signature(maker)).split(" -> ")[0]
+
+
+def _origin(maker: Any) -> str:
+    return f"{maker.__module__}.{getattr(maker, '__qualname__', type(maker).__qualname__)}"
+
+
+def _is_reward_object(reward: Any) -> bool:
+    """Whether it is an object of a class that defines ``__call__`` in Python (not a partial or a builtin)."""
+    return inspect.isfunction(getattr(type(reward), "__call__", None))  # noqa: B004
+
+
+def _accepts(function: Callable[..., Any], count: int, settings: Mapping[str, Any], name: str) -> bool:
+    """Whether ``function`` takes ``count`` positional arguments beside ``settings``; one fewer must do otherwise."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return True
+    for number in (count, count - 1):
+        try:
+            signature.bind(*[None] * number, **settings)
+        except TypeError:
+            continue
+        return number == count
+    raise InvalidInputError(
+        f"reward {name!r} has the signature {signature} and was given the settings {sorted(settings)}; "
+        "it must take (batch) or (batch, context), and its settings as keywords"
+    )
