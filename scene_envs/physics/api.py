@@ -1,0 +1,224 @@
+"""The public functions of the physics: batches of scenes in, results per scene and object out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from scene_envs.errors import InvalidInputError
+from scene_envs.physics.kernels import Chunk
+from scene_envs.physics.pool import PhysicsPool, run_in_process
+from scene_envs.physics.results import (
+    EquilibriumResult,
+    FeasibilityResult,
+    ObjectPair,
+    PenetrationResult,
+    ProjectionResult,
+    ReadyResult,
+    SettleResult,
+)
+from scene_envs.rotations import geodesic_angle, project_to_so3
+from scene_envs.scene import SceneBatch
+
+_CHUNK = 8
+"""Scenes per message to a worker."""
+_ORTHOGONAL = 1e-3
+"""Largest entry of R^T R - I that still passes for a rotation."""
+
+
+def feasibility(
+    batch: SceneBatch,
+    *,
+    max_penetration: float = 1e-3,
+    max_displacement: float = 1e-3,
+    max_rotation: float = 1e-2,
+    duration: float = 0.1,
+    pool: PhysicsPool | None = None,
+) -> FeasibilityResult:
+    """Judge every object: does it overlap another, and does it stay where it is.
+
+    A free object is feasible when it is in no object pair that overlaps deeper than ``max_penetration`` and,
+    with all such objects removed, moves and turns no further than the limits in ``duration`` seconds of
+    simulation under gravity. Welded objects hold others but are not judged.
+
+    Args:
+        batch: B scenes of N slots.
+        max_penetration: m.
+        max_displacement: m, of the object frame.
+        max_rotation: rad, geodesic.
+        duration: s.
+        pool: worker processes; None computes in this process.
+
+    Raises:
+        InvalidInputError: a pose is not finite, or a rotation is not one; its scene and slot are named.
+        MissingDependencyError: pybullet is not installed.
+    """
+    options = {
+        "max_penetration": max_penetration,
+        "max_displacement": max_displacement,
+        "max_rotation": max_rotation,
+        "duration": duration,
+    }
+    rows = _run("feasibility", batch, options, pool)
+    feasible = _stack(rows, batch, "feasible", torch.bool)
+    return FeasibilityResult(
+        feasible=feasible,
+        depth=_stack(rows, batch, "depth"),
+        displacement=_stack(rows, batch, "displacement"),
+        rotation=_stack(rows, batch, "rotation"),
+        valid=_valid(rows),
+        counts=feasible.sum(dim=-1),
+    )
+
+
+def penetration(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> PenetrationResult:
+    """Overlap of every object pair, and in total over pairs of convex parts.
+
+    Needs no simulator. Raises InvalidInputError as :func:`feasibility` does.
+    """
+    rows = _run("penetration", batch, {}, pool)
+    pairs = tuple(
+        tuple(ObjectPair((a, b), depth, total, parts) for a, b, depth, total, parts in (row["pairs"] if row else ()))
+        for row in rows
+    )
+    return PenetrationResult(
+        pairs=pairs,
+        depth=_stack(rows, batch, "depth"),
+        total_per_pair=_stack(rows, batch, "total_per_pair", shape=()),
+        total_per_geometry=_stack(rows, batch, "total_per_geometry", shape=()),
+        valid=_valid(rows),
+    )
+
+
+def equilibrium(batch: SceneBatch, *, duration: float = 0.1, pool: PhysicsPool | None = None) -> EquilibriumResult:
+    """How far every object moves under gravity in ``duration`` seconds, nothing removed.
+
+    Raises InvalidInputError and MissingDependencyError as :func:`feasibility` does.
+    """
+    rows = _run("equilibrium", batch, {"duration": duration}, pool)
+    return EquilibriumResult(_stack(rows, batch, "displacement"), _stack(rows, batch, "rotation"), _valid(rows))
+
+
+def settle(batch: SceneBatch, *, duration: float = 1.0, pool: PhysicsPool | None = None) -> SettleResult:
+    """Let every scene come to rest under gravity, with slight damping.
+
+    Simulates up to ``duration`` seconds, and stops earlier when nothing moves any more. Objects that fall off
+    their support are where they fell to; they are outside the workspace.
+
+    Raises InvalidInputError and MissingDependencyError as :func:`feasibility` does.
+    """
+    rows = _run("settle", batch, {"duration": duration}, pool)
+    settled, displacement, rotation = _moved(rows, batch)
+    return SettleResult(settled, displacement, rotation, _valid(rows))
+
+
+def project(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> ProjectionResult:
+    """The nearest scenes without overlap: translations change, rotations and welded objects do not.
+
+    Touching is allowed. Where objects cannot be separated (more of them than room), the best effort is
+    returned and ``converged`` is False.
+
+    Raises InvalidInputError as :func:`feasibility` does.
+    """
+    rows = _run("project", batch, {}, pool)
+    projected, moved, _ = _moved(rows, batch)
+    return ProjectionResult(
+        batch=projected,
+        converged=_stack(rows, batch, "converged", torch.bool, shape=()),
+        residual_depth=_stack(rows, batch, "residual_depth", shape=()),
+        moved=moved,
+        valid=_valid(rows),
+    )
+
+
+def make_ready(batch: SceneBatch, *, duration: float = 1.5, pool: PhysicsPool | None = None) -> ReadyResult:
+    """Project, settle, then count what is feasible inside the workspace: the simulation-ready objects.
+
+    Args:
+        batch: B scenes of N slots.
+        duration: longest time to settle, s.
+        pool: worker processes; None computes in this process.
+
+    Raises InvalidInputError and MissingDependencyError as :func:`feasibility` does.
+    """
+    projected = project(batch, pool=pool)
+    settled = settle(projected.batch, duration=duration, pool=pool)
+    judged = feasibility(settled.batch, pool=pool)
+    valid = projected.valid & settled.valid & judged.valid
+    ready = judged.feasible & settled.batch.in_workspace & valid[:, None]
+    return ReadyResult(settled.batch, ready, ready.sum(dim=-1), valid)
+
+
+# -- from and to tensors ------------------------------------------------------------------------
+
+
+def _run(
+    kernel: str, batch: SceneBatch, options: dict[str, Any], pool: PhysicsPool | None
+) -> list[dict[str, Any] | None]:
+    _check(batch)
+    translations = batch.translations.double().cpu().numpy()
+    rotations = batch.rotations.double().cpu().numpy()
+    categories = batch.categories.cpu().numpy()
+    workers = max(1, pool.workers) if pool else 1
+    size = max(1, min(_CHUNK, -(-len(batch) // workers)))
+    chunks = [
+        Chunk(batch.scene_type, translations[i : i + size], rotations[i : i + size], categories[i : i + size])
+        for i in range(0, len(batch), size)
+    ]
+    run: Callable[..., list[dict[str, Any] | None]] = pool.run if pool else run_in_process
+    return run(kernel, chunks, options)
+
+
+def _check(batch: SceneBatch) -> None:
+    present = ~batch.is_empty
+    finite = torch.isfinite(batch.tensor[..., :12]).all(dim=-1)
+    product = batch.rotations.transpose(-1, -2) @ batch.rotations - torch.eye(3, device=batch.tensor.device)
+    rotation = (product.abs().amax(dim=(-1, -2)) < _ORTHOGONAL) & (torch.linalg.det(batch.rotations) > 0)
+    for good, what in ((finite, "a pose that is not finite"), (rotation, "a matrix that is not a rotation")):
+        bad = torch.nonzero(present & ~good)
+        if len(bad):
+            scene, slot = bad[0].tolist()
+            raise InvalidInputError(
+                f"scene {scene}, slot {slot} holds {what}: {batch.tensor[scene, slot, :12].tolist()}; "
+                "SceneBatch.from_tensor makes valid poses of a sampler's output"
+            )
+
+
+def _valid(rows: list[dict[str, Any] | None]) -> Tensor:
+    return torch.tensor([row is not None and bool(row["valid"]) for row in rows], dtype=torch.bool)
+
+
+def _stack(
+    rows: list[dict[str, Any] | None],
+    batch: SceneBatch,
+    name: str,
+    dtype: torch.dtype = torch.float32,
+    shape: tuple[int, ...] | None = None,
+) -> Tensor:
+    """(B, N) tensor of a named result (or (B, *shape)), zeros where a row is invalid."""
+    shape = (batch.tensor.shape[1],) if shape is None else shape
+    out = torch.zeros(len(rows), *shape, dtype=dtype)
+    for index, row in enumerate(rows):
+        if row is not None and row["valid"]:
+            out[index] = torch.as_tensor(np.asarray(row[name]), dtype=dtype)
+    return out
+
+
+def _moved(rows: list[dict[str, Any] | None], batch: SceneBatch) -> tuple[SceneBatch, Tensor, Tensor]:
+    """The batch at its new poses, with displacement (B, N) m and rotation (B, N) rad of each object."""
+    translations, rotations = batch.translations.cpu().clone(), batch.rotations.cpu().clone()
+    for index, row in enumerate(rows):
+        if row is not None and row["valid"]:
+            translations[index] = torch.from_numpy(row["translations"]).float()
+            if "rotations" in row:
+                rotations[index] = torch.from_numpy(row["rotations"]).float()
+    present = ~batch.is_empty.cpu()
+    displacement = (translations - batch.translations.cpu()).norm(dim=-1) * present
+    identity = torch.eye(3).expand_as(rotations)
+    before = torch.where(present[..., None, None], batch.rotations.cpu(), identity)
+    after = torch.where(present[..., None, None], project_to_so3(rotations), identity)
+    return batch.with_poses(translations, after), displacement, geodesic_angle(before, after) * present

@@ -1,0 +1,170 @@
+"""Which objects of a scene overlap, and how deep: boxes, then face planes, then FCL."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_envs.physics.geometry import LibraryGeometry
+from scene_envs.physics.narrowphase import PartDistance
+from scene_envs.physics.placement import Objects, PlacedObjects, object_boxes, part_pairs, place
+from scene_envs.physics.separation import separations
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+TOUCHING = 1e-5
+"""Overlap (m) below which the face-plane bound is taken as the depth, without asking FCL."""
+NEAR = 3e-3
+"""Object pairs whose boxes are at most this far apart (m) are listed."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectPairs:
+    """Pairs of objects whose boxes are near each other.
+
+    Attributes:
+        first: (P,) row of the object.
+        second: (P,) row of the other object, larger than ``first``.
+        gap: (P,) m, signed gap of the coarse parts along ``direction``.
+        direction: (P, 3) unit vector in the world, from the first object to the second.
+        depth: (P,) m, how deep the fine parts overlap; 0 when they do not.
+        total: (P,) m, the sum of the depths of all overlapping fine parts (only when asked for).
+        part_count: (P,) overlapping fine part pairs (only when asked for).
+    """
+
+    first: Index
+    second: Index
+    gap: Array
+    direction: Array
+    depth: Array
+    total: Array
+    part_count: Index
+
+
+class Collider:
+    """Finds near and overlapping objects; geometry is built once, poses come per call.
+
+    Args:
+        library: geometry of the assets.
+    """
+
+    def __init__(self, library: LibraryGeometry) -> None:
+        self.library = library
+        self.distance = PartDistance(library)
+
+    def pairs(self, objects: Objects, *, totals: bool = False) -> ObjectPairs:
+        """Near pairs of objects within each scene; two fixed objects are never a pair.
+
+        Args:
+            objects: the objects of one or more scenes.
+            totals: also sum over all part pairs, the literature's per-geometry measure.
+        """
+        coarse = place(self.library, objects, "coarse")
+        first, second = _near_pairs(objects, *object_boxes(coarse))
+        gap, direction, keep = self._coarse_gaps(coarse, first, second)
+        first, second, gap, direction = first[keep], second[keep], gap[keep], direction[keep]
+        depth, total = np.zeros(len(first)), np.zeros(len(first))
+        part_count = np.zeros(len(first), dtype=np.int64)
+        overlapping = np.flatnonzero(gap < 0)
+        if len(overlapping):
+            self._fine_depths(objects, first, second, overlapping, gap, depth, total, part_count, totals)
+        return ObjectPairs(first, second, gap, direction, depth, total, part_count)
+
+    def _coarse_gaps(self, coarse: PlacedObjects, first: Index, second: Index) -> tuple[Array, Array, Index]:
+        pair, a, b = part_pairs(coarse, first, second)
+        near = _boxes_near(coarse.low, coarse.high, a, b, NEAR)
+        pair, a, b = pair[near], a[near], b[near]
+        part_gap, part_direction = separations(self.library, coarse.parts, a, b)
+        gap = np.full(len(first), np.inf)
+        direction = np.zeros((len(first), 3))
+        order = np.lexsort((part_gap, pair))
+        keep, leading = np.unique(pair[order], return_index=True)
+        best = order[leading]
+        gap[keep], direction[keep] = part_gap[best], part_direction[best]
+        return gap, direction, keep
+
+    def _fine_depths(
+        self,
+        objects: Objects,
+        first: Index,
+        second: Index,
+        overlapping: Index,
+        gap: Array,
+        depth: Array,
+        total: Array,
+        part_count: Index,
+        totals: bool,
+    ) -> None:
+        # One part each, coarse the same as fine, barely touching: the face planes have said it all.
+        single = np.array([len(asset.fine.parts) == 1 for asset in self.library.assets])
+        simple = single[objects.category[first]] & single[objects.category[second]] & (gap > -TOUCHING)
+        settled = overlapping[simple[overlapping]]
+        depth[settled] = total[settled] = -gap[settled]
+        part_count[settled] = 1
+        hard = overlapping[~simple[overlapping]]
+        if not len(hard):
+            return
+        used, local = np.unique(np.concatenate([first[hard], second[hard]]), return_inverse=True)
+        fine = place(self.library, objects[used], "fine")
+        pair, a, b = part_pairs(fine, local[: len(hard)], local[len(hard) :])
+        near = _boxes_near(fine.low, fine.high, a, b, 0.0)
+        pair, a, b = pair[near], a[near], b[near]
+        bound, _ = separations(self.library, fine.parts, a, b)
+        bound = -bound
+        deep = bound > 0
+        pair, a, b, bound = pair[deep], a[deep], b[deep], bound[deep]
+        order = np.lexsort((-bound, pair))
+        parts = fine.parts
+        for row in order:
+            target = hard[pair[row]]
+            if not totals and bound[row] <= depth[target]:
+                continue
+            value = float(bound[row])
+            if value > TOUCHING:
+                i, j = a[row], b[row]
+                value = min(
+                    value,
+                    -self.distance(
+                        int(parts.part[i]), parts.rotation[i], parts.translation[i],
+                        int(parts.part[j]), parts.rotation[j], parts.translation[j],
+                    ),
+                )  # fmt: skip
+            if value > 0:
+                depth[target] = max(depth[target], value)
+                total[target] += value
+                part_count[target] += 1
+
+
+def _boxes_near(low: Array, high: Array, a: Index, b: Index, margin: float) -> NDArray[np.bool_]:
+    near = (low[a, 0] <= high[b, 0] + margin) & (low[b, 0] <= high[a, 0] + margin)
+    near &= (low[a, 1] <= high[b, 1] + margin) & (low[b, 1] <= high[a, 1] + margin)
+    near &= (low[a, 2] <= high[b, 2] + margin) & (low[b, 2] <= high[a, 2] + margin)
+    return near
+
+
+@lru_cache(maxsize=512)
+def _upper_triangle(count: int) -> tuple[Index, Index]:
+    first, second = np.triu_indices(count, k=1)
+    return first.astype(np.int64), second.astype(np.int64)
+
+
+def scene_pairs(objects: Objects) -> tuple[Index, Index]:
+    """All pairs of objects of the same scene, except two fixed ones: (P,), (P,) rows."""
+    scenes, starts, counts = np.unique(objects.scene, return_index=True, return_counts=True)
+    if not len(scenes):
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+    triangles = [_upper_triangle(int(count)) for count in counts]
+    first = np.concatenate([t[0] + start for t, start in zip(triangles, starts, strict=True)])
+    second = np.concatenate([t[1] + start for t, start in zip(triangles, starts, strict=True)])
+    free = ~(objects.fixed[first] & objects.fixed[second])
+    return first[free], second[free]
+
+
+def _near_pairs(objects: Objects, low: Array, high: Array) -> tuple[Index, Index]:
+    first, second = scene_pairs(objects)
+    near = _boxes_near(low, high, first, second, NEAR)
+    return first[near], second[near]

@@ -1,0 +1,216 @@
+"""Collision geometry of an asset library, built once per process: what never changes from scene to scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from scene_envs.assets.base import Asset, ConvexPart
+from scene_envs.physics.contact_faces import ContactFace, contact_face
+
+Array = NDArray[np.float64]
+
+_CONTAINED = 1e-6
+"""A fine corner this far (m) outside every coarse part still counts as inside."""
+
+SIZE_CLASSES = ((8, 6), (16, 16), (32, 24))
+"""(corners, face directions) up to which parts share padded arrays; larger parts make a last class."""
+
+
+@dataclass(frozen=True, eq=False)
+class PartGeometry:
+    """A convex part with its face planes, asset frame.
+
+    Attributes:
+        vertices: (V, 3) m.
+        faces: (F, 3) int64 triangles.
+        normals: (K, 3) distinct outward face normals.
+        offsets: (K,) m; the part is where ``normals @ x <= offsets``.
+    """
+
+    vertices: Array
+    faces: NDArray[np.int64]
+    normals: Array
+    offsets: Array
+
+    @classmethod
+    def of(cls, part: ConvexPart) -> PartGeometry:
+        """Face planes of ``part``; triangles of one flat face give one plane."""
+        corners = part.vertices[part.faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        lengths = np.linalg.norm(normals, axis=1)
+        normals = normals[lengths > 1e-14] / lengths[lengths > 1e-14, None]
+        kept: list[int] = []
+        for index, normal in enumerate(normals):
+            if all(normals[other] @ normal < 1.0 - 1e-9 for other in kept):
+                kept.append(index)
+        normals = normals[kept]
+        return cls(part.vertices, part.faces, normals, (normals @ part.vertices.T).max(axis=1))
+
+    @cached_property
+    def size_class(self) -> int:
+        """Index into the padded arrays that hold this part."""
+        for index, (corners, directions) in enumerate(SIZE_CLASSES):
+            if len(self.vertices) <= corners and len(self.normals) <= directions:
+                return index
+        return len(SIZE_CLASSES)
+
+
+@dataclass(frozen=True, eq=False)
+class LevelGeometry:
+    """All parts of one asset at one level of detail.
+
+    Attributes:
+        parts: the convex parts.
+        ids: (P,) index of each part in the library.
+        vertices: (sum V, 3) corners of all parts, m.
+        starts: (P,) where each part begins in ``vertices``.
+    """
+
+    parts: tuple[PartGeometry, ...]
+    ids: NDArray[np.int64]
+    vertices: Array
+    starts: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class AssetGeometry:
+    """One asset: its two levels of detail, and the flat faces it can stand on or carry others with.
+
+    Attributes:
+        asset: the asset.
+        fine: hollow where the asset is hollow.
+        coarse: encloses ``fine``; the same object as ``fine`` when there is nothing to gain.
+        bottom: the flat face at the lowest z of the asset frame, or None.
+        top: the flat face at the highest z, or None.
+    """
+
+    asset: Asset
+    fine: LevelGeometry
+    coarse: LevelGeometry
+    bottom: ContactFace | None
+    top: ContactFace | None
+
+    @property
+    def is_hollow(self) -> bool:
+        """Whether the two levels differ."""
+        return self.coarse is not self.fine
+
+
+@dataclass(frozen=True, eq=False)
+class PartTable:
+    """Parts of one size class, padded with copies of their first corner and direction.
+
+    Attributes:
+        vertices: (P, V, 3) m.
+        normals: (P, K, 3).
+        offsets: (P, K) m.
+    """
+
+    vertices: Array
+    normals: Array
+    offsets: Array
+
+
+class LibraryGeometry:
+    """Collision geometry of several assets; category ``c`` is ``assets[c]``.
+
+    Args:
+        assets: the assets of a scene type, in category order.
+    """
+
+    def __init__(self, assets: Sequence[Asset]) -> None:
+        self.parts: list[PartGeometry] = []
+        self.assets = tuple(self._add(asset) for asset in assets)
+        self.static = np.array([asset.static or asset.mass <= 0 for asset in assets])
+        self.center_of_mass = np.stack([np.asarray(asset.center_of_mass, dtype=np.float64) for asset in assets])
+        self.size_class = np.array([part.size_class for part in self.parts], dtype=np.int64)
+        self.row = np.zeros(len(self.parts), dtype=np.int64)
+        self.tables: list[PartTable | None] = []
+        for index in range(len(SIZE_CLASSES) + 1):
+            members = np.flatnonzero(self.size_class == index)
+            self.row[members] = np.arange(len(members))
+            self.tables.append(_table([self.parts[m] for m in members]) if len(members) else None)
+
+    def _add(self, asset: Asset) -> AssetGeometry:
+        fine = self._level(asset.fine)
+        coarse = self._level(asset.coarse) if len(asset.coarse) < len(asset.fine) else fine
+        if coarse is not fine and not _encloses(coarse, fine):
+            coarse = fine
+        faces = [contact_face(fine.parts, coarse.parts, side) for side in (-1, 1)]
+        return AssetGeometry(asset, fine, coarse, faces[0], faces[1])
+
+    def _level(self, parts: Sequence[ConvexPart]) -> LevelGeometry:
+        geometry = tuple(PartGeometry.of(part) for part in parts)
+        ids = np.arange(len(self.parts), len(self.parts) + len(geometry))
+        self.parts.extend(geometry)
+        counts = np.array([len(part.vertices) for part in geometry])
+        starts = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
+        return LevelGeometry(geometry, ids, np.concatenate([part.vertices for part in geometry]), starts)
+
+
+def _encloses(coarse: LevelGeometry, fine: LevelGeometry) -> bool:
+    """Whether every fine part lies inside one coarse part."""
+    for part in fine.parts:
+        if not any(
+            (outer.normals @ part.vertices.T <= outer.offsets[:, None] + _CONTAINED).all() for outer in coarse.parts
+        ):
+            return False
+    return True
+
+
+def _table(parts: Sequence[PartGeometry]) -> PartTable:
+    corners = max(len(part.vertices) for part in parts)
+    directions = max(len(part.normals) for part in parts)
+    vertices = np.empty((len(parts), corners, 3))
+    normals = np.empty((len(parts), directions, 3))
+    offsets = np.empty((len(parts), directions))
+    for index, part in enumerate(parts):
+        vertices[index] = part.vertices[0]
+        vertices[index, : len(part.vertices)] = part.vertices
+        normals[index], offsets[index] = part.normals[0], part.offsets[0]
+        normals[index, : len(part.normals)] = part.normals
+        offsets[index, : len(part.offsets)] = part.offsets
+    return PartTable(vertices, normals, offsets)
+
+
+def inset_hull(part: PartGeometry, distance: float) -> Array:
+    """Corners (V, 3) of the part with every face moved inward by ``distance`` (m).
+
+    Bullet grows convex meshes by its margin, so a hull that is to act at its true size goes in smaller.
+    A part too thin for the whole distance is inset by two fifths of its thickness.
+    """
+    from scipy.optimize import linprog
+    from scipy.spatial import HalfspaceIntersection
+
+    count = len(part.normals)
+    deepest = linprog(
+        [0.0, 0.0, 0.0, -1.0],
+        A_ub=np.column_stack([part.normals, np.ones(count)]),
+        b_ub=part.offsets,
+        bounds=[(None, None)] * 3 + [(0.0, None)],
+    )
+    center, radius = deepest.x[:3], deepest.x[3]
+    distance = min(distance, 0.8 * radius)
+    planes = np.column_stack([part.normals, distance - part.offsets])
+    try:
+        corners = HalfspaceIntersection(planes, center).intersections
+        return corners[ConvexHull(corners).vertices]
+    except QhullError:
+        return center + (part.vertices - center) * (1.0 - distance / radius)
+
+
+_LIBRARIES: dict[tuple[int, ...], LibraryGeometry] = {}
+
+
+def library_geometry(assets: Sequence[Asset]) -> LibraryGeometry:
+    """The geometry of ``assets``, built on first use and shared by everything in this process."""
+    key = tuple(id(asset) for asset in assets)
+    if key not in _LIBRARIES:
+        _LIBRARIES[key] = LibraryGeometry(assets)  # holds the assets, so that their ids stay taken
+    return _LIBRARIES[key]

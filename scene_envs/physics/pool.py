@@ -1,0 +1,266 @@
+"""Worker processes for physics: order-preserving, and no scene is lost with the worker that had it."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import logging
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from multiprocessing.connection import Connection, wait
+from typing import Any
+
+from scene_envs.errors import InvalidInputError, PhysicsError, SceneEnvsError
+from scene_envs.physics.kernels import KERNELS, Chunk
+from scene_envs.scene_types import SceneType
+
+_LOGGER = logging.getLogger(__name__)
+_NO_MESH: Any = None
+"""Workers draw nothing, so the meshes stay here."""
+_START_UP = 120.0
+"""Extra seconds that the first chunk of a worker may take: imports and geometry."""
+_SINGLE_THREADED = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+@dataclasses.dataclass
+class _Task:
+    """Rows ``rows`` of a batch, to be run together."""
+
+    rows: list[int]
+    chunk: Chunk
+    is_retry: bool = False
+
+
+class _Worker:
+    """One process and the two pipes to it."""
+
+    def __init__(self) -> None:
+        child_reads, parent_writes = os.pipe()
+        parent_reads, child_writes = os.pipe()
+        environment = os.environ | _SINGLE_THREADED | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "scene_envs.physics.worker", str(child_reads), str(child_writes)],
+            pass_fds=(child_reads, child_writes),
+            env=environment,
+            cwd=os.getcwd(),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+        )
+        os.close(child_reads)
+        os.close(child_writes)
+        self.outbox = Connection(parent_writes, readable=False)
+        self.inbox = Connection(parent_reads, writable=False)
+        self.known: set[int] = set()
+        self.is_ready = False
+        self.task: _Task | None = None
+        self.deadline = time.monotonic() + _START_UP
+
+    def stop(self) -> None:
+        """End the process and close the pipes."""
+        self.outbox.close()
+        self.inbox.close()
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+
+
+class PhysicsPool:
+    """Spawned processes that do physics on chunks of scenes.
+
+    Results come in order and do not depend on the number of workers. A chunk whose worker dies or exceeds
+    ``timeout`` is tried once more, scene by scene; scenes that fail again are invalid and the others are not
+    affected. The pool stays usable: lost workers are replaced.
+
+    Args:
+        workers: number of processes; 0 computes in this process.
+        timeout: seconds that a chunk of up to eight scenes may take.
+
+    >>> with PhysicsPool(workers=0) as pool:
+    ...     pool.workers
+    0
+    """
+
+    def __init__(self, workers: int = 1, timeout: float = 60.0) -> None:
+        if workers < 0:
+            raise InvalidInputError(f"workers must be 0 or more, got {workers}; 0 computes in this process")
+        if not timeout > 0:
+            raise InvalidInputError(f"timeout must be a positive number of seconds, got {timeout}")
+        self.workers = workers
+        self.timeout = timeout
+        self._live: list[_Worker] = []
+        self._scene_types: dict[SceneType, int] = {}
+        self._lock = threading.Lock()
+        self._closed = False
+
+    def __enter__(self) -> PhysicsPool:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def __del__(self) -> None:
+        with contextlib.suppress(Exception):
+            self.close()
+
+    def close(self) -> None:
+        """End all workers; the pool cannot be used afterwards."""
+        self._closed = True
+        for worker in self._live:
+            worker.stop()
+        self._live = []
+
+    @property
+    def process_ids(self) -> list[int]:
+        """Operating-system ids of the running workers."""
+        return [worker.process.pid for worker in self._live]
+
+    def run(self, kernel: str, chunks: Sequence[Chunk], options: Mapping[str, Any]) -> list[dict[str, Any] | None]:
+        """Run a kernel on every chunk.
+
+        Args:
+            kernel: name of a function of ``scene_envs.physics.kernels.KERNELS``.
+            chunks: scenes, all of one scene type.
+            options: keyword arguments of the kernel.
+
+        Returns:
+            One result per *scene*, in order; each holds one row, or is None where the scene failed twice.
+
+        Raises:
+            SceneEnvsError: the kernel refused (a missing dependency, an unknown asset).
+        """
+        if self._closed:
+            raise PhysicsError("this PhysicsPool was closed; make a new one")
+        tasks: deque[_Task] = deque()
+        total = 0
+        for chunk in chunks:
+            tasks.append(_Task(list(range(total, total + len(chunk))), chunk))
+            total += len(chunk)
+        results: list[dict[str, Any] | None] = [None] * total
+        if self.workers == 0:
+            run_here(kernel, tasks, options, results)
+            return results
+        with self._lock:
+            try:
+                self._run_all(kernel, tasks, dict(options), results)
+            except BaseException:
+                self._discard_busy()
+                raise
+        return results
+
+    # -- the loop -------------------------------------------------------------------------------
+
+    def _run_all(
+        self, kernel: str, tasks: deque[_Task], options: dict[str, Any], results: list[dict[str, Any] | None]
+    ) -> None:
+        while tasks or any(worker.task for worker in self._live):
+            while len(self._live) < min(self.workers, len(tasks) + sum(w.task is not None for w in self._live)):
+                self._live.append(_Worker())
+            for worker in self._live:
+                if worker.is_ready and worker.task is None and tasks:
+                    self._hand_over(worker, tasks.popleft(), kernel, options, tasks)
+            self._collect(tasks, results)
+
+    def _hand_over(
+        self, worker: _Worker, task: _Task, kernel: str, options: dict[str, Any], tasks: deque[_Task]
+    ) -> None:
+        scene_type = task.chunk.scene_type
+        key = self._scene_types.setdefault(scene_type, len(self._scene_types))
+        worker.task = task
+        grace = 0.0 if key in worker.known else _START_UP
+        worker.deadline = time.monotonic() + self.timeout + grace
+        try:
+            if key not in worker.known:
+                assets = tuple(dataclasses.replace(asset, visual=_NO_MESH) for asset in scene_type.library)
+                worker.outbox.send(("scene_type", key, dataclasses.replace(scene_type), assets))
+                worker.known.add(key)
+            arrays = (task.chunk.translations, task.chunk.rotations, task.chunk.categories)
+            worker.outbox.send(("run", kernel, key, arrays, options))
+        except (BrokenPipeError, OSError):
+            pass  # noticed by _collect, which sees the end of its pipe
+
+    def _collect(self, tasks: deque[_Task], results: list[dict[str, Any] | None]) -> None:
+        """Wait for the next message, death or deadline."""
+        waiting = [worker for worker in self._live if worker.task is not None or not worker.is_ready]
+        if not waiting:
+            return
+        nearest = min(worker.deadline for worker in waiting) - time.monotonic()
+        ready = wait([worker.inbox for worker in waiting], timeout=max(0.0, nearest))
+        for worker in waiting:
+            if worker.inbox in ready:
+                self._receive(worker, tasks, results)
+            elif time.monotonic() > worker.deadline:
+                self._lose(worker, tasks, f"took longer than {self.timeout:g} s")
+
+    def _receive(self, worker: _Worker, tasks: deque[_Task], results: list[dict[str, Any] | None]) -> None:
+        try:
+            kind, body = worker.inbox.recv()
+        except (EOFError, OSError):
+            self._lose(worker, tasks, "died")
+            return
+        if kind == "ready":
+            worker.is_ready = True
+            return
+        task, worker.task = worker.task, None
+        assert task is not None
+        if kind == "done":
+            _store(task, body, results)
+        elif kind == "refused":
+            raise body
+        else:
+            _retry(task, tasks, f"failed ({body})")
+
+    def _lose(self, worker: _Worker, tasks: deque[_Task], how: str) -> None:
+        task, started = worker.task, worker.is_ready
+        self._live.remove(worker)
+        worker.stop()
+        if task is not None:
+            _retry(task, tasks, how)
+        elif not started:
+            raise PhysicsError(
+                f"a physics worker {how} while starting (exit status {worker.process.returncode}); "
+                "its own message is on stderr"
+            )
+
+    def _discard_busy(self) -> None:
+        for worker in [w for w in self._live if w.task is not None or not w.is_ready]:
+            self._live.remove(worker)
+            worker.stop()
+
+
+def run_here(
+    kernel: str, tasks: deque[_Task], options: Mapping[str, Any], results: list[dict[str, Any] | None]
+) -> None:
+    """Run all tasks in this process."""
+    while tasks:
+        task = tasks.popleft()
+        try:
+            _store(task, KERNELS[kernel](task.chunk, **options), results)
+        except SceneEnvsError:
+            raise
+        except Exception as error:
+            _retry(task, tasks, f"failed ({type(error).__name__}: {error})")
+
+
+def run_in_process(kernel: str, chunks: Sequence[Chunk], options: Mapping[str, Any]) -> list[dict[str, Any] | None]:
+    """As :meth:`PhysicsPool.run`, without a pool."""
+    return PhysicsPool(workers=0).run(kernel, chunks, options)
+
+
+def _store(task: _Task, result: dict[str, Any], results: list[dict[str, Any] | None]) -> None:
+    for index, row in enumerate(task.rows):
+        results[row] = {name: values[index] for name, values in result.items()}
+
+
+def _retry(task: _Task, tasks: deque[_Task], how: str) -> None:
+    """Try again scene by scene; give up on what was tried again already."""
+    if task.is_retry:
+        _LOGGER.warning("physics of scene %d %s twice; the scene is invalid", task.rows[0], how)
+        return
+    _LOGGER.warning("physics of scenes %d to %d %s; trying them once more", task.rows[0], task.rows[-1], how)
+    for index, row in reversed(list(enumerate(task.rows))):
+        tasks.appendleft(_Task([row], task.chunk.row(index), is_retry=True))

@@ -1,0 +1,100 @@
+"""Separating planes between many pairs of convex parts at once, in numpy.
+
+For two convex parts every face direction gives a lower bound on their distance when it separates them,
+and otherwise an upper bound on how deep they overlap. For flat contact the bound is exact, which decides
+nearly all pairs of a tidy scene without a call per pair.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_envs.physics.geometry import LibraryGeometry
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedParts:
+    """Parts of placed objects.
+
+    Attributes:
+        part: (I,) index of the part in the library.
+        rotation: (I, 3, 3), asset frame to world.
+        translation: (I, 3) m, world.
+    """
+
+    part: Index
+    rotation: Array
+    translation: Array
+
+
+def rotate(rotation: Array, points: Array) -> Array:
+    """(..., 3, 3) applied to (..., P, 3); written out, so that a row's result never depends on the others."""
+    r, p = rotation[..., None, :, :], points[..., :, None, :]
+    return r[..., 0] * p[..., 0] + r[..., 1] * p[..., 1] + r[..., 2] * p[..., 2]  # type: ignore[no-any-return]
+
+
+def separations(library: LibraryGeometry, placed: PlacedParts, first: Index, second: Index) -> tuple[Array, Array]:
+    """Largest signed gap of each pair of placed parts over all face directions of both.
+
+    Args:
+        library: geometry of the assets.
+        placed: the parts.
+        first: (P,) rows of ``placed``.
+        second: (P,) rows of ``placed``.
+
+    Returns:
+        gap (P,) m, positive when a face plane separates the pair, and the direction (P, 3) of that plane
+        in the world, from the first part to the second. The true distance is at least ``gap``; the true
+        depth is at most ``-gap``.
+    """
+    gap = np.empty(len(first))
+    direction = np.empty((len(first), 3))
+    classes = library.size_class[placed.part]
+    groups = classes[first] * len(library.tables) + classes[second]
+    for group in np.unique(groups):
+        rows = np.flatnonzero(groups == group)
+        gap[rows], direction[rows] = _one_group(
+            library, placed, first[rows], second[rows], *divmod(int(group), len(library.tables))
+        )
+    return gap, direction
+
+
+def _one_group(
+    library: LibraryGeometry, placed: PlacedParts, first: Index, second: Index, class_a: int, class_b: int
+) -> tuple[Array, Array]:
+    table_a, table_b = library.tables[class_a], library.tables[class_b]
+    assert table_a is not None
+    assert table_b is not None
+    row_a, row_b = library.row[placed.part[first]], library.row[placed.part[second]]
+    rotation_a, rotation_b = placed.rotation[first], placed.rotation[second]
+    shift = placed.translation[second] - placed.translation[first]  # (P, 3)
+    gap_a, normal_a = _face_gaps(
+        table_a.normals[row_a], table_a.offsets[row_a], rotation_a, table_b.vertices[row_b], rotation_b, shift
+    )
+    gap_b, normal_b = _face_gaps(
+        table_b.normals[row_b], table_b.offsets[row_b], rotation_b, table_a.vertices[row_a], rotation_a, -shift
+    )
+    use_a = gap_a >= gap_b
+    return np.where(use_a, gap_a, gap_b), np.where(use_a[:, None], normal_a, -normal_b)
+
+
+def _face_gaps(
+    normals: Array, offsets: Array, rotation: Array, vertices: Array, other: Array, shift: Array
+) -> tuple[Array, Array]:
+    """Best face of the owner: (P,) gap and (P, 3) world normal; ``shift`` leads to the other part."""
+    world = rotate(rotation, normals)  # (P, K, 3)
+    local = rotate(other.swapaxes(-1, -2), world)  # in the frame of the other part
+    height = local[:, :, None, 0] * vertices[:, None, :, 0]
+    height += local[:, :, None, 1] * vertices[:, None, :, 1]
+    height += local[:, :, None, 2] * vertices[:, None, :, 2]
+    along = world[..., 0] * shift[:, None, 0] + world[..., 1] * shift[:, None, 1] + world[..., 2] * shift[:, None, 2]
+    gaps = height.min(axis=2) + along - offsets  # (P, K)
+    best = gaps.argmax(axis=1)
+    rows = np.arange(len(best))
+    return gaps[rows, best], world[rows, best]

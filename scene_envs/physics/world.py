@@ -1,0 +1,336 @@
+"""One persistent PyBullet world per asset library: bodies are built once and reused for every scene."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from scene_envs.errors import MissingDependencyError, PhysicsError
+from scene_envs.physics.geometry import LevelGeometry, LibraryGeometry, inset_hull
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+BULLET_MARGIN = 1e-3
+"""Bullet grows each convex mesh by this much (m)."""
+_PARKING = 1000.0
+"""Height (m) of the first unused body; the next ones are 10 m apart above it."""
+
+
+@dataclass(frozen=True)
+class SolverSettings:
+    """How the motion is integrated.
+
+    Attributes:
+        time_step: s.
+        iterations: of the sequential-impulse solver per step.
+        linear_damping: fraction of velocity lost per second.
+        angular_damping: fraction of angular velocity lost per second.
+    """
+
+    time_step: float = 1.0 / 240.0
+    iterations: int = 50
+    linear_damping: float = 0.0
+    angular_damping: float = 0.0
+
+
+class World:
+    """PyBullet with a pool of bodies; the motion of a scene never depends on the scenes before it.
+
+    Each scene's bodies get fresh broadphase proxies in a canonical order (which drops all contacts that
+    earlier scenes left), are sorted the same way whatever the slot order, and never sleep.
+
+    Args:
+        library: geometry of the assets.
+
+    Raises:
+        MissingDependencyError: pybullet is not installed.
+    """
+
+    def __init__(self, library: LibraryGeometry) -> None:
+        try:
+            import pybullet
+        except ImportError as error:
+            raise MissingDependencyError(
+                "settling and equilibrium need pybullet, whose wheels exist for Python 3.10 and 3.11; "
+                "install it there with: pip install pybullet"
+            ) from error
+        self._bullet: Any = pybullet
+        self._library = library
+        self._client = pybullet.connect(pybullet.DIRECT)
+        if self._client < 0:
+            raise PhysicsError("PyBullet has no free client slot; close clients that are no longer used")
+        self._pool_sizes: dict[tuple[int, str], int] = {}
+        self._pool: dict[tuple[int, str], list[int]] = {}
+        self._frames: dict[int, tuple[Array, Array]] = {}  # category -> principal axes, inertia
+        self._inset: dict[tuple[int, str], str] = {}
+
+    # -- bodies ---------------------------------------------------------------------------------
+
+    def _require(self, needed: dict[tuple[int, str], int]) -> None:
+        """Make the pool hold at least ``needed`` bodies per (category, level); a larger pool is built anew."""
+        if all(len(self._pool.get(key, ())) >= count for key, count in needed.items()):
+            return
+        for key, count in needed.items():
+            have = self._pool_sizes.get(key, 0)
+            if count > have:
+                self._pool_sizes[key] = max(count, 2 * have, 1 if self._library.static[key[0]] else 4)
+        bullet, client = self._bullet, self._client
+        bullet.resetSimulation(physicsClientId=client)
+        bullet.setGravity(0.0, 0.0, -9.81, physicsClientId=client)
+        bullet.setPhysicsEngineParameter(
+            numSubSteps=0,
+            contactBreakingThreshold=2e-3,
+            deterministicOverlappingPairs=1,
+            enableFileCaching=0,
+            solverResidualThreshold=0.0,
+            physicsClientId=client,
+        )
+        # A shared small visual: without one PyBullet would read the collision mesh again for every body.
+        visual = bullet.createVisualShape(bullet.GEOM_BOX, halfExtents=(1e-3, 1e-3, 1e-3), physicsClientId=client)
+        self._pool = {}
+        parked = 0
+        for key in sorted(self._pool_sizes):  # one order in every process, whatever was asked for first
+            shape = self._shape(*key)
+            self._pool[key] = []
+            for _ in range(self._pool_sizes[key]):
+                self._pool[key].append(self._body(key[0], shape, visual, parked))
+                parked += 1
+
+    def _shape(self, category: int, level: str) -> int:
+        geometry: LevelGeometry = getattr(self._library.assets[category], level)
+        if (category, level) not in self._inset:
+            axes, _ = self._principal(category)
+            center = self._library.center_of_mass[category]
+            hulls = [(inset_hull(part, BULLET_MARGIN) - center) @ axes for part in geometry.parts]
+            self._inset[category, level] = _wavefront(hulls)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "hulls.obj"
+            path.write_text(self._inset[category, level])
+            shape = self._bullet.createCollisionShape(
+                self._bullet.GEOM_MESH, fileName=str(path), physicsClientId=self._client
+            )
+        if shape < 0:
+            name = self._library.assets[category].asset.name
+            raise PhysicsError(f"PyBullet refused the collision shape of asset {name!r} ({level} parts)")
+        return int(shape)
+
+    def _principal(self, category: int) -> tuple[Array, Array]:
+        """Principal axes (3, 3, columns) and moments (3,) of an asset's inertia."""
+        if category not in self._frames:
+            moments, axes = np.linalg.eigh(np.asarray(self._library.assets[category].asset.inertia))
+            if np.linalg.det(axes) < 0:
+                axes[:, 0] *= -1.0
+            self._frames[category] = axes, moments
+        return self._frames[category]
+
+    def _body(self, category: int, shape: int, visual: int, parked: int) -> int:
+        static = bool(self._library.static[category])
+        mass = 0.0 if static else float(self._library.assets[category].asset.mass)
+        body = self._bullet.createMultiBody(
+            mass,
+            shape,
+            visual,
+            basePosition=_parking_place(parked),
+            useMaximalCoordinates=True,
+            physicsClientId=self._client,
+        )
+        if body < 0:
+            raise PhysicsError(f"PyBullet could not create a body for asset category {category}")
+        settings: dict[str, Any] = {"lateralFriction": 0.6, "restitution": 0.0}
+        if not static:
+            # The mass goes in with the inertia: alone, the inertia call would reset the mass.
+            settings |= {"mass": mass, "localInertiaDiagonal": self._principal(category)[1].tolist()}
+        self._bullet.changeDynamics(body, -1, physicsClientId=self._client, **settings)
+        return int(body)
+
+    # -- motion ---------------------------------------------------------------------------------
+
+    def simulate(
+        self,
+        category: Index,
+        fine: Mask,
+        fixed: Mask,
+        rotation: Array,
+        translation: Array,
+        duration: float,
+        settings: SolverSettings,
+    ) -> tuple[Array, Array, Array]:
+        """Move the objects of one scene for ``duration`` seconds under gravity.
+
+        Args:
+            category: (n,) asset indices.
+            fine: (n,) whether each object collides with its fine parts.
+            fixed: (n,) objects that do not move.
+            rotation: (n, 3, 3).
+            translation: (n, 3) m.
+            duration: s.
+            settings: integration.
+
+        Returns:
+            rotation (n, 3, 3) and translation (n, 3) afterwards, and the angle turned (n,) in radians.
+            Objects that Bullet lost to a numerical failure come back as NaN.
+        """
+        bullet, client = self._bullet, self._client
+        count = len(category)
+        order = np.lexsort((translation[:, 0], translation[:, 1], translation[:, 2], fine, category))
+        levels = np.where(fine, "fine", "coarse")
+        needed: dict[tuple[int, str], int] = {}
+        keys = [(int(category[i]), str(levels[i])) for i in range(count)]
+        for key in keys:
+            needed[key] = needed.get(key, 0) + 1
+        self._require(needed)
+
+        axes = np.stack([self._principal(int(c))[0] for c in category])
+        center = self._library.center_of_mass[category]
+        start_rotation = rotation @ axes
+        start_quaternion = _quaternions(start_rotation)
+        start_position = translation + _apply(rotation, center)
+
+        taken = dict.fromkeys(needed, 0)
+        bodies = np.empty(count, dtype=np.int64)
+        for row in order:
+            key = keys[row]
+            bodies[row] = body = self._pool[key][taken[key]]
+            taken[key] += 1
+            self._prepare(body, key[0], bool(fixed[row]), start_quaternion[row].tolist(), settings)
+        # Bullet refreshes a body's world inertia only when it integrates: one step out of contact does that.
+        bullet.stepSimulation(physicsClientId=client)
+        for row in order:
+            body = int(bodies[row])
+            bullet.resetBasePositionAndOrientation(
+                body, start_position[row].tolist(), start_quaternion[row].tolist(), physicsClientId=client
+            )
+            bullet.resetBaseVelocity(body, _ZERO, _ZERO, physicsClientId=client)
+            # Fresh broadphase proxies: no pair, contact or warm start survives from an earlier scene.
+            bullet.setCollisionFilterGroupMask(body, -1, 1, 1, physicsClientId=client)
+        bullet.setPhysicsEngineParameter(
+            fixedTimeStep=settings.time_step, numSolverIterations=settings.iterations, physicsClientId=client
+        )
+        for _ in range(max(1, round(duration / settings.time_step))):
+            bullet.stepSimulation(physicsClientId=client)
+        end = [bullet.getBasePositionAndOrientation(int(body), physicsClientId=client) for body in bodies]
+        end_position = np.array([pose[0] for pose in end])
+        end_quaternion = np.array([pose[1] for pose in end])
+        self._park(bodies, category)
+
+        end_rotation = _matrices(end_quaternion)
+        new_rotation = _times(end_rotation, axes.swapaxes(-1, -2))
+        new_translation = end_position - _apply(new_rotation, center)
+        angle = _angle_between(start_quaternion, end_quaternion)
+        lost = ~np.isfinite(end_position).all(axis=1) | ~np.isfinite(end_quaternion).all(axis=1)
+        if lost.any():
+            self.reset()
+        return new_rotation, new_translation, angle
+
+    def _prepare(
+        self, body: int, category: int, fixed: bool, quaternion: list[float], settings: SolverSettings
+    ) -> None:
+        """Turn a parked body to its orientation and wake it."""
+        bullet, client = self._bullet, self._client
+        bullet.resetBasePositionAndOrientation(body, _parking_place(body), quaternion, physicsClientId=client)
+        if self._library.static[category]:
+            return
+        bullet.resetBaseVelocity(body, _ZERO, _ZERO, physicsClientId=client)
+        bullet.changeDynamics(
+            body,
+            -1,
+            mass=0.0 if fixed else float(self._library.assets[category].asset.mass),
+            localInertiaDiagonal=_ZERO if fixed else self._principal(category)[1].tolist(),
+            linearDamping=settings.linear_damping,
+            angularDamping=settings.angular_damping,
+            activationState=bullet.ACTIVATION_STATE_DISABLE_SLEEPING,
+            physicsClientId=client,
+        )
+
+    def _park(self, bodies: Index, category: Index) -> None:
+        bullet, client = self._bullet, self._client
+        for row, body in enumerate(bodies.tolist()):
+            bullet.resetBasePositionAndOrientation(body, _parking_place(body), (0, 0, 0, 1), physicsClientId=client)
+            if not self._library.static[category[row]]:
+                bullet.resetBaseVelocity(body, _ZERO, _ZERO, physicsClientId=client)
+                bullet.changeDynamics(body, -1, activationState=bullet.ACTIVATION_STATE_SLEEP, physicsClientId=client)
+
+    def reset(self) -> None:
+        """Throw all bodies away; they are built again when needed."""
+        self._pool = {}
+
+    def close(self) -> None:
+        """Disconnect from PyBullet."""
+        if self._client >= 0:
+            self._bullet.disconnect(self._client)
+            self._client = -1
+
+
+_ZERO = (0.0, 0.0, 0.0)
+
+
+def _parking_place(index: int) -> tuple[float, float, float]:
+    return (0.0, 0.0, _PARKING + 10.0 * index)
+
+
+def _wavefront(hulls: list[Array]) -> str:
+    """A Wavefront file with one group per hull (V, 3); Bullet makes a compound of them."""
+    lines: list[str] = []
+    offset = 1
+    for index, vertices in enumerate(hulls):
+        lines.append(f"o hull{index}")
+        lines.extend(f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices)
+        lines.extend(f"f {a + offset} {b + offset} {c + offset}" for a, b, c in ConvexHull(vertices).simplices)
+        offset += len(vertices)
+    return "\n".join(lines) + "\n"
+
+
+def _apply(rotation: Array, vector: Array) -> Array:
+    r, v = rotation, vector[:, None, :]
+    return r[..., 0] * v[..., 0] + r[..., 1] * v[..., 1] + r[..., 2] * v[..., 2]  # type: ignore[no-any-return]
+
+
+def _times(a: Array, b: Array) -> Array:
+    return a[..., :, 0:1] * b[..., 0:1, :] + a[..., :, 1:2] * b[..., 1:2, :] + a[..., :, 2:3] * b[..., 2:3, :]
+
+
+def _quaternions(matrices: Array) -> Array:
+    """(n, 4) in PyBullet's order (x, y, z, w), from whichever of four equal forms is the most accurate."""
+    m = matrices
+    diagonal = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
+    out = np.empty((len(m), 4))
+    largest = np.stack([*diagonal, diagonal[0] + diagonal[1] + diagonal[2]]).argmax(axis=0)
+    for axis in range(3):
+        j, k = (axis + 1) % 3, (axis + 2) % 3
+        rows = largest == axis
+        r = m[rows]
+        out[np.ix_(rows, (axis, j, k, 3))] = np.column_stack(
+            [1 + r[:, axis, axis] - r[:, j, j] - r[:, k, k], r[:, j, axis] + r[:, axis, j],
+             r[:, k, axis] + r[:, axis, k], r[:, k, j] - r[:, j, k]]
+        )  # fmt: skip
+    rows = largest == 3
+    r = m[rows]
+    out[rows] = np.column_stack(
+        [r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1], 1 + r.trace(axis1=1, axis2=2)]
+    )
+    return out / np.linalg.norm(out, axis=1, keepdims=True)  # type: ignore[no-any-return]
+
+
+def _matrices(xyzw: Array) -> Array:
+    x, y, z, w = (xyzw / np.linalg.norm(xyzw, axis=1, keepdims=True)).T
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return np.stack(rows, axis=1).reshape(-1, 3, 3)
+
+
+def _angle_between(a: Array, b: Array) -> Array:
+    """Angle (n,) between unit quaternions (x, y, z, w), accurate when tiny."""
+    scalar = np.abs((a * b).sum(axis=1))
+    vector = a[:, 3:] * b[:, :3] - b[:, 3:] * a[:, :3] - np.cross(a[:, :3], b[:, :3])
+    return 2.0 * np.arctan2(np.linalg.norm(vector, axis=1), scalar)
