@@ -181,6 +181,8 @@ class Pretrainer:
         for row in self._steps():
             self._log(row)
         self.prior.denoiser.network = network
+        with self._averaged():
+            self.prior.fit_residual(self.heldout_data[:512].to(self.config.device))
         return self.save_prior()
 
     def _steps(self) -> Iterator[dict[str, float]]:
@@ -209,7 +211,7 @@ class Pretrainer:
         loss = self.prior.pretraining_loss(self.train_data[index].to(config.device), self.generator)
         if not bool(torch.isfinite(loss)):
             raise TrainingError(
-                f"the pretraining loss became {float(loss)} at step {self.step}; the last good state is "
+                f"the pretraining loss became {float(loss.detach())} at step {self.step}; the last good state is "
                 f"{str(self.checkpoint_path)!r}: lower learning_rate (now {config.learning_rate}) and run again"
             )
         loss.backward()
