@@ -17,10 +17,11 @@ import torch
 from torch import Generator, Tensor, nn
 
 from agents.checkpoints import load_checkpoint, save_checkpoint
+from agents.denoiser import PriorConfig
 from agents.diffusion import Preconditioning
 from agents.networks import FluxConfig
-from agents.prior import PriorConfig, ScenePrior
-from scene_envs.errors import InvalidInputError, TrainingError
+from agents.prior import ScenePrior
+from scene_envs.errors import TrainingError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene_types import get_scene_type
 

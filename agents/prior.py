@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Generator, Tensor, nn
 
+from agents.denoiser import Denoiser, PriorConfig
 from agents.diffusion import (
     GaussianProcess,
     Preconditioning,
@@ -19,6 +20,7 @@ from agents.diffusion import (
     lognormal_timesteps,
     make_schedule,
 )
+from agents.inpainting import inpaint
 from agents.networks import FluxConfig, FluxDenoiser
 from agents.prior_files import read_prior, write_prior
 from scene_envs.errors import CorruptFileError, InvalidInputError
@@ -28,54 +30,6 @@ from scene_envs.scene import TRANSLATION, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
 _LEVELS, _RESIDUAL = "residual.timesteps", "residual.variance"
-
-
-@dataclass(frozen=True)
-class PriorConfig:
-    """What a prior is made of.
-
-    Attributes:
-        scene_type: name of its scene type.
-        slots: slots per scene that it was trained on.
-        network: size of its denoiser.
-        schedule: noise schedule, ``"karras"``, ``"linear"`` or ``"cosine"``.
-        prediction: ``"karras"``, ``"epsilon"``, ``"x0"`` or ``"v"``.
-        num_timesteps: T of the schedule.
-        noise_mean: mean of ln(noise-to-signal) over training timesteps.
-        noise_std: its standard deviation.
-        translation_weight: weight of x, y, z in the pretraining loss, other features having 1.
-    """
-
-    scene_type: str
-    slots: int
-    network: FluxConfig
-    schedule: str = "karras"
-    prediction: str = "karras"
-    num_timesteps: int = 1000
-    noise_mean: float = -1.8
-    noise_std: float = 2.1
-    translation_weight: float = 3.0
-
-
-class Denoiser(nn.Module):
-    """A network inside its process: x_t (B, N, D) and t (B,) to the denoised scene x_0 (B, N, D)."""
-
-    def __init__(self, network: nn.Module, process: GaussianProcess) -> None:
-        super().__init__()
-        self.network = network
-        self.process = process
-
-    def output(self, x_t: Tensor, t: Tensor) -> Tensor:
-        """The raw network output (B, N, D), in the units of ``process.target``."""
-        process = self.process
-        alpha, _ = process.rates(t, x_t)
-        level = (process.sigma[t.cpu()] / process.alpha[t.cpu()]).to(x_t.device)
-        result: Tensor = self.network(process.network_input(x_t, t), x_t / alpha, level)
-        return result
-
-    def forward(self, x_t: Tensor, t: Tensor) -> Tensor:
-        """The denoised scene x_0 (B, N, D), normalised."""
-        return self.process.x0_from_output(x_t, t, self.output(x_t, t))
 
 
 class ScenePrior(nn.Module):
@@ -236,7 +190,6 @@ class ScenePrior(nn.Module):
         """Normalised x_0 (B, N, D) of scenes whose first slots hold the fixed welded objects."""
         return self.clamp(batch.to_tensor(normalised=self.normalizer))
 
-    @torch.no_grad()
     def inpaint(
         self,
         batch: SceneBatch,
@@ -246,45 +199,8 @@ class ScenePrior(nn.Module):
         generators: Sequence[Generator] | None = None,
         seed: int = 0,
     ) -> SceneBatch:
-        """Regenerate masked slots given the others, by clamping (Lugmayr et al. 2022, Eq. 8, no resampling).
-
-        Args:
-            batch: scenes to change.
-            mask: (B, N) bool, True where a slot is regenerated; fixed welded slots never are.
-            num_steps: denoiser evaluations.
-            generators: one per scene, so that a scene's result does not depend on its neighbours' noise.
-            seed: used to make the generators when none are given.
-
-        Returns:
-            Scenes whose unmasked slots are bit-identical to those of ``batch``.
-        """
-        if mask.shape != batch.tensor.shape[:2] or mask.dtype != torch.bool:
-            raise InvalidInputError(
-                f"mask must be bool of shape {tuple(batch.tensor.shape[:2])}, got {mask.dtype} {tuple(mask.shape)}"
-            )
-        if generators is None:
-            generators = [Generator().manual_seed(seed + i) for i in range(len(batch))]
-        if len(generators) != len(batch):
-            raise InvalidInputError(f"{len(generators)} generators for {len(batch)} scenes; give one per scene")
-        known_x0 = self.encode(batch)
-        keep = ~mask.unsqueeze(-1)
-        shape = known_x0.shape[1:]
-
-        def noise() -> Tensor:
-            return torch.stack([torch.randn(shape, generator=g) for g in generators]).to(known_x0.device)
-
-        table = self.step_table(num_steps)
-        x = self.clamp(noise())
-        for step in range(len(table)):
-            t = table.timesteps[step].to(known_x0.device)
-            noisy_known = self.process.add_noise(known_x0, t, noise())
-            x = self.clamp(torch.where(keep, noisy_known, x))
-            mean, std = self.posterior(x, step, table)
-            x = mean + std * noise()
-        regenerated = self.decode(x)
-        changed = mask.clone()
-        changed[:, : len(self.scene_type.fixed)] = False
-        return SceneBatch(torch.where(changed.unsqueeze(-1), regenerated.tensor, batch.tensor), self.scene_type)
+        """Regenerate the slots where ``mask`` (B, N) is True; see :func:`agents.inpainting.inpaint`."""
+        return inpaint(self, batch, mask, num_steps=num_steps, generators=generators, seed=seed)
 
     def complete(self, batch: SceneBatch, *, num_steps: int = 50, seed: int = 0) -> SceneBatch:
         """Fill the empty slots of ``batch``, keeping its objects."""
