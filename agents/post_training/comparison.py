@@ -146,11 +146,10 @@ def _page(title: str, metrics: Mapping[str, Any], curve: Path, pictures: Mapping
         Tile("held-out loss", f"{guard['ratio']:.2f}×", f"of the base prior; limit {guard['limit']:g}×"),
     ]
     over = guard["over_optimised_from"]
-    verdict = (
-        f"The guard's limit was passed at iteration {over}; the prior kept is that of iteration {guard['best_iteration']}."
-        if over is not None
-        else f"The held-out loss stayed within its limit; the prior kept is that of iteration {guard['best_iteration']}."
+    passed = (
+        "The held-out loss stayed within its limit" if over is None else f"Its limit was passed at iteration {over}"
     )
+    verdict = f"{passed}; the prior kept is that of iteration {guard['best_iteration']}."
     sections = [
         Section("The curve", verdict, [Picture(curve, f"Mean {reward_name} of each batch, and the guard.")]),
         Section(

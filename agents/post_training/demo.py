@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +61,7 @@ def run_demo(
     """
     from scene_envs.physics import PhysicsPool
 
-    config = PostTrainConfig(**{**asdict(recipe or RECIPE), "output": str(output), "seed": seed, "workers": workers})
+    config = replace(recipe or RECIPE, output=str(output), seed=seed, workers=workers)
     started = time.perf_counter()
     base = ScenePrior.load(config.prior if prior is None else prior)
     result = post_train(config, prior=base)

@@ -12,6 +12,7 @@ import torch
 
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.gradients import accumulate_policy_gradient
+from agents.post_training.learner import Learner
 from agents.post_training.trainer import PostTrainer
 from agents.prior import ScenePrior
 
@@ -115,15 +116,15 @@ def diagnose(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> Doc
 
 
 def _examine(trainer: PostTrainer) -> DoctorReport:
-    trainer.directory.mkdir(parents=True)
     trainer.prepare()
+    learner = trainer.learner
     started = time.perf_counter()
-    rollout = trainer.rollout()
+    rollout = learner.rollout(iteration=0)
     sampled = time.perf_counter()
-    advantage = trainer.advantage(rollout)
-    row = trainer.accumulate(rollout, advantage)
+    advantage = learner.advantage(rollout)
+    row = learner.accumulate(rollout, advantage, trainer.scenes, index=0)
     updated = time.perf_counter()
-    steps, largest = _step_rows(trainer, rollout, advantage)
+    steps, largest = _step_rows(learner, rollout, advantage)
     valid = rollout.reward[rollout.valid].double()
     some = len(valid) > 0
     report = DoctorReport(
@@ -143,18 +144,18 @@ def _examine(trainer: PostTrainer) -> DoctorReport:
     return replace(report, advice=_advice(report, trainer.config))
 
 
-def _step_rows(trainer: PostTrainer, rollout: Rollout, advantage: torch.Tensor) -> tuple[list[StepRow], float]:
+def _step_rows(learner: Learner, rollout: Rollout, advantage: torch.Tensor) -> tuple[list[StepRow], float]:
     """The sigma table, and the largest log-ratio over the steps in the gradient."""
     rows, largest = [], 0.0
-    timesteps = trainer.policy.table.timesteps.tolist()
-    for step, weight in enumerate(trainer.loss.step_weights.tolist()):
+    timesteps = learner.policy.table.timesteps.tolist()
+    for step, weight in enumerate(learner.loss.step_weights.tolist()):
         norm = 0.0
         if weight > 0:
-            trainer.optimizer.zero_grad(set_to_none=True)
-            found = accumulate_policy_gradient(trainer.loss, rollout, advantage, [step])
+            learner.optimizer.zero_grad(set_to_none=True)
+            found = accumulate_policy_gradient(learner.loss, rollout, advantage, [step])
             norm, largest = found.norm, max(largest, found.log_ratio)
-        rows.append(StepRow(step, timesteps[step], float(trainer.stds[step]), weight, norm))
-    trainer.optimizer.zero_grad(set_to_none=True)
+        rows.append(StepRow(step, timesteps[step], float(learner.stds[step]), weight, norm))
+    learner.optimizer.zero_grad(set_to_none=True)
     return rows, largest
 
 

@@ -1,0 +1,87 @@
+"""The doctor's screen, the page about a run, and the demonstration from end to end."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+from small_runs import count_objects, small_config
+
+from agents.post_training.demo import run_demo
+from agents.post_training.doctor import diagnose
+from agents.post_training.report import Page, Picture, Section, Tile, write_report
+from agents.prior import ScenePrior, tiny_prior
+from rewards.base import RewardContext, RewardOutput
+from scene_envs.scene import SceneBatch
+
+
+def test_doctor_finds_nothing_wrong_with_log_ratio_and_writes_nothing(tmp_path: Path) -> None:
+    config = small_config(tmp_path / "run")
+    report = diagnose(config, prior=tiny_prior())
+    assert report.log_ratio == 0.0
+    assert len(report.steps) == 5
+    assert report.steps[-1].std == 0.0
+    assert report.steps[-1].weight == 0.0
+    assert all(row.gradient_norm > 0 for row in report.steps if row.weight > 0)
+    assert report.reward_min <= report.reward_mean <= report.reward_max
+    assert not (tmp_path / "run").exists()
+    json.dumps(report.metrics())
+
+
+def test_doctor_says_when_there_is_nothing_to_learn_from(tmp_path: Path) -> None:
+    def flat(batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        return RewardOutput(0.0 * count_objects(batch, context).value)
+
+    report = diagnose(small_config(tmp_path / "run", reward=flat), prior=tiny_prior())
+    assert not report.healthy
+    assert any("nothing to learn" in line for line in report.advice)
+
+
+def test_doctor_says_when_regularisation_is_too_loud(tmp_path: Path) -> None:
+    report = diagnose(small_config(tmp_path / "run", regularisation=1e6), prior=tiny_prior())
+    assert any("lower regularisation" in line for line in report.advice)
+
+
+def test_doctor_fits_one_screen(tmp_path: Path) -> None:
+    report = diagnose(small_config(tmp_path / "run", num_steps=25), prior=tiny_prior())
+    console = Console(width=100, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    console.print(report)
+    text = console.export_text()
+    assert len(text.splitlines()) <= 40
+    assert "log-ratio at the start" in text
+
+
+def test_page_needs_nothing_but_itself_and_escapes_text(tmp_path: Path) -> None:
+    picture = tmp_path / "a.png"
+    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(picture)
+    section = Section("<b>", "a & b", [Picture(picture, "one"), Picture(picture, "two")], [("x", "y"), ("1", "<2>")])
+    text = write_report(tmp_path / "r.html", Page("<t>", "l", [Tile("n", "1")], [section], {"k": "<v>"})).read_text()
+    assert not re.search(r"""(src|href)\s*=\s*["'](?!data:)""", text)
+    assert "http" not in text
+    assert "<script" not in text
+    assert text.count("data:image/png;base64,") == 2
+    assert all(escaped in text for escaped in ("&lt;t&gt;", "&lt;b&gt;", "a &amp; b", "&lt;2&gt;", "&lt;v&gt;"))
+
+
+def test_demonstration_end_to_end(tmp_path: Path) -> None:
+    pytest.importorskip("scene_envs.physics")
+    recipe = small_config(tmp_path, iterations=2)
+    metrics = run_demo(tmp_path / "demo", workers=0, scenes=3, num_steps=4, recipe=recipe, prior=tiny_prior())
+    on_disk = json.loads((tmp_path / "demo" / "metrics.json").read_text())
+    for part in ("before", "after"):
+        assert {"objects", "feasible_objects", "ready_objects"} <= on_disk[part].keys()
+    assert on_disk["guard"]["ratio"] == pytest.approx(metrics["guard"]["ratio"])
+    for name in ("report.html", "curve.png", "before.png", "after.png", "config.yaml", "log.csv"):
+        assert (tmp_path / "demo" / name).stat().st_size > 0
+    base, steered = tiny_prior(), ScenePrior.load(tmp_path / "demo")
+    assert on_disk["before"]["objects"] == pytest.approx(
+        float(base.sample(3, num_steps=4, seed=100_000).counts.float().mean())
+    )
+    assert on_disk["after"]["objects"] == pytest.approx(
+        float(steered.sample(3, num_steps=4, seed=100_000).counts.float().mean())
+    )
