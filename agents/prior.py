@@ -187,7 +187,20 @@ class ScenePrior(nn.Module):
         return SceneBatch.from_tensor(self.clamp(x), self.scene_type, normalised=self.normalizer)
 
     def encode(self, batch: SceneBatch) -> Tensor:
-        """Normalised x_0 (B, N, D) of scenes whose first slots hold the fixed welded objects."""
+        """Normalised x_0 (B, N, D) of scenes.
+
+        Raises:
+            InvalidInputError: the first slots do not hold the scene type's fixed welded objects.
+        """
+        expected = [self.scene_type.assets.index(fixed.asset) for fixed in self.scene_type.fixed]
+        found = batch.categories[:, : len(expected)]
+        wrong = (found != torch.tensor(expected, dtype=found.dtype, device=found.device)).any(dim=1)
+        if bool(wrong.any()):
+            scene = int(torch.nonzero(wrong)[0])
+            names = [fixed.asset for fixed in self.scene_type.fixed]
+            raise InvalidInputError(
+                f"scene {scene} does not begin with the fixed objects {names}; reorder its slots so that it does"
+            )
         return self.clamp(batch.to_tensor(normalised=self.normalizer))
 
     def inpaint(

@@ -41,6 +41,7 @@ def write_prior(directory: str | os.PathLike[str], config: Mapping[str, Any], te
     directory.mkdir(parents=True, exist_ok=True)
     weights = directory / (WEIGHTS_NAME + ".partial")
     save_file({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, weights)
+    weights.chmod(0o644)
     os.replace(weights, directory / WEIGHTS_NAME)
     partial = directory / (CONFIG_NAME + ".partial")
     partial.write_text(json.dumps(config, indent=1) + "\n")

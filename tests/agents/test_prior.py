@@ -9,6 +9,7 @@ import torch
 
 from agents.prior import ScenePrior, tiny_prior
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
+from scene_envs.scene import SceneBatch
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +77,13 @@ def test_a_mask_of_the_wrong_shape_is_named(prior: ScenePrior) -> None:
     batch = prior.sample(2, num_steps=2)
     with pytest.raises(InvalidInputError, match=r"\(2, 34\)"):
         prior.inpaint(batch, torch.zeros(2, 3, dtype=torch.bool))
+
+
+def test_scenes_without_their_table_are_refused(prior: ScenePrior) -> None:
+    batch = prior.sample(2, num_steps=2)
+    shuffled = SceneBatch(batch.tensor.flip(1), batch.scene_type)
+    with pytest.raises(InvalidInputError, match="cafe_table"):
+        prior.encode(shuffled)
 
 
 def test_the_loss_ignores_what_is_known(prior: ScenePrior) -> None:
