@@ -188,6 +188,22 @@ def test_vector_seeds_and_bad_arguments(prior, height):
         gym.make_vec(ID, num_envs=0, prior=prior, reward=height)
 
 
+def test_physics_rewards_bring_their_terms_and_pictures_their_shape():
+    pytest.importorskip("pybullet")
+    kwargs = {"prior": tiny_prior(slots=6), "slots": 6, "reward": "feasible_objects", "num_steps": 1}
+    vector = gym.make_vec(ID, num_envs=2, render_mode="rgb_array", **kwargs)
+    _, info = vector.reset(seed=0)
+    terms = {"term_free_objects", "term_feasible_fraction", "term_deepest_mm"}
+    assert terms <= set(info)
+    _, rewards, _, _, info = vector.step(vector.action_space.sample())
+    final = info["final_info"]
+    np.testing.assert_allclose(rewards, final["term_free_objects"] * final["term_feasible_fraction"], rtol=1e-6)
+    frames = vector.render()
+    assert len(frames) == 2
+    assert frames[0].dtype == np.uint8
+    assert frames[0].ndim == 3
+
+
 def test_wrappers_of_gymnasium_work_on_the_vector_face(prior, height):
     env = gym.make_vec(ID, num_envs=2, prior=prior, reward=height, num_steps=3)
     env = gym.wrappers.vector.RecordEpisodeStatistics(env)
