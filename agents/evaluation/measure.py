@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-import torch
+from torch import Tensor
 
 from agents.evaluation.metrics import category_kl, count_wasserstein, height_errors, workspace_fraction
 from scene_envs.errors import InvalidInputError
@@ -46,7 +45,8 @@ def measure_samples(
     """Measure scenes against reference scenes.
 
     Objects include welded ones, *free* objects do not. A figure without data (no stack in any scene, say) is left
-    out. Scenes whose physics failed leave the figures of that computation and are counted in ``invalid_fraction``.
+    out. Scenes whose physics failed leave the figures of that computation and are counted in
+    ``invalid_fraction`` or ``ready_invalid_fraction``.
 
     Args:
         batch: the scenes to measure.
@@ -64,13 +64,15 @@ def measure_samples(
         penetrating object pairs, and ``overlapping_pairs`` of them per scene; ``deeper_than_1mm_fraction`` and
         ``deeper_than_1cm_fraction`` of free objects; ``feasible_objects`` per scene and ``feasible_fraction`` of free
         objects, both raw; with ``ready``, ``ready_objects`` per scene and ``ready_fraction`` of free objects, both
-        after projection and settling; ``invalid_fraction`` of scenes.
+        after projection and settling; ``invalid_fraction`` of scenes whose feasibility could not be computed, and
+        ``ready_invalid_fraction``.
     """
     if not len(batch) or not len(reference):
         raise InvalidInputError(f"cannot measure {len(batch)} scenes against {len(reference)}: both need at least one")
     figures = {
         **_layout_figures(batch, reference),
-        **_raw_physics_figures(batch, pool),
+        **_overlap_figures(batch, pool),
+        **_feasibility_figures(batch, pool),
         **(_ready_figures(batch, pool) if ready else {}),
     }
     if floor is not None:
@@ -119,9 +121,7 @@ def grammar_scenes(scene_type: str | SceneType, count: int, seed: int = 0) -> Sc
     """``count`` scenes straight from the grammar of a scene type, the same ones for the same seed."""
     from scene_envs.grammars import get_grammar
 
-    grammar = get_grammar(scene_type)
-    rng = np.random.default_rng(seed)
-    return SceneBatch.concatenate([grammar.sample(rng) for _ in range(count)])
+    return get_grammar(scene_type).sample(np.random.default_rng(seed), count)
 
 
 def figure_table(figures: Mapping[str, float]) -> str:
@@ -151,7 +151,7 @@ def _layout_figures(batch: SceneBatch, reference: SceneBatch) -> dict[str, float
         "objects_mean": float(counts.double().mean()),
         "objects_min": float(counts.min()),
         "objects_max": float(counts.max()),
-        "free_objects_mean": float(batch.is_free.sum() / len(batch)),
+        "free_objects_mean": int(batch.is_free.sum()) / len(batch),
         "category_kl": category_kl(batch, reference),
         "count_wasserstein": count_wasserstein(batch, reference),
         "workspace_fraction": workspace_fraction(batch),
@@ -163,32 +163,49 @@ def _layout_figures(batch: SceneBatch, reference: SceneBatch) -> dict[str, float
     return figures
 
 
-def _raw_physics_figures(batch: SceneBatch, pool: PhysicsPool | None) -> dict[str, float]:
-    from scene_envs.physics import feasibility, penetration
+def _overlap_figures(batch: SceneBatch, pool: PhysicsPool | None) -> dict[str, float]:
+    from scene_envs.physics import penetration
+
+    result = penetration(batch, pool=pool)
+    scenes = int(result.valid.sum())
+    if not scenes:
+        return {}
+    depths = [pair.depth for pairs in result.pairs for pair in pairs if pair.depth > CONTACT]
+    figures = {"overlapping_pairs": len(depths) / scenes}
+    if depths:
+        figures["overlap_median_mm"] = 1e3 * float(np.quantile(depths, 0.5))
+        figures["overlap_p95_mm"] = 1e3 * float(np.quantile(depths, 0.95))
+    free = batch.is_free & result.valid.unsqueeze(-1)
+    if bool(free.any()):
+        figures["deeper_than_1mm_fraction"] = float((result.depth[free] > 1e-3).double().mean())
+        figures["deeper_than_1cm_fraction"] = float((result.depth[free] > 1e-2).double().mean())
+    return figures
+
+
+def _feasibility_figures(batch: SceneBatch, pool: PhysicsPool | None) -> dict[str, float]:
+    from scene_envs.physics import feasibility
 
     result = feasibility(batch, pool=pool)
     figures = {"invalid_fraction": 1.0 - float(result.valid.double().mean())}
-    free = batch.is_free & result.valid.unsqueeze(-1)
-    if bool(free.any()):
-        depth = result.depth[free]
-        figures["deeper_than_1mm_fraction"] = float((depth > 1e-3).double().mean())
-        figures["deeper_than_1cm_fraction"] = float((depth > 1e-2).double().mean())
-        figures["feasible_fraction"] = float(result.feasible[free].double().mean())
-    if bool(result.valid.any()):
-        figures["feasible_objects"] = float(result.counts[result.valid].double().mean())
-    return figures
+    return {**figures, **_per_scene_and_fraction("feasible", batch, result.counts, result.valid)}
 
 
 def _ready_figures(batch: SceneBatch, pool: PhysicsPool | None) -> dict[str, float]:
     from scene_envs.physics import make_ready
 
     result = make_ready(batch, pool=pool)
-    if not bool(result.valid.any()):
-        return {}
-    free = batch.is_free[result.valid].sum()
-    figures = {"ready_objects": float(result.counts[result.valid].double().mean())}
-    if int(free):
-        figures["ready_fraction"] = float(result.counts[result.valid].sum() / free)
+    figures = {"ready_invalid_fraction": 1.0 - float(result.valid.double().mean())}
+    return {**figures, **_per_scene_and_fraction("ready", batch, result.counts, result.valid)}
+
+
+def _per_scene_and_fraction(name: str, batch: SceneBatch, counts: Tensor, valid: Tensor) -> dict[str, float]:
+    """Mean of ``counts`` (B,) over valid scenes, and their sum as a share of the free objects there."""
+    figures = {}
+    if bool(valid.any()):
+        figures[f"{name}_objects"] = float(counts[valid].double().mean())
+        free = int(batch.is_free[valid].sum())
+        if free:
+            figures[f"{name}_fraction"] = int(counts[valid].sum()) / free
     return figures
 
 

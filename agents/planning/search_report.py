@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -30,6 +31,7 @@ def draw_curve(
         label: name of the objective.
     """
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     figure = Figure(figsize=(6.4, 4.0), dpi=150, layout="constrained")
     axes = figure.subplots()
@@ -41,6 +43,8 @@ def draw_curve(
     axes.set_xlabel("denoiser evaluations (NFE)")
     axes.set_ylabel(f"best {label}")
     axes.set_xlim(left=0)
+    if all(math.isclose(scale * v, round(scale * v)) for v in itertools.chain(*curves.values()) if math.isfinite(v)):
+        axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, loc="lower right")
     figure.savefig(path)
@@ -62,6 +66,6 @@ def draw_scene(scene: SceneBatch, state: Any, path: Path, *, width: int = 640, h
     marked = state.mask.unsqueeze(0) & scene.is_free
     image = render(scene, width=width, height=height, highlight=marked)[0]
     objects = int(scene.is_free.sum())
-    caption = f"objective {state.objective:.4g}, {objects} free objects, {int(marked.sum())} to regenerate (red)"
+    caption = f"objective {state.objective:.4g} | {objects} free objects | {int(marked.sum())} to regenerate (red)"
     gallery([image], columns=1, captions=[caption]).save(path)
     return path

@@ -52,6 +52,8 @@ class SearchConfig:
     workers: int = 0
 
     def __post_init__(self) -> None:
+        if self.branching < 1:
+            raise InvalidInputError(f"branching={self.branching}: a state needs at least one inpainting")
         if self.budget < self.branching:
             raise InvalidInputError(
                 f"budget={self.budget} scenes do not cover the {self.branching} first samples (branching); raise it"
@@ -145,8 +147,6 @@ def _plan(
     name: str,
     progress: Progress | None,
 ) -> tuple[SearchEnv, PlanResult]:
-    from scene_envs.protocols import resolve_prior
-
     prior = resolve_prior(prior)
     env = SearchEnv(
         scene=prior.scene_type,

@@ -1,0 +1,124 @@
+"""The flat dict of figures, on scenes with known answers."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+import torch
+
+from agents.evaluation import evaluate_prior, figure_table, grammar_scenes, measure_samples
+from agents.prior import tiny_prior
+from scene_envs.errors import InvalidInputError
+from scene_envs.physics import feasibility
+from scene_envs.scene import SceneBatch
+
+
+@pytest.fixture(scope="module")
+def real() -> SceneBatch:
+    return grammar_scenes("dimsum_table", 6, seed=1)
+
+
+def lifted(batch: SceneBatch, by: float) -> SceneBatch:
+    """All free objects ``by`` metres higher."""
+    translations = batch.translations.clone()
+    translations[..., 2] += by * batch.is_free
+    return batch.with_poses(translations, batch.rotations)
+
+
+def one_object(name: str, z: float) -> SceneBatch:
+    batch = SceneBatch.empty("dimsum_table", 1)
+    translations, rotations, categories = batch.translations.clone(), batch.rotations.clone(), batch.categories
+    translations[0, 1] = torch.tensor([0.1, 0.1, z])
+    rotations[0, 1] = torch.eye(3)
+    categories[0, 1] = batch.scene_type.assets.index(name)
+    return SceneBatch.from_parts(translations, rotations, categories, batch.scene_type)
+
+
+def test_real_scenes_score_as_real(real: SceneBatch) -> None:
+    figures = measure_samples(real, real, ready=False)
+    assert figures["scenes"] == 6
+    assert figures["objects_mean"] == pytest.approx(float(real.counts.double().mean()))
+    assert figures["free_objects_mean"] == figures["objects_mean"] - 1  # the table
+    assert (figures["objects_min"], figures["objects_max"]) == (int(real.counts.min()), int(real.counts.max()))
+    assert figures["category_kl"] == figures["count_wasserstein"] == 0.0
+    assert figures["workspace_fraction"] == figures["feasible_fraction"] == 1.0
+    assert figures["feasible_objects"] == figures["free_objects_mean"]
+    assert figures["height_error_table_mm"] < 1e-3
+    assert figures["height_error_stack_mm"] < 1e-3
+    assert figures["deeper_than_1mm_fraction"] == figures["deeper_than_1cm_fraction"] == 0.0
+    assert figures["invalid_fraction"] == 0.0
+
+
+def test_scenes_two_millimetres_too_high_are_measured_as_such(real: SceneBatch) -> None:
+    figures = measure_samples(lifted(real, 2e-3), real, ready=False)
+    assert figures["height_error_table_mm"] == pytest.approx(2.0, abs=1e-3)
+    assert figures["height_error_stack_mm"] == pytest.approx(0.0, abs=1e-3)
+    assert figures["feasible_fraction"] == 0.0  # everything falls further than 1 mm
+    assert figures["deeper_than_1mm_fraction"] == 0.0
+
+
+def test_scenes_five_millimetres_into_the_table_overlap_by_that(real: SceneBatch) -> None:
+    sunk = lifted(real, -5e-3)
+    figures = measure_samples(sunk, real, ready=False)
+    on_table = (sunk.is_free & (sunk.translations[..., 2] < 0)).sum() / sunk.is_free.sum()
+    assert figures["height_error_table_mm"] == pytest.approx(5.0, abs=1e-3)
+    assert figures["overlap_median_mm"] == pytest.approx(5.0, abs=0.05)
+    assert figures["overlap_p95_mm"] == pytest.approx(5.0, abs=0.05)
+    assert figures["deeper_than_1mm_fraction"] == pytest.approx(float(on_table))
+    assert figures["deeper_than_1cm_fraction"] == 0.0
+    assert figures["overlapping_pairs"] == pytest.approx(float(on_table * sunk.is_free.sum() / len(sunk)))
+
+
+def test_the_deep_ones_are_counted_apart(real: SceneBatch) -> None:
+    batch = SceneBatch.concatenate([one_object("teapot", -0.012), one_object("teapot", 0.0)])
+    figures = measure_samples(batch, real, ready=False)
+    assert figures["deeper_than_1mm_fraction"] == figures["deeper_than_1cm_fraction"] == 0.5
+    assert figures["overlapping_pairs"] == 0.5
+    assert figures["overlap_median_mm"] == pytest.approx(12.0, abs=0.05)
+    assert figures["feasible_fraction"] == figures["feasible_objects"] == 0.5
+    assert "height_error_stack_mm" not in figures  # nothing is on a stack
+
+
+def test_ready_figures_are_those_after_projection_and_settling() -> None:
+    reference = one_object("teapot", 0.0)
+    figures = measure_samples(one_object("teapot", -4e-3), reference)
+    assert figures["feasible_objects"] == 0.0
+    assert figures["ready_objects"] == figures["ready_fraction"] == 1.0
+    assert figures["ready_invalid_fraction"] == 0.0
+
+
+def test_the_floor_is_the_same_figures_of_real_scenes(real: SceneBatch) -> None:
+    other = grammar_scenes("dimsum_table", 4, seed=2)
+    figures = measure_samples(lifted(real, 2e-3), real, floor=other, ready=False)
+    alone = measure_samples(other, real, ready=False)
+    assert {k.removeprefix("floor_"): v for k, v in figures.items() if k.startswith("floor_")} == alone
+
+
+def test_a_prior_is_measured_on_its_own_samples(real: SceneBatch) -> None:
+    prior = tiny_prior()
+    figures = evaluate_prior(prior, 3, real, num_steps=2, seed=5, ready=False)
+    samples = prior.sample(3, num_steps=2, seed=5)
+    assert figures["num_steps"] == 2
+    assert figures["objects_mean"] == pytest.approx(float(samples.counts.double().mean()))
+    assert figures["feasible_objects"] == pytest.approx(float(feasibility(samples).counts.double().mean()))
+    assert all(isinstance(v, float) and math.isfinite(v) for v in figures.values())
+    assert json.loads(json.dumps(figures)) == figures
+
+
+def test_grammar_scenes_follow_their_seed() -> None:
+    first, again, other = (grammar_scenes("dimsum_table", 2, seed=s) for s in (7, 7, 8))
+    assert torch.equal(first.tensor, again.tensor)
+    assert not torch.equal(first.tensor, other.tensor)
+
+
+def test_table_lists_every_figure(real: SceneBatch) -> None:
+    figures = measure_samples(real, real, ready=False)
+    rows = figure_table(figures).splitlines()[2:]
+    assert [row.split("|")[1].strip() for row in rows] == list(figures)
+
+
+def test_nothing_to_measure_is_refused(real: SceneBatch) -> None:
+    with pytest.raises(InvalidInputError, match="cannot measure 0 scenes against 6"):
+        measure_samples(real[:0], real)

@@ -1,0 +1,136 @@
+"""Search runs on an untrained prior: what is reproducible, what is kept, what is written."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+
+from agents.planning import SearchOutcome, UCTPlanner, run_search
+from agents.prior import ScenePrior, tiny_prior
+from rewards import RewardContext, RewardOutput
+from scene_envs.errors import InvalidInputError, SceneEnvsError
+from scene_envs.scene import SceneBatch
+from scene_envs.search import SearchEnv
+
+SETTINGS = {"budget": 24, "branching": 3, "num_steps": 4, "max_depth": 5, "seed": 3}
+
+
+def central_objects(batch: SceneBatch, context: RewardContext) -> RewardOutput:
+    """Free objects within 30 cm of the middle; the others are to blame."""
+    central = batch.is_free & (batch.translations[..., :2].norm(dim=-1) < 0.3)
+    return RewardOutput(central.sum(-1).float(), object_flags={"feasible": central})
+
+
+@dataclass(frozen=True)
+class Run:
+    prior: ScenePrior
+    outcome: SearchOutcome
+    output: Path
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    prior, output = tiny_prior(), tmp_path_factory.mktemp("search")
+    return Run(prior, run_search(prior, central_objects, output=output, **SETTINGS), output)
+
+
+def fresh_root(env: SearchEnv, seed: int) -> SearchEnv:
+    env.reset(seed=seed, options={"scene": SceneBatch.empty(env.problem.scene_type, 1)})
+    return env
+
+
+def test_search_beats_its_first_samples(run: Run) -> None:
+    metrics = run.outcome.metrics
+    assert metrics["search"]["objective"] > metrics["first_samples"]["objective"]
+    assert metrics["search"]["objective"] == float(central_objects(run.outcome.best, RewardContext()).value)
+    assert metrics["first_samples"]["objective"] == float(central_objects(run.outcome.first, RewardContext()).value)
+
+
+def test_both_planners_spend_the_same_and_begin_with_the_same_samples(run: Run) -> None:
+    search, best_of, metrics = run.outcome.search, run.outcome.best_of, run.outcome.metrics
+    assert len(search.values) == len(best_of.values) == 24
+    assert metrics["nfe"] == 24 * 4
+    assert search.values[:3] == best_of.values[:3]
+    assert max(search.values[:3]) == metrics["first_samples"]["value"]
+
+
+def test_the_same_seed_gives_the_same_tree_and_another_seed_another(run: Run) -> None:
+    again = run_search(run.prior, central_objects, **SETTINGS)
+    other = run_search(run.prior, central_objects, **{**SETTINGS, "seed": 4})
+    nodes, nodes_again = run.outcome.search.tree.nodes(), again.search.tree.nodes()
+    assert [n.path for n in nodes] == [n.path for n in nodes_again]
+    assert all(torch.equal(a.state.scene, b.state.scene) for a, b in zip(nodes, nodes_again, strict=True))
+    assert not torch.equal(other.best.tensor, run.outcome.best.tensor)
+
+
+def test_a_scene_depends_on_its_path_and_not_on_the_order_of_the_search(run: Run) -> None:
+    settings = {"objective": central_objects, "branching": 3, "num_steps": 4, "max_depth": 5, "prior": run.prior}
+    with_batches = {n.path: n.state.scene for n in run.outcome.search.tree.nodes()}
+    one_by_one = UCTPlanner(exploration=1.0, parallel=1).plan(fresh_root(SearchEnv(**settings), 3), budget=24)
+    shared = [n for n in one_by_one.tree.nodes() if n.path in with_batches]
+    assert len(shared) > 6
+    for node in shared:
+        torch.testing.assert_close(node.state.scene, with_batches[node.path], atol=1e-4, rtol=0)
+
+
+def test_children_keep_what_is_not_masked_bit_for_bit(run: Run) -> None:
+    nodes = [n for n in run.outcome.search.tree.nodes() if n.parent is not None]
+    assert any(bool((~n.parent.state.mask).sum() > 5) for n in nodes)
+    for node in nodes:
+        kept = ~node.parent.state.mask
+        assert torch.equal(node.state.scene[kept], node.parent.state.scene[kept])
+
+
+def test_files_hold_what_was_found(run: Run) -> None:
+    names = {path.name for path in run.output.iterdir()}
+    assert names == {"curve.png", "before.png", "after.png", "best.safetensors", "metrics.json"}
+    assert torch.equal(SceneBatch.load(run.output / "best.safetensors").tensor, run.outcome.best.tensor)
+    metrics = json.loads((run.output / "metrics.json").read_text())
+    assert metrics["search"]["curve"][-1] == metrics["search"]["value"] == run.outcome.search.best_value
+    assert metrics["config"]["budget"] == 24
+    for name in ("curve.png", "before.png", "after.png"):
+        assert (run.output / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_progress_names_the_planner(run: Run) -> None:
+    told: list[tuple[str, int, int]] = []
+    run_search(
+        run.prior,
+        central_objects,
+        progress=lambda name, done, budget, best: told.append((name, done, budget)),
+        **SETTINGS,
+    )
+    assert [t for t in told if t[0] == "search"] == [("search", n, 24) for n in range(3, 25, 3)]
+    assert told[-1] == ("best of N", 24, 24)
+
+
+def test_an_objective_that_never_scores_is_an_error(run: Run) -> None:
+    def broken(batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        raise RuntimeError("no such sensor")
+
+    with pytest.raises(SceneEnvsError, match="could not score any of the first 3 samples"):
+        run_search(run.prior, broken, **SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"budget": 2, "branching": 3}, "budget=2 scenes do not cover the 3 first samples"),
+        ({"branching": 0}, "branching=0"),
+        ({"objective": "central_object"}, "unknown reward 'central_object'"),
+    ],
+)
+def test_bad_settings_name_themselves(run: Run, settings: dict, message: str) -> None:
+    with pytest.raises(SceneEnvsError, match=message):
+        run_search(run.prior, **{"objective": central_objects, **SETTINGS, **settings})
+
+
+def test_settings_come_from_one_place(run: Run) -> None:
+    from agents.planning import SearchConfig
+
+    with pytest.raises(InvalidInputError, match="not both"):
+        run_search(run.prior, central_objects, config=SearchConfig(), budget=3)
