@@ -14,6 +14,7 @@ from agents.post_training.report import Page, Picture, Section, Tile, write_repo
 from agents.post_training.run_files import write_metrics
 from agents.post_training.trainer import PostTrainResult
 from agents.prior import ScenePrior
+from rewards import reward_name as name_of
 from scene_envs.scene import SceneBatch
 
 if TYPE_CHECKING:
@@ -93,7 +94,7 @@ def write_comparison(
     names = [name for name in ("objects", "feasible_objects", "ready_objects") if name in before.figures]
     change = {name: _relative(before.figures[name], after.figures.get(name)) for name in names}
     metrics = {"before": before.figures, "after": after.figures, "change": change, **result.metrics, **(extra or {})}
-    reward_name = _reward_name(config["reward"])
+    reward_name = name_of(config["reward"]).replace("_", " ")
     limit = result.metrics["guard"]["limit"]
     curve = draw_curve(result.history, directory / "curve.png", reward_name=f"mean {reward_name}", limit=limit)
     pictures = {
@@ -227,8 +228,3 @@ def _counted(name: str, counts: Tensor, valid: Tensor, free: Tensor) -> dict[str
 
 def _standard_error(values: Tensor) -> float:
     return float(values.std(unbiased=True) / len(values) ** 0.5) if len(values) > 1 else 0.0
-
-
-def _reward_name(reward: Any) -> str:
-    name = reward.get("name", "reward") if isinstance(reward, Mapping) else reward
-    return str(name).replace("_", " ")

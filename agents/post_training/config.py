@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
+from rewards import reward_name
 from scene_envs.errors import InvalidInputError
 
 CREDITS = ("scene", "object")
@@ -137,15 +138,9 @@ class PostTrainConfig:
             raise InvalidInputError(f"{name}={getattr(self, name)!r} is not known; use one of {', '.join(known)}")
 
     def plain(self) -> dict[str, Any]:
-        """As numbers, strings and lists; a reward given as an object becomes its description."""
-        state = asdict(self) if _is_plain(self.reward) else {**_shallow(self), "reward": describe(self.reward)}
+        """As numbers, strings and lists; a reward given as an object becomes its name."""
+        state = asdict(self) if _is_plain(self.reward) else {**_shallow(self), "reward": reward_name(self.reward)}
         return state
-
-
-def describe(reward: Any) -> str:
-    """A stable name of a reward object or function, for logs."""
-    named = getattr(reward, "name", None) or getattr(reward, "__qualname__", None)
-    return str(named or type(reward).__qualname__)
 
 
 def _shallow(config: PostTrainConfig) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from agents.post_training.comparison import measure_prior, write_comparison
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.trainer import post_train
 from agents.prior import ScenePrior
+from rewards import reward_name
 
 SAMPLE_SEED = 100_000
 """Added to the run's seed for the samples that are measured, so that training never saw their noise."""
@@ -74,7 +75,7 @@ def run_demo(
     measured = time.perf_counter()
     _say(config, "drawing the report")
     seconds = {"training": round(trained - started, 1), "measuring": round(measured - trained, 1)}
-    reward = str(config.plain()["reward"]).replace("_", " ")
+    reward = reward_name(config.reward).replace("_", " ")
     title = f"Steering {base.scene_type.name.replace('_', ' ')} toward {reward}"
     return write_comparison(result, before, after, title=title, extra={"seconds": seconds, "scenes": scenes})
 

@@ -1,0 +1,164 @@
+"""Peak memory of one policy gradient against the number of denoising steps.
+
+    python benchmarks/post_training_memory.py [--prior dimsum_table] [--batch-size 32]
+
+Compares the score-function gradient, accumulated step by step (`DDPOSFLoss`), with a gradient propagated through
+the whole chain. Counts the tensors autograd keeps for the backward pass, by hooks, so the figure is exact, the same
+on every machine and free of the allocator; on a GPU the allocator's peak is printed too. Every step is in the
+gradient. The chain's own states, kept for the score function, are listed apart: kilobytes a scene.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+from weakref import finalize
+
+import torch
+from rich.console import Console
+from rich.table import Table
+from tensordict import TensorDict
+from torch import Tensor
+
+from agents.post_training import DDPOSFLoss, DenoisingPolicy, gradient_weights
+from agents.post_training.policy import gaussian_log_prob
+from agents.prior import ScenePrior, tiny_prior
+
+MEBIBYTE = 2**20
+
+
+class SavedTensors:
+    """Context that follows the bytes autograd keeps for the backward pass; a storage counts once."""
+
+    def __init__(self) -> None:
+        self.now = self.peak = 0
+        self._alive: dict[int, int] = {}
+
+    def __enter__(self) -> SavedTensors:
+        self._hooks: Any = torch.autograd.graph.saved_tensors_hooks(self._pack, lambda holder: holder.tensor)
+        self._hooks.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._hooks.__exit__(kind, error, trace)
+
+    def ignore(self, tensors: list[Tensor]) -> None:
+        """Leave these out: parameters and the states of the chain exist anyway."""
+        for tensor in tensors:
+            self._alive[tensor.untyped_storage().data_ptr()] = 1
+
+    def _pack(self, tensor: Tensor) -> _Holder:
+        storage = tensor.untyped_storage()
+        pointer, size = storage.data_ptr(), storage.nbytes()
+        holder = _Holder(tensor)
+        if pointer not in self._alive:
+            self.now += size
+            self.peak = max(self.peak, self.now)
+            self._alive[pointer] = 0
+        self._alive[pointer] += 1
+        finalize(holder, self._release, pointer, size)
+        return holder
+
+    def _release(self, pointer: int, size: int) -> None:
+        self._alive[pointer] -= 1
+        if self._alive[pointer] == 0:
+            del self._alive[pointer]
+            self.now -= size
+
+
+class _Holder:
+    def __init__(self, tensor: Tensor) -> None:
+        self.tensor = tensor
+
+
+@dataclass(frozen=True)
+class Row:
+    """Peak bytes of one gradient."""
+
+    steps: int
+    score_function: int
+    through_chain: int
+    states: int
+
+
+def score_function(prior: ScenePrior, steps: int, batch: int) -> tuple[Callable[[], None], list[Tensor]]:
+    """The gradient as trained, and the chain's states it reads."""
+    policy = DenoisingPolicy(prior, steps)
+    loss = DDPOSFLoss(policy, step_weights=gradient_weights(policy.stds(prior.config.slots), min_std=1e-6))
+    x, states = prior.initial(batch, prior.config.slots, torch.Generator().manual_seed(0)), []
+    for step in range(steps):
+        action, _ = policy.draw(x, step)
+        states.append((x, action))
+        x = prior.clamp(action)
+    advantage = torch.linspace(-1, 1, batch)
+
+    def run() -> None:
+        for step in range(steps - 1):
+            timestep = policy.table.timesteps[step].expand(batch, 1)
+            fields = {"scene": states[step][0], "timestep": timestep, "action": states[step][1]}
+            loss(TensorDict({**fields, "advantage": advantage}, [batch]))["loss_objective"].backward()
+
+    return run, [tensor for pair in states for tensor in pair]
+
+
+def through_chain(prior: ScenePrior, steps: int, batch: int) -> Callable[[], None]:
+    """The same objective with states attached: one graph over all steps."""
+    policy = DenoisingPolicy(prior, steps)
+    advantage = torch.linspace(-1, 1, batch)
+
+    def run() -> None:
+        x, total = prior.initial(batch, prior.config.slots, torch.Generator().manual_seed(0)), torch.zeros(())
+        for step in range(steps):
+            mean, std = policy.distribution(x, step)
+            action = mean + std * torch.randn_like(mean)
+            if step < steps - 1:
+                total = total - (advantage * gaussian_log_prob(action.detach(), mean, std).sum(dim=1)).mean()
+            x = action
+        total.backward()
+
+    return run
+
+
+def measure(run: Callable[[], None], ignored: list[Tensor]) -> int:
+    """Peak bytes kept for the backward pass."""
+    with SavedTensors() as saved:
+        saved.ignore(ignored)
+        run()
+    return saved.peak
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--prior", default="dimsum_table", help="name, directory, or 'tiny'")
+    parser.add_argument("--batch-size", type=int, default=8)
+    parser.add_argument("--steps", type=int, nargs="+", default=[10, 25, 50, 100])
+    arguments = parser.parse_args()
+    prior = tiny_prior() if arguments.prior == "tiny" else ScenePrior.load(arguments.prior)
+    batch = arguments.batch_size
+    weights = [p.detach() for p in prior.parameters()]
+    rows = []
+    for steps in arguments.steps:
+        ours, states = score_function(prior, steps, batch)
+        state_bytes = sum(t.numel() * t.element_size() for t in states)
+        kept = measure(ours, weights + states)
+        prior.zero_grad()
+        rows.append(Row(steps, kept, measure(through_chain(prior, steps, batch), weights), state_bytes))
+        prior.zero_grad()
+    table = Table(title=f"Kept for the backward pass, {batch} scenes, MiB")
+    for head in ("steps", "score function", "through the chain", "ratio", "states of the chain"):
+        table.add_column(head, justify="right")
+    for row in rows:
+        figures = (f"{n / MEBIBYTE:.1f}" for n in (row.score_function, row.through_chain, row.states))
+        own, chain, kept_states = figures
+        table.add_row(str(row.steps), own, chain, f"{row.through_chain / row.score_function:.0f}x", kept_states)
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()
