@@ -58,7 +58,7 @@ class FunctionReward:
 
     def __init__(self, function: Callable[..., Any], name: str | None = None, **settings: Any) -> None:
         self.function = function
-        self.name: str = name or getattr(function, "__name__", type(function).__name__)
+        self.name = str(name or getattr(function, "__name__", type(function).__name__))
         self.settings = settings
         self._takes_context = _accepts(function, 2, settings, self.name)
 

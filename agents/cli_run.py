@@ -1,0 +1,118 @@
+"""The folder of one command: its configuration, metrics and log."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import math
+import os
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from scene_envs.errors import InvalidInputError
+
+_PACKAGES = ("scene_envs", "rewards", "agents")
+
+
+class Run:
+    """Context in which a command works: its folder exists, and what the packages log goes to stderr and ``log.txt``.
+
+    ``config.yaml`` is written when the command starts, unless an earlier run left one, and again when it is done.
+
+    Args:
+        command: the command's name.
+        settings: its config, whose ``output`` is the folder.
+
+    Attributes:
+        directory: the folder.
+    """
+
+    def __init__(self, command: str, settings: Any) -> None:
+        self.command = command
+        self.settings = settings
+        self.directory = Path(settings.output)
+        self._handlers: list[logging.Handler] = []
+
+    def __enter__(self) -> Run:
+        try:
+            self.directory.mkdir(parents=True, exist_ok=True)
+        except (FileExistsError, NotADirectoryError):
+            raise InvalidInputError(f"output={str(self.directory)!r} is a file, not a folder; give another") from None
+        if not (self.directory / "config.yaml").exists():
+            self._write_config()
+        self._start_logging()
+        self.log(f"scene-envs {self.command}")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            self._write_config()
+        else:
+            self.log(f"failed: {error or kind}")
+        for handler in self._handlers:
+            handler.close()
+            for package in _PACKAGES:
+                logging.getLogger(package).removeHandler(handler)
+
+    def say(self, text: str) -> None:
+        """Tell the user on stdout, and keep it in the log."""
+        print(text, flush=True)
+        self.log(text)
+
+    def log(self, text: str) -> None:
+        """One line into ``log.txt`` alone."""
+        with (self.directory / "log.txt").open("a", encoding="utf-8") as file:
+            file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {text}\n")
+
+    def write_metrics(self, metrics: Mapping[str, Any]) -> None:
+        """``metrics.json``, whole or not at all; numbers that JSON lacks become null."""
+        self._replace("metrics.json", json.dumps(_json_able(metrics), indent=1) + "\n")
+
+    def _write_config(self) -> None:
+        import yaml
+
+        self._replace("config.yaml", yaml.safe_dump(dataclasses.asdict(self.settings), sort_keys=False))
+
+    def _replace(self, name: str, text: str) -> None:
+        partial = self.directory / (name + ".partial")
+        partial.write_text(text, encoding="utf-8")
+        os.replace(partial, self.directory / name)
+
+    def _start_logging(self) -> None:
+        screen = logging.StreamHandler(sys.stderr)
+        screen.setFormatter(logging.Formatter("%(message)s"))
+        file = logging.FileHandler(self.directory / "log.txt", encoding="utf-8")
+        file.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%Y-%m-%d %H:%M:%S"))
+        self._handlers = [screen, file]
+        for package in _PACKAGES:
+            logger = logging.getLogger(package)
+            logger.setLevel(logging.INFO)
+            for handler in self._handlers:
+                logger.addHandler(handler)
+
+
+def fresh_directory(command: str) -> str:
+    """``runs/<command>-<time>``, with a number behind it when two commands start in the same second."""
+    base = Path("runs") / f"{command}-{time.strftime('%Y%m%d-%H%M%S')}"
+    directory, number = base, 1
+    while directory.exists():
+        number += 1
+        directory = base.with_name(f"{base.name}-{number}")
+    return str(directory)
+
+
+def _json_able(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _json_able(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_json_able(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,22 @@
+"""``scene-envs pretrain``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from agents.pretraining import PretrainConfig, pretrain
+
+if TYPE_CHECKING:
+    from agents.cli_run import Run
+
+
+def config() -> type[PretrainConfig]:
+    """The keys of this command."""
+    return PretrainConfig
+
+
+def run(settings: PretrainConfig, run: Run) -> None:
+    """Train the prior; the trainer writes its own metrics."""
+    metrics = pretrain(settings)
+    run.say(f"held-out loss {metrics['heldout_loss']:.4g} after {metrics['trained_steps']} steps")
+    run.say(f"sample it: scene-envs sample prior={run.directory}")

@@ -1,0 +1,63 @@
+"""What several commands do with scenes: score them, make them ready, draw them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from agents.cli_run import Run
+    from scene_envs.physics import PhysicsPool
+    from scene_envs.scene import SceneBatch
+
+_TILE = (400, 300)
+
+
+def reward_figures(reward: Any, batch: SceneBatch, pool: PhysicsPool | None, run: Run) -> dict[str, Any]:
+    """Mean, spread and validity of a reward over the scenes, and the means of its terms."""
+    from rewards import RewardContext, evaluate_reward, reward_name
+
+    output = evaluate_reward(reward, batch, RewardContext(pool=pool), strict=True)
+    valid = output.is_valid
+    value = output.value[valid].double()
+    figures: dict[str, Any] = {"name": reward_name(reward), "valid": int(valid.sum())}
+    if len(value):
+        figures |= {"mean": float(value.mean()), "std": float(value.std(unbiased=False)), "max": float(value.max())}
+        figures["terms"] = {name: float(term[valid].double().mean()) for name, term in output.terms.items()}
+        run.say(f"{figures['name']}: {figures['mean']:.4g} on average, {figures['max']:.4g} at best")
+    return figures
+
+
+def make_ready(batch: SceneBatch, pictures: int, pool: PhysicsPool | None, run: Run) -> dict[str, Any]:
+    """Project and settle the scenes into ``ready.safetensors`` and ``ready.png``; returns the figures."""
+    from scene_envs import physics
+
+    result = physics.make_ready(batch, pool=pool)
+    result.batch.save(run.directory / "ready.safetensors")
+    valid = result.valid
+    free = int(batch.is_free[valid].sum())
+    figures: dict[str, Any] = {"valid": int(valid.sum())}
+    if bool(valid.any()):
+        counts = result.counts[valid]
+        figures |= {"mean": float(counts.double().mean()), "fraction": float(counts.sum()) / max(free, 1)}
+        run.say(
+            f"simulation-ready: {figures['mean']:.1f} objects per scene, {figures['fraction']:.0%} of the free ones"
+        )
+    captions = [
+        f"{int(ready)} of {int(total)} ready"
+        for ready, total in zip(result.counts, batch.is_free.sum(dim=-1), strict=True)
+    ]
+    draw_scenes(result.batch, pictures, run, "ready.png", captions)
+    return figures
+
+
+def draw_scenes(batch: SceneBatch, count: int, run: Run, name: str, captions: list[str] | None = None) -> None:
+    """A gallery of the first ``count`` scenes."""
+    from scene_envs.render import gallery, render
+
+    if count < 1:
+        return
+    shown = batch[: min(count, len(batch))]
+    if captions is None:
+        captions = [f"{int(objects)} objects" for objects in shown.counts]
+    images = render(shown, width=_TILE[0], height=_TILE[1])
+    gallery(list(images), columns=4, captions=captions[: len(shown)]).save(run.directory / name)
