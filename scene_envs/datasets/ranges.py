@@ -8,7 +8,7 @@ import torch
 from scene_envs.grammars import Grammar
 from scene_envs.normalizer import Normalizer
 
-_SAMPLE = 4096
+_SAMPLE = 512
 _SEED = 20_250_101
 
 

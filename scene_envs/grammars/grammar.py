@@ -19,6 +19,9 @@ from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
 _MAX_STRUCTURES = 10_000
+"""Structures drawn for one scene before the grammar is called impossible."""
+_MAX_WITHOUT_ROOM = 100
+"""Structures in a row that may fail for lack of room."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,9 @@ class Grammar:
 
     def _fill(self, scene: NDArray[np.float32], rng: np.random.Generator) -> None:
         """Write one scene into ``scene`` (N, D)."""
-        for _ in range(_MAX_STRUCTURES):
+        structures = without_room = 0
+        while structures < _MAX_STRUCTURES and without_room < _MAX_WITHOUT_ROOM:
+            structures += 1
             nodes_of = [surface.children for surface in self.surfaces]
             towers = [[t for node in nodes for t in node.draw(rng, self.reasons)] for nodes in nodes_of]
             if not self._accepts([tower for surface_towers in towers for tower in surface_towers]):
@@ -97,6 +102,7 @@ class Grammar:
             layout = [_layout(s, t, rng) for s, t in zip(self.surfaces, towers, strict=True)]
             if any(places is None for places in layout):
                 self.reasons["no room"] += 1
+                without_room += 1
                 continue
             scene[:] = self._blank
             slot = len(self.scene_type.fixed)
@@ -105,7 +111,7 @@ class Grammar:
                     slot = self._write(scene, slot, tower, x, y, surface.height, rng)
             return
         raise InvalidInputError(
-            f"grammar {self.name!r} made no scene in {_MAX_STRUCTURES} structures; "
+            f"grammar {self.name!r} made no scene in {structures} structures; "
             f"most frequent reasons: {dict(self.reasons.most_common(3))}"
         )
 
