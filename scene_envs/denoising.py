@@ -126,6 +126,8 @@ class DenoisingCore:
             raise unknown_name("action mode", str(action_mode), ACTION_MODES)
         if not (np.isfinite(max_action) and max_action > 0):
             raise InvalidInputError(f"max_action={max_action!r} must be positive and finite")
+        if not isinstance(num_steps, int) or num_steps < 1:
+            raise InvalidInputError(f"num_steps={num_steps!r} must be a whole number of at least 1")
         self.num_envs = num_envs
         self.scene_type, self.prior = resolve_scene_and_prior(scene, prior)
         self.slots = check_slots(self.scene_type, slots)

@@ -214,6 +214,7 @@ def test_stepping_without_or_beyond_an_episode_needs_a_reset(prior, height):
         ({"scene": "dimsum_tabel"}, UnknownNameError, "did you mean 'dimsum_table'"),
         ({"action_mode": "nois"}, UnknownNameError, "did you mean 'noise'"),
         ({"num_steps": 0}, InvalidInputError, "num_steps=0"),
+        ({"num_steps": 2.5}, InvalidInputError, "num_steps=2.5"),
         ({"num_steps": 1000}, InvalidInputError, "num_steps=1000"),
         ({"slots": 1}, InvalidInputError, "at least 2 slots"),
         ({"max_action": 0.0}, InvalidInputError, "max_action"),
