@@ -1,0 +1,121 @@
+"""Values of the built-in rewards on scenes where they are known."""
+
+import pytest
+import torch
+
+from rewards import (
+    Clip,
+    FeasibleObjects,
+    Gate,
+    ObjectCount,
+    Product,
+    RewardContext,
+    RewardOutput,
+    WeightedSum,
+    evaluate_reward,
+)
+from scene_envs import SceneBatch
+from scene_envs.errors import InvalidInputError
+
+
+def distances(batch, context):
+    """Sum of the objects' x, credited to each."""
+    x = batch.translations[..., 0]
+    return RewardOutput(x.sum(dim=-1), per_object=x, terms={"furthest": x.amax(dim=-1)})
+
+
+def half_invalid(batch, context):
+    return RewardOutput(torch.ones(2), valid=torch.tensor([True, False]))
+
+
+def score(reward, batch):
+    return evaluate_reward(reward, batch, RewardContext(), strict=True)
+
+
+def test_object_count_counts_welded_objects_and_credits_each(cups):
+    output = score(ObjectCount(), cups)
+    assert output.value.tolist() == [4.0, 2.0]
+    assert output.per_object.tolist() == [[1, 1, 1, 1, 0, 0], [1, 1, 0, 0, 0, 0]]
+
+
+def test_weighted_sum_adds_values_credits_and_names_its_terms(cups):
+    output = score(WeightedSum(["object_count", distances, distances], [0.5, 10.0, -1.0]), cups)
+    torch.testing.assert_close(output.value, torch.tensor([0.5 * 4 + 9 * 0.6, 1.0]))
+    torch.testing.assert_close(output.per_object.sum(dim=-1), output.value)
+    assert set(output.terms) == {
+        "object_count", "distances", "distances.furthest", "distances_2", "distances_2.furthest"
+    }  # fmt: skip
+    assert score(WeightedSum(["object_count", half_invalid]), cups).per_object is None
+
+
+def test_product_gate_and_clip(cups):
+    assert score(Product(["object_count", "object_count"]), cups).value.tolist() == [16.0, 4.0]
+    gated = score(Gate(distances, condition="object_count", threshold=4.0, otherwise=-1.0), cups)
+    torch.testing.assert_close(gated.value, torch.tensor([0.6, -1.0]))
+    assert gated.terms["gate_open"].tolist() == [1.0, 0.0]
+    assert gated.per_object[1].abs().sum() == 0
+    clipped = score(Clip("object_count", low=3.0, high=3.5), cups)
+    assert clipped.value.tolist() == [3.5, 3.0]
+    assert clipped.per_object.abs().sum() == 0
+
+
+@pytest.mark.parametrize("composite", [WeightedSum, Product])
+def test_a_scene_is_valid_when_all_parts_could_score_it(composite, cups):
+    assert score(composite(["object_count", half_invalid]), cups).valid.tolist() == [True, False]
+
+
+def test_a_part_that_raises_makes_the_whole_invalid_and_is_named(cups):
+    def breaks(batch, context):
+        raise ValueError("no")
+
+    output = evaluate_reward(WeightedSum(["object_count", breaks]), cups)
+    assert not output.valid.any()
+    assert "breaks" in output.problem
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: WeightedSum([]),
+        lambda: WeightedSum("object_count"),
+        lambda: WeightedSum(["object_count"], [1.0, 2.0]),
+        lambda: Clip("object_count"),
+        lambda: Clip("object_count", low=2.0, high=1.0),
+        lambda: FeasibleObjects(duration=0.0),
+    ],
+)
+def test_wrong_settings_are_refused(make):
+    with pytest.raises(InvalidInputError):
+        make()
+
+
+@pytest.fixture
+def table() -> SceneBatch:
+    """One scene: a plate standing on the table, one floating 20 cm above it, and two teapots in each other."""
+    batch = SceneBatch.empty("dimsum_table", 1, slots=8)
+    translations, categories = batch.translations.clone(), batch.categories.clone()
+    plate, teapot = (batch.scene_type.assets.index(name) for name in ("dinner_plate", "teapot"))
+    rows = ((plate, 0.3, 0.0, 0.0), (plate, -0.3, 0.0, 0.2), (teapot, 0.0, 0.3, 0.0), (teapot, 0.02, 0.3, 0.0))
+    for slot, (category, *position) in enumerate(rows, start=1):
+        categories[0, slot] = category
+        translations[0, slot] = torch.tensor(position)
+    return SceneBatch.from_parts(translations, torch.eye(3).expand(1, 8, 3, 3), categories, batch.scene_type)
+
+
+def test_feasible_objects_counts_what_neither_overlaps_nor_moves(table):
+    output = score(FeasibleObjects(), table)
+    assert output.value.tolist() == [1.0]
+    assert output.object_flags["feasible"].nonzero().tolist() == [[0, 1]]
+    assert output.per_object.tolist() == output.object_flags["feasible"].float().tolist()
+    assert output.terms["free_objects"].item() == 4
+    assert output.terms["feasible_fraction"].item() == 0.25
+    assert output.terms["deepest_mm"].item() > 10
+
+
+def test_feasible_objects_follows_its_settings(table):
+    assert score(FeasibleObjects(max_displacement=10.0, max_rotation=10.0), table).value.tolist() == [2.0]
+
+
+def test_a_scene_without_free_objects_is_valid_and_scores_zero():
+    output = score(FeasibleObjects(), SceneBatch.empty("dimsum_table", 1))
+    assert (output.value.item(), output.valid.item(), output.terms["feasible_fraction"].item()) == (0.0, True, 1.0)
