@@ -5,6 +5,7 @@ from agents.post_training.config import PostTrainConfig
 from agents.post_training.guard import Guard, GuardReading
 from agents.post_training.losses import DDPOSFLoss
 from agents.post_training.policy import DenoisingPolicy, gaussian_log_prob, gradient_weights
+from agents.post_training.steering import steer
 from agents.post_training.trainer import PostTrainer, PostTrainResult, post_train
 
 __all__ = [
@@ -19,4 +20,5 @@ __all__ = [
     "gaussian_log_prob",
     "gradient_weights",
     "post_train",
+    "steer",
 ]

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from agents.post_training.curves import draw_curve
 from agents.post_training.report import Page, Picture, Section, Tile, write_report
 from agents.post_training.run_files import write_metrics
 from agents.post_training.trainer import PostTrainResult
 from agents.prior import ScenePrior
-from rewards import reward_name as name_of
+from rewards import reward_name
 from scene_envs.scene import SceneBatch
 
 if TYPE_CHECKING:
@@ -78,7 +77,8 @@ def measure_prior(
 def write_comparison(
     result: PostTrainResult, before: Measured, after: Measured, *, title: str, extra: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Write ``curve.png``, ``before.png``, ``after.png``, ``report.html`` and ``metrics.json`` into the run directory.
+    """Write ``before.png``, ``after.png``, ``report.html`` and ``metrics.json`` beside the run's
+    ``curve.png``.
 
     Args:
         result: the run.
@@ -94,16 +94,14 @@ def write_comparison(
     names = [name for name in ("objects", "feasible_objects", "ready_objects") if name in before.figures]
     change = {name: _relative(before.figures[name], after.figures.get(name)) for name in names}
     metrics = {"before": before.figures, "after": after.figures, "change": change, **result.metrics, **(extra or {})}
-    reward_name = name_of(config["reward"]).replace("_", " ")
-    limit = result.metrics["guard"]["limit"]
-    curve = draw_curve(result.history, directory / "curve.png", reward_name=f"mean {reward_name}", limit=limit)
+    reward = reward_name(config["reward"]).replace("_", " ")
     pictures = {
         "before": draw_gallery(before.raw, directory / "before.png"),
         "after": draw_gallery(after.raw, directory / "after.png"),
         "before_ready": draw_gallery(before.ready, directory / "before_ready.png", before.is_ready),
         "after_ready": draw_gallery(after.ready, directory / "after_ready.png", after.is_ready),
     }
-    write_report(directory / "report.html", _page(title, metrics, curve, pictures, reward_name))
+    write_report(directory / "report.html", _page(title, metrics, directory / "curve.png", pictures, reward))
     write_metrics(directory, metrics)
     return metrics
 
@@ -133,11 +131,11 @@ def draw_gallery(batch: SceneBatch, path: Path, is_ready: Tensor | None = None) 
     return path
 
 
-def _page(title: str, metrics: Mapping[str, Any], curve: Path, pictures: Mapping[str, Path], reward_name: str) -> Page:
+def _page(title: str, metrics: Mapping[str, Any], curve: Path, pictures: Mapping[str, Path], reward: str) -> Page:
     before, after, guard = metrics["before"], metrics["after"], metrics["guard"]
     count = int(before["scenes"])
     lead = (
-        f"{metrics['iterations']} iterations of DDPO-SF on {reward_name}, with the pretraining loss on real scenes as "
+        f"{metrics['iterations']} iterations of DDPO-SF on {reward}, with the pretraining loss on real scenes as "
         f"regularisation. All numbers are means over {count} fresh, seeded samples of each prior; none was selected."
     )
     tiles = [
@@ -152,7 +150,7 @@ def _page(title: str, metrics: Mapping[str, Any], curve: Path, pictures: Mapping
     )
     verdict = f"{passed}; the prior kept is that of iteration {guard['best_iteration']}."
     sections = [
-        Section("The curve", verdict, [Picture(curve, f"Mean {reward_name} of each batch, and the guard.")]),
+        Section("The curve", verdict, [Picture(curve, f"Mean {reward} of each batch, and the guard.")]),
         Section(
             "As sampled",
             "The first samples of each prior from the same noise, untouched.",

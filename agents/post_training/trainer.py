@@ -9,6 +9,7 @@ from typing import Any
 
 from agents.checkpoints import save_checkpoint
 from agents.post_training.config import PostTrainConfig
+from agents.post_training.curves import draw_curve
 from agents.post_training.guard import Guard, realism
 from agents.post_training.learner import Learner, NonFiniteGradient, is_finite
 from agents.post_training.progress import Progress
@@ -23,6 +24,7 @@ from agents.post_training.run_files import (
     write_metrics,
 )
 from agents.prior import ScenePrior
+from rewards import reward_name
 from scene_envs.errors import TrainingError
 from scene_envs.scene import SceneBatch
 
@@ -247,6 +249,8 @@ class PostTrainer:
             "config": self.config.plain(),
         }
         write_metrics(self.directory, metrics)
+        name = f"mean {reward_name(self.config.reward).replace('_', ' ')}"
+        draw_curve(self.history, self.directory / "curve.png", reward_name=name, limit=self.config.guard_limit)
         return PostTrainResult(ScenePrior.load(self.directory / "prior"), self.history, metrics, self.directory)
 
 
