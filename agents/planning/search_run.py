@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from agents.planning.mask_generators import search_mask
 from agents.planning.planners import BestOfPlanner, PlanResult, UCTPlanner
 from agents.planning.search_report import draw_curve, draw_scene
 from scene_envs.errors import InvalidInputError, SceneEnvsError
@@ -32,7 +33,8 @@ class SearchConfig:
         num_steps: denoiser evaluations per scene.
         exploration: weight of the UCB1 bound.
         parallel: scenes generated per batch of the search; None takes ``branching``.
-        mask: mask generator of the environment, ``"infeasible"`` or ``"random"``, or a function.
+        mask: which objects to regenerate: ``"culprits"``, ``"infeasible"``, ``"random"``, or a function; see
+            :mod:`agents.planning.mask_generators`.
         slots: slots per scene; None takes the scene type's.
         objective_scale: objective at which Φ is 1; None takes the environment's.
         seed: of the tree; the baseline's first scenes are those of the tree.
@@ -45,7 +47,7 @@ class SearchConfig:
     num_steps: int = 50
     exploration: float = UCTPlanner.exploration
     parallel: int | None = None
-    mask: Any = "infeasible"
+    mask: Any = "culprits"
     slots: int | None = None
     objective_scale: float | None = None
     seed: int = 0
@@ -156,7 +158,7 @@ def _plan(
         num_steps=config.num_steps,
         prior=prior,
         slots=config.slots,
-        mask=config.mask,
+        mask=search_mask(config.mask),
         objective_scale=config.objective_scale,
         workers=config.workers,
     )

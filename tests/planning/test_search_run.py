@@ -16,7 +16,7 @@ from scene_envs.errors import InvalidInputError, SceneEnvsError
 from scene_envs.scene import SceneBatch
 from scene_envs.search import SearchEnv
 
-SETTINGS = {"budget": 24, "branching": 3, "num_steps": 4, "max_depth": 5, "seed": 3}
+SETTINGS = {"budget": 24, "branching": 3, "num_steps": 4, "max_depth": 5, "seed": 3, "mask": "infeasible"}
 
 
 def central_objects(batch: SceneBatch, context: RewardContext) -> RewardOutput:
@@ -121,6 +121,7 @@ def test_an_objective_that_never_scores_is_an_error(run: Run) -> None:
     [
         ({"budget": 2, "branching": 3}, "budget=2 scenes do not cover the 3 first samples"),
         ({"branching": 0}, "branching=0"),
+        ({"mask": "culprit"}, "did you mean 'culprits'"),
         ({"objective": "central_object"}, "unknown reward 'central_object'"),
     ],
 )
