@@ -14,6 +14,7 @@ from scene_envs.errors import MissingDependencyError
 from scene_envs.physics.collision import Collider
 from scene_envs.physics.geometry import LibraryGeometry, library_geometry
 from scene_envs.physics.placement import Objects, flatten, object_boxes, place
+from scene_envs.physics.projection import TOLERANCE, project_objects
 from scene_envs.physics.support import Support
 from scene_envs.physics.world import SolverSettings, World
 from scene_envs.scene_types import SceneType
@@ -168,6 +169,24 @@ def settle_kernel(chunk: Chunk, *, duration: float) -> dict[str, Any]:
     return {"translations": translations, "rotations": rotations, "valid": valid}
 
 
+def projection_kernel(chunk: Chunk) -> dict[str, Any]:
+    """See :func:`scene_envs.physics.project`."""
+    physics = physics_of(chunk.scene_type)
+    translations = chunk.translations.copy()
+    residual = np.zeros(len(chunk))
+    for index in range(len(chunk)):
+        objects = physics.flatten(chunk.row(index))
+        result = project_objects(physics.library, physics.collider, objects)
+        translations[index, objects.slot] = result.translation
+        residual[index] = result.residual_depth
+    return {
+        "translations": translations,
+        "residual_depth": residual,
+        "converged": residual <= TOLERANCE,
+        "valid": np.ones(len(chunk), dtype=bool),
+    }
+
+
 def _settle_one(physics: Physics, objects: Objects, duration: float) -> tuple[Array, Array, bool]:
     rotation, translation = objects.rotation, objects.translation
     remaining = duration
@@ -248,6 +267,7 @@ KERNELS: dict[str, Kernel] = {
     "feasibility": feasibility_kernel,
     "equilibrium": equilibrium_kernel,
     "penetration": penetration_kernel,
+    "project": projection_kernel,
     "settle": settle_kernel,
 }
 """What workers can be asked to run."""
