@@ -79,7 +79,7 @@ def _dispatch(words: list[str]) -> int:
 
 def _help(command: str, module: ModuleType) -> str:
     rows = [(f"{field.name}={field.default}", field.meaning) for field in describe_fields(module.config())]
-    return f"scene-envs {command}: {COMMANDS[command]}.\n\n{format_rows(rows)}"
+    return f"scene-envs {command}: {COMMANDS[command]}.\n\n{format_rows(rows) if rows else '  no keys'}"
 
 
 def _run(command: str, module: ModuleType, words: list[str]) -> int:

@@ -106,8 +106,13 @@ def _override(command: str, word: str, hints: dict[str, Any]) -> str:
     if key not in hints:
         raise unknown_name(f"{command} key", key, hints)
     if hints[key] is str or (hints[key] == (str | None) and value != "null"):
-        value = "'" + re.sub(r"(\\*)'", r"\1\1\\'", value) + "'"
+        value = _quoted(value)
     return f"{key}={value}"
+
+
+def _quoted(text: str) -> str:
+    """``text`` in Hydra's quotes, where backslashes count only before a quote."""
+    return "'" + re.sub(r"(\\*)('|$)", lambda found: 2 * found[1] + ("\\'" if found[2] else ""), text) + "'"
 
 
 def _plain_reason(error: BaseException, words: Sequence[str], hints: dict[str, Any]) -> str:

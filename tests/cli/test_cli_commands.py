@@ -1,0 +1,97 @@
+"""Each command does its work on a very small case and leaves what it promises."""
+
+import json
+
+import pytest
+
+from agents.cli import main
+from agents.prior import tiny_prior
+from scene_envs import SceneBatch
+
+pytest.importorskip("pybullet")
+
+
+@pytest.fixture(scope="module")
+def prior(tmp_path_factory) -> str:
+    """The folder of an untrained prior with 6 slots."""
+    return str(tiny_prior(slots=6).save(tmp_path_factory.mktemp("prior")))
+
+
+def metrics(folder) -> dict:
+    return json.loads((folder / "metrics.json").read_text())
+
+
+def files(folder) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def test_sample_then_project(prior, tmp_path, capsys):
+    drawn, ready = tmp_path / "drawn", tmp_path / "ready"
+    small = ["count=3", "num_steps=2", "workers=0", "pictures=1"]
+    assert main(["sample", f"prior={prior}", *small, "reward=object_count", f"output={drawn}"]) == 0
+    assert files(drawn) == {"config.yaml", "metrics.json", "log.txt", "scenes.safetensors", "gallery.png"}
+    scenes = SceneBatch.load(drawn / "scenes.safetensors")
+    assert len(scenes) == 3
+    assert metrics(drawn)["objects"]["mean"] == pytest.approx(scenes.counts.double().mean().item())
+    assert metrics(drawn)["reward"]["mean"] == pytest.approx(metrics(drawn)["objects"]["mean"])
+    scene_file = drawn / "scenes.safetensors"
+    assert main(["project", f"scenes={scene_file}", "workers=0", "pictures=1", f"output={ready}"]) == 0
+    assert len(SceneBatch.load(ready / "ready.safetensors")) == 3
+    assert {"before.png", "ready.png"} <= files(ready)
+    assert metrics(ready)["ready"]["valid"] == 3
+    assert "simulation-ready" in capsys.readouterr().out
+
+
+def test_the_same_seed_draws_the_same_scenes(prior, tmp_path):
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        words = [f"prior={prior}", "count=2", "num_steps=2", "reward=null", "pictures=0", "workers=0", f"seed={seed}"]
+        assert main(["sample", *words, f"output={tmp_path / name}"]) == 0
+    first, again, other = ((tmp_path / name / "scenes.safetensors").read_bytes() for name in "abc")
+    assert first == again != other
+
+
+def test_generate_pretrain_post_train_and_sample_the_result(tmp_path, capsys):
+    data, trained, steered = (tmp_path / name for name in ("data", "trained", "steered"))
+    assert main(["generate", "count=8", "shard_size=8", "workers=0", "progress=false", f"output={data}"]) == 0
+    assert metrics(data)["scenes"] == 8
+    small = ["hidden=16", "depth=1", "heads=1", "batch_size=2", "iterations=2"]
+    assert main(["pretrain", f"data={data}", *small, f"output={trained}"]) == 0
+    assert metrics(trained)["trained_steps"] == 2
+    words = ["iterations=1", "batch_size=2", "num_steps=3", "gradient_steps=2", "regularisation_batch=2"]
+    words += ["bank_size=8", "guard_scenes=2", "progress=none", "reward={name: clip, reward: object_count, high: 30}"]
+    assert main(["post-train", f"prior={trained}", *words, f"output={steered}"]) == 0
+    assert metrics(steered)["iterations"] == 1
+    assert {"config.yaml", "log.txt"} <= files(steered)
+    words = ["count=1", "num_steps=1", "reward=null", "pictures=0", "workers=0"]
+    assert main(["sample", f"prior={steered}", *words, f"output={tmp_path / 'drawn'}"]) == 0
+
+
+def test_search_writes_its_pictures_and_curve(prior, tmp_path, capsys):
+    words = ["objective=object_count", "budget=4", "branching=2", "num_steps=2", "slots=6"]
+    assert main(["search", f"prior={prior}", *words, f"output={tmp_path}"]) == 0
+    assert {"best.safetensors", "before.png", "after.png", "curve.png", "config.yaml"} <= files(tmp_path)
+    found = metrics(tmp_path)
+    assert found["search"]["objective"] >= found["first_samples"]["objective"]
+    assert "by search" in capsys.readouterr().out
+
+
+def test_evaluate_tabulates_the_figures(prior, tmp_path, capsys):
+    words = ["count=2", "num_steps=1", "project=false", "workers=0"]
+    assert main(["evaluate", f"prior={prior}", *words, f"output={tmp_path}"]) == 0
+    assert metrics(tmp_path)["scenes"] == 2
+    assert "| objects_mean |" in capsys.readouterr().out
+
+
+def test_listings_and_the_contract_check(capsys):
+    assert main(["priors"]) == main(["rewards"]) == main(["check-reward", "reward=object_count"]) == 0
+    printed = capsys.readouterr().out
+    assert "feasible_objects: Number of free objects" in printed
+    assert "'object_count' keeps its contract" in printed
+
+
+def test_a_truncated_prior_exits_2(prior, tmp_path, capsys):
+    broken = tiny_prior(slots=6).save(tmp_path / "broken")
+    weights = broken / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-100])
+    assert main(["sample", f"prior={broken}", f"output={tmp_path / 'out'}"]) == 2
+    assert "model.safetensors" in capsys.readouterr().err
