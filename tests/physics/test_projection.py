@@ -32,7 +32,7 @@ def test_two_steamers_share_the_way_apart() -> None:
     assert depth > 0.01
     result = project(batch)
     moves = (result.batch.translations - batch.translations)[0, 1:3]
-    torch.testing.assert_close(moves[0], -moves[1], atol=1e-5, rtol=0)
+    torch.testing.assert_close(moves[0], -moves[1], atol=1e-4, rtol=0)
     assert float(result.moved[0, 1:3].sum()) == pytest.approx(depth, abs=1e-4)
     assert bool(result.converged[0])
 
