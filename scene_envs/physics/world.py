@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ Mask = NDArray[np.bool_]
 
 BULLET_MARGIN = 1e-3
 """Bullet grows each convex mesh by this much (m)."""
+_REACH = 50.0
+"""Half the width (m) of the space in which objects of one scene are held together as one island."""
 _PARKING = 1000.0
 """Height (m) of the first unused body; the next ones are 10 m apart above it."""
 
@@ -71,6 +74,8 @@ class World:
         self._pool: dict[tuple[int, str], list[int]] = {}
         self._frames: dict[int, tuple[Array, Array]] = {}  # category -> principal axes, inertia
         self._inset: dict[tuple[int, str], str] = {}
+        self._parking: dict[int, tuple[float, float, float]] = {}
+        self._binder = -1
 
     # -- bodies ---------------------------------------------------------------------------------
 
@@ -95,14 +100,38 @@ class World:
         )
         # A shared small visual: without one PyBullet would read the collision mesh again for every body.
         visual = bullet.createVisualShape(bullet.GEOM_BOX, halfExtents=(1e-3, 1e-3, 1e-3), physicsClientId=client)
-        self._pool = {}
-        parked = 0
+        self._pool, self._parking = {}, {}
         for key in sorted(self._pool_sizes):  # one order in every process, whatever was asked for first
             shape = self._shape(*key)
             self._pool[key] = []
             for _ in range(self._pool_sizes[key]):
-                self._pool[key].append(self._body(key[0], shape, visual, parked))
-                parked += 1
+                place = (0.0, 0.0, _PARKING + 10.0 * len(self._parking))
+                body = self._body(key[0], shape, visual, place)
+                self._parking[body] = place
+                self._pool[key].append(body)
+
+        self._binder = self._make_binder(visual)
+
+    def _make_binder(self, visual: int) -> int:
+        """A body of two specks in opposite corners of space, whose box overlaps all others.
+
+        Bullet solves objects with overlapping boxes as one island, and numbers islands by the history of its
+        broadphase; that order decides between contacts of compound shapes. With one island there is no choice.
+        """
+        speck = 0.01 * np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
+        shape = self._compound(_wavefront([speck - _REACH, speck + _REACH]))
+        place = (0.0, 0.0, -_PARKING)
+        binder = self._bullet.createMultiBody(
+            1.0, shape, visual, basePosition=place, useMaximalCoordinates=True, physicsClientId=self._client
+        )
+        self._bullet.changeDynamics(
+            binder,
+            -1,
+            activationState=self._bullet.ACTIVATION_STATE_DISABLE_SLEEPING,
+            physicsClientId=self._client,
+        )
+        self._parking[binder] = place
+        return int(binder)
 
     def _shape(self, category: int, level: str) -> int:
         geometry: LevelGeometry = getattr(self._library.assets[category], level)
@@ -111,16 +140,22 @@ class World:
             center = self._library.center_of_mass[category]
             hulls = [(inset_hull(part, BULLET_MARGIN) - center) @ axes for part in geometry.parts]
             self._inset[category, level] = _wavefront(hulls)
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "hulls.obj"
-            path.write_text(self._inset[category, level])
-            shape = self._bullet.createCollisionShape(
-                self._bullet.GEOM_MESH, fileName=str(path), physicsClientId=self._client
-            )
+        shape = self._compound(self._inset[category, level])
         if shape < 0:
             name = self._library.assets[category].asset.name
             raise PhysicsError(f"PyBullet refused the collision shape of asset {name!r} ({level} parts)")
-        return int(shape)
+        return shape
+
+    def _compound(self, wavefront: str) -> int:
+        """A collision shape from a Wavefront text, one convex child per group; negative on failure."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "hulls.obj"
+            path.write_text(wavefront)
+            return int(
+                self._bullet.createCollisionShape(
+                    self._bullet.GEOM_MESH, fileName=str(path), physicsClientId=self._client
+                )
+            )
 
     def _principal(self, category: int) -> tuple[Array, Array]:
         """Principal axes (3, 3, columns) and moments (3,) of an asset's inertia."""
@@ -131,14 +166,14 @@ class World:
             self._frames[category] = axes, moments
         return self._frames[category]
 
-    def _body(self, category: int, shape: int, visual: int, parked: int) -> int:
+    def _body(self, category: int, shape: int, visual: int, place: tuple[float, float, float]) -> int:
         static = bool(self._library.static[category])
         mass = 0.0 if static else float(self._library.assets[category].asset.mass)
         body = self._bullet.createMultiBody(
             mass,
             shape,
             visual,
-            basePosition=_parking_place(parked),
+            basePosition=place,
             useMaximalCoordinates=True,
             physicsClientId=self._client,
         )
@@ -148,6 +183,7 @@ class World:
         if not static:
             # The mass goes in with the inertia: alone, the inertia call would reset the mass.
             settings |= {"mass": mass, "localInertiaDiagonal": self._principal(category)[1].tolist()}
+            settings["activationState"] = self._bullet.ACTIVATION_STATE_SLEEP
         self._bullet.changeDynamics(body, -1, physicsClientId=self._client, **settings)
         return int(body)
 
@@ -202,19 +238,16 @@ class World:
             taken[key] += 1
             self._prepare(body, key[0], bool(fixed[row]), start_quaternion[row].tolist(), settings)
         # Bullet refreshes a body's world inertia only when it integrates: one step out of contact does that.
-        bullet.stepSimulation(physicsClientId=client)
+        steps = max(1, round(duration / settings.time_step))
+        for _ in range(2 + steps % 2):
+            bullet.stepSimulation(physicsClientId=client)
+        self._place(self._binder, _ZERO, _UPRIGHT)
         for row in order:
-            body = int(bodies[row])
-            bullet.resetBasePositionAndOrientation(
-                body, start_position[row].tolist(), start_quaternion[row].tolist(), physicsClientId=client
-            )
-            bullet.resetBaseVelocity(body, _ZERO, _ZERO, physicsClientId=client)
-            # Fresh broadphase proxies: no pair, contact or warm start survives from an earlier scene.
-            bullet.setCollisionFilterGroupMask(body, -1, 1, 1, physicsClientId=client)
+            self._place(int(bodies[row]), start_position[row].tolist(), start_quaternion[row].tolist())
         bullet.setPhysicsEngineParameter(
             fixedTimeStep=settings.time_step, numSolverIterations=settings.iterations, physicsClientId=client
         )
-        for _ in range(max(1, round(duration / settings.time_step))):
+        for _ in range(steps):
             bullet.stepSimulation(physicsClientId=client)
         end = [bullet.getBasePositionAndOrientation(int(body), physicsClientId=client) for body in bodies]
         end_position = np.array([pose[0] for pose in end])
@@ -235,7 +268,7 @@ class World:
     ) -> None:
         """Turn a parked body to its orientation and wake it."""
         bullet, client = self._bullet, self._client
-        bullet.resetBasePositionAndOrientation(body, _parking_place(body), quaternion, physicsClientId=client)
+        bullet.resetBasePositionAndOrientation(body, self._parking[body], quaternion, physicsClientId=client)
         if self._library.static[category]:
             return
         bullet.resetBaseVelocity(body, _ZERO, _ZERO, physicsClientId=client)
@@ -250,13 +283,24 @@ class World:
             physicsClientId=client,
         )
 
-    def _park(self, bodies: Index, category: Index) -> None:
+    def _place(self, body: int, position: Sequence[float], quaternion: Sequence[float]) -> None:
+        """Put a body somewhere, at rest, with nothing remembered of where it was.
+
+        Changing the filter makes a fresh broadphase proxy, which drops the body's pairs, contacts and warm starts.
+        """
         bullet, client = self._bullet, self._client
+        bullet.resetBasePositionAndOrientation(body, position, quaternion, physicsClientId=client)
+        bullet.resetBaseVelocity(body, _ZERO, _ZERO, physicsClientId=client)
+        bullet.setCollisionFilterGroupMask(body, -1, 1, 1, physicsClientId=client)
+
+    def _park(self, bodies: Index, category: Index) -> None:
+        self._place(self._binder, self._parking[self._binder], _UPRIGHT)
         for row, body in enumerate(bodies.tolist()):
-            bullet.resetBasePositionAndOrientation(body, _parking_place(body), (0, 0, 0, 1), physicsClientId=client)
+            self._place(body, self._parking[body], _UPRIGHT)
             if not self._library.static[category[row]]:
-                bullet.resetBaseVelocity(body, _ZERO, _ZERO, physicsClientId=client)
-                bullet.changeDynamics(body, -1, activationState=bullet.ACTIVATION_STATE_SLEEP, physicsClientId=client)
+                self._bullet.changeDynamics(
+                    body, -1, activationState=self._bullet.ACTIVATION_STATE_SLEEP, physicsClientId=self._client
+                )
 
     def reset(self) -> None:
         """Throw all bodies away; they are built again when needed."""
@@ -270,10 +314,7 @@ class World:
 
 
 _ZERO = (0.0, 0.0, 0.0)
-
-
-def _parking_place(index: int) -> tuple[float, float, float]:
-    return (0.0, 0.0, _PARKING + 10.0 * index)
+_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
 def _wavefront(hulls: list[Array]) -> str:
