@@ -87,7 +87,9 @@ def compose(command: str, config: type, words: Sequence[str]) -> Any:
     name = command.replace("-", "_")
     hints = get_type_hints(config)
     overrides = [_override(command, word, hints) for word in words]
-    ConfigStore.instance().store(name=f"{name}_keys", node=config)
+    keys = OmegaConf.structured(config)
+    OmegaConf.set_readonly(keys, False)  # a frozen dataclass starts out read-only
+    ConfigStore.instance().store(name=f"{name}_keys", node=keys)
     try:
         with initialize_config_module("configs", version_base="1.3"):
             tree = hydra_compose(name, overrides=overrides)

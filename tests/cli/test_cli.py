@@ -81,7 +81,7 @@ def test_an_output_that_is_a_file_exits_2(tmp_path, capsys):
 # -- what happens around a command, seen with one of our own -------------------------------------------
 
 
-@dataclass
+@dataclass(frozen=True)
 class EchoConfig:
     """Keys of a command that repeats them.
 

@@ -66,6 +66,13 @@ def test_generate_pretrain_post_train_and_sample_the_result(tmp_path, capsys):
     assert main(["sample", f"prior={steered}", *words, f"output={tmp_path / 'drawn'}"]) == 0
 
 
+def test_the_doctor_prints_its_screen_and_keeps_the_numbers(prior, tmp_path, capsys):
+    words = ["batch_size=2", "num_steps=3", "gradient_steps=2", "regularisation_batch=2", "bank_size=8"]
+    assert main(["doctor", f"prior={prior}", *words, "guard_scenes=2", "slots=20", f"output={tmp_path}"]) == 0
+    assert metrics(tmp_path)["log_ratio"] == 0
+    assert "log-ratio at the start" in capsys.readouterr().out
+
+
 def test_search_writes_its_pictures_and_curve(prior, tmp_path, capsys):
     words = ["objective=object_count", "budget=4", "branching=2", "num_steps=2", "slots=6"]
     assert main(["search", f"prior={prior}", *words, f"output={tmp_path}"]) == 0
