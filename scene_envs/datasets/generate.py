@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from queue import Empty
-from time import perf_counter
+from threading import Thread
+from time import perf_counter, sleep
 from typing import Any
 
 import numpy as np
@@ -135,6 +136,7 @@ def _prepare(folder: Path, grammar: Grammar, settings: dict[str, Any]) -> Normal
     """Make the folder and its metadata, or check that they fit ``settings``; returns the normalizer."""
     scene_type: SceneType = grammar.scene_type
     path = folder / store.METADATA
+    store.remove_partial(folder)
     if path.exists():
         metadata = store.read_metadata(path)
         differing = [key for key in _SETTINGS if metadata.get(key) != settings[key]]
@@ -182,8 +184,16 @@ _worker: dict[str, Any] = {}
 
 def _start_worker(payload: bytes, queue: Any) -> None:
     torch.set_num_threads(1)
+    Thread(target=_exit_with_parent, args=(os.getppid(),), daemon=True).start()
     factory, normalizer_state = pickle.loads(payload)
     _worker.update(grammar=factory(), normalizer=Normalizer.from_state(normalizer_state), queue=queue)
+
+
+def _exit_with_parent(parent: int) -> None:
+    """End this worker when the process that started it is gone (it may have been killed)."""
+    while os.getppid() == parent:
+        sleep(1.0)
+    os._exit(1)
 
 
 def _work(job: _Job) -> int:
@@ -230,6 +240,8 @@ def _follow(futures: list[Future[int]], queue: Any, report: Report) -> None:
         for future in [future for future in pending if future.done()]:
             future.result()
             pending.discard(future)
+    while not queue.empty():  # a worker cannot exit before its last reports are read
+        queue.get()
 
 
 @contextmanager

@@ -48,9 +48,20 @@ def make_metadata(scene_type: SceneType, normalizer: Normalizer, **extra: Any) -
     }
 
 
+def _partial(path: Path) -> Path:
+    """Where ``path`` is written before it takes its name; one place per process, so that two never mix."""
+    return path.with_name(f".{path.name}.{os.getpid()}.partial")
+
+
+def remove_partial(folder: Path) -> None:
+    """Remove what killed processes left half-written in ``folder``."""
+    for path in folder.glob(".*.partial"):
+        path.unlink(missing_ok=True)
+
+
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write JSON atomically."""
-    partial = path.with_name(f".{path.name}.partial")
+    partial = _partial(path)
     partial.write_text(json.dumps(content, indent=2) + "\n")
     os.replace(partial, path)
 
@@ -90,7 +101,7 @@ def write_shard(path: Path, scenes: NDArray[np.float32], prompts: Sequence[str],
     column = pa.ListArray.from_arrays(pa.array(np.arange(count + 1, dtype=np.int32) * slots), rows)
     table = pa.table({SCENES: column, PROMPTS: pa.array(list(prompts), pa.string())})
     table = table.replace_schema_metadata({_NOTES: json.dumps(notes, sort_keys=True).encode()})
-    partial = path.with_name(f".{path.name}.partial")
+    partial = _partial(path)
     pq.write_table(table, partial, compression="zstd")
     os.replace(partial, path)
 

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import subprocess
 import sys
+import time
 from collections import Counter
+from multiprocessing import current_process
 from pathlib import Path
 
 import numpy as np
@@ -73,6 +77,40 @@ def test_a_killed_run_resumes_to_identical_files(
     assert [path.name for path in sorted(tmp_path.glob("[!.]*.parquet"))] == ["scenes-00000.parquet"]
     _generate(tmp_path)
     assert _hashes(tmp_path) == _hashes(reference)
+
+
+def test_a_run_killed_by_the_system_resumes_to_identical_files(reference: Path, tmp_path: Path) -> None:
+    options = {"seed": 3, "workers": 0, "verify": False, "shard_size": 30, "progress": False}
+    code = f"from scene_envs.datasets import generate\ngenerate('dimsum_table', 70, {str(tmp_path)!r}, **{options})"
+    process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
+    while process.poll() is None and not any(tmp_path.glob("scenes-*.parquet")):
+        time.sleep(0.005)
+    process.kill()
+    process.wait()
+    assert (tmp_path / "scenes-00000.parquet").is_file()
+    _generate(tmp_path)
+    assert _hashes(tmp_path) == _hashes(reference)
+
+
+def _mortal_grammar() -> Grammar:
+    """Dimsum, but the first process that uses it dies; the flag file says that it happened."""
+    flag = Path(os.environ["SCENE_ENVS_TEST_FLAG"])
+    grammar = get_grammar("dimsum_table")
+    if current_process().name != "MainProcess" and not flag.exists():
+        flag.touch()
+        os._exit(1)
+    return grammar
+
+
+def test_a_worker_that_dies_is_replaced_and_nothing_is_lost(
+    reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SCENE_ENVS_TEST_FLAG", str(tmp_path / "died"))
+    register_grammar("mortal")(_mortal_grammar)
+    generate("mortal", 30, tmp_path / "data", seed=3, workers=1, verify=False, shard_size=30, progress=False)
+    assert (tmp_path / "died").exists()
+    expected = _hashes(reference)["scenes-00000.parquet"]
+    assert _hashes(tmp_path / "data")["scenes-00000.parquet"] == expected
 
 
 def test_two_workers_write_the_same_files_as_this_process(reference: Path, tmp_path: Path) -> None:
