@@ -46,9 +46,10 @@ def real_scenes(prior: ScenePrior, source: str, count: int, *, seed: int, slots:
         source: ``"grammar"``, or the directory of a dataset.
         count: how many; a smaller dataset gives all it has.
         seed: of the grammar, or of the choice of rows.
-        slots: slots per scene; None takes as many as the prior was trained on.
+        slots: slots per scene at least; None takes as many as the prior was trained on. Real scenes keep all
+            their slots: a prior reads any number.
     """
-    slots = prior.config.slots if slots is None else slots
+    slots = max(prior.scene_type.slots, prior.config.slots if slots is None else slots)
     if source == "grammar":
         from scene_envs.grammars import get_grammar
 
@@ -60,4 +61,5 @@ def real_scenes(prior: ScenePrior, source: str, count: int, *, seed: int, slots:
         raise InvalidInputError(f"real_scenes={source!r} is neither 'grammar' nor the directory of a dataset")
     dataset = SceneDataset.load(source)
     rows = torch.randperm(len(dataset.tensor), generator=Generator().manual_seed(seed))[:count]
-    return SceneBatch(dataset.tensor[rows], prior.scene_type).with_slots(slots)
+    batch = SceneBatch(dataset.tensor[rows], prior.scene_type)
+    return batch.with_slots(max(slots, batch.tensor.shape[1]))
