@@ -4,7 +4,7 @@
 
 JOBS ?= 2
 ENV := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
-PIP := .venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+PIP := .venv/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt
 
 .PHONY: demo test lint install install-dev clean help
 
