@@ -16,7 +16,7 @@ from scene_envs.physics.separation import separations
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-TOUCHING = 1e-5
+TOUCHING = 2e-5
 """Overlap (m) below which the face-plane bound is taken as the depth, without asking FCL."""
 NEAR = 3e-3
 """Object pairs whose boxes are at most this far apart (m) are listed."""
@@ -34,6 +34,8 @@ class ObjectPairs:
         depth: (P,) m, how deep the fine parts overlap; 0 when they do not.
         total: (P,) m, the sum of the depths of all overlapping fine parts (only when asked for).
         part_count: (P,) overlapping fine part pairs (only when asked for).
+        low: (n, 3) lowest corner of each object's box, m.
+        high: (n, 3) highest corner of each object's box, m.
     """
 
     first: Index
@@ -43,6 +45,33 @@ class ObjectPairs:
     depth: Array
     total: Array
     part_count: Index
+    low: Array
+    high: Array
+
+    def among(self, rows: Index) -> ObjectPairs:
+        """The pairs of the objects ``rows`` (m,), ascending, renumbered to 0..m-1."""
+        number = np.full(len(self.low), -1, dtype=np.int64)
+        number[rows] = np.arange(len(rows))
+        first, second = number[self.first], number[self.second]
+        kept = (first >= 0) & (second >= 0)
+        return ObjectPairs(
+            first[kept],
+            second[kept],
+            self.gap[kept],
+            self.direction[kept],
+            self.depth[kept],
+            self.total[kept],
+            self.part_count[kept],
+            self.low[rows],
+            self.high[rows],
+        )
+
+    def deepest(self) -> Array:
+        """(n,) m, the deepest overlap of each object."""
+        depth = np.zeros(len(self.low))
+        np.maximum.at(depth, self.first, self.depth)
+        np.maximum.at(depth, self.second, self.depth)
+        return depth
 
 
 class Collider:
@@ -64,7 +93,8 @@ class Collider:
             totals: also sum over all part pairs, the literature's per-geometry measure.
         """
         coarse = place(self.library, objects, "coarse")
-        first, second = _near_pairs(objects, *object_boxes(coarse))
+        low, high = object_boxes(coarse)
+        first, second = _near_pairs(objects, low, high)
         gap, direction, keep = self._coarse_gaps(coarse, first, second)
         first, second, gap, direction = first[keep], second[keep], gap[keep], direction[keep]
         depth, total = np.zeros(len(first)), np.zeros(len(first))
@@ -72,7 +102,7 @@ class Collider:
         overlapping = np.flatnonzero(gap < 0)
         if len(overlapping):
             self._fine_depths(objects, first, second, overlapping, gap, depth, total, part_count, totals)
-        return ObjectPairs(first, second, gap, direction, depth, total, part_count)
+        return ObjectPairs(first, second, gap, direction, depth, total, part_count, low, high)
 
     def _coarse_gaps(self, coarse: PlacedObjects, first: Index, second: Index) -> tuple[Array, Array, Index]:
         pair, a, b = part_pairs(coarse, first, second)
@@ -99,9 +129,12 @@ class Collider:
         part_count: Index,
         totals: bool,
     ) -> None:
-        # One part each, coarse the same as fine, barely touching: the face planes have said it all.
+        # Barely touching: the face planes of the enclosing coarse parts have said enough. Sums over part pairs
+        # need the parts themselves, unless there is one of each.
         single = np.array([len(asset.fine.parts) == 1 for asset in self.library.assets])
-        simple = single[objects.category[first]] & single[objects.category[second]] & (gap > -TOUCHING)
+        simple = gap > -TOUCHING
+        if totals:
+            simple &= single[objects.category[first]] & single[objects.category[second]]
         settled = overlapping[simple[overlapping]]
         depth[settled] = total[settled] = -gap[settled]
         part_count[settled] = 1

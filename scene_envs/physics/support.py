@@ -67,7 +67,7 @@ class Support:
         self.bottom = _Faces.of([asset.bottom for asset in library.assets])
         self.top = _Faces.of([asset.top for asset in library.assets])
 
-    def needs_fine(self, objects: Objects, pairs: ObjectPairs, low: Array, high: Array) -> Mask:
+    def needs_fine(self, objects: Objects, pairs: ObjectPairs) -> Mask:
         """(n,) objects that must collide with their fine parts.
 
         Coarse shapes act like fine ones in a contact when the solid outlines of two facing flat faces
@@ -76,8 +76,6 @@ class Support:
         Args:
             objects: the objects.
             pairs: their near pairs.
-            low: (n, 3) lowest corners of the objects' boxes, m.
-            high: (n, 3) highest corners.
         """
         a, b = pairs.first, pairs.second
         relevant = (pairs.gap < _REACH) & (self.hollow[objects.category[a]] | self.hollow[objects.category[b]])
@@ -86,7 +84,8 @@ class Support:
         first_above = pairs.direction[:, 2] < 0
         upper, lower = np.where(first_above, a, b), np.where(first_above, b, a)
         alike = facing & (
-            self._meets_all_round(objects, upper, lower, pairs.gap) | self._on_plane(objects, upper, lower, low, high)
+            self._meets_all_round(objects, upper, lower, pairs.gap)
+            | self._on_plane(objects, upper, lower, pairs.low, pairs.high)
         )
         upright = objects.rotation[:, 2, 2] > _UPRIGHT
         beside = (np.abs(pairs.direction[:, 2]) < 0.1) & upright[a] & upright[b]

@@ -14,6 +14,7 @@ from scipy.spatial import ConvexHull
 
 from scene_envs.errors import MissingDependencyError, PhysicsError
 from scene_envs.physics.geometry import LevelGeometry, LibraryGeometry, inset_hull
+from scene_envs.physics.placement import Objects
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -190,23 +191,13 @@ class World:
     # -- motion ---------------------------------------------------------------------------------
 
     def simulate(
-        self,
-        category: Index,
-        fine: Mask,
-        fixed: Mask,
-        rotation: Array,
-        translation: Array,
-        duration: float,
-        settings: SolverSettings,
+        self, objects: Objects, fine: Mask, duration: float, settings: SolverSettings
     ) -> tuple[Array, Array, Array]:
         """Move the objects of one scene for ``duration`` seconds under gravity.
 
         Args:
-            category: (n,) asset indices.
+            objects: the n objects.
             fine: (n,) whether each object collides with its fine parts.
-            fixed: (n,) objects that do not move.
-            rotation: (n, 3, 3).
-            translation: (n, 3) m.
             duration: s.
             settings: integration.
 
@@ -215,7 +206,8 @@ class World:
             Objects that Bullet lost to a numerical failure come back as NaN.
         """
         bullet, client = self._bullet, self._client
-        count = len(category)
+        category, fixed, count = objects.category, objects.fixed, len(objects)
+        rotation, translation = objects.rotation, objects.translation
         order = np.lexsort((translation[:, 0], translation[:, 1], translation[:, 2], fine, category))
         levels = np.where(fine, "fine", "coarse")
         needed: dict[tuple[int, str], int] = {}
