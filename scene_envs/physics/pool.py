@@ -23,7 +23,8 @@ _LOGGER = logging.getLogger(__name__)
 _NO_MESH: Any = None
 """Workers draw nothing, so the meshes stay here."""
 _START_UP = 120.0
-"""Extra seconds that the first chunk of a worker may take: imports and geometry."""
+"""Seconds that a worker may take to start, or to build the geometry of a scene type."""
+_MOST_FAILED_STARTS = 3
 _SINGLE_THREADED = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
@@ -42,7 +43,9 @@ class _Worker:
     def __init__(self) -> None:
         child_reads, parent_writes = os.pipe()
         parent_reads, child_writes = os.pipe()
-        environment = os.environ | _SINGLE_THREADED | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+        environment = (
+            os.environ | _SINGLE_THREADED | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
+        )
         self.process = subprocess.Popen(
             [sys.executable, "-m", "scene_envs.physics.worker", str(child_reads), str(child_writes)],
             pass_fds=(child_reads, child_writes),
@@ -96,6 +99,7 @@ class PhysicsPool:
         self._scene_types: dict[SceneType, int] = {}
         self._lock = threading.Lock()
         self._closed = False
+        self._failed_starts = 0
 
     def __enter__(self) -> PhysicsPool:
         return self
@@ -162,26 +166,26 @@ class PhysicsPool:
                 self._live.append(_Worker())
             for worker in self._live:
                 if worker.is_ready and worker.task is None and tasks:
-                    self._hand_over(worker, tasks.popleft(), kernel, options, tasks)
+                    self._next(worker, tasks, kernel, options)
             self._collect(tasks, results)
 
-    def _hand_over(
-        self, worker: _Worker, task: _Task, kernel: str, options: dict[str, Any], tasks: deque[_Task]
-    ) -> None:
-        scene_type = task.chunk.scene_type
+    def _next(self, worker: _Worker, tasks: deque[_Task], kernel: str, options: dict[str, Any]) -> None:
+        """Give an idle worker the scene type it lacks, or its next task."""
+        scene_type = tasks[0].chunk.scene_type
         key = self._scene_types.setdefault(scene_type, len(self._scene_types))
-        worker.task = task
-        grace = 0.0 if key in worker.known else _START_UP
-        worker.deadline = time.monotonic() + self.timeout + grace
-        try:
-            if key not in worker.known:
-                assets = tuple(dataclasses.replace(asset, visual=_NO_MESH) for asset in scene_type.library)
-                worker.outbox.send(("scene_type", key, dataclasses.replace(scene_type), assets))
-                worker.known.add(key)
-            arrays = (task.chunk.translations, task.chunk.rotations, task.chunk.categories)
-            worker.outbox.send(("run", kernel, key, arrays, options))
-        except (BrokenPipeError, OSError):
-            pass  # noticed by _collect, which sees the end of its pipe
+        message: tuple[Any, ...]
+        if key not in worker.known:
+            assets = tuple(dataclasses.replace(asset, visual=_NO_MESH) for asset in scene_type.library)
+            message = ("scene_type", key, dataclasses.replace(scene_type), assets)
+            worker.known.add(key)
+            worker.is_ready, worker.deadline = False, time.monotonic() + _START_UP
+        else:
+            worker.task = tasks.popleft()
+            chunk = worker.task.chunk
+            message = ("run", kernel, key, (chunk.translations, chunk.rotations, chunk.categories), options)
+            worker.deadline = time.monotonic() + self.timeout
+        with contextlib.suppress(OSError):  # a dead worker is noticed by _collect, which sees the end of its pipe
+            worker.outbox.send(message)
 
     def _collect(self, tasks: deque[_Task], results: list[dict[str, Any] | None]) -> None:
         """Wait for the next message, death or deadline."""
@@ -204,6 +208,7 @@ class PhysicsPool:
             return
         if kind == "ready":
             worker.is_ready = True
+            self._failed_starts = 0
             return
         task, worker.task = worker.task, None
         assert task is not None
@@ -221,10 +226,12 @@ class PhysicsPool:
         if task is not None:
             _retry(task, tasks, how)
         elif not started:
-            raise PhysicsError(
-                f"a physics worker {how} while starting (exit status {worker.process.returncode}); "
-                "its own message is on stderr"
-            )
+            self._failed_starts += 1
+            if self._failed_starts >= _MOST_FAILED_STARTS:
+                raise PhysicsError(
+                    f"{self._failed_starts} physics workers in a row {how} while starting "
+                    f"(exit status {worker.process.returncode}); their own message is on stderr"
+                )
 
     def _discard_busy(self) -> None:
         for worker in [w for w in self._live if w.task is not None or not w.is_ready]:

@@ -14,6 +14,7 @@ from typing import Any
 from scene_envs.assets.base import AssetLibrary
 from scene_envs.errors import SceneEnvsError
 from scene_envs.physics.kernels import KERNELS, Chunk
+from scene_envs.physics.motion import physics_of
 from scene_envs.scene_types import SceneType
 
 
@@ -30,6 +31,8 @@ def serve(inbox: Connection, outbox: Connection) -> None:
             key, scene_type, assets = body
             scene_type.__dict__["library"] = AssetLibrary(assets)  # what the cached property would hold
             scene_types[key] = scene_type
+            physics_of(scene_type)  # geometry is built before the first chunk's clock starts
+            outbox.send(("ready", None))
             continue
         try:
             outbox.send(("done", _run(scene_types, *body)))

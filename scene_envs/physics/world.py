@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -60,7 +63,8 @@ class World:
 
     def __init__(self, library: LibraryGeometry) -> None:
         try:
-            import pybullet
+            with _silence():
+                import pybullet
         except ImportError as error:
             raise MissingDependencyError(
                 "settling and equilibrium need pybullet, whose wheels exist for Python 3.10 and 3.11; "
@@ -303,6 +307,23 @@ class World:
         if self._client >= 0:
             self._bullet.disconnect(self._client)
             self._client = -1
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Keep the greeting that PyBullet prints on import out of the user's terminal."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    with open(os.devnull, "w") as sink:
+        kept = os.dup(1), os.dup(2)
+        try:
+            os.dup2(sink.fileno(), 1)
+            os.dup2(sink.fileno(), 2)
+            yield
+        finally:
+            for copy, descriptor in zip(kept, (1, 2), strict=True):
+                os.dup2(copy, descriptor)
+                os.close(copy)
 
 
 _ZERO = (0.0, 0.0, 0.0)
