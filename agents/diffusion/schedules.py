@@ -65,7 +65,11 @@ def cosine_alpha_bar(num_timesteps: int, offset: float = 0.008, max_beta: float 
     return torch.cat([torch.ones(1, dtype=torch.float64), torch.cumprod(1.0 - beta, dim=0)])
 
 
-_SCHEDULES: dict[str, Callable[[int], Tensor]] = {"karras": karras_alpha_bar, "linear": linear_alpha_bar, "cosine": cosine_alpha_bar}
+_SCHEDULES: dict[str, Callable[[int], Tensor]] = {
+    "karras": karras_alpha_bar,
+    "linear": linear_alpha_bar,
+    "cosine": cosine_alpha_bar,
+}
 
 
 def make_schedule(name: str, num_timesteps: int = 1000) -> NoiseSchedule:
