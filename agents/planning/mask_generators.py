@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,6 @@ from scene_envs.search_masks import (
     MASK_GENERATORS,
     MaskGenerator,
     bad_objects,
-    infeasible_mask,
     resolve_mask_generator,
 )
 
@@ -24,34 +24,66 @@ MAX_PENETRATION = 1e-3
 """Object pairs that overlap deeper than this (m) count, as in feasibility."""
 
 
-def culprits_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-    """The fewest objects whose removal leaves the others without overlap, and all empty slots.
+@dataclass(frozen=True)
+class CulpritsMask:
+    """The fewest objects whose replacement ends all overlaps, and a few empty slots.
 
-    An objective that counts feasible objects blames both objects of an overlapping pair; regenerating one of them is
-    enough. Objects that overlap most others are taken out first, until no pair of kept ones overlaps. Objects that
-    are blamed and overlap nothing (they fall or slide) are regenerated too. Falls back to
-    :func:`~scene_envs.search_masks.infeasible_mask` when nothing is blamed.
+    An objective that counts feasible objects blames both objects of an overlapping pair; replacing one of them is
+    enough. Objects that overlap most others go first, until no kept pair overlaps. Blamed objects that overlap nothing
+    (they fall or slide) go too. Where that is fewer than ``at_least`` slots, random empty ones join, so that good
+    scenes can grow. An objective that says nothing about single objects gets ``at_least`` random slots.
+
+    Few slots at a time matter. While the noise is high the kept objects are hidden in it too, so the masked slots take
+    their usual share of objects whatever is already there: with all empty slots masked, inpainting by clamping crowds
+    the scene and spoils what was kept.
 
     Args:
-        scene: a batch of one.
-        score: the objective's verdict on it.
-        rng: breaks ties.
+        at_least: slots regenerated, when the scene has as many.
 
-    Returns:
-        (N,) bool, True where a slot is regenerated.
+    A scene without free objects is regenerated whole.
     """
+
+    at_least: int = 4
+
+    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+        """(N,) bool, True where a slot is regenerated.
+
+        Args:
+            scene: a batch of one.
+            score: the objective's verdict on it.
+            rng: breaks ties and draws slots.
+        """
+        free, empty = scene.is_free[0], scene.is_empty[0]
+        if not bool(free.any()):
+            return empty.clone()
+        bad = bad_objects(scene, score)
+        mask = torch.zeros_like(empty)
+        if bad is None:
+            mask[self._draw(free | empty, self.at_least, rng)] = True
+            return mask
+        mask[_culprits(scene, bad, rng)] = True
+        for more in (empty, free):
+            mask[self._draw(more & ~mask, self.at_least - int(mask.sum()), rng)] = True
+        return mask
+
+    @staticmethod
+    def _draw(candidates: Tensor, count: int, rng: np.random.Generator) -> list[int]:
+        slots = torch.nonzero(candidates).flatten().tolist()
+        chosen: list[int] = rng.permutation(slots)[: max(0, count)].astype(int).tolist()
+        return chosen
+
+
+def _culprits(scene: SceneBatch, bad: Tensor, rng: np.random.Generator) -> list[int]:
+    """Slots of blamed objects (``bad``, (N,) bool), less those that are fine once others are gone."""
     from scene_envs.physics import penetration
 
-    bad = bad_objects(scene, score)
-    if bad is None or not bool(bad.any()):
-        return infeasible_mask(scene, score, rng)
+    blamed = torch.nonzero(bad).flatten().tolist()
+    if not blamed:
+        return []
     pairs = [pair.slots for pair in penetration(scene).pairs[0] if pair.depth > MAX_PENETRATION]
     overlapping = {slot for pair in pairs for slot in pair}
     welded = set(torch.nonzero(scene.is_welded[0]).flatten().tolist())
-    alone = [slot for slot in torch.nonzero(bad).flatten().tolist() if slot not in overlapping]
-    mask = scene.is_empty[0].clone()
-    mask[cover(pairs, welded, rng) + alone] = True
-    return mask
+    return cover(pairs, welded, rng) + [slot for slot in blamed if slot not in overlapping]
 
 
 def cover(pairs: Sequence[tuple[int, int]], fixed: Collection[int], rng: np.random.Generator) -> list[int]:
@@ -72,7 +104,7 @@ def cover(pairs: Sequence[tuple[int, int]], fixed: Collection[int], rng: np.rand
     return sorted(chosen)
 
 
-SEARCH_MASKS: dict[str, MaskGenerator] = {**MASK_GENERATORS, "culprits": culprits_mask}
+SEARCH_MASKS: dict[str, MaskGenerator] = {**MASK_GENERATORS, "culprits": CulpritsMask()}
 """Mask generators that a search run knows by name: the environment's own and those of this module."""
 
 

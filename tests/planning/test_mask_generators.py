@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from agents.planning.mask_generators import cover, culprits_mask, search_mask
+from agents.planning.mask_generators import CulpritsMask, cover, search_mask
+from rewards import RewardOutput
 from scene_envs.env_reward import RewardScorer, Score
 from scene_envs.errors import UnknownNameError
 from scene_envs.scene import SceneBatch
-from scene_envs.search_masks import infeasible_mask
+from scene_envs.search_masks import MaskGenerator, infeasible_mask
 
 
 def table_with(*objects: tuple[str, float, float, float]) -> SceneBatch:
@@ -30,39 +31,55 @@ def feasible_score(scene: SceneBatch) -> Score:
     return RewardScorer("feasible_objects")(scene)
 
 
-def masked_objects(scene: SceneBatch, mask: torch.Tensor) -> list[int]:
-    assert bool(mask[scene.is_empty[0]].all())  # empty slots are always regenerated
-    return torch.nonzero(mask & ~scene.is_empty[0]).flatten().tolist()
+def masked(scene: SceneBatch, mask: MaskGenerator, seed: int = 0) -> tuple[list[int], int]:
+    """Masked objects, and how many empty slots are masked with them."""
+    chosen = mask(scene, feasible_score(scene), np.random.default_rng(seed))
+    empty = scene.is_empty[0]
+    return torch.nonzero(chosen & ~empty).flatten().tolist(), int((chosen & empty).sum())
 
 
 def test_one_object_in_the_way_of_two_is_the_only_one_replaced() -> None:
     scene = table_with(("teapot", 0, 0, 0), ("dinner_plate", 0.15, 0, 0), ("dinner_plate", -0.15, 0, 0))
-    score = feasible_score(scene)
-    rng = np.random.default_rng(0)
-    assert masked_objects(scene, infeasible_mask(scene, score, rng)) == [1, 2, 3]
-    assert masked_objects(scene, culprits_mask(scene, score, rng)) == [1]
+    assert masked(scene, infeasible_mask) == ([1, 2, 3], 30)
+    assert masked(scene, CulpritsMask(at_least=1)) == ([1], 0)
 
 
 def test_of_two_that_overlap_one_is_replaced_and_chance_says_which() -> None:
     scene = table_with(("dinner_plate", 0, 0, 0), ("dinner_plate", 0.2, 0, 0), ("teacup", -0.3, 0, 0))
-    score = feasible_score(scene)
-    chosen = [masked_objects(scene, culprits_mask(scene, score, np.random.default_rng(s))) for s in range(20)]
-    assert set(map(tuple, chosen)) == {(1,), (2,)}
-    assert chosen[0] == masked_objects(scene, culprits_mask(scene, score, np.random.default_rng(0)))
+    chosen = [masked(scene, CulpritsMask(at_least=1), seed) for seed in range(12)]
+    assert {tuple(slots) for slots, _ in chosen} == {(1,), (2,)}
+    assert chosen[0] == masked(scene, CulpritsMask(at_least=1))
 
 
 def test_objects_that_fall_or_sink_into_the_table_are_replaced() -> None:
     scene = table_with(("teacup", 0.2, 0, 0.05), ("teapot", -0.2, 0, -0.01), ("teacup", 0, 0.2, 0))
-    score = feasible_score(scene)
-    assert masked_objects(scene, culprits_mask(scene, score, np.random.default_rng(0))) == [1, 2]
+    assert masked(scene, CulpritsMask(at_least=2)) == ([1, 2], 0)
+    assert masked(scene, CulpritsMask(at_least=5)) == ([1, 2], 3)
 
 
-def test_without_anyone_to_blame_it_is_the_mask_of_the_environment() -> None:
+def test_a_perfect_scene_grows_in_a_few_empty_slots() -> None:
     scene = table_with(("teacup", 0.2, 0, 0), ("teapot", -0.2, 0, 0))
-    score = feasible_score(scene)
-    mask = culprits_mask(scene, score, np.random.default_rng(0))
-    assert torch.equal(mask, infeasible_mask(scene, score, np.random.default_rng(0)))
-    assert masked_objects(scene, mask) == []
+    assert masked(scene, CulpritsMask()) == ([], 4)
+
+
+def test_a_full_perfect_scene_still_has_something_to_try() -> None:
+    scene = table_with(("teacup", 0.2, 0, 0), ("teapot", -0.2, 0, 0)).with_slots(4)
+    slots, empties = masked(scene, CulpritsMask(at_least=2))
+    assert (len(slots), empties) == (1, 1)
+
+
+def test_a_bare_table_is_regenerated_whole() -> None:
+    assert masked(SceneBatch.empty("dimsum_table", 1), CulpritsMask()) == ([], 33)
+
+
+def test_an_objective_that_blames_nobody_by_name_gets_random_slots() -> None:
+    scene = table_with(*(("teacup", 0.1 * k, 0, 0) for k in range(-3, 4)))
+    score = RewardScorer(lambda batch, context: RewardOutput(batch.counts.float()))(scene)
+    masks = [CulpritsMask(at_least=3)(scene, score, np.random.default_rng(seed)) for seed in range(30)]
+    assert {int(mask.sum()) for mask in masks} == {3}
+    reached = torch.stack(masks).any(dim=0)
+    assert not bool(reached[0])  # the table
+    assert int(reached.sum()) > 25
 
 
 def test_covers_touch_every_pair_and_spare_the_fixed() -> None:
@@ -76,7 +93,7 @@ def test_covers_touch_every_pair_and_spare_the_fixed() -> None:
 
 
 def test_names_are_resolved_and_unknown_ones_get_an_offer() -> None:
-    assert search_mask("culprits") is culprits_mask
+    assert search_mask("culprits") == CulpritsMask()
     assert search_mask("infeasible") is infeasible_mask
     with pytest.raises(UnknownNameError, match="did you mean 'culprits'"):
         search_mask("culprit")
