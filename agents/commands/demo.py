@@ -31,17 +31,8 @@ def config() -> type[DemoConfig]:
 
 def run(settings: DemoConfig, run: Run) -> None:
     """Post-train, compare, report."""
+    from agents.commands.post_train import say_change
     from agents.post_training.demo import run_demo
 
-    metrics = run_demo(settings.output, settings.seed, settings.workers)
-    before, after = metrics["before"], metrics["after"]
-    for name, label in (
-        ("objects", "objects per scene"),
-        ("feasible_objects", "feasible as sampled"),
-        ("ready_objects", "simulation-ready"),
-    ):
-        if before.get(name) and name in after:
-            change = after[name] / before[name] - 1
-            run.say(f"{label:<20} {before[name]:6.2f} -> {after[name]:6.2f}  ({change:+.0%})")
-    run.say(f"{'held-out loss':<20} {metrics['guard']['ratio']:.2f}x of the base prior's")
+    say_change(run_demo(settings.output, settings.seed, settings.workers), run)
     run.say(f"open {run.directory / 'report.html'}; scene-envs sample prior={run.directory} draws more")

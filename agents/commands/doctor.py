@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from agents.post_training import PostTrainConfig
+from agents.commands.post_train import PostTrainKeys
 
 if TYPE_CHECKING:
     from agents.cli_run import Run
 
 
-def config() -> type[PostTrainConfig]:
+def config() -> type[PostTrainKeys]:
     """The keys of this command: those of post-train."""
-    return PostTrainConfig
+    return PostTrainKeys
 
 
-def run(settings: PostTrainConfig, run: Run) -> None:
+def run(settings: PostTrainKeys, run: Run) -> None:
     """Examine the run that ``post-train`` would make of these settings."""
     from rich.console import Console
 
     from agents.post_training.doctor import diagnose
 
-    report = diagnose(settings)
+    report = diagnose(settings.run_config)
     run.write_metrics(report.metrics())
     Console().print(report)
     for line in report.advice:

@@ -58,10 +58,17 @@ def test_generate_pretrain_post_train_and_sample_the_result(tmp_path, capsys):
     assert main(["pretrain", f"data={data}", *small, f"output={trained}"]) == 0
     assert metrics(trained)["trained_steps"] == 2
     words = ["iterations=1", "batch_size=2", "num_steps=3", "gradient_steps=2", "regularisation_batch=2"]
-    words += ["bank_size=8", "guard_scenes=2", "progress=none", "reward={name: clip, reward: object_count, high: 30}"]
+    words += [
+        "bank_size=8",
+        "guard_scenes=2",
+        "report_scenes=1",
+        "progress=none",
+        "reward={name: clip, reward: object_count, high: 30}",
+    ]
     assert main(["post-train", f"prior={trained}", *words, f"output={steered}"]) == 0
     assert metrics(steered)["iterations"] == 1
-    assert {"config.yaml", "log.txt"} <= files(steered)
+    assert {"config.yaml", "log.txt", "report.html", "curve.png", "before.png", "after.png"} <= files(steered)
+    assert "simulation-ready" in capsys.readouterr().out
     words = ["count=1", "num_steps=1", "reward=null", "pictures=0", "workers=0"]
     assert main(["sample", f"prior={steered}", *words, f"output={tmp_path / 'drawn'}"]) == 0
 
