@@ -48,6 +48,12 @@ class SolverSettings:
     angular_damping: float = 0.0
 
 
+_LOOK = 12
+"""Steps after which to see whether everything is at rest."""
+_STILL_SPEED, _STILL_TURN = 1e-3, 1e-2
+"""Speeds (m/s, rad/s) below which an object that began at rest cannot get far in a tenth of a second."""
+
+
 class World:
     """PyBullet with a pool of bodies; the motion of a scene never depends on the scenes before it.
 
@@ -220,9 +226,9 @@ class World:
             needed[key] = needed.get(key, 0) + 1
         self._require(needed)
 
-        axes = np.stack([self._principal(int(c))[0] for c in category])
+        axes = np.array([self._principal(c)[0] for c in category.tolist()])
         center = self._library.center_of_mass[category]
-        start_rotation = rotation @ axes
+        start_rotation = _times(rotation, axes)
         start_quaternion = _quaternions(start_rotation)
         start_position = translation + _apply(rotation, center)
 
@@ -243,8 +249,16 @@ class World:
         bullet.setPhysicsEngineParameter(
             fixedTimeStep=settings.time_step, numSolverIterations=settings.iterations, physicsClientId=client
         )
-        for _ in range(steps):
-            bullet.stepSimulation(physicsClientId=client)
+        done = 0
+        while done < steps:
+            ahead = min(_LOOK, steps - done)
+            for _ in range(ahead):
+                bullet.stepSimulation(physicsClientId=client)
+            done += ahead
+            if done < steps and self._is_still(bodies[~fixed]):
+                if (steps - done) % 2:
+                    bullet.stepSimulation(physicsClientId=client)
+                break
         end = [bullet.getBasePositionAndOrientation(int(body), physicsClientId=client) for body in bodies]
         end_position = np.array([pose[0] for pose in end])
         end_quaternion = np.array([pose[1] for pose in end])
@@ -258,6 +272,14 @@ class World:
         if lost.any():
             self.reset()
         return new_rotation, new_translation, angle
+
+    def _is_still(self, bodies: Index) -> bool:
+        """Whether nothing moves or starts to: what is at rest stays at rest."""
+        for body in bodies.tolist():
+            linear, angular = self._bullet.getBaseVelocity(body, physicsClientId=self._client)
+            if not all(abs(v) < _STILL_SPEED for v in linear) or not all(abs(v) < _STILL_TURN for v in angular):
+                return False
+        return True
 
     def _prepare(
         self, body: int, category: int, fixed: bool, quaternion: list[float], settings: SolverSettings
@@ -353,24 +375,21 @@ def _times(a: Array, b: Array) -> Array:
 
 def _quaternions(matrices: Array) -> Array:
     """(n, 4) in PyBullet's order (x, y, z, w), from whichever of four equal forms is the most accurate."""
-    m = matrices
-    diagonal = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
-    out = np.empty((len(m), 4))
-    largest = np.stack([*diagonal, diagonal[0] + diagonal[1] + diagonal[2]]).argmax(axis=0)
-    for axis in range(3):
-        j, k = (axis + 1) % 3, (axis + 2) % 3
-        rows = largest == axis
-        r = m[rows]
-        out[np.ix_(rows, (axis, j, k, 3))] = np.column_stack(
-            [1 + r[:, axis, axis] - r[:, j, j] - r[:, k, k], r[:, j, axis] + r[:, axis, j],
-             r[:, k, axis] + r[:, axis, k], r[:, k, j] - r[:, j, k]]
-        )  # fmt: skip
-    rows = largest == 3
-    r = m[rows]
-    out[rows] = np.column_stack(
-        [r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1], 1 + r.trace(axis1=1, axis2=2)]
-    )
-    return out / np.linalg.norm(out, axis=1, keepdims=True)  # type: ignore[no-any-return]
+    m = matrices.reshape(-1, 9).T
+    a, b, c = m[0], m[4], m[8]
+    x, y, z = m[7] - m[5], m[2] - m[6], m[3] - m[1]
+    xy, xz, yz = m[1] + m[3], m[2] + m[6], m[5] + m[7]
+    forms = np.array(
+        [
+            [1 + a - b - c, xy, xz, x],
+            [xy, 1 - a + b - c, yz, y],
+            [xz, yz, 1 - a - b + c, z],
+            [x, y, z, 1 + a + b + c],
+        ]
+    )  # (form, component, n)
+    best = np.array([a, b, c, a + b + c]).argmax(axis=0)
+    quaternion = forms[best, :, np.arange(len(best))]
+    return quaternion / np.sqrt((quaternion * quaternion).sum(axis=1, keepdims=True))  # type: ignore[no-any-return]
 
 
 def _matrices(xyzw: Array) -> Array:

@@ -1,0 +1,192 @@
+"""Feasibility and settling: what stands stays, what floats falls, and nothing depends on what came before."""
+
+from __future__ import annotations
+
+import builtins
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from simple_scenes import SIDE, TYPE, scene, turned
+
+from scene_envs.errors import MissingDependencyError
+from scene_envs.grammars import get_grammar
+from scene_envs.physics import equilibrium, feasibility, make_ready, penetration, settle
+from scene_envs.physics.motion import Physics, physics_of
+from scene_envs.physics.world import World
+from scene_envs.scene import SceneBatch
+
+
+def tower(height: int, x: float = 0.0) -> list[tuple[str, float, float, float]]:
+    return [("cube", x, 0.0, SIDE * level) for level in range(height)]
+
+
+def dimsum(count: int, seed: int) -> SceneBatch:
+    return get_grammar("dimsum_table").sample(np.random.default_rng(seed), count)
+
+
+def jittered(batch: SceneBatch, seed: int) -> SceneBatch:
+    noise = torch.randn(batch.translations.shape, generator=torch.Generator().manual_seed(seed))
+    noise *= torch.tensor([0.01, 0.01, 0.002]) * batch.is_free.unsqueeze(-1)
+    return batch.with_poses(batch.translations + noise, batch.rotations)
+
+
+@pytest.mark.parametrize("height", [1, 2, 5, 8])
+def test_a_tower_at_rest_is_feasible(height: int) -> None:
+    result = feasibility(scene(*tower(height)))
+    assert result.counts.tolist() == [height]
+    assert bool(result.valid.all())
+    assert not bool(result.feasible[0, 0])  # the welded floor is not judged
+
+
+@pytest.mark.parametrize(("gap", "stays"), [(0.0, True), (0.0005, True), (0.0013, False), (0.02, False)])
+def test_an_object_above_its_support_falls_by_the_gap(gap: float, stays: bool) -> None:
+    """Alone (a closed form) and on another box (simulated)."""
+    alone, stacked = (
+        feasibility(scene(("cube", 0.0, 0.0, gap))),
+        feasibility(scene(*tower(1), ("cube", 0.0, 0.0, SIDE + gap))),
+    )
+    assert bool(alone.feasible[0, 1]) is stays
+    assert bool(stacked.feasible[0, 2]) is stays
+    assert float(alone.displacement[0, 1]) == pytest.approx(gap, abs=1e-6)
+    assert float(stacked.displacement[0, 2]) == pytest.approx(gap, abs=5e-4)
+
+
+def test_free_fall_has_its_closed_form() -> None:
+    """0.1 s of free fall is 49 mm; the semi-implicit integrator adds one step's worth."""
+    result = equilibrium(scene(("cube", 0.0, 0.0, 1.0), ("cube", 0.02, 0.02, 1.2)))
+    expected = 0.5 * 9.81 * 0.1**2
+    assert result.displacement[0, 1:3].tolist() == pytest.approx([expected, expected], abs=2.5e-3)
+
+
+def test_the_closed_form_of_a_lone_object_agrees_with_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
+    batch = SceneBatch.concatenate([scene(("cube", 0.3, -0.2, gap), yaw=0.4) for gap in (-0.0005, 0.0, 0.0007, 0.004)])
+    quick = feasibility(batch)
+    support = physics_of(TYPE).support
+    monkeypatch.setattr(
+        support,
+        "at_rest",
+        lambda objects, *_: (np.zeros(len(objects), bool), np.zeros(len(objects)), np.zeros(len(objects))),
+    )
+    slow = feasibility(batch)
+    assert torch.equal(quick.feasible, slow.feasible)
+    torch.testing.assert_close(quick.displacement, slow.displacement, atol=2e-4, rtol=0)
+
+
+def test_an_overhanging_object_tips_and_fails() -> None:
+    """The centre of mass one centimetre past the edge."""
+    result = feasibility(scene(*tower(1), ("cube", 0.06, 0.0, SIDE)))
+    assert result.feasible[0, 1:3].tolist() == [True, False]
+    assert float(result.rotation[0, 2]) > 0.01
+
+
+def test_a_post_on_a_slope_of_its_own_falls_over() -> None:
+    tilt = Rotation.from_euler("x", 0.2).as_matrix()
+    result = feasibility(turned(scene(("post", 0.0, 0.0, 0.002)), 1, tilt))
+    assert not bool(result.feasible[0, 1])
+
+
+def test_overlapping_objects_fail_and_the_rest_is_judged_without_them() -> None:
+    """Two boxes 2 mm into each other fail; the box on top of them loses its support; a third is not concerned."""
+    batch = scene(
+        ("cube", 0.0, 0.0, 0.0), ("cube", SIDE - 0.002, 0.0, 0.0), ("cube", 0.0, 0.0, SIDE), ("cube", 0.5, 0.0, 0.0)
+    )
+    result = feasibility(batch)
+    assert result.feasible[0, 1:5].tolist() == [False, False, False, True]
+    assert result.depth[0, 1:5].tolist() == pytest.approx([0.002, 0.002, 0.0, 0.0], abs=1e-6)
+    assert float(result.displacement[0, 3]) > 0.01
+    assert result.displacement[0, 1:3].tolist() == [0.0, 0.0]
+
+
+def test_an_object_in_the_table_is_no_longer_there_to_stand_on() -> None:
+    result = feasibility(scene(("cube", 0.0, 0.0, -0.004), ("cube", 0.0, 0.0, SIDE - 0.004)))
+    assert result.counts.tolist() == [0]
+
+
+def test_hollow_objects_hold_what_is_in_them_and_not_what_hovers_over_them() -> None:
+    """A post stands on a bowl's floor; another at the height of its rim, over the hole, falls in."""
+    inside = feasibility(scene(("bowl", 0.0, 0.0, 0.0), ("post", 0.0, 0.0, 0.01)))
+    hovering = feasibility(scene(("bowl", 0.0, 0.0, 0.0), ("post", 0.0, 0.0, 0.1)))
+    assert inside.counts.tolist() == [2]
+    assert hovering.feasible[0, 1:3].tolist() == [True, False]
+
+
+def test_generated_scenes_are_feasible_throughout() -> None:
+    batch = dimsum(12, 5)
+    result = feasibility(batch)
+    assert torch.equal(result.feasible, batch.is_free)
+
+
+def test_coarse_shapes_give_the_verdict_of_fine_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At most one object in a hundred differs, over scenes at rest and jittered ones."""
+    batch = SceneBatch.concatenate([dimsum(3, 6), jittered(dimsum(3, 7), 1)])
+    mixed = feasibility(batch)
+    support = physics_of(batch.scene_type).support
+    monkeypatch.setattr(support, "needs_fine", lambda objects, pairs: support.hollow[objects.category])
+    fine = feasibility(batch)
+    assert int((mixed.feasible != fine.feasible).sum()) <= 0.01 * int(batch.is_free.sum())
+
+
+def test_a_result_depends_on_its_scene_alone() -> None:
+    """Bit-identical in any order, in any company, in a fresh world, and for any order of slots."""
+    batch = SceneBatch.concatenate([dimsum(4, 8), jittered(dimsum(4, 9), 2)])
+    first = feasibility(batch)
+    backward = feasibility(batch[list(range(len(batch)))[::-1]])
+    physics = physics_of(batch.scene_type)
+    physics._world = None
+    alone = [feasibility(batch[index]) for index in (7, 2, 5)]
+    assert torch.equal(backward.displacement.flip(0), first.displacement)
+    assert torch.equal(backward.rotation.flip(0), first.rotation)
+    for index, result in zip((7, 2, 5), alone, strict=True):
+        assert torch.equal(result.displacement[0], first.displacement[index])
+    order = torch.randperm(batch.tensor.shape[1], generator=torch.Generator().manual_seed(0))
+    shuffled = feasibility(SceneBatch(batch.tensor[:, order], batch.scene_type))
+    assert torch.equal(shuffled.feasible, first.feasible[:, order])
+
+
+def test_empty_scenes_and_empty_batches_are_fine() -> None:
+    assert feasibility(scene()).counts.tolist() == [0]
+    assert feasibility(SceneBatch.empty(TYPE, 0)).feasible.shape == (0, TYPE.slots)
+
+
+def test_settling_lets_objects_come_down_and_stay() -> None:
+    batch = scene(("cube", 0.0, 0.0, 0.03), ("cube", 0.0, 0.0, 0.14), ("cube", 0.5, 0.1, 0.005))
+    result = settle(batch, duration=1.0)
+    assert result.batch.translations[0, 1:4, 2].tolist() == pytest.approx([0.0, SIDE, 0.0], abs=5e-4)
+    assert result.displacement[0, 1:4].tolist() == pytest.approx([0.03, 0.04, 0.005], abs=1e-3)
+    assert torch.equal(result.batch.translations[:, 0], batch.translations[:, 0])
+    assert feasibility(result.batch).counts.tolist() == [3]
+    assert float(penetration(result.batch).depth.max()) < 1e-4
+
+
+def test_what_has_no_support_is_not_ready() -> None:
+    """Beside the table an object falls out of the workspace; the one on the table is ready."""
+    result = make_ready(scene(("cube", 0.0, 0.0, -0.01), ("cube", 2.5, 0.0, 0.0)))
+    assert result.ready[0, 1:3].tolist() == [True, False]
+    assert result.counts.tolist() == [1]
+    assert float(result.batch.translations[0, 2, 2]) < -0.02
+
+
+def test_jittered_scenes_become_ready() -> None:
+    batch = jittered(dimsum(6, 10), 3)
+    raw, ready = feasibility(batch), make_ready(batch)
+    free = int(batch.is_free.sum())
+    assert int(raw.counts.sum()) < 0.6 * free
+    assert int(ready.counts.sum()) >= 0.95 * free
+
+
+def test_without_pybullet_only_settling_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    real_import = builtins.__import__
+
+    def no_bullet(name: str, *rest: Any, **more: Any) -> Any:
+        if name == "pybullet":
+            raise ImportError("No module named 'pybullet'")
+        return real_import(name, *rest, **more)
+
+    monkeypatch.setattr(builtins, "__import__", no_bullet)
+    physics = Physics(physics_of(TYPE).library)
+    with pytest.raises(MissingDependencyError, match="pip install pybullet"):
+        World(physics.library)
+    assert penetration(scene(*tower(2))).valid.tolist() == [True]

@@ -1,0 +1,141 @@
+"""The pool: same results for any number of workers, and nothing lost with a worker."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from simple_scenes import scene
+
+from scene_envs.errors import InvalidInputError, PhysicsError
+from scene_envs.grammars import get_grammar
+from scene_envs.physics import FeasibilityResult, PhysicsPool, feasibility, penetration, project, settle
+from scene_envs.scene import SceneBatch
+
+FIELDS = ("feasible", "depth", "displacement", "rotation", "valid", "counts")
+
+
+def same(first: FeasibilityResult, second: FeasibilityResult) -> bool:
+    return all(torch.equal(getattr(first, name), getattr(second, name)) for name in FIELDS)
+
+
+@pytest.fixture(scope="module")
+def batch() -> SceneBatch:
+    clean = get_grammar("dimsum_table").sample(np.random.default_rng(11), 20)
+    noise = 0.004 * torch.randn(clean.translations.shape, generator=torch.Generator().manual_seed(0))
+    return clean.with_poses(clean.translations + noise * clean.is_free.unsqueeze(-1), clean.rotations)
+
+
+@pytest.fixture(scope="module")
+def expected(batch: SceneBatch) -> FeasibilityResult:
+    return feasibility(batch)
+
+
+@pytest.fixture(scope="module")
+def pool() -> Iterator[PhysicsPool]:
+    with PhysicsPool(workers=2) as pool:
+        yield pool
+
+
+def test_none_one_and_two_workers_agree_bit_for_bit(
+    batch: SceneBatch, expected: FeasibilityResult, pool: PhysicsPool
+) -> None:
+    with PhysicsPool(workers=1) as one:
+        assert same(feasibility(batch, pool=one), expected)
+    assert same(feasibility(batch, pool=pool), expected)
+    assert len(pool.process_ids) == 2
+
+
+def test_every_function_runs_in_workers(batch: SceneBatch, pool: PhysicsPool) -> None:
+    few = batch[:3]
+    assert torch.equal(settle(few, duration=0.25, pool=pool).batch.tensor, settle(few, duration=0.25).batch.tensor)
+    assert torch.equal(project(few, pool=pool).batch.tensor, project(few).batch.tensor)
+    assert penetration(few, pool=pool).pairs == penetration(few).pairs
+
+
+def test_a_scene_type_that_only_this_process_knows_works_in_workers(pool: PhysicsPool) -> None:
+    """Its assets come from no recipe: geometry travels with it."""
+    batch = SceneBatch.concatenate([scene(("cube", 0.1 * i, 0.0, 0.0)) for i in range(3)])
+    assert feasibility(batch, pool=pool).counts.tolist() == [1, 1, 1]
+
+
+def test_a_worker_killed_mid_run_costs_nothing(
+    batch: SceneBatch, expected: FeasibilityResult, pool: PhysicsPool
+) -> None:
+    feasibility(batch[:2], pool=pool)  # both workers are up
+    victim = pool.process_ids[0]
+    large = SceneBatch.concatenate([batch] * 4)
+    killer = threading.Timer(0.15, os.kill, (victim, signal.SIGKILL))
+    killer.start()
+    result = feasibility(large, pool=pool)
+    killer.join()
+    assert bool(result.valid.all())
+    assert torch.equal(result.displacement, expected.displacement.repeat(4, 1))
+    assert same(feasibility(batch, pool=pool), expected)
+    assert victim not in pool.process_ids
+
+
+def test_a_scene_that_fails_twice_is_invalid_and_the_others_are_not(
+    batch: SceneBatch, expected: FeasibilityResult
+) -> None:
+    """Too short a time limit for anything, then a sufficient one: the pool recovers."""
+    with PhysicsPool(workers=1, timeout=60.0) as pool:
+        feasibility(batch[:1], pool=pool)
+        pool.timeout = 1e-6
+        hopeless = feasibility(batch[:2], pool=pool)
+        assert hopeless.valid.tolist() == [False, False]
+        assert hopeless.counts.tolist() == [0, 0]
+        pool.timeout = 60.0
+        assert same(feasibility(batch, pool=pool), expected)
+
+
+def test_a_kernel_that_raises_on_one_scene_loses_that_scene(
+    batch: SceneBatch, expected: FeasibilityResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from scene_envs.physics import kernels
+
+    real = kernels.KERNELS["feasibility"]
+    culprit = batch.translations[3, 1].double().numpy()
+
+    def fails_once(chunk: kernels.Chunk, **options: float) -> dict[str, object]:
+        if (np.abs(chunk.translations[:, 1] - culprit).max(axis=1) < 1e-9).any():
+            raise ZeroDivisionError("on purpose")
+        return real(chunk, **options)
+
+    monkeypatch.setitem(kernels.KERNELS, "feasibility", fails_once)
+    result = feasibility(batch)
+    assert torch.nonzero(~result.valid).flatten().tolist() == [3]
+    others = torch.arange(len(batch)) != 3
+    assert torch.equal(result.displacement[others], expected.displacement[others])
+
+
+def test_wrong_arguments_and_a_closed_pool_are_refused(batch: SceneBatch) -> None:
+    with pytest.raises(InvalidInputError, match="workers"):
+        PhysicsPool(workers=-1)
+    with pytest.raises(InvalidInputError, match="timeout"):
+        PhysicsPool(timeout=0.0)
+    pool = PhysicsPool(workers=1)
+    pool.close()
+    with pytest.raises(PhysicsError, match="closed"):
+        feasibility(batch[:1], pool=pool)
+
+
+def test_closing_ends_the_processes() -> None:
+    pool = PhysicsPool(workers=1)
+    feasibility(scene(("cube", 0.0, 0.0, 0.0)), pool=pool)
+    (process,) = pool.process_ids
+    pool.close()
+    deadline = time.monotonic() + 10.0
+    while time.monotonic() < deadline:
+        try:
+            os.kill(process, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.01)
+    pytest.fail("the worker is still running")
