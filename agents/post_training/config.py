@@ -8,7 +8,7 @@ from typing import Any
 from rewards import reward_name
 from scene_envs.errors import InvalidInputError
 
-CREDITS = ("scene", "object")
+CREDITS = ("auto", "scene", "object")
 RESUMABLE = ("iterations", "output", "workers", "progress", "checkpoint_every")
 """Fields that may change between a run and its continuation."""
 
@@ -24,8 +24,8 @@ class PostTrainConfig:
 
     with ``step_scale = steps with weight > 0 / gradient_steps``, log p reduced over a scene's entries as
     ``log_prob_reduction`` says, and the pretraining loss a mean over scenes and entries. ``regularisation`` means
-    nothing without these reductions: with ``"mean"`` it is the published code's lambda (100 to 500 there); with
-    ``"sum"`` the same balance needs one larger by the number of random entries of a scene.
+    nothing without these reductions: with ``"sum"`` the same balance needs one larger by the number of random
+    entries of a scene.
 
     Attributes:
         prior: the prior to start from, a shipped name or a path.
@@ -42,7 +42,8 @@ class PostTrainConfig:
         log_prob_reduction: ``"mean"`` or ``"sum"`` of log p over the random entries of a scene.
         clip_epsilon: half-width of the probability-ratio clip (DDPO-IS); null for the score function (DDPO-SF).
         updates: optimiser steps per batch; more than one needs ``clip_epsilon``.
-        credit: ``"scene"`` gives every slot the scene's advantage, ``"object"`` its own (rewards with ``per_object``).
+        credit: ``"scene"`` gives every slot the scene's advantage, ``"object"`` its own (rewards with ``per_object``),
+            ``"auto"`` takes ``"object"`` where the reward allows it.
         baseline: ``"leave_one_out"`` or ``"mean"``.
         advantage_clip: advantages are kept within plus and minus this.
         regularisation: coefficient of the pretraining loss on real scenes.
@@ -71,21 +72,21 @@ class PostTrainConfig:
     reward: Any = "object_count"
     output: str = "runs/post-train"
     seed: int = 0
-    iterations: int = 100
-    batch_size: int = 64
+    iterations: int = 60
+    batch_size: int = 48
     num_steps: int = 25
     gradient_steps: int = 8
-    min_std: float = 1e-2
+    min_std: float = 0.03
     skip_first: float = 0.0
     step_weighting: str = "uniform"
     log_prob_reduction: str = "mean"
     clip_epsilon: float | None = None
     updates: int = 1
-    credit: str = "scene"
+    credit: str = "auto"
     baseline: str = "leave_one_out"
     advantage_clip: float = 5.0
-    regularisation: float = 100.0
-    regularisation_batch: int = 64
+    regularisation: float = 0.5
+    regularisation_batch: int = 48
     real_scenes: str = "grammar"
     bank_size: int = 4096
     learning_rate: float = 5e-5
@@ -95,7 +96,7 @@ class PostTrainConfig:
     ema: float = 0.0
     slots: int | None = None
     chunk: int | None = None
-    guard_every: int = 10
+    guard_every: int = 5
     guard_scenes: int = 256
     guard_limit: float = 1.5
     guard_action: str = "report"

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 LOUD, QUIET = 30.0, 1 / 30.0
 """Ratios of the two gradient norms beyond which the louder one drowns the other."""
+DOMINANT = 0.7
+"""Share of the squared policy gradient beyond which one step drowns the others."""
 
 
 @dataclass(frozen=True)
@@ -181,12 +183,12 @@ def _advice(report: DoctorReport, config: PostTrainConfig) -> list[str]:
                 f"The reward drowns the regularisation (ratio {report.gradient_ratio:.2g}): "
                 f"raise regularisation from {config.regularisation:g}, or expect the guard to stop you."
             )
-    norms = sorted(row.gradient_norm for row in report.steps if row.weight > 0)
-    if norms and norms[0] >= 0 and norms[-1] > 20 * max(norms[len(norms) // 2], 1e-12):
-        worst = max(report.steps, key=lambda row: row.gradient_norm)
+    worst = max(report.steps, key=lambda row: row.gradient_norm)
+    total = sum(row.gradient_norm**2 for row in report.steps)
+    if total > 0 and worst.gradient_norm**2 > DOMINANT * total and sum(row.weight > 0 for row in report.steps) > 2:
         advice.append(
-            f"Step {worst.step} (sigma {worst.std:.3g}) has {norms[-1] / max(norms[len(norms) // 2], 1e-12):.0f}x the "
-            f"median gradient: raise min_std from {config.min_std:g} or set step_weighting=std."
+            f"Step {worst.step} (sigma {worst.std:.3g}) alone is {worst.gradient_norm**2 / total:.0%} of the squared "
+            f"policy gradient: raise min_std from {config.min_std:g} or set step_weighting=std."
         )
     return advice
 

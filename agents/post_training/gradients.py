@@ -107,12 +107,12 @@ def gradient_norm(parameters: Iterable[nn.Parameter]) -> float:
 
 
 def credited_reward(rollout: Rollout, credit: str) -> tuple[Tensor, Tensor]:
-    """Rewards and their validity, (B,) for credit ``"scene"`` and (B, N) for ``"object"``.
+    """Rewards and their validity, (B,) for credit ``"scene"`` and (B, N) for ``"object"``; ``"auto"`` is one of them.
 
     Raises:
         InvalidInputError: credit per object is asked of a reward that has no ``per_object``.
     """
-    if credit == "scene":
+    if credit == "scene" or (credit == "auto" and rollout.per_object is None):
         return rollout.reward, rollout.valid
     if rollout.per_object is None:
         raise InvalidInputError("credit='object' needs a reward with per_object values; this one scores scenes only")

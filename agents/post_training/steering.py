@@ -15,6 +15,9 @@ from rewards import reward_name
 SAMPLE_SEED = 100_000
 """Added to the run's seed for the samples that are measured, so that training never saw their noise."""
 
+_PHYSICS_TIMEOUT = 300.0
+"""Seconds for a chunk of scenes: on a busy machine a slow scene must not become an invalid one."""
+
 
 def steer(
     config: PostTrainConfig, *, scenes: int = 256, num_steps: int = 50, prior: ScenePrior | None = None
@@ -41,7 +44,7 @@ def steer(
     result = post_train(config, prior=base)
     trained = time.perf_counter()
     seed = config.seed + SAMPLE_SEED
-    with PhysicsPool(workers=config.workers) as pool:
+    with PhysicsPool(workers=config.workers, timeout=_PHYSICS_TIMEOUT) as pool:
         _say(config, f"measuring {scenes} samples of the base prior")
         before = measure_prior(base, scenes, num_steps=num_steps, seed=seed, pool=pool)
         _say(config, f"measuring {scenes} samples of the post-trained prior")

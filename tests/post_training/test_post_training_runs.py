@@ -80,7 +80,7 @@ def test_run_leaves_a_prior_a_log_and_metrics(tmp_path: Path) -> None:
     assert "reward: " in (tmp_path / "config.yaml").read_text()
 
 
-@pytest.mark.parametrize("changes", [{}, {"ema": 0.5, "credit": "object"}, {"updates": 2, "clip_epsilon": 1e-3}])
+@pytest.mark.parametrize("changes", [{}, {"ema": 0.5, "credit": "scene"}, {"updates": 2, "clip_epsilon": 1e-3}])
 def test_stopped_and_resumed_run_equals_the_uninterrupted_one(tmp_path: Path, changes: dict) -> None:
     whole = post_train(small_config(tmp_path / "whole", iterations=4, **changes), prior=tiny_prior())
     post_train(small_config(tmp_path / "parts", iterations=2, **changes), prior=tiny_prior())
@@ -242,6 +242,9 @@ def test_credit_per_object_needs_such_a_reward(tmp_path: Path) -> None:
 
     with pytest.raises(InvalidInputError, match="per_object"):
         post_train(small_config(tmp_path, reward=plain, credit="object"), prior=tiny_prior())
+    auto = post_train(small_config(tmp_path / "auto", reward=plain, iterations=1), prior=tiny_prior())
+    scene = post_train(small_config(tmp_path / "scene", reward=plain, iterations=1, credit="scene"), prior=tiny_prior())
+    assert without_seconds(auto.history) == without_seconds(scene.history)
 
 
 @pytest.mark.parametrize(
