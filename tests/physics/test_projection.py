@@ -30,7 +30,7 @@ def test_two_steamers_share_the_way_apart() -> None:
     """Equal and opposite moves, together as long as the way out of the hulls' Minkowski difference (scipy)."""
     batch = scene_of(("steamer_bottom", -0.11, 0.0, 0.0), ("steamer_bottom", 0.11, 0.0, 0.0))
     hull = batch.scene_type.library["steamer_bottom"].coarse[0].vertices
-    difference = (hull[:, None] - (hull + [0.22, 0.0, 0.0])[None]).reshape(-1, 3)
+    difference = (hull[:, None] - (hull + np.array([0.22, 0.0, 0.0]))[None]).reshape(-1, 3)
     way_out = -ConvexHull(difference).equations[:, 3].max()  # from the origin to the nearest face
     result = project(batch)
     moves = (result.batch.translations - batch.translations)[0, 1:3]
