@@ -84,7 +84,7 @@ class UCTPlanner:
             denoiser. Every value of ``parallel`` gives its own tree, the same one each time.
     """
 
-    exploration: float = 0.2
+    exploration: float = 0.05
     parallel: int = 1
 
     def __post_init__(self) -> None:
