@@ -59,9 +59,9 @@ class Args:
     """denoising steps per scene"""
     gradient_steps: int = 8
     """steps per iteration in the policy gradient"""
-    min_std: float = 1e-2
+    min_std: float = 0.1
     """steps with a smaller std stay out of the gradient"""
-    regularization: float = 100.0
+    regularization: float = 0.2
     """coefficient of the pretraining loss (mean over entries) on real scenes"""
     real_scenes: int = 2048
     """scenes drawn from the grammar for the regularisation; an eighth of them is held out"""
