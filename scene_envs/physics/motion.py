@@ -11,21 +11,26 @@ from numpy.typing import NDArray
 from scene_envs.physics.collision import Collider, ObjectPairs
 from scene_envs.physics.geometry import LibraryGeometry, library_geometry
 from scene_envs.physics.placement import Objects
-from scene_envs.physics.support import Support
+from scene_envs.physics.support import Support, clusters
 from scene_envs.physics.world import SolverSettings, World
 from scene_envs.scene_types import SceneType
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 _LOGGER = logging.getLogger(__name__)
 
 _SEGMENT = 0.25
 """Seconds after which settling looks again at which shapes it needs, and whether anything still moves."""
+_ROOM = 0.05
+"""Objects further apart than this (m) sideways do not meet within a segment of settling."""
 _STILL = 2e-5
 """An object that moved less than this (m, or rad) in a segment has come to rest."""
 _TALL = 3
 """Objects on this many others are where the solver's own sinking becomes visible."""
+_HIGH = 7
+"""Objects on this many others are judged with the finest steps at once."""
 _DOUBT = 6e-4, 3e-3
 """Motion (m) of an object high in a stack that calls for a finer integration before it is believed."""
 FINEST = SolverSettings(1.0 / 960.0, 35)
@@ -83,20 +88,14 @@ def motion(physics: Physics, objects: Objects, pairs: ObjectPairs, duration: flo
     moving, pairs = objects[active], pairs.among(active)
     fine = physics.support.needs_fine(moving, pairs)
     height = physics.support.tallest(moving, pairs)
+    group = clusters(moving, pairs.low, pairs.high, duration)
     lost: list[int] = []
     for scene in np.unique(moving.scene):
         rows = np.flatnonzero(moving.scene == scene)
         if moving.fixed[rows].all():
             continue
-        tall = height[rows] >= _TALL
-        settings = settings_for(int(height[rows].max()))
-        end_rotation, end_translation, angle = physics.world.simulate(moving[rows], fine[rows], duration, settings)
-        moved = np.linalg.norm(end_translation - moving.translation[rows], axis=1)
-        if settings != FINEST and (tall & (moved > _DOUBT[0]) & (moved < _DOUBT[1])).any():
-            # High in a stack, a millimetre may be the integrator's: look again, closer.
-            end_rotation, end_translation, angle = physics.world.simulate(moving[rows], fine[rows], duration, FINEST)
-            moved = np.linalg.norm(end_translation - moving.translation[rows], axis=1)
-        if not (np.isfinite(moved).all() and np.isfinite(end_rotation).all()):
+        moved, angle = _move(physics, moving[rows], fine[rows], group[rows], height[rows], duration)
+        if not (np.isfinite(moved).all() and np.isfinite(angle).all()):
             _LOGGER.warning("the simulation of a scene diverged; its row is invalid")
             lost.append(int(scene))
             continue
@@ -107,26 +106,53 @@ def motion(physics: Physics, objects: Objects, pairs: ObjectPairs, duration: flo
     return displacement, rotation, np.array(lost, dtype=np.int64)
 
 
+def _move(
+    physics: Physics, objects: Objects, fine: Mask, group: Index, height: Index, duration: float
+) -> tuple[Array, Array]:
+    """Displacement (n,) m and rotation (n,) rad of one scene's objects, each cluster with the steps it needs."""
+    displacement, rotation = np.zeros(len(objects)), np.zeros(len(objects))
+    tallest = np.zeros(int(group.max()) + 1, dtype=np.int64)
+    np.maximum.at(tallest, group[~objects.fixed], height[~objects.fixed])
+
+    def run(chosen: Mask, settings: SolverSettings) -> None:
+        rows = np.flatnonzero(objects.fixed | chosen)
+        end = physics.world.simulate(objects[rows], fine[rows], group[rows], duration, settings)
+        displacement[rows] = np.linalg.norm(end[1] - objects.translation[rows], axis=1)
+        rotation[rows] = end[2]
+
+    for settings in {settings_for(int(carriers)): None for carriers in tallest[group[~objects.fixed]]}:
+        run(np.array([label >= 0 and settings_for(int(tallest[label])) == settings for label in group]), settings)
+    doubtful = (height >= _TALL) & (displacement > _DOUBT[0]) & (displacement < _DOUBT[1])
+    again = np.unique(group[doubtful & ~objects.fixed])
+    again = again[tallest[again] < _HIGH]
+    if len(again):  # high in a stack, a millimetre may be the integrator's: look again, closer
+        run(np.isin(group, again), FINEST)
+    return displacement, rotation
+
+
 def settle_scene(physics: Physics, objects: Objects, duration: float) -> tuple[Array, Array, bool]:
     """Let one scene come to rest: rotation (n, 3, 3), translation (n, 3) m, and whether it stayed finite."""
-    rotation, translation = objects.rotation, objects.translation
+    rotation, translation = objects.rotation.copy(), objects.translation.copy()
+    at_rest = objects.fixed.copy()
     remaining = duration
-    while remaining > 1e-9 and not objects.fixed.all():
+    while remaining > 1e-9 and not at_rest.all():
         span = min(_SEGMENT, remaining)
         remaining -= span
         current = Objects(objects.scene, objects.slot, objects.category, rotation, translation, objects.fixed)
         pairs = physics.collider.pairs(current)
-        fine = physics.support.needs_fine(current, pairs)
-        settings = settings_for(int(physics.support.tallest(current, pairs).max(initial=0)), damping=_DAMPING)
-        end_rotation, end_translation, angle = physics.world.simulate(current, fine, span, settings)
+        group = clusters(current, pairs.low, pairs.high, span, sideways=_ROOM)
+        awake = np.isin(group, group[~at_rest])
+        rows = np.flatnonzero(awake | objects.fixed)
+        moving, pairs = current[rows], pairs.among(rows)
+        fine = physics.support.needs_fine(moving, pairs)
+        settings = settings_for(int(physics.support.tallest(moving, pairs).max(initial=0)), damping=_DAMPING)
+        end_rotation, end_translation, angle = physics.world.simulate(moving, fine, group[rows], span, settings)
         if not (np.isfinite(end_rotation).all() and np.isfinite(end_translation).all()):
             return objects.rotation, objects.translation, False
-        free = ~objects.fixed
-        moved = np.linalg.norm(end_translation - translation, axis=1)[free].max(initial=0.0)
-        rotation = np.where(free[:, None, None], end_rotation, rotation)
-        translation = np.where(free[:, None], end_translation, translation)
-        if moved < _STILL and angle[free].max(initial=0.0) < _STILL:
-            break
+        moved = np.linalg.norm(end_translation - translation[rows], axis=1)
+        at_rest[rows] = objects.fixed[rows] | ((moved < _STILL) & (angle < _STILL))
+        free = ~objects.fixed[rows]
+        rotation[rows[free]], translation[rows[free]] = end_rotation[free], end_translation[free]
     return rotation, translation, True
 
 
@@ -137,6 +163,6 @@ def settings_for(height: int, damping: float = 0.0) -> SolverSettings:
         height: how many objects carry the topmost one.
         damping: fraction of velocity lost per second.
     """
-    if height >= 7:
+    if height >= _HIGH:
         return replace(FINEST, linear_damping=damping, angular_damping=damping)
     return SolverSettings(1.0 / 480.0, 25 if height < _TALL else 40, damping, damping)

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from scene_envs.physics.collision import ObjectPairs, scene_pairs
 from scene_envs.physics.contact_faces import ContactFace
@@ -29,8 +31,8 @@ _FLAT = 3e-4
 """Tilt (rad) up to which an object on its own needs no simulation."""
 _CLEAR = 0.01
 """An object is on its own when nothing is within this distance (m) of it sideways or below,"""
-_CLEAR_ABOVE = 0.06
-"""or within this distance (m) above: further than anything falls in 0.1 s."""
+_CLEAR_ABOVE = 0.01
+"""or within this distance (m) above, beyond what falls in the time."""
 _BALANCE = 5e-3
 """The centre of mass must lie at least this far (m) inside the foot."""
 
@@ -126,11 +128,7 @@ class Support:
         Returns:
             mask (n,), displacement (n,) m and rotation (n,) rad; the last two only where the mask is True.
         """
-        first, second = scene_pairs(objects)
-        near = (low[first, 0] <= high[second, 0] + _CLEAR) & (low[second, 0] <= high[first, 0] + _CLEAR)
-        near &= (low[first, 1] <= high[second, 1] + _CLEAR) & (low[second, 1] <= high[first, 1] + _CLEAR)
-        near &= (low[first, 2] <= high[second, 2] + _CLEAR_ABOVE) & (low[second, 2] <= high[first, 2] + _CLEAR_ABOVE)
-        first, second = first[near], second[near]
+        first, second = neighbors_of(objects, low, high, _CLEAR, duration)
         n = len(objects)
         neighbors = np.bincount(first, minlength=n) + np.bincount(second, minlength=n)
         support = np.full(n, -1, dtype=np.int64)
@@ -168,6 +166,30 @@ class Support:
             if not objects.fixed[lower[index]]:
                 depth[upper[index]] = max(depth[upper[index]], depth[lower[index]] + 1)
         return depth
+
+
+def neighbors_of(objects: Objects, low: Array, high: Array, sideways: float, duration: float) -> tuple[Index, Index]:
+    """Pairs (P,), (P,) of objects of one scene that could meet within ``duration`` seconds.
+
+    Their boxes are within ``sideways`` m of each other, and no further apart in height than what falls in the time.
+    """
+    first, second = scene_pairs(objects)
+    near = (low[first, 0] <= high[second, 0] + sideways) & (low[second, 0] <= high[first, 0] + sideways)
+    near &= (low[first, 1] <= high[second, 1] + sideways) & (low[second, 1] <= high[first, 1] + sideways)
+    above = 0.5 * GRAVITY * duration**2 + _CLEAR_ABOVE
+    near &= (low[first, 2] <= high[second, 2] + above) & (low[second, 2] <= high[first, 2] + above)
+    return first[near], second[near]
+
+
+def clusters(objects: Objects, low: Array, high: Array, duration: float, sideways: float = _CLEAR) -> Index:
+    """(n,) a number per free object, shared by those that could meet in ``duration`` seconds; -1 for fixed ones."""
+    first, second = neighbors_of(objects, low, high, sideways, duration)
+    free = ~(objects.fixed[first] | objects.fixed[second])
+    first, second = first[free], second[free]
+    n = len(objects)
+    graph = coo_matrix((np.ones(len(first)), (first, second)), shape=(n, n))
+    labels = connected_components(graph, directed=False)[1].astype(np.int64)
+    return np.where(objects.fixed, -1, labels)
 
 
 def _face_center(objects: Objects, rows: Index, faces: _Faces) -> Array:

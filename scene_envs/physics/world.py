@@ -201,13 +201,14 @@ class World:
     # -- motion ---------------------------------------------------------------------------------
 
     def simulate(
-        self, objects: Objects, fine: Mask, duration: float, settings: SolverSettings
+        self, objects: Objects, fine: Mask, group: Index, duration: float, settings: SolverSettings
     ) -> tuple[Array, Array, Array]:
         """Move the objects of one scene for ``duration`` seconds under gravity.
 
         Args:
             objects: the n objects.
             fine: (n,) whether each object collides with its fine parts.
+            group: (n,) number of the cluster of each free object; a cluster leaves when all of it is at rest.
             duration: s.
             settings: integration.
 
@@ -249,20 +250,23 @@ class World:
         bullet.setPhysicsEngineParameter(
             fixedTimeStep=settings.time_step, numSolverIterations=settings.iterations, physicsClientId=client
         )
+        end_position, end_quaternion = np.empty((count, 3)), np.empty((count, 4))
+        running = {int(label): np.flatnonzero(group == label) for label in np.unique(group[~fixed])}
         done = 0
         while done < steps:
             ahead = min(_LOOK, steps - done)
-            for _ in range(ahead):
+            for _ in range(ahead if running else ahead % 2):  # always an even number in all
                 bullet.stepSimulation(physicsClientId=client)
             done += ahead
-            if done < steps and self._is_still(bodies[~fixed]):
-                if (steps - done) % 2:
-                    bullet.stepSimulation(physicsClientId=client)
-                break
-        end = [bullet.getBasePositionAndOrientation(int(body), physicsClientId=client) for body in bodies]
-        end_position = np.array([pose[0] for pose in end])
-        end_quaternion = np.array([pose[1] for pose in end])
-        self._park(bodies, category)
+            for label, rows in list(running.items()):
+                if done < steps and self._is_still(bodies[rows]):
+                    self._read(bodies, rows, end_position, end_quaternion)
+                    self._park(bodies[rows], category[rows])
+                    del running[label]
+        for rows in (np.flatnonzero(fixed), *running.values()):
+            self._read(bodies, rows, end_position, end_quaternion)
+            self._park(bodies[rows], category[rows])
+        self._place(self._binder, self._parking[self._binder], _UPRIGHT)
 
         end_rotation = _matrices(end_quaternion)
         new_rotation = _times(end_rotation, axes.swapaxes(-1, -2))
@@ -272,6 +276,12 @@ class World:
         if lost.any():
             self.reset()
         return new_rotation, new_translation, angle
+
+    def _read(self, bodies: Index, rows: Index, position: Array, quaternion: Array) -> None:
+        for row in rows.tolist():
+            position[row], quaternion[row] = self._bullet.getBasePositionAndOrientation(
+                int(bodies[row]), physicsClientId=self._client
+            )
 
     def _is_still(self, bodies: Index) -> bool:
         """Whether nothing moves or starts to: what is at rest stays at rest."""
@@ -312,7 +322,6 @@ class World:
         bullet.setCollisionFilterGroupMask(body, -1, 1, 1, physicsClientId=client)
 
     def _park(self, bodies: Index, category: Index) -> None:
-        self._place(self._binder, self._parking[self._binder], _UPRIGHT)
         for row, body in enumerate(bodies.tolist()):
             self._place(body, self._parking[body], _UPRIGHT)
             if not self._library.static[category[row]]:
