@@ -66,6 +66,6 @@ def draw_scene(scene: SceneBatch, state: Any, path: Path, *, width: int = 640, h
     marked = state.mask.unsqueeze(0) & scene.is_free
     image = render(scene, width=width, height=height, highlight=marked)[0]
     objects = int(scene.is_free.sum())
-    caption = f"objective {state.objective:.4g} | {objects} free objects | {int(marked.sum())} to regenerate (red)"
+    caption = f"objective {state.objective:.4g} | {objects} free objects | {int(marked.sum())} to redo (red)"
     gallery([image], columns=1, captions=[caption]).save(path)
     return path
