@@ -120,7 +120,7 @@ def _move(
         displacement[rows] = np.linalg.norm(end[1] - objects.translation[rows], axis=1)
         rotation[rows] = end[2]
 
-    for settings in {settings_for(int(carriers)): None for carriers in tallest[group[~objects.fixed]]}:
+    for settings in dict.fromkeys(settings_for(int(carriers)) for carriers in tallest[group[~objects.fixed]]):
         run(np.array([label >= 0 and settings_for(int(tallest[label])) == settings for label in group]), settings)
     doubtful = (height >= _TALL) & (displacement > _DOUBT[0]) & (displacement < _DOUBT[1])
     again = np.unique(group[doubtful & ~objects.fixed])
@@ -165,4 +165,4 @@ def settings_for(height: int, damping: float = 0.0) -> SolverSettings:
     """
     if height >= _HIGH:
         return replace(FINEST, linear_damping=damping, angular_damping=damping)
-    return SolverSettings(1.0 / 480.0, 25 if height < _TALL else 40, damping, damping)
+    return SolverSettings(1.0 / 480.0, 35, damping, damping)

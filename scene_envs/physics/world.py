@@ -107,6 +107,7 @@ class World:
             deterministicOverlappingPairs=1,
             enableFileCaching=0,
             solverResidualThreshold=0.0,
+            contactERP=0.2,  # overlaps within the limits close in 10 ms; 0.4 makes objects hop
             physicsClientId=client,
         )
         # A shared small visual: without one PyBullet would read the collision mesh again for every body.
