@@ -13,7 +13,7 @@ from agents.prior import ScenePrior
 RECIPE = PostTrainConfig(
     prior="dimsum_table",
     reward="object_count",
-    iterations=30,
+    iterations=24,
     batch_size=32,
     num_steps=25,
     gradient_steps=8,
@@ -26,7 +26,7 @@ RECIPE = PostTrainConfig(
     guard_limit=1.4,
     checkpoint_every=10,
 )
-"""What ``make demo`` runs, for two cores and about four minutes of training."""
+"""What ``make demo`` runs: two minutes of training on two cores."""
 
 
 def run_demo(
