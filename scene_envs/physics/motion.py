@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +35,9 @@ _DOUBT = 6e-4, 3e-3
 """Motion (m) of an object high in a stack that calls for a finer integration before it is believed."""
 FINEST = SolverSettings(1.0 / 960.0, 35)
 """What stacks are judged with in doubt: a tower of ten boxes sinks by about half a millimetre."""
-SETTLING = SolverSettings(1.0 / 240.0, 30, linear_damping=0.3, angular_damping=0.3)
-"""Steps on the way to rest: coarser than those of the judgement that follows, three times cheaper, slightly damped."""
+_DAMPING = 0.3
+"""Fraction of velocity that objects lose per second while they settle. Coarser steps do not pay here: with 1/240 s
+jittered Dimsum scenes took 1.4 times as long to come to rest, and 1.5 % of objects were not ready afterwards."""
 
 
 class Physics:
@@ -144,7 +146,9 @@ def settle_scene(physics: Physics, objects: Objects, duration: float) -> tuple[A
         rows = np.flatnonzero(awake | objects.fixed)
         moving, pairs = current[rows], pairs.among(rows)
         fine = physics.support.needs_fine(moving, pairs)
-        end_rotation, end_translation, angle = physics.world.simulate(moving, fine, group[rows], span, SETTLING)
+        settings = settings_for(int(physics.support.tallest(moving, pairs).max(initial=0)))
+        settings = replace(settings, linear_damping=_DAMPING, angular_damping=_DAMPING)
+        end_rotation, end_translation, angle = physics.world.simulate(moving, fine, group[rows], span, settings)
         if not (np.isfinite(end_rotation).all() and np.isfinite(end_translation).all()):
             return objects.rotation, objects.translation, False
         moved = np.linalg.norm(end_translation - translation[rows], axis=1)
