@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from scene_envs.errors import MissingDependencyError, PhysicsError
+from scene_envs.physics import rigid
 from scene_envs.physics.geometry import LevelGeometry, LibraryGeometry, inset_hull
 from scene_envs.physics.placement import Objects
 
@@ -230,9 +231,9 @@ class World:
 
         axes = np.array([self._principal(c)[0] for c in category.tolist()])
         center = self._library.center_of_mass[category]
-        start_rotation = _times(rotation, axes)
-        start_quaternion = _quaternions(start_rotation)
-        start_position = translation + _apply(rotation, center)
+        start_rotation = rigid.times(rotation, axes)
+        start_quaternion = rigid.quaternions(start_rotation)
+        start_position = translation + rigid.apply(rotation, center)
 
         taken = dict.fromkeys(needed, 0)
         bodies = np.empty(count, dtype=np.int64)
@@ -269,10 +270,10 @@ class World:
             self._park(bodies[rows], category[rows])
         self._place(self._binder, self._parking[self._binder], _UPRIGHT)
 
-        end_rotation = _matrices(end_quaternion)
-        new_rotation = _times(end_rotation, axes.swapaxes(-1, -2))
-        new_translation = end_position - _apply(new_rotation, center)
-        angle = _angle_between(start_quaternion, end_quaternion)
+        end_rotation = rigid.matrices(end_quaternion)
+        new_rotation = rigid.times(end_rotation, axes.swapaxes(-1, -2))
+        new_translation = end_position - rigid.apply(new_rotation, center)
+        angle = rigid.angle_between(start_quaternion, end_quaternion)
         lost = ~np.isfinite(end_position).all(axis=1) | ~np.isfinite(end_quaternion).all(axis=1)
         if lost.any():
             self.reset()
@@ -372,48 +373,3 @@ def _wavefront(hulls: list[Array]) -> str:
         lines.extend(f"f {a + offset} {b + offset} {c + offset}" for a, b, c in ConvexHull(vertices).simplices)
         offset += len(vertices)
     return "\n".join(lines) + "\n"
-
-
-def _apply(rotation: Array, vector: Array) -> Array:
-    r, v = rotation, vector[:, None, :]
-    return r[..., 0] * v[..., 0] + r[..., 1] * v[..., 1] + r[..., 2] * v[..., 2]  # type: ignore[no-any-return]
-
-
-def _times(a: Array, b: Array) -> Array:
-    return a[..., :, 0:1] * b[..., 0:1, :] + a[..., :, 1:2] * b[..., 1:2, :] + a[..., :, 2:3] * b[..., 2:3, :]
-
-
-def _quaternions(matrices: Array) -> Array:
-    """(n, 4) in PyBullet's order (x, y, z, w), from whichever of four equal forms is the most accurate."""
-    m = matrices.reshape(-1, 9).T
-    a, b, c = m[0], m[4], m[8]
-    x, y, z = m[7] - m[5], m[2] - m[6], m[3] - m[1]
-    xy, xz, yz = m[1] + m[3], m[2] + m[6], m[5] + m[7]
-    forms = np.array(
-        [
-            [1 + a - b - c, xy, xz, x],
-            [xy, 1 - a + b - c, yz, y],
-            [xz, yz, 1 - a - b + c, z],
-            [x, y, z, 1 + a + b + c],
-        ]
-    )  # (form, component, n)
-    best = np.array([a, b, c, a + b + c]).argmax(axis=0)
-    quaternion = forms[best, :, np.arange(len(best))]
-    return quaternion / np.sqrt((quaternion * quaternion).sum(axis=1, keepdims=True))  # type: ignore[no-any-return]
-
-
-def _matrices(xyzw: Array) -> Array:
-    x, y, z, w = (xyzw / np.linalg.norm(xyzw, axis=1, keepdims=True)).T
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return np.stack(rows, axis=1).reshape(-1, 3, 3)
-
-
-def _angle_between(a: Array, b: Array) -> Array:
-    """Angle (n,) between unit quaternions (x, y, z, w), accurate when tiny."""
-    scalar = np.abs((a * b).sum(axis=1))
-    vector = a[:, 3:] * b[:, :3] - b[:, 3:] * a[:, :3] - np.cross(a[:, :3], b[:, :3])
-    return 2.0 * np.arctan2(np.linalg.norm(vector, axis=1), scalar)
