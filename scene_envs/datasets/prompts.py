@@ -80,6 +80,18 @@ def describe(batch: SceneBatch, rng: np.random.Generator, *, kinds: Sequence[str
     return [_describe(facts, kinds, nouns, rng) for facts in scene_facts(batch)]
 
 
+def describe_all(batch: SceneBatch, rng: np.random.Generator, *, count: int = 3) -> list[tuple[str, ...]]:
+    """``count`` prompts per scene, of different kinds and without duplicates where the scene has that much to say.
+
+    Raises:
+        InvalidInputError: ``count`` is not positive.
+    """
+    if count < 1:
+        raise InvalidInputError(f"count must be at least 1 prompt per scene, got {count}")
+    nouns = _Nouns(batch.scene_type)
+    return [_describe_all(facts, count, nouns, rng) for facts in scene_facts(batch)]
+
+
 def parse_prompt(text: str, scene_type: str | SceneType) -> PromptFacts:
     """Read a prompt made by :func:`describe` back into its claims.
 
@@ -171,6 +183,20 @@ def _describe(facts: SceneFacts, kinds: Sequence[str], nouns: _Nouns, rng: np.ra
         return f"A scene with {_join([nouns.say(facts.objects[name], name) for name in names])}."
     pairs = _subset(sorted(facts.on_top), rng)
     return f"A scene with {_join([_relation(facts.on_top[pair], pair, nouns) for pair in pairs])}."
+
+
+def _describe_all(facts: SceneFacts, count: int, nouns: _Nouns, rng: np.random.Generator) -> tuple[str, ...]:
+    prompts: list[str] = []
+    for turn in range(count):
+        for _ in range(10):
+            prompt = _describe(facts, [KINDS[turn % len(KINDS)]], nouns, rng)
+            if prompt not in prompts:
+                break
+            prompt = _describe(facts, ["names"], nouns, rng)
+            if prompt not in prompts:
+                break
+        prompts.append(prompt)
+    return tuple(prompts)
 
 
 def _relation(number: int, pair: tuple[str, str], nouns: _Nouns) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from scene_envs.datasets import SceneFacts, describe, parse_prompt, scene_facts
+from scene_envs.datasets.prompts import SceneFacts, describe, describe_all, parse_prompt, scene_facts
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch
@@ -98,3 +98,11 @@ def test_other_text_is_refused(text: str) -> None:
 def test_unknown_kinds_are_refused(batch: SceneBatch) -> None:
     with pytest.raises(InvalidInputError, match="mood"):
         describe(batch, np.random.default_rng(0), kinds=["mood"])
+
+
+def test_three_prompts_of_different_kinds_per_scene(batch: SceneBatch) -> None:
+    prompts = describe_all(batch, np.random.default_rng(0))
+    assert prompts == describe_all(batch, np.random.default_rng(0))
+    for three, scene in zip(prompts, scene_facts(batch), strict=True):
+        assert len(set(three)) == 3
+        assert all(parse_prompt(prompt, batch.scene_type).holds(scene) for prompt in three)
