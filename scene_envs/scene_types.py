@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.plugins import load_plugins
 
 if TYPE_CHECKING:
     from scene_envs.assets.base import AssetLibrary
@@ -57,6 +58,7 @@ class SceneType:
         fixed: welded objects with one constant pose; they take the first slots of a scene.
         camera: the paper's semantic-render camera.
         description: one sentence for listings.
+        asset_folders: folders of users' own assets, searched before the built-in ones.
 
     >>> scene_type = get_scene_type("dimsum_table")
     >>> scene_type.num_assets, scene_type.slots, scene_type.features
@@ -71,6 +73,7 @@ class SceneType:
     fixed: tuple[FixedObject, ...]
     camera: Camera
     description: str = ""
+    asset_folders: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for asset in (*self.welded, *(f.asset for f in self.fixed)):
@@ -116,12 +119,15 @@ def get_scene_type(name: str | SceneType) -> SceneType:
     if isinstance(name, SceneType):
         return name
     if name not in _REGISTRY:
+        load_plugins()
+    if name not in _REGISTRY:
         raise unknown_name("scene type", name, _REGISTRY)
     return _REGISTRY[name]
 
 
 def list_scene_types() -> list[str]:
-    """Names of all registered scene types, sorted."""
+    """Names of all registered scene types, those of installed packages included, sorted."""
+    load_plugins()
     return sorted(_REGISTRY)
 
 

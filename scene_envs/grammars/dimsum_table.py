@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 
-from scene_envs.grammars.dsl import NOTHING, Geometric, Group, Node, Object, OneOf, Repeat, Stack
-from scene_envs.grammars.grammar import Grammar, Surface, register_grammar
+from scene_envs.grammars.dsl import NOTHING, Geometric, Group, Node, Object, OneOf, Repeat, Stack, Surface
+from scene_envs.grammars.grammar import Grammar, register_grammar
 from scene_envs.grammars.surface import Gaussian, Region
 from scene_envs.scene_types import get_scene_type
 

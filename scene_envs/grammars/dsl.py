@@ -1,14 +1,15 @@
 """The words of a grammar: objects, stacks, choices and repetitions, each of which draws towers.
 
-A *tower* is what stands on a support: one object, or a stack of objects on the same vertical axis.
-Nodes say what is there (the structure); a :class:`~scene_envs.grammars.surface.Gaussian` says where.
+A *tower* is what stands on a support: one object, or a stack of objects on the same vertical axis, with what
+stands on it and what is in it. Nodes say what is there (the structure); a *wish* such as
+:class:`~scene_envs.grammars.surface.Gaussian` says where.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import accumulate
@@ -17,7 +18,10 @@ from typing import Protocol
 import numpy as np
 
 from scene_envs.errors import InvalidInputError
-from scene_envs.grammars.surface import Gaussian
+from scene_envs.grammars.containers import Filling
+from scene_envs.grammars.surface import Gaussian, Region, Wish, Yaw
+
+_CENTER = Gaussian(along=0.0)
 
 
 @dataclass(frozen=True)
@@ -26,13 +30,58 @@ class Tower:
 
     Attributes:
         assets: asset names from the bottom up.
-        step: height (m) between the frames of neighbours.
-        where: the distribution of the axis.
+        where: the distribution of the axis, in the frame of the support.
+        step: height (m) between the frames of neighbours; None stacks each on the top of the one below.
+        yaw: how each object is turned.
+        loads: what stands on the bottom object: surfaces, each with its towers.
+        contents: assets inside the bottom object, which come to rest in it.
+        filling: how the contents get there.
     """
 
     assets: tuple[str, ...]
-    where: Gaussian
-    step: float = 0.0
+    where: Wish
+    step: float | None = None
+    yaw: Yaw = Yaw()  # noqa: RUF009  (frozen)
+    loads: tuple[tuple[Surface, tuple[Tower, ...]], ...] = ()
+    contents: tuple[str, ...] = ()
+    filling: Filling | None = None
+
+    def walk(self) -> Iterator[Tower]:
+        """This tower and all that stand on it, recursively."""
+        yield self
+        for _, towers in self.loads:
+            for tower in towers:
+                yield from tower.walk()
+
+    def count(self) -> int:
+        """Objects in this tower, on it and in it."""
+        return sum(len(tower.assets) + len(tower.contents) for tower in self.walk())
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A horizontal support of a grammar, with what stands on it.
+
+    Attributes:
+        children: what stands here; drawn and placed in this order.
+        region: where children may stand.
+        keep_out: per asset, the radius (m) no other child's keep-out may meet; by default the plan of the asset.
+        footprint: per asset, the radius (m) that must lie wholly on the support; by default the plan of the asset.
+        height: z of the surface (m), in the world or in the frame of the object that carries it; None takes the
+            height at which something rests in the middle of that object.
+        layouts: how often the whole layout is tried before the structure is thrown away.
+    """
+
+    children: Sequence[Node]
+    region: Region
+    keep_out: Mapping[str, float] = field(default_factory=dict)
+    footprint: Mapping[str, float] = field(default_factory=dict)
+    height: float | None = 0.0
+    layouts: int = 10
+
+    def draw(self, rng: np.random.Generator, reasons: Counter[str]) -> tuple[Tower, ...]:
+        """The towers on this surface."""
+        return tuple(tower for node in self.children for tower in node.draw(rng, reasons))
 
 
 class Node(Protocol):
@@ -45,13 +94,28 @@ class Node(Protocol):
 
 @dataclass(frozen=True)
 class Object:
-    """One object at a distribution of places."""
+    """One object at a distribution of places, with what stands on it or is in it.
+
+    Attributes:
+        asset: asset name.
+        where: the distribution of its place, in the frame of its support; its middle by default.
+        yaw: how it is turned; any angle by default.
+        on: surfaces that it carries, in its own frame: a shelf's tiers, the middle of a plate, the floor of a bowl.
+        inside: things that come to rest in it under gravity: cutlery in a crock, fruit in a bowl.
+    """
 
     asset: str
-    where: Gaussian
+    where: Wish = _CENTER
+    yaw: Yaw = Yaw()  # noqa: RUF009  (frozen)
+    on: Sequence[Surface] = ()
+    inside: Filling | None = None
 
     def draw(self, rng: np.random.Generator, reasons: Counter[str]) -> list[Tower]:
-        return [Tower((self.asset,), self.where)]
+        loads = tuple((surface, surface.draw(rng, reasons)) for surface in self.on)
+        contents: tuple[str, ...] = ()
+        if self.inside is not None:
+            contents = tuple(asset for tower in self.inside.node.draw(rng, reasons) for asset in tower.assets)
+        return [Tower((self.asset,), self.where, None, self.yaw, loads, contents, self.inside)]
 
 
 @dataclass(frozen=True)
@@ -61,16 +125,18 @@ class Stack:
     Attributes:
         base: the asset that carries others.
         then: weights of what comes next: ``base`` (go on), another asset (ends the stack), or None (ends it).
-        step: height (m) by which each level rises.
-        where: the distribution of the stack's axis.
+        step: height (m) by which each level rises; None puts each on the top of the one below.
+        where: the distribution of the stack's axis; the middle of the support by default.
         at_most: objects in the stack, at most; drawn again when it grows higher.
+        yaw: how each object is turned; any angle by default.
     """
 
     base: str
     then: Mapping[str | None, float]
-    step: float
-    where: Gaussian
+    step: float | None = None
+    where: Wish = _CENTER
     at_most: int = 10
+    yaw: Yaw = Yaw()  # noqa: RUF009  (frozen)
 
     @cached_property
     def _next(self) -> tuple[list[str | None], list[float]]:
@@ -86,8 +152,35 @@ class Stack:
                 if following is not None:
                     assets.append(following)
             if len(assets) <= self.at_most:
-                return [Tower(tuple(assets), self.where, self.step)]
+                return [Tower(tuple(assets), self.where, self.step, self.yaw)]
             reasons[f"stack of {self.base} above {self.at_most}"] += 1
+
+
+@dataclass(frozen=True)
+class Pile:
+    """A pile whose members are drawn one by one from a mixture: board games, books, plates of several kinds.
+
+    Attributes:
+        members: (weight, asset) options for every level.
+        height: the distribution of the number of objects.
+        where: the distribution of the pile's axis; the middle of the support by default.
+        yaw: how each object is turned; any angle by default.
+    """
+
+    members: tuple[tuple[float, str], ...]
+    height: Geometric
+    where: Wish = _CENTER
+    yaw: Yaw = Yaw()  # noqa: RUF009  (frozen)
+
+    @cached_property
+    def _cumulative(self) -> list[float]:
+        return list(accumulate(weight for weight, _ in self.members))
+
+    def draw(self, rng: np.random.Generator, reasons: Counter[str]) -> list[Tower]:
+        count = self.height.draw(rng)
+        draws = (bisect_right(self._cumulative, rng.random() * self._cumulative[-1]) for _ in range(count))
+        assets = tuple(self.members[index][1] for index in draws)
+        return [Tower(assets, self.where, None, self.yaw)] if assets else []
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,8 +12,9 @@ import torch
 from numpy.typing import NDArray
 
 from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.grammars.dsl import Node, Tower
-from scene_envs.grammars.surface import FreeSurface, Region
+from scene_envs.grammars.dsl import Surface, Tower
+from scene_envs.grammars.layout import Frame, Layout, Pose
+from scene_envs.plugins import load_plugins
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
@@ -24,36 +24,18 @@ _MAX_WITHOUT_ROOM = 100
 """Structures in a row that may fail for lack of room."""
 
 
-@dataclass(frozen=True)
-class Surface:
-    """A horizontal support of a grammar, with what stands on it.
-
-    Attributes:
-        children: what stands here; drawn and placed in this order.
-        region: where children may stand.
-        keep_out: per asset, the radius (m) no other child's keep-out circle may enter.
-        footprint: per asset, the radius (m) that must lie wholly on the support.
-        height: z of the surface, m, world frame.
-        layouts: how often the whole layout is tried before the structure is thrown away.
-    """
-
-    children: Sequence[Node]
-    region: Region
-    keep_out: Mapping[str, float]
-    footprint: Mapping[str, float]
-    height: float = 0.0
-    layouts: int = 10
-
-
 @dataclass
 class Grammar:
-    """A distribution over scenes of one type. Poses are exact: yaw-only rotations, towers on one axis.
+    """A distribution over scenes of one type.
+
+    Poses are exact: objects stand upright, towers on one axis; only what is inside a container comes to rest there.
 
     Attributes:
         name: the registered name.
         scene_type: the scene type, or its name.
         surfaces: the supports with their children.
-        such_that: named conditions on all towers of a scene; a structure that fails one is thrown away.
+        such_that: named conditions on all towers of a scene, those that stand on others included; a structure
+            that fails one is thrown away.
         reasons: how often, and why, draws were thrown away since the grammar was made.
 
     >>> grammar = get_grammar("dimsum_table")
@@ -90,74 +72,53 @@ class Grammar:
     def _category(self) -> dict[str, int]:
         return {name: index for index, name in enumerate(self.scene_type.assets)}
 
+    @cached_property
+    def _layout(self) -> Layout:
+        return Layout(self.scene_type, self.reasons)
+
     def _fill(self, scene: NDArray[np.float32], rng: np.random.Generator) -> None:
         """Write one scene into ``scene`` (N, D)."""
         structures = without_room = 0
         while structures < _MAX_STRUCTURES and without_room < _MAX_WITHOUT_ROOM:
             structures += 1
-            nodes_of = [surface.children for surface in self.surfaces]
-            towers = [[t for node in nodes for t in node.draw(rng, self.reasons)] for nodes in nodes_of]
-            if not self._accepts([tower for surface_towers in towers for tower in surface_towers]):
+            towers = [surface.draw(rng, self.reasons) for surface in self.surfaces]
+            if not self._accepts([part for row in towers for tower in row for part in tower.walk()]):
                 continue
-            layout = [_layout(s, t, rng) for s, t in zip(self.surfaces, towers, strict=True)]
-            if any(places is None for places in layout):
-                self.reasons["no room"] += 1
-                without_room += 1
-                continue
-            scene[:] = self._blank
-            slot = len(self.scene_type.fixed)
-            for surface, surface_towers, places in zip(self.surfaces, towers, layout, strict=True):
-                for tower, (x, y) in zip(surface_towers, places or (), strict=True):
-                    slot = self._write(scene, slot, tower, x, y, surface.height, rng)
-            return
+            poses = self._place(towers, rng)
+            if poses is not None:
+                self._write(scene, poses)
+                return
+            self.reasons["no room"] += 1
+            without_room += 1
         raise InvalidInputError(
             f"grammar {self.name!r} made no scene in {structures} structures; "
             f"most frequent reasons: {dict(self.reasons.most_common(3))}"
         )
 
+    def _place(self, towers: Sequence[Sequence[Tower]], rng: np.random.Generator) -> list[Pose] | None:
+        poses: list[Pose] = []
+        for surface, row in zip(self.surfaces, towers, strict=True):
+            placed = self._layout.place(surface, row, Frame(), None, rng)
+            if placed is None:
+                return None
+            poses += placed
+        return poses
+
     def _accepts(self, towers: Sequence[Tower]) -> bool:
         failed = next((name for name, holds in self.such_that.items() if not holds(towers)), None)
-        objects = sum(len(tower.assets) for tower in towers)
+        objects = sum(len(tower.assets) + len(tower.contents) for tower in towers)
         if failed is None and objects + len(self.scene_type.fixed) > self.scene_type.slots:
             failed = f"more than {self.scene_type.slots} objects"
         if failed is not None:
             self.reasons[failed] += 1
         return failed is None
 
-    def _write(
-        self,
-        scene: NDArray[np.float32],
-        slot: int,
-        tower: Tower,
-        x: float,
-        y: float,
-        z: float,
-        rng: np.random.Generator,
-    ) -> int:
-        for level, asset in enumerate(tower.assets):
-            yaw = rng.random() * 2.0 * math.pi
-            cos, sin = math.cos(yaw), math.sin(yaw)
-            scene[slot, :12] = (x, y, z + level * tower.step, cos, -sin, 0.0, sin, cos, 0.0, 0.0, 0.0, 1.0)
+    def _write(self, scene: NDArray[np.float32], poses: Sequence[Pose]) -> None:
+        scene[:] = self._blank
+        for slot, pose in enumerate(poses, start=len(self.scene_type.fixed)):
+            scene[slot, :12] = (*pose.translation, *pose.rotation)
             scene[slot, -1] = 0.0
-            scene[slot, 12 + self._category[asset]] = 1.0
-            slot += 1
-        return slot
-
-
-def _layout(surface: Surface, towers: Sequence[Tower], rng: np.random.Generator) -> list[tuple[float, float]] | None:
-    """Positions of the towers' axes, (x, y) in m each; None when they do not fit."""
-    for _ in range(surface.layouts):
-        free = FreeSurface(surface.region)
-        places: list[tuple[float, float]] = []
-        for tower in towers:
-            asset = tower.assets[0]
-            spot = free.place(tower.where, surface.keep_out[asset], surface.footprint[asset], rng)
-            if spot is None:
-                break
-            places.append(spot)
-        else:
-            return places
-    return None
+            scene[slot, 12 + self._category[pose.asset]] = 1.0
 
 
 _REGISTRY: dict[str, Callable[[], Grammar]] = {}
@@ -183,10 +144,13 @@ def get_grammar(scene_type: str | SceneType | Grammar) -> Grammar:
 def grammar_factory(name: str) -> Callable[[], Grammar]:
     """The function registered as ``name``; raises UnknownNameError with the nearest known name."""
     if name not in _REGISTRY:
+        load_plugins()
+    if name not in _REGISTRY:
         raise unknown_name("grammar", name, _REGISTRY)
     return _REGISTRY[name]
 
 
 def list_grammars() -> list[str]:
-    """Names of all registered grammars, sorted."""
+    """Names of all registered grammars, those of installed packages included, sorted."""
+    load_plugins()
     return sorted(_REGISTRY)

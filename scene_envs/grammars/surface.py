@@ -3,16 +3,34 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scene_envs.grammars.plan import Disc, Placed, Plan, meet
+
 _DRAWS = 24
 """Draws from a child's own distribution before the free region is enumerated."""
 _CELL = 0.02
-"""Side of the cells (m) in which a crowded free region is enumerated."""
+"""Side of the cells (m) in which a crowded free region is enumerated; larger where the region is larger than 2 m."""
+_MOST_CELLS = 100
+"""Cells along each side of a region, at most."""
+
+
+class Wish(Protocol):
+    """A distribution over places (x, y) in the frame of a support, m."""
+
+    def draw(self, rng: np.random.Generator) -> tuple[float, float]:
+        """One place."""
+        ...
+
+    def log_density(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """(P,) log density up to a constant, at ``points`` (P, 2); None when it lives on a line or point."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -54,94 +72,224 @@ class Gaussian:
 
 
 @dataclass(frozen=True)
+class Uniform:
+    """Anywhere in a rectangle of the support: ``half_x``, ``half_y`` (m) about (``x``, ``y``)."""
+
+    half_x: float
+    half_y: float
+    x: float = 0.0
+    y: float = 0.0
+
+    def draw(self, rng: np.random.Generator) -> tuple[float, float]:
+        """One position (x, y), m."""
+        return (
+            self.x + self.half_x * (2.0 * rng.random() - 1.0),
+            self.y + self.half_y * (2.0 * rng.random() - 1.0),
+        )
+
+    def log_density(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(P,) 0 inside, minus infinity outside."""
+        inside = (np.abs(points[:, 0] - self.x) <= self.half_x) & (np.abs(points[:, 1] - self.y) <= self.half_y)
+        return np.where(inside, 0.0, -np.inf)
+
+
+@dataclass(frozen=True)
+class Line:
+    """Anywhere on the segment between two points (x, y), m: along a wall, at the edge of a shelf."""
+
+    start: tuple[float, float]
+    end: tuple[float, float]
+
+    def draw(self, rng: np.random.Generator) -> tuple[float, float]:
+        """One position (x, y), m."""
+        t = rng.random()
+        return (
+            self.start[0] + t * (self.end[0] - self.start[0]),
+            self.start[1] + t * (self.end[1] - self.start[1]),
+        )
+
+    def log_density(self, points: NDArray[np.float64]) -> None:
+        """None: a line has no density in the plane."""
+        return None
+
+
+@dataclass(frozen=True)
+class Yaw:
+    """How a child is turned about the vertical: one of ``choices`` plus a normal deviate.
+
+    Attributes:
+        std: standard deviation, rad; infinite for any angle.
+        choices: angles (rad) of the object's +x axis from the support's, equally likely.
+    """
+
+    std: float = math.inf
+    choices: tuple[float, ...] = (0.0,)
+
+    def draw(self, rng: np.random.Generator) -> float:
+        """One angle, rad."""
+        if self.std == math.inf:
+            return rng.random() * 2.0 * math.pi
+        center = self.choices[0] if len(self.choices) == 1 else self.choices[int(rng.integers(len(self.choices)))]
+        return center + self.std * rng.standard_normal()
+
+
+@dataclass(frozen=True)
 class Region:
-    """A rectangle cut by an optional disc, both centred on the support's origin.
+    """Where children may stand: a rectangle cut by an optional disc, in the support's frame.
 
     Attributes:
         half_x, half_y: half sides of the rectangle (m) in which object frames stay.
-        radius: radius (m) of the disc in which whole footprints stay; infinite for none.
+        radius: radius (m) of the disc about the support's origin in which whole footprints stay.
+        overhang: how far (m) footprints may reach beyond the rectangle; 0 keeps all of them inside.
+        x, y: centre of the rectangle, m.
     """
 
     half_x: float
     half_y: float
     radius: float = math.inf
+    overhang: float = math.inf
+    x: float = 0.0
+    y: float = 0.0
 
-    def contains(self, x: float, y: float, footprint: float) -> bool:
-        """Whether a child with a round ``footprint`` (radius, m) at (x, y) is inside."""
-        if abs(x) > self.half_x or abs(y) > self.half_y:
+    def contains(self, child: Placed) -> bool:
+        """Whether a child with this footprint is inside."""
+        if abs(child.x - self.x) > self.half_x or abs(child.y - self.y) > self.half_y:
             return False
-        return math.hypot(x, y) + footprint <= self.radius
+        plan = child.plan
+        if isinstance(plan, Disc):
+            if math.hypot(child.x, child.y) + plan.radius > self.radius:
+                return False
+            return (
+                abs(child.x - self.x) + plan.radius <= self.half_x + self.overhang
+                and abs(child.y - self.y) + plan.radius <= self.half_y + self.overhang
+            )
+        if self.radius == math.inf and self.overhang == math.inf:
+            return True
+        limit_x, limit_y = self.half_x + self.overhang, self.half_y + self.overhang
+        return all(
+            math.hypot(x, y) <= self.radius and abs(x - self.x) <= limit_x and abs(y - self.y) <= limit_y
+            for x, y in child.corners()
+        )
 
     @cached_property
+    def _cells(self) -> tuple[NDArray[np.float64], float, float]:
+        nx, ny = (min(_MOST_CELLS, max(1, math.ceil(2 * half / _CELL))) for half in (self.half_x, self.half_y))
+        wide, deep = 2 * self.half_x / nx, 2 * self.half_y / ny
+        xs = (np.arange(nx) + 0.5) * wide - self.half_x + self.x
+        ys = (np.arange(ny) + 0.5) * deep - self.half_y + self.y
+        return np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1).reshape(-1, 2), wide, deep
+
+    @property
     def cells(self) -> NDArray[np.float64]:
         """(P, 2) cell centres that cover the rectangle, m."""
-        nx, ny = (max(1, math.ceil(2 * half / _CELL)) for half in (self.half_x, self.half_y))
-        xs = (np.arange(nx) + 0.5) * (2 * self.half_x / nx) - self.half_x
-        ys = (np.arange(ny) + 0.5) * (2 * self.half_y / ny) - self.half_y
-        return np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1).reshape(-1, 2)
+        return self._cells[0]
+
+    @property
+    def cell_size(self) -> tuple[float, float]:
+        """Sides of a cell, m."""
+        return self._cells[1], self._cells[2]
+
+
+@dataclass(frozen=True)
+class Outline:
+    """What a child needs of its support.
+
+    Attributes:
+        keep_out: what no other child's keep-out may meet; one plan per level of a stack.
+        footprint: what must lie in the region; one plan per level.
+    """
+
+    keep_out: tuple[Plan, ...]
+    footprint: tuple[Plan, ...]
 
 
 @dataclass
 class FreeSurface:
     """A flat support while it is being filled.
 
-    Children keep their distance: two centres are at least the sum of their keep-out radii apart.
-
     >>> surface = FreeSurface(Region(0.5, 0.5))
     >>> rng = np.random.default_rng(0)
-    >>> a, b = (surface.place(Gaussian(along=0.01), 0.1, 0.1, rng) for _ in range(2))
-    >>> math.dist(a, b) >= 0.2
+    >>> cup = Outline((Disc(0.1),), (Disc(0.1),))
+    >>> a, b = (surface.place(Gaussian(along=0.01), Yaw(), cup, rng) for _ in range(2))
+    >>> math.dist(a[:2], b[:2]) >= 0.2
     True
     """
 
     region: Region
-    _placed: list[tuple[float, float, float]] = field(default_factory=list)
+    _placed: list[Placed] = field(default_factory=list)
 
-    def is_free(self, x: float, y: float, keep_out: float, footprint: float) -> bool:
-        """Whether a child with this keep-out radius and footprint (m) fits at (x, y)."""
-        if not self.region.contains(x, y, footprint):
-            return False
-        for other_x, other_y, other in self._placed:
-            dx, dy, reach = x - other_x, y - other_y, keep_out + other
-            if dx * dx + dy * dy < reach * reach:
-                return False
-        return True
+    def fit(self, x: float, y: float, yaws: Sequence[float], outline: Outline) -> list[Placed] | None:
+        """The child's keep-outs at (x, y) with one yaw (rad) per level, if it fits there; else None."""
+        turns = [(math.cos(yaw), math.sin(yaw)) for yaw in yaws]
+        for plan, (cos, sin) in zip(outline.footprint, turns, strict=False):
+            if not self.region.contains(Placed(plan, x, y, cos, sin)):
+                return None
+        child = [Placed(plan, x, y, cos, sin) for plan, (cos, sin) in zip(outline.keep_out, turns, strict=False)]
+        for other in self._placed:
+            for level in child:
+                if meet(level, other):
+                    return None
+        return child
 
     def place(
-        self, wish: Gaussian, keep_out: float, footprint: float, rng: np.random.Generator
-    ) -> tuple[float, float] | None:
+        self, wish: Wish, yaw: Yaw, outline: Outline, rng: np.random.Generator, levels: int = 1
+    ) -> tuple[float, float, tuple[float, ...]] | None:
         """Place one child where its distribution, cut to the free region, says; None when there is no room.
 
         A few plain draws are tried first; on a crowded support the free cells are enumerated and one of
         them is drawn by its density.
+
+        Returns:
+            x, y (m) and the yaw (rad) of each of its ``levels``.
         """
         for _ in range(_DRAWS):
             x, y = wish.draw(rng)
-            if self.is_free(x, y, keep_out, footprint):
-                break
-        else:
-            spot = self._draw_from_cells(wish, keep_out, footprint, rng)
-            if spot is None:
-                return None
-            x, y = spot
-        self._placed.append((x, y, keep_out))
-        return x, y
+            yaws = tuple(yaw.draw(rng) for _ in range(levels))
+            child = self.fit(x, y, yaws, outline)
+            if child is not None:
+                self._placed += child
+                return x, y, yaws
+        return self._place_in_cells(wish, yaw, outline, rng, levels)
 
-    def _draw_from_cells(
-        self, wish: Gaussian, keep_out: float, footprint: float, rng: np.random.Generator
-    ) -> tuple[float, float] | None:
+    def _place_in_cells(
+        self, wish: Wish, yaw: Yaw, outline: Outline, rng: np.random.Generator, levels: int
+    ) -> tuple[float, float, tuple[float, ...]] | None:
         cells = self.region.cells
-        free = np.hypot(cells[:, 0], cells[:, 1]) + footprint <= self.region.radius
-        for x, y, other in self._placed:
-            free &= (cells[:, 0] - x) ** 2 + (cells[:, 1] - y) ** 2 >= (keep_out + other) ** 2
-        candidates = cells[free]
+        log_density = wish.log_density(cells)
+        if log_density is None:
+            return None
+        free = np.isfinite(log_density) & self._roomy(cells, outline)
+        candidates, log_density = cells[free], log_density[free]
         if not len(candidates):
             return None
-        log_density = wish.log_density(candidates)
+        wide, deep = self.region.cell_size
         cumulative = np.cumsum(np.exp(log_density - log_density.max()))
         for _ in range(_DRAWS):
             x, y = candidates[np.searchsorted(cumulative, rng.random() * cumulative[-1], side="right")]
-            x, y = float(x + (rng.random() - 0.5) * _CELL), float(y + (rng.random() - 0.5) * _CELL)
-            if self.is_free(x, y, keep_out, footprint):
-                return x, y
+            x, y = float(x + (rng.random() - 0.5) * wide), float(y + (rng.random() - 0.5) * deep)
+            yaws = tuple(yaw.draw(rng) for _ in range(levels))
+            child = self.fit(x, y, yaws, outline)
+            if child is not None:
+                self._placed += child
+                return x, y, yaws
         return None
+
+    def _roomy(self, cells: NDArray[np.float64], outline: Outline) -> NDArray[np.bool_]:
+        """(P,) cells that are not ruled out by circles within the plans: a quick, generous test."""
+        inner = max(_inscribed(plan) for plan in outline.keep_out)
+        foot = max(_inscribed(plan) for plan in outline.footprint)
+        region = self.region
+        free = np.hypot(cells[:, 0], cells[:, 1]) + foot <= region.radius
+        free &= np.abs(cells[:, 0] - region.x) + foot <= region.half_x + region.overhang + region.cell_size[0]
+        free &= np.abs(cells[:, 1] - region.y) + foot <= region.half_y + region.overhang + region.cell_size[1]
+        for other in self._placed:
+            x, y = other.center()
+            free &= (cells[:, 0] - x) ** 2 + (cells[:, 1] - y) ** 2 >= (inner + _inscribed(other.plan)) ** 2
+        return free
+
+
+def _inscribed(plan: Plan) -> float:
+    """Radius (m) of a disc about the frame that lies within the plan, whatever its yaw."""
+    if isinstance(plan, Disc):
+        return plan.radius
+    return max(0.0, min(plan.half_x - abs(plan.center_x), plan.half_y - abs(plan.center_y)))

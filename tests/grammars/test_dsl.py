@@ -12,6 +12,7 @@ from scipy import stats
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.grammars import (
     NOTHING,
+    Disc,
     FreeSurface,
     Gaussian,
     Geometric,
@@ -19,10 +20,12 @@ from scene_envs.grammars import (
     Group,
     Object,
     OneOf,
+    Outline,
     Region,
     Repeat,
     Stack,
     Surface,
+    Yaw,
     get_grammar,
     list_grammars,
     register_grammar,
@@ -76,19 +79,21 @@ def test_one_of_without_positive_weight_is_refused() -> None:
 
 def test_placement_keeps_distance_on_a_crowded_surface_and_says_when_it_is_full() -> None:
     surface, rng = FreeSurface(Region(0.5, 0.5)), np.random.default_rng(0)
+    disc = Outline((Disc(0.1),), (Disc(0.0),))
     spots = []
-    while (spot := surface.place(Gaussian(along=0.05), 0.1, 0.0, rng)) is not None:
+    while (spot := surface.place(Gaussian(along=0.05), Yaw(), disc, rng)) is not None:
         spots.append(spot)
     # Random placement of discs of diameter 0.2 with centres in a unit square: jamming leaves no free cell.
     assert 18 <= len(spots) <= 35
-    assert min(math.dist(a, b) for i, a in enumerate(spots) for b in spots[:i]) >= 0.2
-    assert max(max(map(abs, spot)) for spot in spots) <= 0.5
+    assert min(math.dist(a[:2], b[:2]) for i, a in enumerate(spots) for b in spots[:i]) >= 0.2
+    assert max(max(map(abs, spot[:2])) for spot in spots) <= 0.5
 
 
 def test_placement_follows_its_distribution_cut_to_the_free_region() -> None:
     rng = np.random.default_rng(0)
     wish = Gaussian(x=0.6, y=0.0, along=0.05)
-    xs = [FreeSurface(Region(0.475, 0.475)).place(wish, 0.1, 0.0, rng) for _ in range(600)]
+    disc = Outline((Disc(0.1),), (Disc(0.0),))
+    xs = [FreeSurface(Region(0.475, 0.475)).place(wish, Yaw(), disc, rng) for _ in range(600)]
     mean = np.mean([spot[0] for spot in xs if spot is not None])
     expected = stats.truncnorm(-np.inf, (0.475 - 0.6) / 0.05, loc=0.6, scale=0.05).mean()
     assert mean == pytest.approx(expected, abs=4e-3)
