@@ -1,44 +1,50 @@
-"""Cameras for pictures, and the light that goes with them."""
+"""Cameras for pictures, and the lamp that goes with them."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_envs.scene_types import Camera, SceneType
+from scene_envs.errors import InvalidInputError
+from scene_envs.render.framing import fit_camera, frame_scene_type
+from scene_envs.scene_types import Camera, SceneType, get_scene_type
 
 _FOV = 28.0
-_ELEVATION, _AZIMUTH = np.radians(37.0), np.radians(-62.0)
-LIGHT_DIRECTION = (-0.55, -0.35, 1.0)
-"""From the scene to the light, world frame: over the left shoulder of the picture camera."""
+_MARGIN = 0.05
+_LAMP_PIXELS = 512, 1024
+"""Resolution of the lamp's depth image for workspaces up to 2 m, and for larger ones."""
 
 
-def picture_camera(scene_type: SceneType, width: int = 480, height: int = 360) -> Camera:
-    """The three-quarter view of the workspace that pictures use when no camera is given."""
-    center, radius = _focus(scene_type)
-    direction = np.array(
-        [np.cos(_ELEVATION) * np.cos(_AZIMUTH), np.cos(_ELEVATION) * np.sin(_AZIMUTH), np.sin(_ELEVATION)]
-    )
-    position = center + direction * radius / np.tan(np.radians(_FOV) / 2.0)
-    return Camera(_triple(position), _triple(center), (0.0, 0.0, 1.0), width, height, _FOV)
+def picture_camera(scene_type: str | SceneType, width: int = 480, height: int = 360) -> Camera:
+    """The three-quarter view that pictures use when no camera is given.
+
+    It is derived from the workspace and the fixed objects (see
+    :func:`~scene_envs.render.framing.frame_scene_type`), so it also suits scene types of your own.
+
+    Args:
+        scene_type: the scene type or its name.
+        width: image width, pixels; with the height it decides how far away the camera must be.
+        height: image height, pixels.
+
+    >>> camera = picture_camera("dimsum_table", 640, 480)
+    >>> camera.width, camera.fov_y
+    (640, 28.0)
+    """
+    if width < 1 or height < 1:
+        raise InvalidInputError(f"an image needs at least 1 x 1 pixels, got width={width}, height={height}")
+    framing = frame_scene_type(get_scene_type(scene_type))
+    position, target = fit_camera(framing.points, framing.to_camera, _FOV, width / height, _MARGIN)
+    return Camera(_triple(position), _triple(target), (0.0, 0.0, 1.0), width, height, _FOV)
 
 
 def light_camera(scene_type: SceneType) -> Camera:
-    """The view from a far lamp along :data:`LIGHT_DIRECTION` that sees the whole workspace."""
-    center, radius = _focus(scene_type)
-    direction = np.array(LIGHT_DIRECTION) / np.linalg.norm(LIGHT_DIRECTION)
-    distance = 8.0 * radius
-    fov = 2.0 * np.degrees(np.arctan(1.25 * radius / distance))
-    return Camera(_triple(center + distance * direction), _triple(center), (0.0, 1.0, 0.0), 512, 512, float(fov))
-
-
-def _focus(scene_type: SceneType) -> tuple[NDArray[np.float64], float]:
-    """Centre and radius (m) of what matters: the floor of the workspace and its lower third."""
-    low, high = (np.array(corner) for corner in scene_type.workspace)
-    extent = high - low
-    center = 0.5 * (low + high)
-    center[2] = low[2] + 0.15 * extent[2]
-    return center, float(0.47 * np.hypot(extent[0], extent[1]))
+    """The view from a far lamp that sees the whole workspace."""
+    framing = frame_scene_type(scene_type)
+    distance = 8.0 * framing.radius
+    fov = 2.0 * np.degrees(np.arctan(1.1 * framing.radius / distance))
+    pixels = _LAMP_PIXELS[framing.radius > 2.0]
+    position = framing.center + distance * framing.to_light
+    return Camera(_triple(position), _triple(framing.center), (0.0, 1.0, 0.0), pixels, pixels, float(fov))
 
 
 def _triple(vector: NDArray[np.float64]) -> tuple[float, float, float]:

@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from scene_envs.errors import InvalidInputError
-from scene_envs.render.cameras import LIGHT_DIRECTION, light_camera, picture_camera
+from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.render.cameras import light_camera, picture_camera
+from scene_envs.render.framing import frame_scene_type
 from scene_envs.render.lighting import blur, contact_shade, soft_shadow, surface_normals
 from scene_envs.render.stage import Frame, Stage, get_stage
 from scene_envs.rotations import matrix_to_quaternion
@@ -24,6 +25,9 @@ _SHADOW = np.array([0.40, 0.38, 0.34], dtype=np.float32)
 """What a full shadow takes from red, green and blue."""
 _SEMANTIC_BACKGROUND = 255
 _SUPERSAMPLING = 2
+_STYLES = ("picture", "semantic")
+_TABLE = 0.68
+"""Radius (m) of what a picture of a dim sum table shows; contact shading is tuned there."""
 
 
 def render(
@@ -40,9 +44,9 @@ def render(
     Args:
         batch: B scenes.
         style: ``"picture"`` is a lit three-quarter view with soft shadows; ``"semantic"`` is one flat colour per
-            category on white, seen by the camera of the scene type.
+            asset on white, seen by the camera of the scene type (the paper's: 640 x 480, 45 degrees).
         camera: replaces the camera of the style.
-        width: image width, pixels; the camera's by default.
+        width: image width, pixels; the camera's by default. The view of a picture is fitted to the image.
         height: image height, pixels; the camera's by default.
         highlight: (B, N) bool, objects to draw in red (pictures only).
 
@@ -50,14 +54,15 @@ def render(
         (B, H, W, 3) uint8, RGB.
 
     Raises:
-        InvalidInputError: unknown style, sizes below 1 pixel, or a highlight of another shape.
+        UnknownNameError: no such style.
+        InvalidInputError: sizes below 1 pixel, or a highlight of another shape.
         MissingDependencyError: PyBullet is not installed.
     """
     scene_type = batch.scene_type
-    if style not in ("picture", "semantic"):
-        raise InvalidInputError(f"unknown render style {style!r}; use 'picture' or 'semantic'")
+    if style not in _STYLES:
+        raise unknown_name("render style", style, _STYLES)
     if camera is None:
-        camera = scene_type.camera if style == "semantic" else picture_camera(scene_type)
+        camera = scene_type.camera if style == "semantic" else _fitted_camera(scene_type, width, height)
     width, height = camera.width if width is None else width, camera.height if height is None else height
     if width < 1 or height < 1:
         raise InvalidInputError(f"an image needs at least 1 x 1 pixels, got width={width}, height={height}")
@@ -75,6 +80,13 @@ def render(
         else:
             images[index] = _picture(stage, camera, width, height, scene_type, marked[index])
     return images
+
+
+def _fitted_camera(scene_type: SceneType, width: int | None, height: int | None) -> Camera:
+    """The picture camera at the size asked for; where one side is missing, at the default proportions."""
+    default = picture_camera(scene_type)
+    width, height = default.width if width is None else width, default.height if height is None else height
+    return picture_camera(scene_type, width, height)
 
 
 def _as_mask(highlight: torch.Tensor | NDArray[np.bool_] | None, batch: SceneBatch) -> NDArray[np.bool_]:
@@ -99,8 +111,11 @@ def _picture(
     stage: Stage, camera: Camera, width: int, height: int, scene_type: SceneType, marked: NDArray[np.bool_]
 ) -> NDArray[np.uint8]:
     scale = _SUPERSAMPLING
-    frame = stage.look(camera, scale * width, scale * height, LIGHT_DIRECTION)
+    framing = frame_scene_type(scene_type)
+    frame = stage.look(camera, scale * width, scale * height, framing.to_light.tolist())
     lamp = light_camera(scene_type)
+    texel = 2.0 * np.linalg.norm(np.subtract(lamp.position, lamp.target)) / lamp.height  # m, in the lamp's image
+    texel *= np.tan(np.radians(lamp.fov_y) / 2.0)
     light = stage.look(lamp, lamp.width, lamp.height)
     color = frame.color
     if marked.any():
@@ -109,9 +124,10 @@ def _picture(
             red[..., None], 0.42 * color + 0.58 * _HIGHLIGHT * (color.mean(-1, keepdims=True) / 200.0), color
         )
     normals = surface_normals(frame)
-    shadow = soft_shadow(frame, light, normals)[..., None]
-    shade = blur(contact_shade(frame, normals), 2 * scale + 1)[..., None]
-    towards = np.clip(2.0 * normals @ _camera_direction(frame, LIGHT_DIRECTION), 0.0, 1.0)[..., None]
+    shadow = soft_shadow(frame, light, normals, bias=1.3 * texel, lift=2.6 * texel)[..., None]
+    reach = 0.04 * np.sqrt(framing.radius / _TABLE)
+    shade = blur(contact_shade(frame, normals, radius=reach), 2 * scale + 1)[..., None]
+    towards = np.clip(2.0 * normals @ _camera_direction(frame, framing.to_light), 0.0, 1.0)[..., None]
     lit = color * (1.0 - _SHADOW * shadow * (0.4 + 0.6 * towards)) * (1.0 - np.minimum(1.25 * shade, 0.5))
     ramp = np.linspace(0.0, 1.0, scale * height, dtype=np.float32)[:, None, None]
     backdrop = _BACKDROP[0] * (1.0 - ramp) + _BACKDROP[1] * ramp
@@ -120,7 +136,6 @@ def _picture(
     return np.rint(np.clip(small, 0.0, 255.0)).astype(np.uint8)
 
 
-def _camera_direction(frame: Frame, direction: tuple[float, float, float]) -> NDArray[np.float32]:
-    """A world direction in the camera frame, of unit length."""
-    turned = frame.view[:3, :3] @ np.array(direction)
-    return (turned / np.linalg.norm(turned)).astype(np.float32)
+def _camera_direction(frame: Frame, direction: NDArray[np.float64]) -> NDArray[np.float32]:
+    """A world direction of unit length in the camera frame."""
+    return (frame.view[:3, :3] @ direction).astype(np.float32)

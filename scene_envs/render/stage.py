@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import os
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -19,8 +20,8 @@ from scene_envs.errors import MissingDependencyError
 from scene_envs.scene_types import Camera
 
 _AWAY = (0.0, 0.0, -1000.0)
-_CELL, _CELLS = 8, 16
-"""The palette texture: 16 x 16 cells of 8 pixels, one per colour."""
+_CELL, _CELLS = 8, 32
+"""The palette texture: 32 x 32 cells of 8 pixels, one per colour."""
 
 
 @dataclass(frozen=True)
@@ -107,9 +108,7 @@ class Stage:
                 bullet.resetBasePositionAndOrientation(body, _AWAY, (0, 0, 0, 1), physicsClientId=self._client)
         self._slot_of = slot_of
 
-    def look(
-        self, camera: Camera, width: int, height: int, light: tuple[float, float, float] = (0.3, -0.4, 1.0)
-    ) -> Frame:
+    def look(self, camera: Camera, width: int, height: int, light: Sequence[float] = (0.3, -0.4, 1.0)) -> Frame:
         """Draw the placed objects, ``width`` x ``height`` pixels, lit from direction ``light``."""
         bullet = self._bullet
         distance = float(np.linalg.norm(np.subtract(camera.position, camera.target)))
@@ -139,9 +138,9 @@ class Stage:
         """All colours of the library in one texture; TinyRenderer knows textures but no vertex colours."""
         from PIL import Image
 
-        palette = np.unique(np.concatenate([_color_codes(asset) for asset in self._library]))
+        palette, self._mask = make_palette(np.concatenate([_color_codes(asset) for asset in self._library]), _CELLS**2)
         codes = np.zeros(_CELLS**2, dtype=np.int64)
-        codes[: len(palette)] = palette[: _CELLS**2]
+        codes[: len(palette)] = palette
         rgb = np.stack([codes >> 16, (codes >> 8) & 255, codes & 255], axis=-1).astype(np.uint8)
         pixels = rgb.reshape(_CELLS, _CELLS, 3).repeat(_CELL, axis=0).repeat(_CELL, axis=1)
         handle, path = tempfile.mkstemp(suffix=".png")
@@ -163,7 +162,7 @@ class Stage:
         return body
 
     def _add_shape(self, asset: Asset) -> int:
-        cells = np.searchsorted(self._palette, _color_codes(asset)).clip(max=_CELLS**2 - 1)
+        cells = np.searchsorted(self._palette, _color_codes(asset) & self._mask)
         uv = np.stack([(cells % _CELLS + 0.5) / _CELLS, 1.0 - (cells // _CELLS + 0.5) / _CELLS], axis=1)
         gloss = 0.0 if asset.static else 0.35
         shape: int = self._bullet.createVisualShape(
@@ -185,8 +184,31 @@ def get_stage(names: tuple[str, ...]) -> Stage:
     return Stage(names)
 
 
-def _color_codes(asset: Asset) -> NDArray[np.int64]:
+def make_palette(codes: NDArray[np.int64], limit: int) -> tuple[NDArray[np.int64], int]:
+    """The colours (0xRRGGBB, sorted) that stand for ``codes``, at most ``limit``, and the bits of a colour they keep.
+
+    Colours are exact as long as they fit; meshes with more (scans) lose the lowest bits of each channel.
+    """
+    for bits in range(8, 0, -1):
+        channel = (0xFF << (8 - bits)) & 0xFF
+        mask = channel << 16 | channel << 8 | channel
+        palette = np.unique(codes & mask)
+        if len(palette) <= limit:
+            break
+    return palette, mask
+
+
+def vertex_colors(asset: Asset) -> NDArray[np.uint8]:
+    """(V, 3): the colour of each vertex of the visual mesh; the class colour where the mesh has none."""
     visual: Any = asset.visual.visual
-    rgb = np.asarray(visual.vertex_colors)[:, :3].astype(np.int64)
+    if getattr(visual, "kind", None) == "texture":
+        visual = visual.to_color()
+    if getattr(visual, "kind", None) is None:
+        return np.tile(np.array(asset.color, dtype=np.uint8), (len(asset.visual.vertices), 1))
+    return np.asarray(visual.vertex_colors)[:, :3].astype(np.uint8)
+
+
+def _color_codes(asset: Asset) -> NDArray[np.int64]:
+    rgb = vertex_colors(asset).astype(np.int64)
     codes: NDArray[np.int64] = (rgb[:, 0] << 16) | (rgb[:, 1] << 8) | rgb[:, 2]
     return codes

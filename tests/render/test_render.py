@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from scene_envs.errors import InvalidInputError, MissingDependencyError
+from scene_envs.errors import InvalidInputError, MissingDependencyError, UnknownNameError
 from scene_envs.render import gallery, picture_camera, render
 from scene_envs.render.stage import get_stage, load_pybullet
 from scene_envs.rotations import yaw_matrix
@@ -132,8 +132,8 @@ def test_an_empty_batch_gives_no_images():
 
 
 def test_wrong_arguments_are_named():
-    with pytest.raises(InvalidInputError, match="'sketch'"):
-        render(scene(), style="sketch")
+    with pytest.raises(UnknownNameError, match="unknown render style 'pictrue'; did you mean 'picture'"):
+        render(scene(), style="pictrue")
     with pytest.raises(InvalidInputError, match="width=0"):
         render(scene(), width=0)
     with pytest.raises(InvalidInputError, match=r"\(1, 8\); got \(1, 3\)"):

@@ -1,0 +1,149 @@
+"""What a picture of a scene type must show, and from where: worked out from its workspace and fixed objects."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_envs.scene_types import SceneType
+
+Array = NDArray[np.float64]
+_SIDES = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+_TOP = np.array([0.0, 0.0, 1.0])
+_RAYS = 24
+
+
+@dataclass(frozen=True, eq=False)
+class Framing:
+    """What is to be seen, and the directions to look and to light it from.
+
+    Attributes:
+        points: (P, 3) m, world frame; all of them belong in the picture.
+        to_camera: (3,) unit vector from the scene towards the camera.
+        to_light: (3,) unit vector from the scene towards the lamp.
+        ground: z below which nothing stands, m.
+    """
+
+    points: Array
+    to_camera: Array
+    to_light: Array
+    ground: float
+
+    @property
+    def center(self) -> Array:
+        """(3,) middle of the bounding box of the points, m."""
+        return 0.5 * (self.points.min(axis=0) + self.points.max(axis=0))
+
+    @property
+    def radius(self) -> float:
+        """Largest distance (m) of a point from the centre."""
+        return float(np.linalg.norm(self.points - self.center, axis=1).max())
+
+
+@lru_cache(maxsize=64)
+def frame_scene_type(scene_type: SceneType) -> Framing:
+    """How to look at scenes of this type.
+
+    A support that rises through the workspace (a shelf) is seen whole, from its open side and slightly above; one that
+    is open to the sky (a bin) steeply from above. Where objects stand on a support (a table, a floor) or on nothing,
+    the view is a three-quarter one from above, across the longer side, steeper the flatter the workspace is.
+    """
+    low, high = (np.array(corner) for corner in scene_type.workspace)
+    extent = high - low
+    boxes, vertices = _fixed_geometry(scene_type)
+    ground = float(min(low[2], vertices[:, 2].min(initial=np.inf)))
+    if vertices[:, 2].max(initial=-np.inf) > low[2] + 0.25 * extent[2]:
+        side = _open_side(boxes)
+        top = vertices[:, 2].max()
+        above = _footprint(low, high, 1.0, top + 0.6 * max(0.0, high[2] - top))
+        points = np.concatenate([vertices, above])
+        if side is None:
+            return Framing(points, _direction(_across(extent), 52.0), _direction(_across(extent) - 85.0, 62.0), ground)
+        facing = float(np.degrees(np.arctan2(side[1], side[0])))
+        return Framing(points, _direction(facing - 30.0, 15.0), _direction(facing - 62.0, 36.0), ground)
+    flatness = float(np.clip(2.0 - extent[2] / (0.18 * extent[:2].max()), 0.0, 1.0))  # 0: a table, 1: a room
+    azimuth, elevation = _across(extent) * (1.0 - flatness) - 24.0 * flatness, 37.0 + 10.0 * flatness
+    upper = vertices[vertices[:, 2] >= low[2] - 0.05 * extent[:2].max()]
+    height = min(0.5 * extent[:2].min(), 0.75 * extent[2])
+    filled = _footprint(low, high, 0.7, low[2] + height)
+    base = upper if len(upper) else _footprint(low, high, 1.0, low[2])
+    points = np.concatenate([base, filled])
+    return Framing(points, _direction(azimuth, elevation), _direction(azimuth - 85.0, 57.0), ground)
+
+
+def fit_camera(points: Array, to_camera: Array, fov_y: float, aspect: float, margin: float) -> tuple[Array, Array]:
+    """Position and target (m) of the nearest camera without roll that sees all points.
+
+    Args:
+        points: (P, 3) m.
+        to_camera: (3,) unit vector from the scene to the camera; not vertical.
+        fov_y: vertical field of view, degrees.
+        aspect: width / height.
+        margin: part of the half image that stays free at each border.
+    """
+    right = np.cross(_TOP, to_camera)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(to_camera, right), to_camera])
+    seen = points @ axes.T  # (P, 3): right, up, towards the camera
+    slope = np.tan(np.radians(fov_y) / 2.0) * (1.0 - margin) * np.array([aspect, 1.0])
+    # A camera at (x, y, d) sees a point when |x_p - x| <= slope_x (d - d_p), and the same for y.
+    most = (seen[:, :2] + slope * seen[:, 2:]).max(axis=0)
+    least = (-seen[:, :2] + slope * seen[:, 2:]).max(axis=0)
+    distance = float(((most + least) / (2.0 * slope)).max())
+    place = np.array([*(0.5 * (most - least)), distance])
+    target = np.array([place[0], place[1], 0.5 * (seen[:, 2].min() + seen[:, 2].max())])
+    return place @ axes, target @ axes
+
+
+def _fixed_geometry(scene_type: SceneType) -> tuple[Array, Array]:
+    """World boxes (P, 2, 3) around the parts of fixed objects, and all corners (V, 3) of those parts, m."""
+    boxes, vertices = [np.empty((0, 2, 3))], [np.empty((0, 3))]
+    for fixed in scene_type.fixed:
+        rotation = np.reshape(fixed.rotation, (3, 3))
+        for part in scene_type.library[fixed.asset].fine:
+            corners = part.vertices @ rotation.T + np.array(fixed.translation)
+            vertices.append(corners)
+            boxes.append(np.stack([corners.min(axis=0), corners.max(axis=0)])[None])
+    return np.concatenate(boxes), np.concatenate(vertices)
+
+
+def _open_side(boxes: Array) -> Array | None:
+    """The horizontal direction from which most can be seen; None when that is straight from above."""
+    covered = [_covered(boxes, side) for side in _SIDES]
+    return None if _covered(boxes, _TOP) <= min(covered) else _SIDES[int(np.argmin(covered))]
+
+
+def _covered(boxes: Array, side: Array) -> float:
+    """Part of the view from ``side`` that boxes block before two thirds of the depth."""
+    axis = int(np.argmax(np.abs(side)))
+    across: Sequence[int] = [a for a in range(3) if a != axis]
+    low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+    depth = np.sort(boxes[:, :, axis] * side[axis], axis=1)
+    reach = max(low[axis] * side[axis], high[axis] * side[axis]) - (2.0 / 3.0) * (high[axis] - low[axis])
+    steps = (np.arange(_RAYS) + 0.5) / _RAYS
+    u, v = (low[a] + steps * (high[a] - low[a]) for a in across)
+    in_u, in_v = (
+        (boxes[:, 0, a, None] <= w) & (w <= boxes[:, 1, a, None]) & (depth[:, 1:] > reach)
+        for a, w in zip(across, (u, v), strict=True)
+    )
+    return float((in_u[:, :, None] & in_v[:, None, :]).any(axis=0).mean())
+
+
+def _footprint(low: Array, high: Array, share: float, z: float) -> Array:
+    """(4, 3): corners of the middle ``share`` of the workspace's footprint at height ``z``, m."""
+    center, half = 0.5 * (low + high), 0.5 * share * (high - low)
+    return np.array([[center[0] + i * half[0], center[1] + j * half[1], z] for i in (-1, 1) for j in (-1, 1)])
+
+
+def _across(extent: Array) -> float:
+    """Azimuth (degrees) of a camera that has the longer side of the workspace across its picture."""
+    return -28.0 if extent[1] > 1.25 * extent[0] else -62.0
+
+
+def _direction(azimuth: float, elevation: float) -> Array:
+    a, e = np.radians(azimuth), np.radians(elevation)
+    return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
