@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -15,11 +15,60 @@ from scene_envs.physics.separation import separations
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 TOUCHING = 2e-5
 """Overlap (m) below which the face-plane bound is taken as the depth, without asking FCL."""
 NEAR = 3e-3
-"""Object pairs whose boxes are at most this far apart (m) are listed."""
+"""Object pairs whose boxes are at most this far apart (m) are listed,"""
+NEAR_FIXED = 0.06
+"""and up to this far (m) in height where one of the two is fixed: what falls onto it has a closed form."""
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """Near pairs of parts.
+
+    Attributes:
+        first: (Q,) object rows.
+        second: (Q,) object rows, larger than ``first``.
+        part_first: (Q,) part of the first object in the library.
+        part_second: (Q,) part of the second.
+        gap: (Q,) m along ``direction``; the true distance is at least this much.
+        direction: (Q, 3) unit vector in the world, from the first part to the second.
+    """
+
+    first: Index
+    second: Index
+    part_first: Index
+    part_second: Index
+    gap: Array
+    direction: Array
+
+    def among(self, number: Index) -> Contacts:
+        """The contacts of objects whose new ``number`` (n,) is not negative, renumbered."""
+        first, second = number[self.first], number[self.second]
+        return replace(self, first=first, second=second)[(first >= 0) & (second >= 0)]
+
+    def __getitem__(self, rows: Index | Mask) -> Contacts:
+        return Contacts(
+            self.first[rows],
+            self.second[rows],
+            self.part_first[rows],
+            self.part_second[rows],
+            self.gap[rows],
+            self.direction[rows],
+        )
+
+    def __add__(self, other: Contacts) -> Contacts:
+        return Contacts(
+            np.concatenate([self.first, other.first]),
+            np.concatenate([self.second, other.second]),
+            np.concatenate([self.part_first, other.part_first]),
+            np.concatenate([self.part_second, other.part_second]),
+            np.concatenate([self.gap, other.gap]),
+            np.concatenate([self.direction, other.direction]),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +85,7 @@ class ObjectPairs:
         part_count: (P,) overlapping fine part pairs (only when asked for).
         low: (n, 3) lowest corner of each object's box, m.
         high: (n, 3) highest corner of each object's box, m.
+        contacts: near pairs of their coarse parts.
     """
 
     first: Index
@@ -47,6 +97,7 @@ class ObjectPairs:
     part_count: Index
     low: Array
     high: Array
+    contacts: Contacts
 
     def among(self, rows: Index) -> ObjectPairs:
         """The pairs of the objects ``rows`` (m,), ascending, renumbered to 0..m-1."""
@@ -64,6 +115,7 @@ class ObjectPairs:
             self.part_count[kept],
             self.low[rows],
             self.high[rows],
+            self.contacts.among(number),
         )
 
     def deepest(self) -> Array:
@@ -95,27 +147,56 @@ class Collider:
         coarse = place(self.library, objects, "coarse")
         low, high = object_boxes(coarse)
         first, second = _near_pairs(objects, low, high)
-        gap, direction, keep = self._coarse_gaps(coarse, first, second)
+        contacts, gap, direction, keep = self._coarse_gaps(objects, coarse, first, second)
         first, second, gap, direction = first[keep], second[keep], gap[keep], direction[keep]
         depth, total = np.zeros(len(first)), np.zeros(len(first))
         part_count = np.zeros(len(first), dtype=np.int64)
         overlapping = np.flatnonzero(gap < 0)
         if len(overlapping):
             self._fine_depths(objects, first, second, overlapping, gap, depth, total, part_count, totals)
-        return ObjectPairs(first, second, gap, direction, depth, total, part_count, low, high)
+        return ObjectPairs(first, second, gap, direction, depth, total, part_count, low, high, contacts)
 
-    def _coarse_gaps(self, coarse: PlacedObjects, first: Index, second: Index) -> tuple[Array, Array, Index]:
-        pair, a, b = part_pairs(coarse, first, second)
-        near = _boxes_near(coarse.low, coarse.high, a, b, NEAR)
+    def contacts(self, objects: Objects, pairs: ObjectPairs, fine: Mask) -> Contacts:
+        """Near parts: the fine ones of some object pairs, the coarse ones of the others.
+
+        Args:
+            objects: the objects.
+            pairs: what :meth:`pairs` found for these objects.
+            fine: (P,) which of the pairs.
+        """
+        if not fine.any():
+            return pairs.contacts
+        count = len(objects)
+        first, second = pairs.first[fine], pairs.second[fine]
+        coarse = ~np.isin(pairs.contacts.first * count + pairs.contacts.second, first * count + second)
+        used, local = np.unique(np.concatenate([first, second]), return_inverse=True)
+        placed = place(self.library, objects[used], "fine")
+        pair, a, b = part_pairs(placed, local[: len(first)], local[len(first) :])
+        return pairs.contacts[coarse] + self._near_parts(objects, placed, first, second, pair, a, b)[0]
+
+    def _near_parts(
+        self, objects: Objects, placed: PlacedObjects, first: Index, second: Index, pair: Index, a: Index, b: Index
+    ) -> tuple[Contacts, Index]:
+        """Contacts among the part pairs (``a``, ``b``) of object pairs, and the object pair of each."""
+        fixed = (objects.fixed[first] | objects.fixed[second])[pair]
+        near = np.flatnonzero(_boxes_near(placed.low, placed.high, a, b, NEAR, fixed))
         pair, a, b = pair[near], a[near], b[near]
-        part_gap, part_direction = separations(self.library, coarse.parts, a, b)
+        gap, direction = separations(self.library, placed.parts, a, b)
+        part = placed.parts.part
+        return Contacts(first[pair], second[pair], part[a], part[b], gap, direction), pair
+
+    def _coarse_gaps(
+        self, objects: Objects, coarse: PlacedObjects, first: Index, second: Index
+    ) -> tuple[Contacts, Array, Array, Index]:
+        pair, a, b = part_pairs(coarse, first, second)
+        contacts, pair = self._near_parts(objects, coarse, first, second, pair, a, b)
         gap = np.full(len(first), np.inf)
         direction = np.zeros((len(first), 3))
-        order = np.lexsort((part_gap, pair))
+        order = np.lexsort((contacts.gap, pair))
         keep, leading = np.unique(pair[order], return_index=True)
         best = order[leading]
-        gap[keep], direction[keep] = part_gap[best], part_direction[best]
-        return gap, direction, keep
+        gap[keep], direction[keep] = contacts.gap[best], contacts.direction[best]
+        return contacts, gap, direction, keep
 
     def _fine_depths(
         self,
@@ -172,10 +253,13 @@ class Collider:
                 part_count[target] += 1
 
 
-def _boxes_near(low: Array, high: Array, a: Index, b: Index, margin: float) -> NDArray[np.bool_]:
+def _boxes_near(
+    low: Array, high: Array, a: Index, b: Index, margin: float, fixed: NDArray[np.bool_] | None = None
+) -> NDArray[np.bool_]:
+    height = margin if fixed is None else np.where(fixed, NEAR_FIXED, margin)
     near = (low[a, 0] <= high[b, 0] + margin) & (low[b, 0] <= high[a, 0] + margin)
     near &= (low[a, 1] <= high[b, 1] + margin) & (low[b, 1] <= high[a, 1] + margin)
-    near &= (low[a, 2] <= high[b, 2] + margin) & (low[b, 2] <= high[a, 2] + margin)
+    near &= (low[a, 2] <= high[b, 2] + height) & (low[b, 2] <= high[a, 2] + height)
     return near
 
 
@@ -199,5 +283,5 @@ def scene_pairs(objects: Objects) -> tuple[Index, Index]:
 
 def _near_pairs(objects: Objects, low: Array, high: Array) -> tuple[Index, Index]:
     first, second = scene_pairs(objects)
-    near = _boxes_near(low, high, first, second, NEAR)
+    near = _boxes_near(low, high, first, second, NEAR, objects.fixed[first] | objects.fixed[second])
     return first[near], second[near]

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scene_envs.physics.collision import Collider, ObjectPairs
 from scene_envs.physics.geometry import LibraryGeometry, library_geometry
-from scene_envs.physics.placement import Objects
-from scene_envs.physics.support import Support, clusters
+from scene_envs.physics.placement import Objects, object_boxes, place
+from scene_envs.physics.rest import Rest, Statics
+from scene_envs.physics.support import Support, clusters, company
 from scene_envs.physics.world import SolverSettings, World
 from scene_envs.scene_types import SceneType
 
@@ -23,8 +24,10 @@ _LOGGER = logging.getLogger(__name__)
 
 _SEGMENT = 0.25
 """Seconds after which settling looks again at which shapes it needs, and whether anything still moves."""
-_ROOM = 0.05
-"""Objects further apart than this (m) sideways do not meet within a segment of settling."""
+_FAR, _MARGIN = 2e-3, 1e-3
+"""An object that moved further than this (m) may have met others, whose boxes are within that distance (m) of its way."""
+_MEETINGS = 4
+"""How often to look again with what was met."""
 _STILL, _STILL_ANGLE = 5e-5, 5e-4
 """An object that moved less than this (m, rad) in a segment has come to rest."""
 _TALL = 3
@@ -51,7 +54,13 @@ class Physics:
         self.library = library
         self.collider = Collider(library)
         self.support = Support(library)
+        self.statics = Statics(library)
         self._world: World | None = None
+
+    def rest(self, objects: Objects, pairs: ObjectPairs, duration: float) -> Rest:
+        """Which objects of some scenes need no simulation for ``duration`` seconds."""
+        contacts = self.collider.contacts(objects, pairs, self.support.differs(objects, pairs))
+        return self.statics.at_rest(objects, pairs, contacts, duration)
 
     @property
     def world(self) -> World:
@@ -72,6 +81,26 @@ def physics_of(scene_type: SceneType) -> Physics:
     return _PHYSICS[id(library)]
 
 
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """Objects of one scene after some time.
+
+    Attributes:
+        rotation: (n, 3, 3).
+        translation: (n, 3) m.
+        angle: (n,) rad, how far each turned.
+    """
+
+    rotation: Array
+    translation: Array
+    angle: Array
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether the simulation did not diverge."""
+        return bool(np.isfinite(self.rotation).all() and np.isfinite(self.translation).all())
+
+
 def motion(physics: Physics, objects: Objects, pairs: ObjectPairs, duration: float) -> tuple[Array, Array, Index]:
     """How far objects of several scenes move in ``duration`` seconds.
 
@@ -84,78 +113,159 @@ def motion(physics: Physics, objects: Objects, pairs: ObjectPairs, duration: flo
     Returns:
         displacement (n,) m, rotation (n,) rad, and the scenes whose simulation diverged.
     """
-    resting, displacement, rotation = physics.support.at_rest(objects, pairs.low, pairs.high, duration)
-    active = np.flatnonzero(~resting)
-    moving, pairs = objects[active], pairs.among(active)
-    fine = physics.support.needs_fine(moving, pairs)
-    height = physics.support.tallest(moving, pairs)
-    group = clusters(moving, pairs.low, pairs.high, duration)
+    rest = physics.rest(objects, pairs, duration)
+    displacement, rotation = np.abs(rest.rise), rest.tilt.copy()
     lost: list[int] = []
-    for scene in np.unique(moving.scene):
-        rows = np.flatnonzero(moving.scene == scene)
-        if moving.fixed[rows].all():
-            continue
-        moved, angle = _move(physics, moving[rows], fine[rows], group[rows], height[rows], duration)
-        if not (np.isfinite(moved).all() and np.isfinite(angle).all()):
+    for scene in np.unique(objects.scene[~(rest.still | objects.fixed)]):
+        rows = np.flatnonzero(objects.scene == scene)
+        moved = advance(physics, objects[rows], pairs.among(rows), rest[rows], duration)
+        if not moved.is_finite:
             _LOGGER.warning("the simulation of a scene diverged; its row is invalid")
             lost.append(int(scene))
             continue
-        displacement[active[rows]] = moved
-        rotation[active[rows]] = angle
+        displacement[rows] = np.linalg.norm(moved.translation - objects.translation[rows], axis=1)
+        rotation[rows] = moved.angle
     displacement[objects.fixed] = 0.0
     rotation[objects.fixed] = 0.0
     return displacement, rotation, np.array(lost, dtype=np.int64)
 
 
-def _move(
-    physics: Physics, objects: Objects, fine: Mask, group: Index, height: Index, duration: float
-) -> tuple[Array, Array]:
-    """Displacement (n,) m and rotation (n,) rad of one scene's objects, each cluster with the steps it needs."""
-    displacement, rotation = np.zeros(len(objects)), np.zeros(len(objects))
+def advance(
+    physics: Physics, objects: Objects, pairs: ObjectPairs, rest: Rest, duration: float, *, settling: bool = False
+) -> Moved:
+    """The objects of one scene ``duration`` seconds later.
+
+    What is at rest is where its closed form says, all else is simulated with what it touches. When something
+    simulated reaches an object that was not, or one that had come to rest and left, the two are simulated
+    again together.
+
+    Args:
+        physics: of the scene's assets.
+        objects: of one scene.
+        pairs: their near pairs.
+        rest: which of them have a closed form.
+        duration: s.
+        settling: damp the motion, and integrate once only.
+    """
+    translation = objects.translation.copy()
+    translation[:, 2] += rest.rise
+    moved = Moved(objects.rotation.copy(), translation, rest.tilt.copy())
+    chosen = company(objects, pairs, ~(rest.still | objects.fixed))
+    group = np.full(len(objects), -1, dtype=np.int64)
+    rows = np.flatnonzero(chosen)
+    group[rows] = clusters(objects[rows], pairs.low[rows], pairs.high[rows])
+    due = chosen
+    for _ in range(_MEETINGS):
+        left = _simulate(physics, objects, pairs, due, group, duration, moved, settling=settling)
+        if not moved.is_finite:
+            break
+        hits = _meetings(physics, objects, pairs, due, group, left, moved)
+        if hits is None:
+            break
+        due = _merge(objects, pairs, group, *hits)
+    return moved
+
+
+def _simulate(
+    physics: Physics,
+    objects: Objects,
+    pairs: ObjectPairs,
+    due: Mask,
+    group: Index,
+    duration: float,
+    moved: Moved,
+    *,
+    settling: bool,
+) -> Mask:
+    """Simulate the objects ``due`` (n,), write where they get into ``moved``, and say which left early (n,)."""
+    left = np.zeros(len(objects), dtype=bool)
+    rows = np.flatnonzero(due | objects.fixed)
+    among, near = objects[rows], pairs.among(rows)
+    fine, height = np.zeros(len(objects), dtype=bool), np.zeros(len(objects), dtype=np.int64)
+    fine[rows], height[rows] = physics.support.needs_fine(among, near), physics.support.tallest(among, near)
     tallest = np.zeros(int(group.max()) + 1, dtype=np.int64)
-    np.maximum.at(tallest, group[~objects.fixed], height[~objects.fixed])
+    np.maximum.at(tallest, group[due], height[due])
 
-    def run(chosen: Mask, settings: SolverSettings) -> None:
-        rows = np.flatnonzero(objects.fixed | chosen)
+    def run(members: Mask, settings: SolverSettings) -> None:
+        if settling:
+            settings = replace(settings, linear_damping=_DAMPING, angular_damping=_DAMPING)
+        rows = np.flatnonzero(objects.fixed | members)
         end = physics.world.simulate(objects[rows], fine[rows], group[rows], duration, settings)
-        displacement[rows] = np.linalg.norm(end[1] - objects.translation[rows], axis=1)
-        rotation[rows] = end[2]
+        free = ~objects.fixed[rows]
+        moved.rotation[rows[free]], moved.translation[rows[free]] = end[0][free], end[1][free]
+        moved.angle[rows[free]], left[rows[free]] = end[2][free], end[3][free]
 
-    for settings in dict.fromkeys(settings_for(int(carriers)) for carriers in tallest[group[~objects.fixed]]):
-        run(np.array([label >= 0 and settings_for(int(tallest[label])) == settings for label in group]), settings)
-    doubtful = (height >= _TALL) & (displacement > _DOUBT[0]) & (displacement < _DOUBT[1])
-    again = np.unique(group[doubtful & ~objects.fixed])
+    for settings in dict.fromkeys(settings_for(int(carriers)) for carriers in tallest[group[due]]):
+        run(due & np.array([label >= 0 and settings_for(int(tallest[label])) == settings for label in group]), settings)
+    if settling:
+        return left
+    displacement = np.linalg.norm(moved.translation - objects.translation, axis=1)
+    doubtful = due & (height >= _TALL) & (displacement > _DOUBT[0]) & (displacement < _DOUBT[1])
+    again = np.unique(group[doubtful])
     again = again[tallest[again] < _HIGH]
     if len(again):  # high in a stack, a millimetre may be the integrator's: look again, closer
-        run(np.isin(group, again), FINEST)
-    return displacement, rotation
+        run(due & np.isin(group, again), FINEST)
+    return left
+
+
+def _meetings(
+    physics: Physics, objects: Objects, pairs: ObjectPairs, due: Mask, group: Index, left: Mask, moved: Moved
+) -> tuple[Index, Index] | None:
+    """Pairs of objects, the first simulated just now, that come together although not simulated together."""
+    far = np.linalg.norm(moved.translation - objects.translation, axis=1)
+    reach = np.linalg.norm(pairs.high - pairs.low, axis=1)
+    movers = np.flatnonzero(due & (far + moved.angle * reach > _FAR))
+    others = np.flatnonzero(~objects.fixed)
+    if not len(movers) or len(others) < 2:
+        return None
+    ends = replace(objects[movers], rotation=moved.rotation[movers], translation=moved.translation[movers])
+    low, high = object_boxes(place(physics.library, ends, "coarse"))
+    low, high = np.minimum(low, pairs.low[movers]) - _MARGIN, np.maximum(high, pairs.high[movers]) + _MARGIN
+    meets = (low[:, None] <= pairs.high[others][None]) & (pairs.low[others][None] <= high[:, None])
+    first, second = np.nonzero(meets.all(axis=2))
+    first, second = movers[first], others[second]
+    apart = (group[first] != group[second]) | (group[second] < 0)
+    first, second = first[apart], second[apart]
+    if not ((group[second] < 0) | left[second] | ~due[second]).any():
+        return None
+    return first, second
+
+
+def _merge(objects: Objects, pairs: ObjectPairs, group: Index, first: Index, second: Index) -> Mask:
+    """Join the clusters of objects that met, in ``group`` and in place; what is to be simulated again (n,)."""
+    count = len(objects)
+    touched = np.zeros(count, dtype=bool)
+    touched[first] = touched[second] = True
+    touched |= np.isin(group, group[touched & (group >= 0)])
+    due = company(objects, pairs, touched)
+    due |= np.isin(group, group[due & (group >= 0)])
+    # One cluster for all of them: they are few, and what was at rest is at rest again.
+    group[due] = int(group.max()) + 1
+    return due
 
 
 def settle_scene(physics: Physics, objects: Objects, duration: float) -> tuple[Array, Array, bool]:
     """Let one scene come to rest: rotation (n, 3, 3), translation (n, 3) m, and whether it stayed finite."""
-    rotation, translation = objects.rotation.copy(), objects.translation.copy()
-    at_rest = objects.fixed.copy()
+    current = objects
+    calm = np.zeros(len(objects), dtype=bool)  # was simulated, and did not move
     remaining = duration
-    while remaining > 1e-9 and not at_rest.all():
+    while remaining > 1e-9:
         span = min(_SEGMENT, remaining)
         remaining -= span
-        current = Objects(objects.scene, objects.slot, objects.category, rotation, translation, objects.fixed)
         pairs = physics.collider.pairs(current)
-        group = clusters(current, pairs.low, pairs.high, span, sideways=_ROOM)
-        awake = np.isin(group, group[~at_rest])
-        rows = np.flatnonzero(awake | objects.fixed)
-        moving, pairs = current[rows], pairs.among(rows)
-        fine = physics.support.needs_fine(moving, pairs)
-        settings = settings_for(int(physics.support.tallest(moving, pairs).max(initial=0)))
-        settings = replace(settings, linear_damping=_DAMPING, angular_damping=_DAMPING)
-        end_rotation, end_translation, angle = physics.world.simulate(moving, fine, group[rows], span, settings)
-        if not (np.isfinite(end_rotation).all() and np.isfinite(end_translation).all()):
+        rest = physics.rest(current, pairs, span)
+        active = ~(rest.still | current.fixed)
+        done = active & ~company(current, pairs, active & ~calm)
+        rest = Rest(rest.still | done, rest.rise, rest.tilt)
+        if not (active & ~done).any() and (np.abs(rest.rise) < _STILL).all():
+            break
+        moved = advance(physics, current, pairs, rest, span, settling=True)
+        if not moved.is_finite:
             return objects.rotation, objects.translation, False
-        moved = np.linalg.norm(end_translation - translation[rows], axis=1)
-        at_rest[rows] = objects.fixed[rows] | ((moved < _STILL) & (angle < _STILL_ANGLE))
-        free = ~objects.fixed[rows]
-        rotation[rows[free]], translation[rows[free]] = end_rotation[free], end_translation[free]
-    return rotation, translation, True
+        far = np.linalg.norm(moved.translation - current.translation, axis=1)
+        calm = (far < _STILL) & (moved.angle < _STILL_ANGLE)
+        current = replace(current, rotation=moved.rotation, translation=moved.translation)
+    return current.rotation, current.translation, True
 
 
 def settings_for(height: int) -> SolverSettings:

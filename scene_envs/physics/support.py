@@ -1,4 +1,4 @@
-"""What holds an object: when coarse shapes give the same verdict, and when no simulation is needed at all."""
+"""Who can touch whom: when coarse shapes give the same verdict, how high stacks are, what must be simulated together."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from scene_envs.physics.collision import ObjectPairs, scene_pairs
+from scene_envs.physics.collision import ObjectPairs
 from scene_envs.physics.contact_faces import ContactFace
 from scene_envs.physics.geometry import LibraryGeometry
 from scene_envs.physics.placement import Objects
@@ -18,23 +18,16 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-GRAVITY = 9.81
-"""m/s^2."""
-
 _REACH = 2e-3
 """Pairs further apart than this (m) do not carry each other."""
 _SAME_DEPTH = 1e-4
 """Coarse and fine overlap may differ by this much (m) and still act alike."""
 _UPRIGHT = 0.999
 """Cosine of the tilt up to which faces count as facing each other."""
-_FLAT = 3e-4
-"""Tilt (rad) up to which an object on its own needs no simulation."""
 _CLEAR = 0.01
-"""An object is on its own when nothing is within this distance (m) of it sideways or below,"""
-_CLEAR_ABOVE = 0.01
-"""or within this distance (m) above, beyond what falls in the time."""
-_BALANCE = 5e-3
-"""The centre of mass must lie at least this far (m) inside the foot."""
+"""Objects within this distance (m) of each other sideways,"""
+_CLEAR_ABOVE = 0.06
+"""and within this distance (m) in height, are simulated in one cluster."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,12 +58,24 @@ class Support:
 
     def __init__(self, library: LibraryGeometry) -> None:
         self.hollow = np.array([asset.is_hollow for asset in library.assets])
-        self.center_of_mass = library.center_of_mass
         self.bottom = _Faces.of([asset.bottom for asset in library.assets])
         self.top = _Faces.of([asset.top for asset in library.assets])
 
     def needs_fine(self, objects: Objects, pairs: ObjectPairs) -> Mask:
         """(n,) objects that must collide with their fine parts.
+
+        Args:
+            objects: the objects.
+            pairs: their near pairs.
+        """
+        different = self.differs(objects, pairs)
+        fine = np.zeros(len(objects), dtype=bool)
+        fine[pairs.first[different]] = True
+        fine[pairs.second[different]] = True
+        return fine & self.hollow[objects.category]
+
+    def differs(self, objects: Objects, pairs: ObjectPairs) -> Mask:
+        """(P,) pairs whose coarse parts do not carry each other as the fine ones do.
 
         Coarse shapes act like fine ones in a contact when the solid outlines of two facing flat faces
         meet all the way round, on a flat surface that is larger than the object, or side by side.
@@ -91,11 +96,7 @@ class Support:
         )
         upright = objects.rotation[:, 2, 2] > _UPRIGHT
         beside = (np.abs(pairs.direction[:, 2]) < 0.1) & upright[a] & upright[b]
-        different = relevant & ~(same_depth & (alike | beside))
-        fine = np.zeros(len(objects), dtype=bool)
-        fine[a[different]] = True
-        fine[b[different]] = True
-        return fine & self.hollow[objects.category]
+        return relevant & ~(same_depth & (alike | beside))
 
     def _meets_all_round(self, objects: Objects, upper: Index, lower: Index, gap: Array) -> Mask:
         up, down = objects.category[upper], objects.category[lower]
@@ -120,41 +121,6 @@ class Support:
             larger = np.hypot(reach_x, reach_y) <= self.top.inner[down]
             return larger & (self.top.hole[down] == 0) & (objects.rotation[lower, 2, 2] > _UPRIGHT)  # type: ignore[no-any-return]
 
-    def at_rest(self, objects: Objects, low: Array, high: Array, duration: float) -> tuple[Mask, Array, Array]:
-        """Objects that stand alone and upright on a fixed flat surface: their motion has a closed form.
-
-        Such an object rises by its overlap, or falls by its gap as far as free fall takes it in ``duration``.
-
-        Returns:
-            mask (n,), displacement (n,) m and rotation (n,) rad; the last two only where the mask is True.
-        """
-        first, second = neighbors_of(objects, low, high, _CLEAR, duration)
-        n = len(objects)
-        neighbors = np.bincount(first, minlength=n) + np.bincount(second, minlength=n)
-        support = np.full(n, -1, dtype=np.int64)
-        support[first[objects.fixed[second]]] = second[objects.fixed[second]]
-        support[second[objects.fixed[first]]] = first[objects.fixed[first]]
-        rows = np.flatnonzero((neighbors == 1) & (support >= 0) & ~objects.fixed)
-        mask, displacement, rotation = np.zeros(n, dtype=bool), np.zeros(n), np.zeros(n)
-        if not len(rows):
-            return mask, displacement, rotation
-        under = support[rows]
-        tilt = np.hypot(objects.rotation[rows, 0, 2], objects.rotation[rows, 1, 2])
-        level = np.hypot(objects.rotation[under, 0, 2], objects.rotation[under, 1, 2]) < 1e-6
-        up = objects.category[rows]
-        foot = _face_center(objects, rows, self.bottom)
-        gap = foot[:, 2] - _face_center(objects, under, self.top)[:, 2]
-        lever = np.hypot(*(self.center_of_mass[up, :2] - self.bottom.center[up]).T)
-        with np.errstate(invalid="ignore"):
-            good = (tilt < _FLAT) & (objects.rotation[rows, 2, 2] > 0) & level & (objects.rotation[under, 2, 2] > 0)
-            good &= (gap > -2e-3) & (lever < self.bottom.inner[up] - _BALANCE)
-        good &= self._on_plane(objects, rows, under, low, high)
-        rows = rows[good]
-        mask[rows] = True
-        displacement[rows] = np.where(gap[good] < 0, -gap[good], np.minimum(gap[good], 0.5 * GRAVITY * duration**2))
-        rotation[rows] = tilt[good]
-        return mask, displacement, rotation
-
     def tallest(self, objects: Objects, pairs: ObjectPairs) -> Index:
         """(n,) how many objects carry each object, one above the other (0 on a fixed surface)."""
         vertical = (np.abs(pairs.direction[:, 2]) > 0.5) & (pairs.gap < _REACH)
@@ -168,28 +134,39 @@ class Support:
         return depth
 
 
-def neighbors_of(objects: Objects, low: Array, high: Array, sideways: float, duration: float) -> tuple[Index, Index]:
-    """Pairs (P,), (P,) of objects of one scene that could meet within ``duration`` seconds.
+def clusters(objects: Objects, low: Array, high: Array, sideways: float = _CLEAR) -> Index:
+    """(n,) a number per free object of one scene, shared by those near each other; -1 for fixed ones."""
+    rows = np.flatnonzero(~objects.fixed)
+    margin = np.array([sideways, sideways, _CLEAR_ABOVE])
+    first, second = np.triu_indices(len(rows), k=1)
+    first, second = rows[first], rows[second]
+    near = ((low[first] <= high[second] + margin) & (low[second] <= high[first] + margin)).all(axis=1)
+    return np.where(objects.fixed, -1, components(len(objects), first[near], second[near]))
 
-    Their boxes are within ``sideways`` m of each other, and no further apart in height than what falls in the time.
+
+def components(count: int, first: Index, second: Index) -> Index:
+    """(count,) number of the connected component of each node, edges given as (P,), (P,)."""
+    graph = coo_matrix((np.ones(len(first)), (first, second)), shape=(count, count))
+    return connected_components(graph, directed=False)[1].astype(np.int64)  # type: ignore[no-any-return]
+
+
+def company(objects: Objects, pairs: ObjectPairs, chosen: Mask) -> Mask:
+    """(n,) free objects that must be simulated with the ``chosen`` ones.
+
+    These are what touches or nearly touches a chosen object, and whatever those stand on or carry.
     """
-    first, second = scene_pairs(objects)
-    near = (low[first, 0] <= high[second, 0] + sideways) & (low[second, 0] <= high[first, 0] + sideways)
-    near &= (low[first, 1] <= high[second, 1] + sideways) & (low[second, 1] <= high[first, 1] + sideways)
-    above = 0.5 * GRAVITY * duration**2 + _CLEAR_ABOVE
-    near &= (low[first, 2] <= high[second, 2] + above) & (low[second, 2] <= high[first, 2] + above)
-    return first[near], second[near]
-
-
-def clusters(objects: Objects, low: Array, high: Array, duration: float, sideways: float = _CLEAR) -> Index:
-    """(n,) a number per free object, shared by those that could meet in ``duration`` seconds; -1 for fixed ones."""
-    first, second = neighbors_of(objects, low, high, sideways, duration)
-    free = ~(objects.fixed[first] | objects.fixed[second])
-    first, second = first[free], second[free]
-    n = len(objects)
-    graph = coo_matrix((np.ones(len(first)), (first, second)), shape=(n, n))
-    labels = connected_components(graph, directed=False)[1].astype(np.int64)
-    return np.where(objects.fixed, -1, labels)
+    free = ~(objects.fixed[pairs.first] | objects.fixed[pairs.second]) & (pairs.gap < _REACH)
+    first, second = pairs.first[free], pairs.second[free]
+    together = chosen.copy()
+    touched = chosen[first] | chosen[second]
+    together[first[touched]] = together[second[touched]] = True
+    vertical = (np.abs(pairs.direction[free, 2]) > 0.5) | (pairs.gap[free] < -_SAME_DEPTH)
+    first, second = first[vertical], second[vertical]
+    while True:
+        touched = together[first] != together[second]
+        if not touched.any():
+            return together
+        together[first[touched]] = together[second[touched]] = True
 
 
 def _face_center(objects: Objects, rows: Index, faces: _Faces) -> Array:

@@ -204,7 +204,7 @@ class World:
 
     def simulate(
         self, objects: Objects, fine: Mask, group: Index, duration: float, settings: SolverSettings
-    ) -> tuple[Array, Array, Array]:
+    ) -> tuple[Array, Array, Array, Mask]:
         """Move the objects of one scene for ``duration`` seconds under gravity.
 
         Args:
@@ -215,8 +215,8 @@ class World:
             settings: integration.
 
         Returns:
-            rotation (n, 3, 3) and translation (n, 3) afterwards, and the angle turned (n,) in radians.
-            Objects that Bullet lost to a numerical failure come back as NaN.
+            rotation (n, 3, 3) and translation (n, 3) m afterwards, the angle turned (n,) in radians, and which
+            objects (n,) came to rest and left before the end. Objects that Bullet lost to a numerical failure come back as NaN.
         """
         bullet, client = self._bullet, self._client
         category, fixed, count = objects.category, objects.fixed, len(objects)
@@ -254,6 +254,7 @@ class World:
         )
         end_position, end_quaternion = np.empty((count, 3)), np.empty((count, 4))
         running = {int(label): np.flatnonzero(group == label) for label in np.unique(group[~fixed])}
+        left = np.zeros(count, dtype=bool)
         done = 0
         while done < steps:
             ahead = min(_LOOK, steps - done)
@@ -264,6 +265,7 @@ class World:
                 if done < steps and self._is_still(bodies[rows]):
                     self._read(bodies, rows, end_position, end_quaternion)
                     self._park(bodies[rows], category[rows])
+                    left[rows] = True
                     del running[label]
         for rows in (np.flatnonzero(fixed), *running.values()):
             self._read(bodies, rows, end_position, end_quaternion)
@@ -277,7 +279,7 @@ class World:
         lost = ~np.isfinite(end_position).all(axis=1) | ~np.isfinite(end_quaternion).all(axis=1)
         if lost.any():
             self.reset()
-        return new_rotation, new_translation, angle
+        return new_rotation, new_translation, angle, left
 
     def _read(self, bodies: Index, rows: Index, position: Array, quaternion: Array) -> None:
         for row in rows.tolist():

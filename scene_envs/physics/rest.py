@@ -1,0 +1,303 @@
+"""Which objects stand where they are for a reason that needs no simulation: the statics of upright stacks.
+
+An upright object rests on the one object under it when its centre of mass, with everything that it carries, lies
+inside both its own foot and the flat face below. Gaps close and small overlaps open, from the lowest object up. What
+stands like that, and meets nothing on that way, is at rest; all else has to be simulated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from scene_envs.physics import rigid
+from scene_envs.physics.collision import NEAR, Contacts, ObjectPairs, scene_pairs
+from scene_envs.physics.geometry import AssetGeometry, LibraryGeometry, PartGeometry
+from scene_envs.physics.placement import Objects
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+GRAVITY = 9.81
+"""m/s^2."""
+
+_FLAT = 3e-4
+"""Tilt (rad) up to which an object counts as upright."""
+_FOOT = 1e-4
+"""Corners this close (m) to the lowest one belong to the foot."""
+_MEETS = 2e-4
+"""A contact is the foot's own when its height agrees this well (m)."""
+_BALANCE = 5e-3
+"""The centre of mass must lie at least this far (m) inside the foot and the face below."""
+_TOUCHING = 1e-4
+"""Overlap (m) beside an object that is too small to move it."""
+_DEEPEST = 2e-3
+"""An object sunk deeper than this (m) does not simply rise."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """What has a closed form.
+
+    Attributes:
+        still: (n,) bool; free objects that need no simulation.
+        rise: (n,) m, how far each of them moves up; negative is down. 0 elsewhere.
+        tilt: (n,) rad, the angle by which it comes to stand upright.
+    """
+
+    still: Mask
+    rise: Array
+    tilt: Array
+
+    def __getitem__(self, rows: Index) -> Rest:
+        return Rest(self.still[rows], self.rise[rows], self.tilt[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class _Polygons:
+    """Convex polygons in the asset's xy plane, padded with copies of their first corner and edge.
+
+    Attributes:
+        height: (P,) z in the asset frame, m; NaN where there is no polygon.
+        corners: (P, V, 2) m.
+        normals: (P, V, 2) outward.
+        offsets: (P, V) m; inside is ``normals @ x <= offsets``.
+    """
+
+    height: Array
+    corners: Array
+    normals: Array
+    offsets: Array
+
+    @classmethod
+    def of(cls, polygons: list[tuple[float, Array] | None]) -> _Polygons:
+        width = max((len(polygon[1]) for polygon in polygons if polygon is not None), default=3)
+        count = len(polygons)
+        height, offsets = np.full(count, np.nan), np.full((count, width), -1.0)
+        corners, normals = np.zeros((count, width, 2)), np.zeros((count, width, 2))
+        for index, polygon in enumerate(polygons):
+            if polygon is None:
+                continue
+            points = polygon[1]
+            edge = np.roll(points, -1, axis=0) - points
+            normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
+            height[index] = polygon[0]
+            for target, values in ((corners, points), (normals, normal), (offsets, (normal * points).sum(axis=1))):
+                target[index] = values[0]
+                target[index, : len(points)] = values
+        return cls(height, corners, normals, offsets)
+
+    def outside(self, rows: Index, points: Array) -> Array:
+        """(Q, K): how far (m) points (Q, K, 2) in the asset frame lie outside polygons ``rows`` (Q,)."""
+        normals, offsets = self.normals[rows][:, None], self.offsets[rows][:, None]
+        along = normals[..., 0] * points[:, :, None, 0] + normals[..., 1] * points[:, :, None, 1]
+        return (along - offsets).max(axis=2)  # type: ignore[no-any-return]
+
+
+class Statics:
+    """Judges from precomputed feet and surfaces what stands.
+
+    Args:
+        library: geometry of the assets.
+    """
+
+    def __init__(self, library: LibraryGeometry) -> None:
+        self._library = library
+        self._mass = np.array([float(asset.asset.mass) for asset in library.assets])
+        self._foot = _Polygons.of([_foot(asset) for asset in library.assets])
+        self._solid = np.array([asset.bottom is not None and asset.bottom.hole == 0 for asset in library.assets])
+        self._surface = _Polygons.of([_surface(part) for part in library.parts])
+        for asset in library.assets:
+            if asset.is_hollow:  # solid hulls have tops where there is nothing to stand on
+                self._surface.offsets[asset.coarse.ids] = -np.inf
+        self._rim = _Polygons.of([_rim(asset) for asset in library.assets])
+        tops, bottoms = [asset.top for asset in library.assets], [asset.bottom for asset in library.assets]
+        self._hole_top = np.array([np.inf if top is None else top.hole for top in tops])
+        self._rim_reach = np.array([0.0 if top is None else top.corners for top in tops])
+        self._rim_center = np.array([(0.0, 0.0) if top is None else top.center for top in tops])
+        self._hole_foot = np.array([np.inf if bottom is None else bottom.hole for bottom in bottoms])
+        self._foot_reach = np.array([0.0 if bottom is None else bottom.corners for bottom in bottoms])
+        self._foot_center = np.array([(0.0, 0.0) if bottom is None else bottom.center for bottom in bottoms])
+
+    def at_rest(self, objects: Objects, pairs: ObjectPairs, contacts: Contacts, duration: float) -> Rest:
+        """What needs no simulation for ``duration`` seconds.
+
+        Args:
+            objects: the objects of one or more scenes.
+            pairs: their near pairs.
+            contacts: the near parts of those.
+            duration: s.
+        """
+        count = len(objects)
+        tilt = np.hypot(objects.rotation[:, 0, 2], objects.rotation[:, 1, 2])
+        upright = (tilt < _FLAT) & (objects.rotation[:, 2, 2] > 0)
+        rows, upper, lower = self._standing(objects, contacts, upright)
+        support = np.full(count, -1, dtype=np.int64)
+        drop = np.zeros(count)
+        order = np.lexsort((contacts.gap[rows], upper))
+        found, leading = np.unique(upper[order], return_index=True)
+        chosen = order[leading]
+        support[found], drop[found] = lower[chosen], contacts.gap[rows][chosen]
+        support[objects.fixed] = -1
+        rise, height = _rises(support, drop, objects.fixed)
+        center = self._loaded_center(objects, support, height)
+        best = np.zeros(count, dtype=bool)
+        held = (lower == support[upper]) & (contacts.gap[rows] < drop[upper] + _TOUCHING)
+        rows, upper, lower = rows[held], upper[held], lower[held]
+        good = self._holds(objects, contacts, rows, upper, lower, center)
+        best[upper[good]] = True
+        still = best & (support >= 0) & ~objects.fixed & upright
+        rise = np.maximum(rise, -0.5 * GRAVITY * duration**2)
+        self._clear(objects, pairs, contacts, rise, still)
+        while True:  # what stands on something that has to be simulated has to be simulated
+            lost = still & ~(still | objects.fixed)[np.maximum(support, 0)]
+            if not lost.any():
+                break
+            still &= ~lost
+        return Rest(still, np.where(still, rise, 0.0), np.where(still, tilt, 0.0))
+
+    def _standing(self, objects: Objects, contacts: Contacts, upright: Mask) -> tuple[Index, Index, Index]:
+        """Contacts of a foot with a horizontal face below: rows, upper and lower objects."""
+        vertical = np.flatnonzero(np.abs(contacts.direction[:, 2]) > 0.9999)
+        up = contacts.direction[vertical, 2] > 0
+        first, second = contacts.first[vertical], contacts.second[vertical]
+        upper, lower = np.where(up, second, first), np.where(up, first, second)
+        part = np.where(up, contacts.part_first[vertical], contacts.part_second[vertical])
+        z = objects.translation[:, 2]
+        foot = z[upper] + self._foot.height[objects.category[upper]]
+        with np.errstate(invalid="ignore"):
+            meets = np.abs(foot - z[lower] - self._surface.height[part] - contacts.gap[vertical]) < _MEETS
+        good = meets & upright[upper] & upright[lower] & (contacts.gap[vertical] > -_DEEPEST) & ~objects.fixed[upper]
+        return vertical[good], upper[good], lower[good]
+
+    def _loaded_center(self, objects: Objects, support: Index, height: Index) -> Array:
+        """(n, 2) centre of mass of each object together with everything on it, world frame."""
+        mass = self._mass[objects.category].copy()
+        local = self._library.center_of_mass[objects.category]
+        moment = mass[:, None] * (objects.translation + rigid.apply(objects.rotation, local))[:, :2]
+        for level in range(int(height.max(initial=0)), 0, -1):
+            rows = np.flatnonzero((height == level) & (support >= 0))
+            np.add.at(mass, support[rows], mass[rows])
+            np.add.at(moment, support[rows], moment[rows])
+        return moment / np.maximum(mass, 1e-12)[:, None]  # type: ignore[no-any-return]
+
+    def _holds(
+        self, objects: Objects, contacts: Contacts, rows: Index, upper: Index, lower: Index, center: Array
+    ) -> Mask:
+        """Whether each contact alone keeps its upper object from tipping."""
+        good = np.zeros(len(rows), dtype=bool)
+        middle = center[upper][:, None]
+        candidates = self._foot.outside(objects.category[upper], _into(objects, upper, middle))[:, 0] < -_BALANCE
+        local = _into(objects, lower, middle)
+        part = np.where(contacts.second[rows] == upper, contacts.part_first[rows], contacts.part_second[rows])
+        inside = candidates & (self._surface.outside(part, local)[:, 0] < -_BALANCE)
+        q = np.flatnonzero(inside)
+        up = objects.category[upper[q]]
+        corners = _into(objects, lower[q], _out_of(objects, upper[q], self._foot.corners[up]))
+        good[q] = self._solid[up] | (self._surface.outside(part[q], corners).max(axis=1) < 0.0)
+        # The rim question is the same for all parts of the two objects.
+        _, leading = np.unique(upper, return_index=True)
+        q = leading[candidates[leading]]
+        up, down = objects.category[upper[q]], objects.category[lower[q]]
+        at_rim = np.abs(self._rim.height[down] - self._surface.height[part[q]]) < _MEETS
+        offset = np.linalg.norm(
+            _into(objects, lower[q], _out_of(objects, upper[q], self._foot_center[up][:, None]))[:, 0]
+            - self._rim_center[down],
+            axis=1,
+        )
+        at_rim &= self._rim.outside(down, local[q])[:, 0] < -_BALANCE
+        at_rim &= offset <= self._foot_reach[up] - self._hole_top[down]
+        at_rim &= (self._hole_foot[up] == 0) | (offset <= self._rim_reach[down] - self._hole_foot[up])
+        good[q] |= at_rim
+        return good
+
+    def _clear(self, objects: Objects, pairs: ObjectPairs, contacts: Contacts, rise: Array, still: Mask) -> None:
+        """Strike from ``still``, in place, what meets something on its way."""
+        while True:
+            moved = np.where(still, rise, 0.0)
+            relative = contacts.direction[:, 2] * (moved[contacts.second] - moved[contacts.first])
+            bad = contacts.gap + relative < -_TOUCHING
+            # An overlap with what is simulated is not this object's to judge, but that one's company is simulated.
+            struck = np.zeros(len(still), dtype=bool)
+            struck[contacts.first[bad]] = True
+            struck[contacts.second[bad]] = True
+            struck &= still
+            if not struck.any():
+                break
+            still &= ~struck
+        falling = still & (rise < -0.5 * NEAR)
+        if falling.any():
+            low, high = pairs.low.copy(), pairs.high
+            low[falling, 2] += rise[falling]
+            first, second = scene_pairs(objects)
+            keep = (falling[first] | falling[second]) & ~(objects.fixed[first] | objects.fixed[second])
+            first, second = first[keep], second[keep]
+            meets = ((low[first] <= high[second] + NEAR) & (low[second] <= high[first] + NEAR)).all(axis=1)
+            still[first[meets & falling[first]]] = False
+            still[second[meets & falling[second]]] = False
+
+
+def _rises(support: Index, drop: Array, fixed: Mask) -> tuple[Array, Index]:
+    """How far (m) each object moves up until it meets its support, and how many objects carry it."""
+    rise, height = np.zeros(len(support)), np.zeros(len(support), dtype=np.int64)
+    carried = np.flatnonzero(support >= 0)
+    under = support[carried]
+    while True:
+        new_height = np.where(fixed[under], 1, height[under] + 1)
+        rise[carried] = rise[under] - drop[carried]
+        if (new_height == height[carried]).all() or new_height.max(initial=0) > len(support):
+            return rise, np.minimum(height, len(support))
+        height[carried] = new_height
+
+
+def _into(objects: Objects, rows: Index, points: Array) -> Array:
+    """World points (Q, K, 2) in the frames of upright objects ``rows`` (Q,)."""
+    relative = points - objects.translation[rows, None, :2]
+    r = objects.rotation[rows, :2, :2][:, None]
+    return r[..., 0, :] * relative[..., 0:1] + r[..., 1, :] * relative[..., 1:2]
+
+
+def _out_of(objects: Objects, rows: Index, points: Array) -> Array:
+    """Points (Q, K, 2) of upright objects ``rows`` (Q,) in the world."""
+    r = objects.rotation[rows, :2, :2][:, None]
+    moved = r[..., :, 0] * points[..., 0:1] + r[..., :, 1] * points[..., 1:2]
+    return moved + objects.translation[rows, None, :2]  # type: ignore[no-any-return]
+
+
+def _outline(points: Array) -> Array | None:
+    """Counter-clockwise convex outline (K, 2), or None when there is no area."""
+    if len(points) < 3:
+        return None
+    try:
+        hull = ConvexHull(points)
+    except QhullError:
+        return None
+    return np.asarray(points[hull.vertices]) if hull.volume > 1e-7 else None
+
+
+def _foot(asset: AssetGeometry) -> tuple[float, Array] | None:
+    """Height and outline of the lowest corners of all fine parts."""
+    vertices = asset.fine.vertices
+    height = float(vertices[:, 2].min())
+    outline = _outline(vertices[vertices[:, 2] < height + _FOOT][:, :2])
+    return None if outline is None else (height, outline)
+
+
+def _surface(part: PartGeometry) -> tuple[float, Array] | None:
+    """Height and outline of a part's flat top."""
+    height = float(part.vertices[:, 2].max())
+    outline = _outline(part.vertices[part.vertices[:, 2] > height - 1e-5][:, :2])
+    return None if outline is None else (height, outline)
+
+
+def _rim(asset: AssetGeometry) -> tuple[float, Array] | None:
+    """Height and outline of the top face that closes round a hole."""
+    if asset.top is None:
+        return None
+    vertices = asset.fine.vertices
+    outline = _outline(vertices[vertices[:, 2] > asset.top.height - 1e-5][:, :2])
+    return None if outline is None else (asset.top.height, outline)
