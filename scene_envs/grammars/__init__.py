@@ -4,23 +4,25 @@ from scene_envs.grammars import dimsum_table as _dimsum_table  # noqa: F401  (re
 from scene_envs.grammars.containers import Filling, Heap, Standing
 from scene_envs.grammars.dsl import (
     NOTHING,
+    Cluster,
     Geometric,
     Group,
-    Node,
     Object,
     OneOf,
     Pile,
     Repeat,
     Stack,
-    Surface,
-    Tower,
+    Tiers,
 )
 from scene_envs.grammars.grammar import Grammar, get_grammar, list_grammars, register_grammar
 from scene_envs.grammars.plan import Disc, Rectangle
-from scene_envs.grammars.surface import FreeSurface, Gaussian, Line, Outline, Region, Uniform, Yaw
+from scene_envs.grammars.surface import FreeSurface, Outline, Region
+from scene_envs.grammars.towers import Node, Surface, Tower
+from scene_envs.grammars.wishes import Gaussian, Line, Moved, Uniform, Yaw
 
 __all__ = [
     "NOTHING",
+    "Cluster",
     "Disc",
     "Filling",
     "FreeSurface",
@@ -30,6 +32,7 @@ __all__ = [
     "Group",
     "Heap",
     "Line",
+    "Moved",
     "Node",
     "Object",
     "OneOf",
@@ -41,6 +44,7 @@ __all__ = [
     "Stack",
     "Standing",
     "Surface",
+    "Tiers",
     "Tower",
     "Uniform",
     "Yaw",

@@ -17,7 +17,7 @@ from scene_envs.scene_types import Camera, FixedObject, SceneType
 
 if TYPE_CHECKING:
     from scene_envs.assets.base import Asset
-    from scene_envs.grammars.dsl import Node
+    from scene_envs.grammars.towers import Node
     from scene_envs.scene import SceneBatch
 
 Array = NDArray[np.float64]

@@ -9,87 +9,19 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import accumulate
-from typing import Protocol
 
 import numpy as np
 
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars.containers import Filling
-from scene_envs.grammars.surface import Gaussian, Region, Wish, Yaw
+from scene_envs.grammars.towers import Node, Surface, Tower
+from scene_envs.grammars.wishes import Gaussian, Wish, Yaw
 
 _CENTER = Gaussian(along=0.0)
-
-
-@dataclass(frozen=True)
-class Tower:
-    """Objects on one vertical axis, bottom first.
-
-    Attributes:
-        assets: asset names from the bottom up.
-        where: the distribution of the axis, in the frame of the support.
-        step: height (m) between the frames of neighbours; None stacks each on the top of the one below.
-        yaw: how each object is turned.
-        loads: what stands on the bottom object: surfaces, each with its towers.
-        contents: assets inside the bottom object, which come to rest in it.
-        filling: how the contents get there.
-    """
-
-    assets: tuple[str, ...]
-    where: Wish
-    step: float | None = None
-    yaw: Yaw = Yaw()  # noqa: RUF009  (frozen)
-    loads: tuple[tuple[Surface, tuple[Tower, ...]], ...] = ()
-    contents: tuple[str, ...] = ()
-    filling: Filling | None = None
-
-    def walk(self) -> Iterator[Tower]:
-        """This tower and all that stand on it, recursively."""
-        yield self
-        for _, towers in self.loads:
-            for tower in towers:
-                yield from tower.walk()
-
-    def count(self) -> int:
-        """Objects in this tower, on it and in it."""
-        return sum(len(tower.assets) + len(tower.contents) for tower in self.walk())
-
-
-@dataclass(frozen=True)
-class Surface:
-    """A horizontal support of a grammar, with what stands on it.
-
-    Attributes:
-        children: what stands here; drawn and placed in this order.
-        region: where children may stand.
-        keep_out: per asset, the radius (m) no other child's keep-out may meet; by default the plan of the asset.
-        footprint: per asset, the radius (m) that must lie wholly on the support; by default the plan of the asset.
-        height: z of the surface (m), in the world or in the frame of the object that carries it; None takes the
-            height at which something rests in the middle of that object.
-        layouts: how often the whole layout is tried before the structure is thrown away.
-    """
-
-    children: Sequence[Node]
-    region: Region
-    keep_out: Mapping[str, float] = field(default_factory=dict)
-    footprint: Mapping[str, float] = field(default_factory=dict)
-    height: float | None = 0.0
-    layouts: int = 10
-
-    def draw(self, rng: np.random.Generator, reasons: Counter[str]) -> tuple[Tower, ...]:
-        """The towers on this surface."""
-        return tuple(tower for node in self.children for tower in node.draw(rng, reasons))
-
-
-class Node(Protocol):
-    """Anything that draws towers."""
-
-    def draw(self, rng: np.random.Generator, reasons: Counter[str]) -> list[Tower]:
-        """Draw towers; count in ``reasons`` why draws were thrown away."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -102,6 +34,7 @@ class Object:
         yaw: how it is turned; any angle by default.
         on: surfaces that it carries, in its own frame: a shelf's tiers, the middle of a plate, the floor of a bowl.
         inside: things that come to rest in it under gravity: cutlery in a crock, fruit in a bowl.
+        beside: what stands next to it on the same support, at places in its frame: chairs around a table.
     """
 
     asset: str
@@ -109,13 +42,44 @@ class Object:
     yaw: Yaw = Yaw()  # noqa: RUF009  (frozen)
     on: Sequence[Surface] = ()
     inside: Filling | None = None
+    beside: Node | None = None
 
     def draw(self, rng: np.random.Generator, reasons: Counter[str]) -> list[Tower]:
         loads = tuple((surface, surface.draw(rng, reasons)) for surface in self.on)
         contents: tuple[str, ...] = ()
         if self.inside is not None:
             contents = tuple(asset for tower in self.inside.node.draw(rng, reasons) for asset in tower.assets)
-        return [Tower((self.asset,), self.where, None, self.yaw, loads, contents, self.inside)]
+        beside = () if self.beside is None else tuple(self.beside.draw(rng, reasons))
+        return [Tower((self.asset,), self.where, None, self.yaw, loads, contents, self.inside, beside)]
+
+
+@dataclass(frozen=True)
+class Tiers:
+    """Several surfaces of what carries this node, such as the boards of a fixed shelf, drawn together."""
+
+    surfaces: Sequence[Surface]
+
+    def draw(self, rng: np.random.Generator, reasons: Counter[str]) -> list[Tower]:
+        return [Tower((), _CENTER, loads=tuple((surface, surface.draw(rng, reasons)) for surface in self.surfaces))]
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Nodes whose places are relative to one random place: the settings on two sides of a table.
+
+    Attributes:
+        member: what stands there.
+        where: the distribution of the common place.
+        yaw: how the whole is turned; not at all by default.
+    """
+
+    member: Node
+    where: Wish
+    yaw: Yaw = Yaw(std=0.0)  # noqa: RUF009  (frozen)
+
+    def draw(self, rng: np.random.Generator, reasons: Counter[str]) -> list[Tower]:
+        (x, y), yaw = self.where.draw(rng), self.yaw.draw(rng)
+        return [tower.moved(x, y, yaw) for tower in self.member.draw(rng, reasons)]
 
 
 @dataclass(frozen=True)

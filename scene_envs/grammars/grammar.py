@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 
 from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.grammars.dsl import Surface, Tower
 from scene_envs.grammars.layout import Frame, Layout, Pose
+from scene_envs.grammars.towers import Surface, Tower
 from scene_envs.plugins import load_plugins
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type

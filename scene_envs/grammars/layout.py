@@ -5,15 +5,18 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from scene_envs.grammars.containers import Containers
-from scene_envs.grammars.dsl import Surface, Tower
 from scene_envs.grammars.plan import Disc, Plan, carrying_height, foot_of, plan_of, top_of
 from scene_envs.grammars.surface import FreeSurface, Outline
+from scene_envs.grammars.towers import Surface, Tower
 from scene_envs.scene_types import SceneType
+
+_SPOTS = 20
+"""Places tried for an object that has others beside it."""
 
 Rotation = tuple[float, ...]
 """A rotation matrix, row-major."""
@@ -89,16 +92,36 @@ class Layout:
         free = FreeSurface(surface.region)
         poses: list[Pose] = []
         for tower in towers:
-            outline = self._outline(surface, tower.assets)
-            spot = free.place(tower.where, tower.yaw, outline, rng, len(tower.assets))
-            if spot is None:
-                return None
-            x, y = frame.point(spot[0], spot[1])
-            placed = self._tower(tower, x, y, height, [frame.yaw + yaw for yaw in spot[2]], rng)
+            placed = self._add(free, surface, tower, frame, height, rng)
             if placed is None:
                 return None
             poses += placed
         return poses
+
+    def _add(
+        self, free: FreeSurface, surface: Surface, tower: Tower, frame: Frame, height: float, rng: np.random.Generator
+    ) -> list[Pose] | None:
+        """One tower with all that is on it, in it and beside it."""
+        if not tower.assets:
+            return self._loads(tower, replace(frame, z=height), None, rng)
+        outline, mark = self._outline(surface, tower.assets), free.mark()
+        for _ in range(_SPOTS if tower.beside else 1):
+            spot = free.place(tower.where, tower.yaw, outline, rng, len(tower.assets))
+            if spot is None:
+                return None
+            beside: list[Pose] = []
+            for neighbor in tower.beside:
+                near = neighbor.moved(spot[0], spot[1], spot[2][0])
+                added = self._add(free, surface, near, frame, height, rng)
+                if added is None:
+                    break
+                beside += added
+            else:
+                x, y = frame.point(spot[0], spot[1])
+                own = self._tower(tower, x, y, height, [frame.yaw + yaw for yaw in spot[2]], rng)
+                return None if own is None else own + beside
+            free.reset(mark)
+        return None
 
     def _tower(
         self, tower: Tower, x: float, y: float, height: float, yaws: Sequence[float], rng: np.random.Generator
@@ -112,14 +135,14 @@ class Layout:
                 z = z + rise if tower.step is None else base + level * tower.step
             poses.append(Pose(asset, (x, y, z), about_z(yaw)))
         frame = Frame(x, y, base, yaws[0])
+        loads = self._loads(tower, frame, tower.assets[0], rng)
+        contents = self._contents(tower, frame, rng) if tower.contents else []
+        return None if loads is None or contents is None else poses + loads + contents
+
+    def _loads(self, tower: Tower, frame: Frame, carrier: str | None, rng: np.random.Generator) -> list[Pose] | None:
+        poses: list[Pose] = []
         for surface, towers in tower.loads:
-            placed = self.place(surface, towers, frame, tower.assets[0], rng)
-            if placed is None:
-                return None
-            poses += placed
-        if tower.contents:
-            assert tower.filling is not None
-            placed = self._contents(tower, frame, rng)
+            placed = self.place(surface, towers, frame, carrier, rng)
             if placed is None:
                 return None
             poses += placed

@@ -6,12 +6,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scene_envs.grammars.plan import Disc, Placed, Plan, meet
+from scene_envs.grammars.wishes import Wish, Yaw
 
 _DRAWS = 24
 """Draws from a child's own distribution before the free region is enumerated."""
@@ -19,118 +19,6 @@ _CELL = 0.02
 """Side of the cells (m) in which a crowded free region is enumerated; larger where the region is larger than 2 m."""
 _MOST_CELLS = 100
 """Cells along each side of a region, at most."""
-
-
-class Wish(Protocol):
-    """A distribution over places (x, y) in the frame of a support, m."""
-
-    def draw(self, rng: np.random.Generator) -> tuple[float, float]:
-        """One place."""
-        ...
-
-    def log_density(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """(P,) log density up to a constant, at ``points`` (P, 2); None when it lives on a line or point."""
-        ...
-
-
-@dataclass(frozen=True)
-class Gaussian:
-    """Where a child would like to stand: a normal distribution in the plane of its support.
-
-    Attributes:
-        x, y: mean, m, in the support's frame.
-        along: standard deviation (m) along ``direction``.
-        across: standard deviation (m) across it; the same as ``along`` when None.
-        direction: angle of the first axis from +x, rad.
-    """
-
-    x: float = 0.0
-    y: float = 0.0
-    along: float = 0.1
-    across: float | None = None
-    direction: float = 0.0
-
-    @cached_property
-    def _axes(self) -> tuple[float, float, float, float]:
-        across = self.along if self.across is None else self.across
-        return math.cos(self.direction), math.sin(self.direction), self.along, across
-
-    def draw(self, rng: np.random.Generator) -> tuple[float, float]:
-        """One position (x, y), m."""
-        cos, sin, along, across = self._axes
-        u, v = along * rng.standard_normal(), across * rng.standard_normal()
-        return self.x + cos * u - sin * v, self.y + sin * u + cos * v
-
-    def log_density(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(P,) log density up to a constant, at ``points`` (P, 2)."""
-        cos, sin, along, across = self._axes
-        dx, dy = points[:, 0] - self.x, points[:, 1] - self.y
-        result: NDArray[np.float64] = -0.5 * (
-            ((cos * dx + sin * dy) / along) ** 2 + ((cos * dy - sin * dx) / across) ** 2
-        )
-        return result
-
-
-@dataclass(frozen=True)
-class Uniform:
-    """Anywhere in a rectangle of the support: ``half_x``, ``half_y`` (m) about (``x``, ``y``)."""
-
-    half_x: float
-    half_y: float
-    x: float = 0.0
-    y: float = 0.0
-
-    def draw(self, rng: np.random.Generator) -> tuple[float, float]:
-        """One position (x, y), m."""
-        return (
-            self.x + self.half_x * (2.0 * rng.random() - 1.0),
-            self.y + self.half_y * (2.0 * rng.random() - 1.0),
-        )
-
-    def log_density(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(P,) 0 inside, minus infinity outside."""
-        inside = (np.abs(points[:, 0] - self.x) <= self.half_x) & (np.abs(points[:, 1] - self.y) <= self.half_y)
-        return np.where(inside, 0.0, -np.inf)
-
-
-@dataclass(frozen=True)
-class Line:
-    """Anywhere on the segment between two points (x, y), m: along a wall, at the edge of a shelf."""
-
-    start: tuple[float, float]
-    end: tuple[float, float]
-
-    def draw(self, rng: np.random.Generator) -> tuple[float, float]:
-        """One position (x, y), m."""
-        t = rng.random()
-        return (
-            self.start[0] + t * (self.end[0] - self.start[0]),
-            self.start[1] + t * (self.end[1] - self.start[1]),
-        )
-
-    def log_density(self, points: NDArray[np.float64]) -> None:
-        """None: a line has no density in the plane."""
-        return None
-
-
-@dataclass(frozen=True)
-class Yaw:
-    """How a child is turned about the vertical: one of ``choices`` plus a normal deviate.
-
-    Attributes:
-        std: standard deviation, rad; infinite for any angle.
-        choices: angles (rad) of the object's +x axis from the support's, equally likely.
-    """
-
-    std: float = math.inf
-    choices: tuple[float, ...] = (0.0,)
-
-    def draw(self, rng: np.random.Generator) -> float:
-        """One angle, rad."""
-        if self.std == math.inf:
-            return rng.random() * 2.0 * math.pi
-        center = self.choices[0] if len(self.choices) == 1 else self.choices[int(rng.integers(len(self.choices)))]
-        return center + self.std * rng.standard_normal()
 
 
 @dataclass(frozen=True)
@@ -207,6 +95,7 @@ class Outline:
 class FreeSurface:
     """A flat support while it is being filled.
 
+    >>> from scene_envs.grammars.wishes import Gaussian
     >>> surface = FreeSurface(Region(0.5, 0.5))
     >>> rng = np.random.default_rng(0)
     >>> cup = Outline((Disc(0.1),), (Disc(0.1),))
@@ -217,6 +106,14 @@ class FreeSurface:
 
     region: Region
     _placed: list[Placed] = field(default_factory=list)
+
+    def mark(self) -> int:
+        """How many plans stand here, for :meth:`reset`."""
+        return len(self._placed)
+
+    def reset(self, mark: int) -> None:
+        """Take away what was placed since :meth:`mark`."""
+        del self._placed[mark:]
 
     def fit(self, x: float, y: float, yaws: Sequence[float], outline: Outline) -> list[Placed] | None:
         """The child's keep-outs at (x, y) with one yaw (rad) per level, if it fits there; else None."""
