@@ -1,0 +1,148 @@
+"""The export itself: a folder of scenes and their assets."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.export.asset_files import AssetFiles
+from scene_envs.export.formats import get_format, resolve_formats
+from scene_envs.export.placed import place
+from scene_envs.scene import SceneBatch
+from scene_envs.scene_types import SceneType
+
+MANIFEST = "export.json"
+FRICTION = 0.6
+"""That of the project's own physics."""
+
+
+@dataclass(frozen=True)
+class ExportReport:
+    """What was written.
+
+    Attributes:
+        output: the folder.
+        formats: the formats, in the order they were asked for.
+        scenes: per scene, the main file of each format.
+        assets: names of the assets in use.
+        size: bytes of everything in the export.
+    """
+
+    output: Path
+    formats: tuple[str, ...]
+    scenes: tuple[Mapping[str, Path], ...]
+    assets: tuple[str, ...]
+    size: int
+
+
+def export(
+    batch: SceneBatch,
+    output: str | os.PathLike[str],
+    formats: str | Sequence[str] = "all",
+    *,
+    friction: float = FRICTION,
+) -> ExportReport:
+    """Write scenes for simulators and viewers.
+
+    ``output`` gets ``assets/<asset>/`` (meshes, convex parts, URDF; written once and shared) and
+    ``scene_000/``, ``scene_001/``, … with one main file per format. All paths inside are relative, so the
+    folder can be moved. Poses are written in full double precision. More formats can be added to the same
+    scenes by a second call; an interrupted export goes on when the same call is made again.
+
+    Args:
+        batch: B scenes. Export what is simulation-ready (:func:`scene_envs.physics.make_ready`) if it is to stand
+            still: nothing is moved here.
+        output: folder; made where there is none. Other files in it are left alone.
+        formats: a name, several, or ``"all"`` that can be written here; see
+            :func:`scene_envs.export.list_formats`.
+        friction: coefficient of friction of all surfaces.
+
+    Raises:
+        UnknownNameError: no such format.
+        MissingDependencyError: a format needs a package that is not installed.
+        InvalidInputError: a pose is not valid, or ``output`` holds an export of other scenes.
+    """
+    if not 0.0 <= friction < float("inf"):
+        raise InvalidInputError(f"friction must be a finite number >= 0, got {friction}")
+    names = resolve_formats(formats)
+    writers = {name: get_format(name).writer() for name in names}
+    placed = place(batch)
+    root = Path(output)
+    manifest = _claim(root, batch, friction)
+    files = AssetFiles(root / "assets", batch.scene_type.library.assets, friction)
+    digits = max(3, len(str(len(placed) - 1)))
+    scenes = []
+    for scene in placed:
+        folder = root / f"scene_{scene.index:0{digits}d}"
+        folder.mkdir(exist_ok=True)
+        scenes.append({name: write(scene, files, folder) for name, write in writers.items()})
+    manifest["formats"] = sorted({*manifest["formats"], *names})
+    _write_manifest(root, manifest)
+    used = tuple(dict.fromkeys(asset.name for scene in placed for asset in scene.assets))
+    return ExportReport(root, names, tuple(scenes), used, _size(root))
+
+
+def _claim(root: Path, batch: SceneBatch, friction: float) -> dict[str, Any]:
+    """Make the folder this export's; the manifest of an earlier export of the same scenes, or a new one."""
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise InvalidInputError(f"{str(root)!r} is a file, not a folder; choose another output") from None
+    fresh: dict[str, Any] = {
+        "scene_type": batch.scene_type.name,
+        "scenes": len(batch),
+        "friction": friction,
+        "digest": _digest(batch),
+        "formats": [],
+    }
+    path = root / MANIFEST
+    if path.exists():
+        try:
+            found = dict(json.loads(path.read_text()))
+            same = all(found[key] == fresh[key] for key in ("scene_type", "scenes", "friction", "digest"))
+            found["formats"] = list(found["formats"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise CorruptFileError(f"{str(path)!r} is not what an export writes: {error}") from error
+        if not same:
+            raise InvalidInputError(
+                f"{str(root)!r} holds an export of other scenes ({found['scenes']} of {found['scene_type']!r}); "
+                "choose another output, or remove that folder"
+            )
+        return found
+    taken = sorted(path.name for pattern in ("assets", "scene_[0-9]*") for path in root.glob(pattern))
+    if taken:
+        raise InvalidInputError(
+            f"{str(root)!r} already holds {taken[0]!r}, which no export wrote; choose an empty folder as output"
+        )
+    _write_manifest(root, fresh)
+    return fresh
+
+
+def _write_manifest(root: Path, manifest: Mapping[str, Any]) -> None:
+    partial = root / f".{MANIFEST}.partial"
+    partial.write_text(json.dumps(manifest, indent=1) + "\n")
+    os.replace(partial, root / MANIFEST)
+
+
+def _digest(batch: SceneBatch) -> str:
+    """What the files depend on: poses, and the geometry and mass of the assets."""
+    digest = hashlib.sha256(batch.tensor.cpu().contiguous().numpy().tobytes())
+    scene_type: SceneType = batch.scene_type
+    digest.update(repr((scene_type.assets, scene_type.welded)).encode())
+    for asset in scene_type.library:
+        digest.update(repr((asset.name, asset.mass, asset.static)).encode())
+        digest.update(asset.inertia.tobytes() + asset.center_of_mass.tobytes())
+        for part in asset.fine:
+            digest.update(part.vertices.tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _size(root: Path) -> int:
+    folders = [root / "assets", *root.glob("scene_[0-9]*")]
+    return sum(path.stat().st_size for folder in folders for path in folder.rglob("*") if path.is_file())

@@ -1,0 +1,47 @@
+"""Plain arrays: ``.npz``, and a pickled dictionary for programs that read those."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scene_envs.export.asset_files import AssetFiles
+from scene_envs.export.placed import PlacedScene
+
+
+def scene_arrays(scene: PlacedScene) -> dict[str, Any]:
+    """What both files hold, for the n objects of a scene in slot order.
+
+    Returns:
+        ``translations`` (n, 3) float64 m, ``rotations`` (n, 3, 3) float64, ``categories`` (n,) int64, ``slots`` (n,)
+        int64, ``welded`` (n,) bool, ``names`` (n,) text, ``asset_names`` (C,) text in category order, and
+        ``scene_type``, one text.
+    """
+    things = scene.objects
+    return {
+        "translations": np.array([thing.translation for thing in things], dtype=np.float64).reshape(-1, 3),
+        "rotations": np.array([thing.rotation for thing in things], dtype=np.float64).reshape(-1, 3, 3),
+        "categories": np.array([thing.category for thing in things], dtype=np.int64),
+        "slots": np.array([thing.slot for thing in things], dtype=np.int64),
+        "welded": np.array([thing.welded for thing in things], dtype=bool),
+        "names": np.array([thing.name for thing in things], dtype=str),
+        "asset_names": np.array(scene.scene_type.assets, dtype=str),
+        "scene_type": np.array(scene.scene_type.name),
+    }
+
+
+def write_npz(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
+    """``scene.npz``; reads with ``numpy.load`` and nothing else."""
+    path = folder / "scene.npz"
+    np.savez(path, **scene_arrays(scene))
+    return path
+
+
+def write_pickle(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
+    """``scene.pkl``: the same as a dictionary of arrays; needs numpy alone to load."""
+    path = folder / "scene.pkl"
+    path.write_bytes(pickle.dumps(scene_arrays(scene), protocol=4))
+    return path

@@ -1,0 +1,149 @@
+"""The ``assets`` folder of an export: meshes of each asset, written once and shared by scenes and formats."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from scene_envs.assets.base import Array, Asset, ConvexPart
+from scene_envs.assets.shapes import convex_hull
+from scene_envs.export.placed import identifiers
+
+_MAX_COLORS = 1024
+_CELL = 4
+"""Width of a colour's cell in the palette, pixels."""
+
+
+class AssetFiles:
+    """Writes what a format asks for, the first time it is asked for.
+
+    Args:
+        folder: the ``assets`` folder.
+        assets: all assets that may be asked for; they settle the names.
+        friction: friction coefficient that formats write into their files.
+
+    Attributes:
+        root: the ``assets`` folder.
+        friction: as given.
+    """
+
+    def __init__(self, folder: Path, assets: Sequence[Asset], friction: float) -> None:
+        self.root = folder
+        self.friction = friction
+        self._names = identifiers(asset.name for asset in assets)
+        self._done: dict[tuple[str, str], Any] = {}
+
+    def name(self, asset: Asset) -> str:
+        """The asset's name as an identifier, which is also that of its folder."""
+        return self._names[asset.name]
+
+    def folder(self, asset: Asset) -> Path:
+        """Where the asset's files lie."""
+        folder = self.root / self.name(asset)
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+    def once(self, asset: Asset, what: str, write: Callable[[Path], Any]) -> Any:
+        """The result of ``write(folder)``, called once per asset and ``what``."""
+        key = (asset.name, what)
+        if key not in self._done:
+            self._done[key] = write(self.folder(asset))
+        return self._done[key]
+
+    def visual(self, asset: Asset) -> Path:
+        """``visual.obj`` with normals, its colours in ``visual.png``; one material, ``visual.mtl``."""
+        path: Path = self.once(asset, "visual", lambda folder: _write_visual(visual_mesh(asset), folder))
+        return path
+
+    def parts(self, asset: Asset) -> list[Path]:
+        """``part_00.obj`` …, the fine convex parts."""
+        paths: list[Path] = self.once(asset, "part", lambda folder: _write_parts(asset.fine, folder, "part"))
+        return paths
+
+    def inset_parts(self, asset: Asset, inset: float) -> list[Path]:
+        """``inset_00.obj`` …, the fine parts with every face moved inward by ``inset`` m, for Bullet."""
+
+        def write(folder: Path) -> list[Path]:
+            from scene_envs.physics.geometry import PartGeometry, inset_hull
+
+            hulls = [convex_hull(inset_hull(PartGeometry.of(part), inset)) for part in asset.fine]
+            return _write_parts(hulls, folder, "inset")
+
+        paths: list[Path] = self.once(asset, "inset", write)
+        return paths
+
+
+def visual_mesh(asset: Asset) -> trimesh.Trimesh:
+    """The asset's coloured mesh, or its convex parts in the class colour where it has none."""
+    mesh: trimesh.Trimesh | None = asset.visual
+    if mesh is not None and len(mesh.faces):
+        return mesh
+    parts = [trimesh.Trimesh(part.vertices, part.faces, process=False) for part in asset.fine]
+    joined: trimesh.Trimesh = trimesh.util.concatenate(parts)
+    joined.visual = trimesh.visual.ColorVisuals(joined, vertex_colors=np.array([*asset.color, 255], dtype=np.uint8))
+    return joined
+
+
+def face_colors(mesh: trimesh.Trimesh) -> NDArray[np.uint8]:
+    """(F, 3) colour of each face; textures are sampled at the corners."""
+    visual: Any = mesh.visual
+    if visual.kind == "texture":
+        visual = visual.to_color()
+        corners = np.asarray(visual.vertex_colors)[mesh.faces]
+        return np.round(corners[..., :3].mean(axis=1)).astype(np.uint8)  # type: ignore[no-any-return]
+    return np.asarray(visual.face_colors)[:, :3].astype(np.uint8)
+
+
+def obj_text(vertices: Array, faces: NDArray[np.int64]) -> str:
+    """A Wavefront file of one mesh without colours; vertices in m."""
+    lines = [f"v {x:.12g} {y:.12g} {z:.12g}" for x, y, z in (vertices + 0.0).tolist()]
+    lines += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
+    return "\n".join(lines) + "\n"
+
+
+def _write_parts(parts: Sequence[ConvexPart], folder: Path, prefix: str) -> list[Path]:
+    paths = []
+    for index, part in enumerate(parts):
+        path = folder / f"{prefix}_{index:02d}.obj"
+        path.write_text(obj_text(part.vertices, part.faces))
+        paths.append(path)
+    return paths
+
+
+def _write_visual(mesh: trimesh.Trimesh, folder: Path) -> Path:
+    """The mesh with one texture cell per colour: most loaders read textures, and few read colours of vertices."""
+    from PIL import Image
+
+    palette, cell = np.unique(_few_colors(face_colors(mesh)), axis=0, return_inverse=True)
+    side = int(np.ceil(np.sqrt(len(palette))))
+    pixels = np.zeros((side * side, 3), dtype=np.uint8)
+    pixels[: len(palette)] = palette
+    image = pixels.reshape(side, side, 3).repeat(_CELL, axis=0).repeat(_CELL, axis=1)
+    Image.fromarray(image).save(folder / "visual.png")
+    (folder / "visual.mtl").write_text("newmtl palette\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nmap_Kd visual.png\n")
+    index = np.arange(len(palette))
+    u, v = (index % side + 0.5) / side, 1.0 - (index // side + 0.5) / side
+    lines = ["mtllib visual.mtl", "usemtl palette"]
+    lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in (mesh.vertices + 0.0).tolist()]
+    lines += [f"vn {x:.5g} {y:.5g} {z:.5g}" for x, y, z in (mesh.vertex_normals + 0.0).tolist()]
+    lines += [f"vt {x:.9g} {y:.9g}" for x, y in zip(u.tolist(), v.tolist(), strict=True)]
+    for (a, b, c), t in zip((mesh.faces + 1).tolist(), (cell.ravel() + 1).tolist(), strict=True):
+        lines.append(f"f {a}/{t}/{a} {b}/{t}/{b} {c}/{t}/{c}")
+    path = folder / "visual.obj"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def _few_colors(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The colours with as many bits per channel as keep them within the palette."""
+    for bits in range(8, 2, -1):
+        step = 1 << (8 - bits)
+        rounded = np.minimum(colors.astype(np.int64) // step * step + step // 2, 255).astype(np.uint8)
+        if len(np.unique(rounded, axis=0)) <= _MAX_COLORS:
+            break
+    return rounded

@@ -1,0 +1,76 @@
+"""Drake model directives: one file per scene, over the URDF of each asset."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from scene_envs.export.asset_files import AssetFiles
+from scene_envs.export.placed import PlacedObject, PlacedScene, angle_axis, number
+from scene_envs.export.urdf import asset_urdf, relative
+
+
+class _AngleAxis(dict[str, Any]):
+    """Written with the tag ``!AngleAxis``."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """Block style outside, flow style for lists of numbers, doubles in full."""
+
+
+def _represent_angle_axis(dumper: yaml.SafeDumper, value: _AngleAxis) -> yaml.Node:
+    return dumper.represent_mapping("!AngleAxis", value, flow_style=True)
+
+
+def _represent_float(dumper: yaml.SafeDumper, value: float) -> yaml.Node:
+    return dumper.represent_scalar("tag:yaml.org,2002:float", number(value))
+
+
+_Dumper.add_representer(_AngleAxis, _represent_angle_axis)
+_Dumper.add_representer(float, _represent_float)
+
+
+def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
+    """``scene.dmd.yaml``; its package is the whole export, whose ``package.xml`` is written here too."""
+    package = write_package(files.root.parent)
+    directives: list[dict[str, Any]] = []
+    for thing in scene.objects:
+        directives += _directives(thing, files, package)
+    path = folder / "scene.dmd.yaml"
+    text = yaml.dump({"directives": directives}, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=200)
+    path.write_text(text)
+    return path
+
+
+def write_package(root: Path) -> str:
+    """The name in ``package.xml`` of the export folder ``root``; made from the folder's name where there is none yet."""
+    path = root / "package.xml"
+    if path.exists():
+        found = re.search(r"<name>([^<]+)</name>", path.read_text())
+        if found:
+            return found[1]
+    name = "".join(c if c.isascii() and c.isalnum() else "_" for c in root.resolve().name) or "scenes"
+    path.write_text(
+        f'<?xml version="1.0"?>\n<package format="2">\n  <name>{name}</name>\n  <version>1.0.0</version>\n'
+        "  <description>Scenes and their assets.</description>\n</package>\n"
+    )
+    return name
+
+
+def _directives(thing: PlacedObject, files: AssetFiles, package: str) -> list[dict[str, Any]]:
+    link = files.name(thing.asset)
+    file = f"package://{package}/{relative(asset_urdf(thing.asset, files), files.root.parent)}"
+    model: dict[str, Any] = {"name": thing.name, "file": file}
+    angle, axis = angle_axis(thing.rotation)
+    pose = {
+        "translation": thing.translation.tolist(),
+        "rotation": _AngleAxis(angle_deg=angle, axis=axis.tolist()),
+    }
+    if not thing.welded:
+        model["default_free_body_pose"] = {link: {"base_frame": "world", **pose}}
+        return [{"add_model": model}]
+    weld = {"parent": "world", "child": f"{thing.name}::{link}", "X_PC": pose}
+    return [{"add_model": model}, {"add_weld": weld}]

@@ -1,0 +1,131 @@
+"""Formats by name: the built-in ones, those of installed packages, and yours."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.metadata import entry_points
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from scene_envs.errors import InvalidInputError, MissingDependencyError, unknown_name
+
+if TYPE_CHECKING:
+    from scene_envs.export.asset_files import AssetFiles
+    from scene_envs.export.placed import PlacedScene
+
+SceneWriter = Callable[["PlacedScene", "AssetFiles", Path], Path]
+"""Writes one scene into its folder, what assets need into theirs, and returns the main file."""
+
+ENTRY_POINT_GROUP = "scene_envs.export_formats"
+"""Packages offer formats under this group: an entry named after the format, whose value is a SceneWriter."""
+
+
+@dataclass(frozen=True)
+class ExportFormat:
+    """One format.
+
+    Attributes:
+        name: what to write after ``formats=``.
+        summary: one line for listings.
+        write: the writer, or where it is, as ``"module:function"``.
+        requires: module that must be importable to write it; empty for none.
+        install: what to install to get that module.
+    """
+
+    name: str
+    summary: str
+    write: SceneWriter | str
+    requires: str = ""
+    install: str = ""
+
+    def writer(self) -> SceneWriter:
+        """The writer, imported; raises MissingDependencyError where what it needs is not installed."""
+        if self.requires and find_spec(self.requires) is None:
+            raise MissingDependencyError(
+                f"format {self.name!r} needs {self.install}, which is not installed; "
+                f"install it with `pip install {self.install}`, or leave {self.name!r} out of formats="
+            )
+        if not isinstance(self.write, str):
+            return self.write
+        module, _, function = self.write.partition(":")
+        writer: SceneWriter = getattr(import_module(module), function)
+        return writer
+
+
+_HERE = "scene_envs.export"
+_FORMATS: dict[str, ExportFormat] = {
+    entry.name: entry
+    for entry in (
+        ExportFormat("urdf", "URDF per asset, poses as JSON", f"{_HERE}.urdf:write_scene"),
+        ExportFormat("sdf", "SDF world (Gazebo, Drake)", f"{_HERE}.sdf:write_scene"),
+        ExportFormat("drake", "Drake model directives", f"{_HERE}.drake:write_scene"),
+        ExportFormat("mjcf", "MJCF (MuJoCo)", f"{_HERE}.mjcf:write_scene"),
+        ExportFormat("usd", "USD with UsdPhysics", f"{_HERE}.usd:write_scene", "pxr", "usd-core"),
+        ExportFormat("glb", "coloured mesh, no physics", f"{_HERE}.glb:write_scene"),
+        ExportFormat("npz", "numpy arrays", f"{_HERE}.arrays:write_npz"),
+        ExportFormat("pickle", "dictionary of numpy arrays", f"{_HERE}.arrays:write_pickle"),
+    )
+}
+
+
+def register_format(name: str, *, summary: str = "") -> Callable[[SceneWriter], SceneWriter]:
+    """Make the decorated function the writer of format ``name``; the same name again replaces it.
+
+    It takes ``(scene: PlacedScene, files: AssetFiles, folder: Path)``, writes the scene into ``folder`` and returns
+    the path of its main file. ``files`` gives the meshes of assets, which are shared by all scenes.
+
+    >>> @register_format("doctest_poses", summary="one line per object")
+    ... def write(scene, files, folder):
+    ...     path = folder / "poses.txt"
+    ...     path.write_text("".join(f"{o.name} {o.translation.tolist()}" for o in scene.objects))
+    ...     return path
+    >>> "doctest_poses" in list_formats()
+    True
+    """
+    if not name.isidentifier():
+        raise InvalidInputError(f"format name {name!r}: use letters, digits and underscores, such as 'my_format'")
+
+    def register(write: SceneWriter) -> SceneWriter:
+        _FORMATS[name] = ExportFormat(name, summary or (write.__doc__ or "").strip().split("\n")[0], write)
+        return write
+
+    return register
+
+
+def list_formats() -> list[str]:
+    """Names of all formats, those of installed packages included, sorted."""
+    return sorted({*_FORMATS, *(point.name for point in entry_points(group=ENTRY_POINT_GROUP))})
+
+
+def get_format(name: str) -> ExportFormat:
+    """The format called ``name``.
+
+    Raises:
+        UnknownNameError: no such format; the nearest known one is offered.
+    """
+    if name in _FORMATS:
+        return _FORMATS[name]
+    for point in entry_points(group=ENTRY_POINT_GROUP):
+        if point.name == name:
+            return ExportFormat(name, f"from {point.module}", point.value)
+    raise unknown_name("export format", name, list_formats())
+
+
+def resolve_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
+    """Names of formats, each once, from one name, several, or ``"all"`` (all built in that can be written here).
+
+    Raises:
+        UnknownNameError: no such format.
+        InvalidInputError: none are given.
+    """
+    if formats == "all":
+        return tuple(f.name for f in _FORMATS.values() if not f.requires or find_spec(f.requires) is not None)
+    names = (formats,) if isinstance(formats, str) else tuple(dict.fromkeys(formats))
+    if not names:
+        raise InvalidInputError(f"formats is empty; give at least one of {', '.join(list_formats())}")
+    for name in names:
+        get_format(name)
+    return names

@@ -1,0 +1,27 @@
+"""GLB: one coloured mesh file per scene, for viewers and renderers. No physics."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from scene_envs.export.asset_files import AssetFiles, visual_mesh
+from scene_envs.export.placed import PlacedScene
+
+Y_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+"""World frame (z up) to the frame of glTF (y up)."""
+
+
+def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
+    """``scene.glb``: a node per object under a node ``z_up``, which turns our frame to that of glTF."""
+    graph = trimesh.Scene(base_frame="world")
+    graph.graph.update("z_up", "world", matrix=Y_UP)
+    for asset in scene.assets:
+        graph.geometry[files.name(asset)] = visual_mesh(asset)
+    for thing in scene.objects:
+        graph.graph.update(thing.name, "z_up", matrix=thing.matrix, geometry=files.name(thing.asset))
+    path = folder / "scene.glb"
+    path.write_bytes(graph.export(file_type="glb", include_normals=True))
+    return path

@@ -1,0 +1,89 @@
+"""MJCF: one model per scene, for MuJoCo."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from scene_envs.assets.base import Asset
+from scene_envs.export.asset_files import AssetFiles
+from scene_envs.export.placed import PlacedObject, PlacedScene, number, numbers, principal_inertia, quaternion
+from scene_envs.export.urdf import relative, write_xml
+from scene_envs.scene_types import Camera
+
+TIMESTEP = 0.002
+"""s."""
+_CONTACT = {"solref": "0.004 1", "solimp": "0.95 0.99 0.001"}
+"""As stiff as the time step allows: objects at rest sink by micrometres, where MuJoCo's defaults let them sink 0.1 mm."""
+
+
+def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
+    """``scene.xml``: one body per object, with a free joint of the same name unless it is welded."""
+    root = ET.Element("mujoco", model=f"{scene.scene_type.name}_{scene.index}")
+    directory = relative(files.root, folder)
+    ET.SubElement(root, "compiler", angle="radian", meshdir=directory, texturedir=directory)
+    option = ET.SubElement(
+        root, "option", timestep=number(TIMESTEP), integrator="implicitfast", cone="elliptic", impratio="10"
+    )
+    ET.SubElement(option, "flag", multiccd="enable")
+    defaults = ET.SubElement(root, "default")
+    visual = ET.SubElement(defaults, "default", {"class": "visual"})
+    ET.SubElement(visual, "geom", type="mesh", contype="0", conaffinity="0", group="2", mass="0")
+    collision = ET.SubElement(defaults, "default", {"class": "collision"})
+    friction = f"{number(files.friction)} 0.005 0.0001"
+    ET.SubElement(collision, "geom", type="mesh", group="3", mass="0", friction=friction, **_CONTACT)
+    shared, world = ET.SubElement(root, "asset"), ET.SubElement(root, "worldbody")
+    _add_view(root, shared, world, scene.scene_type.camera)
+    for asset in scene.assets:
+        _add_asset(shared, asset, files)
+    for thing in scene.objects:
+        _add_body(world, thing, files)
+    return write_xml(root, folder / "scene.xml")
+
+
+def _add_asset(parent: ET.Element, asset: Asset, files: AssetFiles) -> None:
+    name, visual = files.name(asset), files.visual(asset)
+    texture = relative(visual.with_suffix(".png"), files.root)
+    ET.SubElement(parent, "texture", name=name, type="2d", file=texture)
+    ET.SubElement(parent, "material", name=name, texture=name, specular="0.2")
+    ET.SubElement(parent, "mesh", name=f"{name}_visual", file=relative(visual, files.root), inertia="shell")
+    for part in files.parts(asset):
+        ET.SubElement(parent, "mesh", name=f"{name}_{part.stem}", file=relative(part, files.root))
+
+
+def _add_body(world: ET.Element, thing: PlacedObject, files: AssetFiles) -> None:
+    asset, name = thing.asset, files.name(thing.asset)
+    body = ET.SubElement(
+        world, "body", name=thing.name, pos=numbers(thing.translation), quat=numbers(thing.quaternion)
+    )
+    if not thing.welded:
+        ET.SubElement(body, "freejoint", name=thing.name)
+        moments, axes = principal_inertia(asset.inertia)
+        ET.SubElement(
+            body,
+            "inertial",
+            pos=numbers(asset.center_of_mass),
+            quat=numbers(quaternion(axes)),
+            mass=number(asset.mass),
+            diaginertia=numbers(moments),
+        )
+    ET.SubElement(body, "geom", {"class": "visual", "mesh": f"{name}_visual", "material": name})
+    for part in files.parts(asset):
+        ET.SubElement(body, "geom", {"class": "collision", "mesh": f"{name}_{part.stem}"})
+
+
+def _add_view(root: ET.Element, shared: ET.Element, world: ET.Element, camera: Camera) -> None:
+    """Light, a pale background, and the scene type's camera under the name ``scene``."""
+    visual = ET.SubElement(root, "visual")
+    ET.SubElement(visual, "headlight", ambient="0.35 0.35 0.35", diffuse="0.35 0.35 0.35", specular="0 0 0")
+    ET.SubElement(visual, "quality", shadowsize="4096")
+    ET.SubElement(shared, "texture", type="skybox", builtin="flat", rgb1="0.95 0.95 0.95", width="16", height="16")
+    ET.SubElement(world, "light", pos="0.6 -0.9 3", dir="-0.2 0.3 -1", directional="true", diffuse="0.4 0.4 0.4")
+    backward = np.subtract(camera.position, camera.target)
+    right = np.cross(camera.up, backward)
+    up = np.cross(backward, right)
+    axes = np.concatenate([right / np.linalg.norm(right), up / np.linalg.norm(up)])
+    fovy = number(camera.fov_y)
+    ET.SubElement(world, "camera", name="scene", pos=numbers(camera.position), xyaxes=numbers(axes), fovy=fovy)

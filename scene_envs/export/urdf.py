@@ -1,0 +1,86 @@
+"""URDF: one robot per asset, and a list of the objects of each scene."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+from scene_envs.assets.base import Asset
+from scene_envs.export.asset_files import AssetFiles
+from scene_envs.export.placed import PlacedScene, number, numbers
+
+BULLET_MARGIN = 1e-3
+"""Bullet grows each convex mesh by this much (m); the parts of its URDF are smaller by as much."""
+_DRAKE = "http://drake.mit.edu"
+
+
+def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
+    """``objects.json``: name, URDF, pose and whether it is welded, per object; URDFs go to the assets."""
+    objects = [
+        {
+            "name": thing.name,
+            "urdf": relative(asset_urdf(thing.asset, files), folder),
+            "bullet_urdf": relative(bullet_urdf(thing.asset, files), folder),
+            "translation": thing.translation.tolist(),
+            "quaternion_wxyz": thing.quaternion.tolist(),
+            "welded": thing.welded,
+        }
+        for thing in scene.objects
+    ]
+    path = folder / "objects.json"
+    path.write_text(json.dumps({"scene_type": scene.scene_type.name, "objects": objects}, indent=1) + "\n")
+    return path
+
+
+def asset_urdf(asset: Asset, files: AssetFiles) -> Path:
+    """``<name>.urdf`` with exact parts, for everything but PyBullet. An asset without mass has none here either."""
+    path: Path = files.once(
+        asset, "urdf", lambda folder: _write(asset, files, files.parts(asset), folder / f"{files.name(asset)}.urdf")
+    )
+    return path
+
+
+def bullet_urdf(asset: Asset, files: AssetFiles) -> Path:
+    """``<name>_bullet.urdf``, whose parts act at their true size in PyBullet, which adds a margin to them."""
+    parts = files.inset_parts(asset, BULLET_MARGIN)
+    path: Path = files.once(
+        asset, "bullet", lambda folder: _write(asset, files, parts, folder / f"{files.name(asset)}_bullet.urdf")
+    )
+    return path
+
+
+def relative(path: Path, folder: Path) -> str:
+    """``path`` as seen from ``folder``, with forward slashes."""
+    return Path(os.path.relpath(path, folder)).as_posix()
+
+
+def write_xml(root: ET.Element, path: Path) -> Path:
+    """Write an XML document, indented."""
+    ET.indent(root)
+    path.write_text('<?xml version="1.0"?>\n' + ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
+    return path
+
+
+def _write(asset: Asset, files: AssetFiles, parts: list[Path], path: Path) -> Path:
+    name = files.name(asset)
+    root = ET.Element("robot", {"name": name, "xmlns:drake": _DRAKE})
+    link = ET.SubElement(root, "link", name=name)
+    contact = ET.SubElement(link, "contact")  # read by PyBullet
+    ET.SubElement(contact, "lateral_friction", value=number(files.friction))
+    inertial = ET.SubElement(link, "inertial")
+    ET.SubElement(inertial, "origin", xyz=numbers(asset.center_of_mass), rpy="0 0 0")
+    ET.SubElement(inertial, "mass", value=number(asset.mass))
+    moments = {f"i{a}{b}": number(asset.inertia[i, j]) for i, a in enumerate("xyz") for j, b in enumerate("xyz") if i <= j}
+    ET.SubElement(inertial, "inertia", moments)
+    visual = ET.SubElement(ET.SubElement(link, "visual"), "geometry")
+    ET.SubElement(visual, "mesh", filename=relative(files.visual(asset), path.parent))
+    for part in parts:
+        collision = ET.SubElement(link, "collision", name=part.stem)
+        mesh = ET.SubElement(ET.SubElement(collision, "geometry"), "mesh", filename=relative(part, path.parent))
+        ET.SubElement(mesh, "drake:declare_convex")
+        proximity = ET.SubElement(collision, "drake:proximity_properties")
+        for coefficient in ("drake:mu_static", "drake:mu_dynamic"):
+            ET.SubElement(proximity, coefficient, value=number(files.friction))
+    return write_xml(root, path)
