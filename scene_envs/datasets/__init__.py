@@ -1,20 +1,39 @@
-"""Datasets of scenes: generation from grammars, files, prompts."""
+"""Datasets of scenes: generation from grammars, files, prompts, mixtures."""
 
 from scene_envs.datasets.dataset import SceneDataset
 from scene_envs.datasets.generate import GenerationReport, generate
-from scene_envs.datasets.prompts import PromptFacts, SceneFacts, describe, parse_prompt, scene_facts
+from scene_envs.datasets.info import DatasetInfo, read_metadata
+from scene_envs.datasets.mixing import MixedDataset, mix
+from scene_envs.datasets.prompts import PromptFacts, SceneFacts, describe, describe_all, parse_prompt, scene_facts
 from scene_envs.datasets.ranges import fixed_normalizer
-from scene_envs.datasets.verification import verify_scenes
+from scene_envs.datasets.splits import Part
+from scene_envs.datasets.store import StorageError
+from scene_envs.datasets.stream import SceneStream
+from scene_envs.datasets.union import from_union, to_union, union_normalizer, union_scene_type
+from scene_envs.datasets.verification import judge_scenes, verify_scenes
 
 __all__ = [
+    "DatasetInfo",
     "GenerationReport",
+    "MixedDataset",
+    "Part",
     "PromptFacts",
     "SceneDataset",
     "SceneFacts",
+    "SceneStream",
+    "StorageError",
     "describe",
+    "describe_all",
     "fixed_normalizer",
+    "from_union",
     "generate",
+    "judge_scenes",
+    "mix",
     "parse_prompt",
+    "read_metadata",
     "scene_facts",
+    "to_union",
+    "union_normalizer",
+    "union_scene_type",
     "verify_scenes",
 ]

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from scene_envs.datasets import store
-from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
+from scene_envs.datasets.files import Rows, find_files, find_metadata, list_blocks, read_block, to_rows
+from scene_envs.datasets.info import DatasetInfo, read_metadata
+from scene_envs.datasets.layout import FIXED_TOLERANCE, Layout, scene_keys
+from scene_envs.datasets.splits import Part, check_fractions, split_rows
+from scene_envs.errors import InvalidInputError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
@@ -21,21 +26,23 @@ from scene_envs.scene_types import SceneType, get_scene_type
 
 @dataclass(frozen=True, eq=False)
 class SceneDataset:
-    """M scenes of one type with a prompt each.
+    """M scenes of one type with their prompts.
 
     Attributes:
         tensor: (M, N, D) float32, raw (metres, rotation entries, one-hot).
-        prompts: M prompts.
+        prompts: M prompts, the first of each scene.
         normalizer: the normalizer the files were written with.
         scene_type: the scene type.
         metadata: the content of ``metadata.json``.
+        prompt_sets: M tuples, all prompts of each scene, the one in ``prompts`` first.
 
     >>> scenes = SceneBatch.empty("dimsum_table", 10)
-    >>> dataset = SceneDataset(scenes.tensor, ["A scene with 1 object."] * 10, Normalizer.fit(scenes.tensor),
-    ...                        scenes.scene_type)
+    >>> shifted = scenes.tensor.clone()
+    >>> shifted[:, 0, 0] = torch.arange(10) / 10
+    >>> dataset = SceneDataset(shifted, ["A scene with 1 object."] * 10, Normalizer.fit(shifted), scenes.scene_type)
     >>> train, test = dataset.split((0.8, 0.2), seed=0)
-    >>> len(train), len(test)
-    (8, 2)
+    >>> len(train), len(test), test.prompt_sets[0]
+    (8, 2, ('A scene with 1 object.',))
     """
 
     tensor: Tensor
@@ -43,10 +50,16 @@ class SceneDataset:
     normalizer: Normalizer
     scene_type: SceneType
     metadata: dict[str, Any] = field(default_factory=dict)
+    prompt_sets: list[tuple[str, ...]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         if len(self.prompts) != self.tensor.shape[0]:
             raise InvalidInputError(f"{self.tensor.shape[0]} scenes need as many prompts, got {len(self.prompts)}")
+        if not self.prompt_sets:
+            object.__setattr__(self, "prompt_sets", [(prompt,) for prompt in self.prompts])
+        firsts = [prompts[:1] for prompts in self.prompt_sets]
+        if firsts != [(prompt,) for prompt in self.prompts]:
+            raise InvalidInputError("prompt_sets needs one tuple per scene that starts with the scene's prompt")
 
     @classmethod
     def load(
@@ -56,56 +69,100 @@ class SceneDataset:
         scene_type: str | SceneType | None = None,
         aliases: Mapping[str, str] | None = None,
         limit: int | None = None,
+        metadata: str | os.PathLike[str] | None = None,
+        fixed_tolerance: float = FIXED_TOLERANCE,
+        slots: int | None = None,
     ) -> SceneDataset:
-        """Read a dataset folder, or one parquet file with its ``metadata.json`` beside it.
+        """Read a dataset from disk, whole: parquet or arrow, ours or another's.
 
-        Categories are matched by model path, never by index. A folder that is still being generated
-        gives the shards that are finished (see :attr:`complete`).
+        Categories are matched by model path, never by index; the scene type's fixed objects move to the first
+        slots, and are added to scenes that lack them. A folder that is still being generated gives the shards
+        that are finished (see :attr:`complete`).
 
         Args:
-            path: folder or ``.parquet`` file.
+            path: folder of ``.parquet`` or ``.arrow`` files, one such file, or a folder that Hugging Face's
+                ``Dataset.save_to_disk`` wrote.
             scene_type: overrides the scene type named in the metadata (datasets of others name none).
             aliases: model path, or its stem, to asset name, for datasets with other asset names.
             limit: read at most this many scenes.
+            metadata: ``metadata.json``, when it is neither beside the files nor in the folder above.
+            fixed_tolerance: how far (m, rotation entries) fixed objects may stand from the scene type's pose, which
+                they are given; ``math.inf`` accepts any.
+            slots: N of the scenes, at least the files'; None takes the files'.
 
         Raises:
-            InvalidInputError: nothing there, or no scene type given or named.
-            CorruptFileError: a file cannot be read, or lacks columns or keys.
+            InvalidInputError: nothing there, no scene type given or named, or a fixed object stands elsewhere.
+            CorruptFileError: a file cannot be read, lacks columns or keys, or holds what is no scene (row named).
             UnknownNameError: a model path that is no asset of the scene type.
         """
-        path = Path(path)
-        folder = path if path.is_dir() else path.parent
-        files = sorted(path.glob("[!.]*.parquet")) if path.is_dir() else [path]
-        if not path.exists() or not files:
-            raise InvalidInputError(f"no parquet files at {str(path)!r}; give a dataset folder or a .parquet file")
-        metadata = store.read_metadata(folder / store.METADATA)
-        name = scene_type if scene_type is not None else metadata.get("scene_type")
-        if name is None:
-            raise InvalidInputError(f"{str(folder / store.METADATA)!r} names no scene type; pass scene_type=")
-        resolved = get_scene_type(name)
-        normalizer = Normalizer.from_state(metadata["normalizer_state"])
-        order = _feature_order(metadata["model_paths"], resolved, aliases or {})
-        if normalizer.scale.shape[0] != resolved.features:
-            raise CorruptFileError(
-                f"the normalizer in {str(folder / store.METADATA)!r} has {normalizer.scale.shape[0]} features, "
-                f"{resolved.name!r} has {resolved.features}"
-            )
+        files = find_files(path)
+        layout = make_layout(metadata or find_metadata(path), scene_type, aliases, fixed_tolerance, slots)
+        blocks = (block for file in files for block in list_blocks(file))
+        return cls._collect((read_block(block, layout.info.features) for block in blocks), layout, limit)
+
+    @classmethod
+    def from_huggingface(
+        cls,
+        dataset: Any,
+        metadata: str | os.PathLike[str],
+        *,
+        scene_type: str | SceneType | None = None,
+        aliases: Mapping[str, str] | None = None,
+        limit: int | None = None,
+        fixed_tolerance: float = FIXED_TOLERANCE,
+        slots: int | None = None,
+    ) -> SceneDataset:
+        """From a ``datasets.Dataset`` (one split, as ``load_dataset`` gives it) and its ``metadata.json``.
+
+        Arguments and errors as for :meth:`load`.
+        """
+        layout = make_layout(metadata, scene_type, aliases, fixed_tolerance, slots)
+
+        def rows() -> Iterator[Rows]:
+            start = 0
+            for table in dataset.with_format("arrow").iter(batch_size=2000):
+                yield to_rows(table, layout.info.features, "the dataset", start)
+                start += table.num_rows
+
+        return cls._collect(rows(), layout, limit)
+
+    @classmethod
+    def _collect(cls, blocks: Iterable[Rows], layout: Layout, limit: int | None) -> SceneDataset:
         parts: list[Tensor] = []
-        prompts: list[str] = []
-        for file in files:
-            normalised, texts = store.read_shard(file, resolved.features)
-            parts.append(normalizer.unnormalize(torch.from_numpy(normalised.copy()))[..., order])
-            prompts += texts
-            if limit is not None and len(prompts) >= limit:
+        sets: list[tuple[str, ...]] = []
+        for rows in blocks:
+            parts.append(layout.scenes(rows))
+            sets += rows.prompt_sets
+            if limit is not None and len(sets) >= limit:
                 break
-        tensor = torch.cat(parts)[:limit]
-        reordered = Normalizer(*(v[order] for v in _vectors(normalizer)))
-        return cls(tensor, prompts[:limit], reordered, resolved, metadata)
+        width = max((part.shape[1] for part in parts), default=layout.scene_type.slots)
+        padded = [SceneBatch(part, layout.scene_type).with_slots(width).tensor for part in parts]
+        tensor = torch.cat(padded)[:limit] if parts else torch.empty(0, width, layout.scene_type.features)
+        return cls.from_sets(tensor, sets[:limit], layout.normalizer, layout.scene_type, layout.info.metadata)
+
+    @classmethod
+    def from_sets(
+        cls,
+        tensor: Tensor,
+        prompt_sets: Sequence[tuple[str, ...]],
+        normalizer: Normalizer,
+        scene_type: str | SceneType,
+        metadata: dict[str, Any] | None = None,
+    ) -> SceneDataset:
+        """From raw scenes (M, N, D) with a tuple of prompts each; their first is the prompt."""
+        sets = list(prompt_sets)
+        first = [prompts[0] for prompts in sets]
+        return cls(tensor, first, normalizer, get_scene_type(scene_type), metadata or {}, sets)
 
     @property
     def complete(self) -> bool:
         """Whether all scenes that were asked for are here (True for datasets that do not say)."""
-        return len(self) >= int(self.metadata.get("count", 0))
+        return len(self) >= int(self.metadata.get("count") or 0)
+
+    @property
+    def keys(self) -> NDArray[np.uint64]:
+        """(M,): equal for rows that hold the same scene; see :func:`~scene_envs.datasets.layout.scene_keys`."""
+        return scene_keys(self.tensor)
 
     def __len__(self) -> int:
         return self.tensor.shape[0]
@@ -113,8 +170,8 @@ class SceneDataset:
     def __getitem__(self, index: slice | Sequence[int] | Tensor) -> SceneDataset:
         """A sub-dataset."""
         chosen = torch.arange(len(self))[index if isinstance(index, slice) else torch.as_tensor(index)]
-        prompts = [self.prompts[i] for i in chosen.tolist()]
-        return SceneDataset(self.tensor[chosen], prompts, self.normalizer, self.scene_type, self.metadata)
+        sets = [self.prompt_sets[i] for i in chosen.tolist()]
+        return self.from_sets(self.tensor[chosen], sets, self.normalizer, self.scene_type, self.metadata)
 
     def batch(self, index: slice | Sequence[int] | Tensor = slice(None)) -> SceneBatch:
         """Scenes as a :class:`~scene_envs.scene.SceneBatch`."""
@@ -123,47 +180,58 @@ class SceneDataset:
     def split(self, fractions: Sequence[float], seed: int = 0) -> tuple[SceneDataset, ...]:
         """Disjoint random parts of the given sizes; fractions may sum to less than one.
 
+        Rows that repeat a scene (with another prompt) come into the same part. Parts of a dataset that grew are
+        others; :meth:`stable_split` keeps them.
+
         Raises:
             InvalidInputError: a fraction is negative, or they sum to more than one.
         """
-        if any(fraction < 0 for fraction in fractions) or sum(fractions) > 1 + 1e-9:
-            raise InvalidInputError(f"fractions must be >= 0 and sum to at most 1, got {list(fractions)}")
-        order = torch.randperm(len(self), generator=torch.Generator().manual_seed(seed))
-        edges = [round(bound * len(self)) for bound in accumulate(fractions, initial=0.0)]
-        return tuple(self[order[low:high]] for low, high in pairwise(edges))
+        return tuple(self[torch.from_numpy(rows)] for rows in split_rows(self.keys, fractions, seed))
+
+    def stable_split(self, fractions: Sequence[float], seed: int = 0) -> tuple[SceneDataset, ...]:
+        """Disjoint parts decided scene by scene, so that a scene keeps its part when the dataset grows.
+
+        The parts are those of :class:`~scene_envs.datasets.splits.Part`, which streams use too; their sizes are as
+        asked for on average.
+
+        Raises:
+            InvalidInputError: a fraction is negative, or they sum to more than one.
+        """
+        keys, parts = self.keys, check_fractions(fractions)
+        inside = [Part(parts, index, seed).contains(keys) for index in range(len(parts))]
+        return tuple(self[torch.from_numpy(np.flatnonzero(rows))] for rows in inside)
 
     def save(self, output: str | os.PathLike[str], *, shard_size: int = 2000) -> Path:
-        """Write as a dataset folder that :meth:`load` reads."""
+        """Write as a dataset folder that :meth:`load` reads.
+
+        Raises:
+            InvalidInputError: the folder holds a dataset.
+            StorageError: a file cannot be written.
+        """
         folder = Path(output)
         if any(folder.glob("*.parquet")):
             raise InvalidInputError(f"{str(folder)!r} already holds parquet files; choose an empty folder")
         folder.mkdir(parents=True, exist_ok=True)
         metadata = store.make_metadata(self.scene_type, self.normalizer, count=len(self))
+        metadata["max_num_objects_per_scene"] = self.tensor.shape[1]
         store.write_json(folder / store.METADATA, metadata)
         for index, start in enumerate(range(0, len(self), shard_size)):
             chunk = slice(start, start + shard_size)
             scenes = self.normalizer.normalize(self.tensor[chunk]).numpy()
-            store.write_shard(folder / store.shard_name(index), scenes, self.prompts[chunk], {})
+            store.write_shard(folder / store.shard_name(index), scenes, self.prompt_sets[chunk], {})
         return folder
 
 
-def _vectors(normalizer: Normalizer) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return normalizer.scale, normalizer.min, normalizer.input_min, normalizer.input_max
-
-
-def _feature_order(model_paths: Sequence[str], scene_type: SceneType, aliases: Mapping[str, str]) -> Tensor:
-    """(D,) int64: for each feature of ``scene_type``, the feature of the file that holds it."""
-    names = []
-    for path in model_paths:
-        stem = Path(path).stem
-        name = aliases.get(path, aliases.get(stem, stem))
-        if name not in scene_type.assets:
-            raise unknown_name(
-                f"asset of {scene_type.name!r} (model path {path!r}; pass aliases=)", name, scene_type.assets
-            )
-        names.append(name)
-    missing = [asset for asset in scene_type.assets if asset not in names]
-    if missing:
-        raise CorruptFileError(f"model_paths lacks the assets {missing} of scene type {scene_type.name!r}")
-    categories = [12 + names.index(asset) for asset in scene_type.assets]
-    return torch.tensor([*range(12), *categories, 12 + len(names)])
+def make_layout(
+    metadata: str | os.PathLike[str],
+    scene_type: str | SceneType | None,
+    aliases: Mapping[str, str] | None,
+    fixed_tolerance: float,
+    slots: int | None,
+) -> Layout:
+    """How files with this ``metadata.json`` become scenes; arguments and errors as for :meth:`SceneDataset.load`."""
+    info: DatasetInfo = read_metadata(metadata)
+    name = scene_type if scene_type is not None else info.scene_type
+    if name is None:
+        raise InvalidInputError(f"{str(info.path)!r} names no scene type; pass scene_type=")
+    return Layout(info, get_scene_type(name), aliases or {}, fixed_tolerance, slots)

@@ -4,28 +4,56 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from scene_envs.grammars import Grammar
 from scene_envs.normalizer import Normalizer
 
-_SAMPLE = 512
+_OBJECTS = 20_000
+"""Objects the sample holds at least, unless that takes more than ``_SCENES``."""
+_SCENES = 4096
+_STEP = 256
 _SEED = 20_250_101
+_UPRIGHT = 1e-6
+"""A rotation entry that tells of tilt counts as zero below this."""
+_TILT = [5, 8, 9, 10]
+"""Features of a rotation that are zero when the object only turns about z: xz, yz, zx, zy."""
+_PLANE = [3, 4, 6, 7]
+"""Features of a rotation about z: xx, xy, yx, yy."""
 
 
 def fixed_normalizer(grammar: Grammar) -> Normalizer:
     """The normalizer of a grammar's scenes, a function of the grammar alone.
 
-    Which features vary is read off a sample of unverified scenes, empty slots included. x and y take the
-    workspace's range, rotation entries that change sign take [-1, 1], z and the others the sample's range.
+    What varies is read off a sample of unverified scenes, empty slots included: at least 20,000 objects, or 4,096
+    scenes. x and y take the workspace's range, z and one-hots the sample's. Rotations: if any object of the sample is
+    tilted, all nine entries take [-1, 1]; if objects only turn about z, the four entries that tell of tilt are
+    constant (they come back exactly) and the four of the turn take [-1, 1] each if they vary.
     """
-    scenes = grammar.sample_array(np.random.default_rng(_SEED), _SAMPLE)
+    low, high, tilted = _ranges(grammar)
     grammar.reasons.clear()
-    fitted = Normalizer.fit(torch.from_numpy(scenes))
-    low, high = fitted.input_min.clone(), fitted.input_max.clone()
     for axis in (0, 1):
         low[axis], high[axis] = (corner[axis] for corner in grammar.scene_type.workspace)
-    rotation = torch.zeros_like(low, dtype=torch.bool)
-    rotation[3:12] = True
-    signed = rotation & (low < 0) & (high > 0)
-    low[signed], high[signed] = -1.0, 1.0
+    if not tilted:
+        low[_TILT] = high[_TILT] = 0.0
+    for feature in range(3, 12) if tilted else _PLANE:
+        if tilted or high[feature] - low[feature] > _UPRIGHT:
+            low[feature], high[feature] = -1.0, 1.0
+    low[12:], high[12:] = 0.0, 1.0
     return Normalizer.from_range(low, high)
+
+
+def _ranges(grammar: Grammar) -> tuple[Tensor, Tensor, bool]:
+    """Smallest and largest value (D,) of each feature in a sample, and whether any object of it is tilted."""
+    rng = np.random.default_rng(_SEED)
+    features = grammar.scene_type.features
+    low, high = torch.full((features,), torch.inf), torch.full((features,), -torch.inf)
+    objects = scenes = 0
+    tilted = False
+    while objects < _OBJECTS and scenes < _SCENES:
+        flat = torch.from_numpy(grammar.sample_array(rng, _STEP)).flatten(0, 1)
+        present = flat[flat[:, -1] < 0.5]
+        low, high = torch.minimum(low, flat.amin(dim=0)), torch.maximum(high, flat.amax(dim=0))
+        tilted |= bool((present[:, _TILT].abs() > _UPRIGHT).any() or (present[:, 11] < 1 - _UPRIGHT).any())
+        objects, scenes = objects + len(present), scenes + _STEP
+    return low, high, tilted

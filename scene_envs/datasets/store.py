@@ -1,14 +1,17 @@
-"""Files of a dataset: parquet shards of normalised scenes and prompts, and one ``metadata.json``.
+"""Files of a dataset, written: parquet shards of normalised scenes and prompts, and one ``metadata.json``.
 
 The layout is that of the published datasets: column ``scenes`` holds normalised (N, D) float32 scenes,
-``language_annotation`` one prompt each; ``metadata.json`` names the assets and holds the normalizer.
+``language_annotation`` one prompt each; ``metadata.json`` names the assets and holds the normalizer. The further
+column ``language_annotations`` holds all prompts of a scene.
 """
 
 from __future__ import annotations
 
+import errno
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +20,22 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene_types import SceneType
 
 METADATA = "metadata.json"
 SCENES = "scenes"
 PROMPTS = "language_annotation"
+PROMPT_SETS = "language_annotations"
 _NOTES = b"scene_envs"
 _MODEL_PATH = "scene_envs/assets/{name}"
+_ROW_GROUP = 500
+"""Scenes per row group: what a streaming reader has to hold at least."""
+
+
+class StorageError(SceneEnvsError, OSError):
+    """A file could not be written: the disk is full, or the folder may not be written to."""
 
 
 def shard_name(index: int) -> str:
@@ -48,93 +58,62 @@ def make_metadata(scene_type: SceneType, normalizer: Normalizer, **extra: Any) -
     }
 
 
-def _partial(path: Path) -> Path:
-    """Where ``path`` is written before it takes its name; one place per process, so that two never mix."""
-    return path.with_name(f".{path.name}.{os.getpid()}.partial")
-
-
-def remove_partial(folder: Path) -> None:
-    """Remove what killed processes left half-written in ``folder``."""
-    for path in folder.glob(".*.partial"):
-        path.unlink(missing_ok=True)
-
-
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write JSON atomically."""
-    partial = _partial(path)
-    partial.write_text(json.dumps(content, indent=2) + "\n")
-    os.replace(partial, path)
+    """Write JSON atomically; raises :class:`StorageError`."""
+    write_bytes(path, (json.dumps(content, indent=2) + "\n").encode())
 
 
-def read_metadata(path: Path) -> dict[str, Any]:
-    """Read ``metadata.json`` at ``path`` and check that the keys every reader needs are there.
-
-    Raises:
-        InvalidInputError: there is no such file.
-        CorruptFileError: it is not JSON, or lacks keys (they are named).
-    """
-    if not path.is_file():
-        raise InvalidInputError(f"no {METADATA} at {str(path)!r}; a dataset folder holds one beside its parquet files")
-    try:
-        metadata = json.loads(path.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CorruptFileError(f"{str(path)!r} is not valid JSON: {error}") from error
-    needed = ("model_paths", "normalizer_state")
-    missing = [key for key in needed if not isinstance(metadata, dict) or key not in metadata]
-    if missing:
-        raise CorruptFileError(f"{str(path)!r} lacks the keys {missing}; a dataset's metadata needs {list(needed)}")
-    return dict(metadata)
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write one file, whole or not at all; raises :class:`StorageError`."""
+    with _replacing(path) as partial:
+        partial.write_bytes(content)
 
 
-def write_shard(path: Path, scenes: NDArray[np.float32], prompts: Sequence[str], notes: Mapping[str, Any]) -> None:
+def write_shard(
+    path: Path, scenes: NDArray[np.float32], prompt_sets: Sequence[tuple[str, ...]], notes: Mapping[str, Any]
+) -> None:
     """Write one parquet file atomically.
 
     Args:
         path: where to.
         scenes: (M, N, D) float32, normalised.
-        prompts: M prompts.
+        prompt_sets: the prompts of each of the M scenes; ``language_annotations`` is left out when all have one.
         notes: JSON-able facts kept in the file's footer, such as why scenes were thrown away.
+
+    Raises:
+        StorageError: the file cannot be written; nothing is left of it.
     """
+    write_bytes(path, encode_shard(scenes, prompt_sets, notes))
+
+
+def encode_shard(
+    scenes: NDArray[np.float32], prompt_sets: Sequence[tuple[str, ...]], notes: Mapping[str, Any]
+) -> bytes:
+    """The bytes of the parquet file that :func:`write_shard` writes; equal for equal arguments."""
     count, slots, features = scenes.shape
     values = pa.array(np.ascontiguousarray(scenes).reshape(-1))
     rows = pa.ListArray.from_arrays(pa.array(np.arange(count * slots + 1, dtype=np.int32) * features), values)
-    column = pa.ListArray.from_arrays(pa.array(np.arange(count + 1, dtype=np.int32) * slots), rows)
-    table = pa.table({SCENES: column, PROMPTS: pa.array(list(prompts), pa.string())})
-    table = table.replace_schema_metadata({_NOTES: json.dumps(notes, sort_keys=True).encode()})
-    partial = _partial(path)
-    pq.write_table(table, partial, compression="zstd")
-    os.replace(partial, path)
+    columns: dict[str, pa.Array] = {
+        SCENES: pa.ListArray.from_arrays(pa.array(np.arange(count + 1, dtype=np.int32) * slots), rows),
+        PROMPTS: pa.array([prompts[0] for prompts in prompt_sets], pa.string()),
+    }
+    if any(len(prompts) > 1 for prompts in prompt_sets):
+        columns[PROMPT_SETS] = pa.array([list(prompts) for prompts in prompt_sets], pa.list_(pa.string()))
+    table = pa.table(columns).replace_schema_metadata({_NOTES: json.dumps(notes, sort_keys=True).encode()})
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, compression="zstd", row_group_size=_ROW_GROUP)
+    return bytes(sink.getvalue().to_pybytes())
 
 
 def read_notes(path: Path) -> dict[str, Any]:
-    """The facts that :func:`write_shard` kept in the footer; empty for files of others."""
-    footer = _open(path).schema_arrow.metadata or {}
-    return dict(json.loads(footer.get(_NOTES, b"{}")))
+    """The facts that :func:`write_shard` kept in the footer, and ``rows``; raises CorruptFileError."""
+    file = open_parquet(path)
+    footer = file.schema_arrow.metadata or {}
+    return {**json.loads(footer.get(_NOTES, b"{}")), "rows": file.metadata.num_rows}
 
 
-def read_shard(path: Path, features: int) -> tuple[NDArray[np.float32], list[str]]:
-    """Scenes (M, N, D), normalised, and M prompts of one parquet file.
-
-    Raises:
-        CorruptFileError: not a parquet file, truncated, columns missing, or scenes of the wrong shape.
-    """
-    file = _open(path)
-    columns = file.schema_arrow.names
-    missing = [name for name in (SCENES, PROMPTS) if name not in columns]
-    if missing:
-        raise CorruptFileError(f"{str(path)!r} lacks the column(s) {missing}; it has {columns}")
-    try:
-        table = file.read([SCENES, PROMPTS])
-        scenes = _to_array(table[SCENES].combine_chunks(), features)
-    except (pa.ArrowException, OSError, ValueError) as error:
-        raise CorruptFileError(
-            f"cannot read scenes of {features} features per slot from {str(path)!r}: {error}; "
-            "delete the file and generate again to remake it"
-        ) from error
-    return scenes, [text or "" for text in table[PROMPTS].to_pylist()]
-
-
-def _open(path: Path) -> pq.ParquetFile:
+def open_parquet(path: Path) -> pq.ParquetFile:
+    """The parquet file at ``path``; raises InvalidInputError (none there) or CorruptFileError."""
     try:
         return pq.ParquetFile(path)
     except FileNotFoundError:
@@ -145,19 +124,31 @@ def _open(path: Path) -> pq.ParquetFile:
         ) from error
 
 
-def _to_array(column: pa.Array, features: int) -> NDArray[np.float32]:
-    """Nested lists (M of N of D) as (M, N, D); raises ValueError when they are ragged or of another width."""
-    if isinstance(column, pa.ChunkedArray):
-        column = pa.concat_arrays(column.chunks) if column.num_chunks else pa.array([], column.type)
-    if isinstance(column, pa.ExtensionArray):  # Array2D of Hugging Face `datasets`
-        column = column.storage
-    values = column.flatten().flatten().to_numpy(zero_copy_only=False).astype(np.float32, copy=False)
-    count = len(column)
-    if count == 0:
-        return np.empty((0, 0, features), dtype=np.float32)
-    widths = np.asarray(column.flatten().value_lengths())
-    heights = np.asarray(column.value_lengths())
-    if (widths != features).any() or (heights != heights[0]).any():
-        found = sorted(set(heights.tolist())), sorted(set(widths.tolist()))
-        raise ValueError(f"slots per scene {found[0]}, features per slot {found[1]}, expected {features} features")
-    return values.reshape(count, int(heights[0]), features)
+def remove_partial(folder: Path) -> None:
+    """Remove what killed processes left half-written in ``folder``."""
+    for path in folder.glob(".*.partial"):
+        path.unlink(missing_ok=True)
+
+
+def storage_error(path: Path, error: OSError) -> StorageError:
+    """What to raise when ``path`` could not be written."""
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+    reason = "the disk is full" if full else error.strerror or str(error)
+    remedy = "make room" if full else "make the folder writable"
+    return StorageError(
+        f"cannot write {str(path)!r}: {reason}; finished files are kept, {remedy} and run again to resume"
+    )
+
+
+@contextmanager
+def _replacing(path: Path) -> Iterator[Path]:
+    """A place to write ``path`` at before it takes its name; one per process, so that two never mix."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        yield partial
+        os.replace(partial, path)
+    except OSError as error:
+        raise storage_error(path, error) from error
+    finally:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)

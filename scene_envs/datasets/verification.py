@@ -16,23 +16,33 @@ MAX_DISPLACEMENT = 1e-2
 """How far (m) any object of a kept scene may move while it settles."""
 DURATION = 0.5
 """How long (s) a scene settles."""
+KEPT = ""
+"""The verdict on a scene that is kept."""
+
+
+def judge_scenes(batch: SceneBatch) -> list[str]:
+    """Why each scene is thrown away: ``"outside workspace"``, ``"penetration"``, … or :data:`KEPT`.
+
+    Runs in the calling process. Scenes are judged in the constructed poses; settling only tests them. The verdict on
+    a scene does not depend on the others of the batch.
+    """
+    inside = (batch.in_workspace | batch.is_empty).all(dim=1)
+    verdicts = [KEPT if ok else "outside workspace" for ok in inside.tolist()]
+    candidates = torch.nonzero(inside).flatten()
+    if len(candidates):
+        for index, verdict in zip(candidates.tolist(), _physics(batch[candidates]), strict=True):
+            verdicts[index] = verdict
+    return verdicts
 
 
 def verify_scenes(batch: SceneBatch, reasons: Counter[str]) -> Tensor:
-    """(B,) bool: scenes to keep; why others are thrown away is counted in ``reasons``.
-
-    Runs in the calling process. Scenes are judged in the constructed poses; settling only tests them.
-    """
-    kept = (batch.in_workspace | batch.is_empty).all(dim=1)
-    reasons["outside workspace"] += int((~kept).sum())
-    candidates = torch.nonzero(kept).flatten()
-    if len(candidates):
-        passed = _physics(batch[candidates], reasons)
-        kept[candidates] = passed
-    return kept
+    """(B,) bool: scenes to keep; why others are thrown away is counted in ``reasons``."""
+    verdicts = judge_scenes(batch)
+    reasons.update(verdict for verdict in verdicts if verdict != KEPT)
+    return torch.tensor([verdict == KEPT for verdict in verdicts], dtype=torch.bool)
 
 
-def _physics(batch: SceneBatch, reasons: Counter[str]) -> Tensor:
+def _physics(batch: SceneBatch) -> list[str]:
     from scene_envs.physics import feasibility
 
     result = feasibility(
@@ -42,10 +52,9 @@ def _physics(batch: SceneBatch, reasons: Counter[str]) -> Tensor:
         max_rotation=math.inf,
         duration=DURATION,
     )
-    valid = result.valid
     shallow = (result.depth <= MAX_PENETRATION).all(dim=1)
     still = ((result.displacement <= MAX_DISPLACEMENT) | ~batch.is_free).all(dim=1)
-    reasons["physics failed"] += int((~valid).sum())
-    reasons["penetration"] += int((valid & ~shallow).sum())
-    reasons["moved while settling"] += int((valid & shallow & ~still).sum())
-    return valid & shallow & still
+    return [
+        "physics failed" if not valid else "penetration" if not clear else "moved while settling" if not calm else KEPT
+        for valid, clear, calm in zip(result.valid.tolist(), shallow.tolist(), still.tolist(), strict=True)
+    ]

@@ -1,0 +1,136 @@
+"""One shard of a generated dataset: a function of its job and grammar alone."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from scene_envs.datasets import store
+from scene_envs.datasets.journal import Journal
+from scene_envs.datasets.progress import Report
+from scene_envs.datasets.prompts import describe_all
+from scene_envs.datasets.verification import KEPT, judge_scenes
+from scene_envs.errors import PhysicsError
+from scene_envs.grammars import Grammar
+from scene_envs.normalizer import Normalizer
+from scene_envs.scene import SceneBatch
+
+_MAX_CHUNK = 32
+"""Scenes judged at a time at most."""
+_CHUNK_SECONDS = 0.5
+"""About how long a chunk may take, so that slow grammars report often; chunks do not change the result."""
+_MAX_FRUITLESS = 2000
+"""Scenes thrown away in a row before the grammar is called hopeless."""
+_UNFIT = "outside the normalizer"
+
+
+@dataclass(frozen=True)
+class Job:
+    """What one shard is to be.
+
+    Attributes:
+        index: of the shard.
+        size: scenes in it.
+        seed: of the dataset.
+        verify: keep only scenes that pass :func:`~scene_envs.datasets.verification.judge_scenes`.
+        path: where it goes.
+    """
+
+    index: int
+    size: int
+    seed: int
+    verify: bool
+    path: str
+
+
+def make_shard(
+    job: Job, grammar: Grammar, normalizer: Normalizer, report: Report, journal: Journal | None = None
+) -> bytes:
+    """The bytes of the shard's parquet file.
+
+    Candidate k is drawn from a random generator of its own, seeded by (seed, shard, k), and the shard holds the first
+    ``job.size`` candidates that pass. So neither the size of chunks nor an interruption changes the result.
+
+    Args:
+        job: which shard.
+        grammar: what to draw from.
+        normalizer: of the dataset.
+        report: told after each chunk.
+        journal: verdicts of an earlier, interrupted attempt, which are not computed again; None keeps none.
+
+    Raises:
+        PhysicsError: no candidate passes, over and over.
+        StorageError: the journal cannot be written.
+    """
+    known = journal.read() if journal is not None else []
+    kept: list[Tensor] = []
+    reasons: Counter[str] = Counter()
+    tried = fruitless = 0
+    chunk = 1
+    while len(kept) < job.size:
+        ahead = len(known) - tried
+        start = perf_counter()
+        count = min(ahead, _MAX_CHUNK) if ahead > 0 else chunk
+        scenes, drawn = _draw(grammar, job, tried, count)
+        verdicts = known[tried : tried + count] if ahead > 0 else _judge(scenes, grammar, normalizer, job.verify)
+        if journal is not None and ahead <= 0:
+            journal.append(verdicts)
+        before, fresh, first = reasons.copy(), len(kept), tried
+        for scene, why, verdict in zip(scenes, drawn, verdicts, strict=True):
+            if len(kept) == job.size:
+                break
+            tried += 1
+            reasons.update(why)
+            fruitless = 0 if verdict == KEPT else fruitless + 1
+            if verdict == KEPT:
+                kept.append(scene)
+            else:
+                reasons[verdict] += 1
+        report(len(kept) - fresh, tried - first, dict(reasons - before))
+        if fruitless >= _MAX_FRUITLESS:
+            raise PhysicsError(
+                f"grammar {grammar.name!r}: {fruitless} scenes in a row were thrown away; "
+                f"most frequent reasons: {dict(reasons.most_common(3))}"
+            )
+        if ahead <= 0:
+            seconds = (perf_counter() - start) / count
+            chunk = max(1, min(_MAX_CHUNK, 2 * chunk, int(_CHUNK_SECONDS / max(seconds, 1e-6))))
+    batch = SceneBatch(torch.stack(kept), grammar.scene_type)
+    prompt_sets = describe_all(batch, np.random.default_rng([job.seed, job.index, 1]))
+    notes = {"tried": tried, "reasons": dict(sorted((+reasons).items()))}
+    return store.encode_shard(normalizer.normalize(batch.tensor).numpy(), prompt_sets, notes)
+
+
+def _draw(grammar: Grammar, job: Job, first: int, count: int) -> tuple[Tensor, list[Counter[str]]]:
+    """Candidates ``first`` … ``first + count - 1`` (count, N, D), and why the grammar threw structures away."""
+    scenes, reasons = [], []
+    for candidate in range(first, first + count):
+        grammar.reasons.clear()
+        rng = np.random.default_rng([job.seed, job.index, 0, candidate])
+        scenes.append(torch.from_numpy(grammar.sample_array(rng, 1)))
+        reasons.append(Counter(grammar.reasons))
+    return torch.cat(scenes), reasons
+
+
+def _judge(scenes: Tensor, grammar: Grammar, normalizer: Normalizer, verify: bool) -> list[str]:
+    batch = SceneBatch(scenes, grammar.scene_type)
+    fits = _fits(scenes, normalizer)
+    verdicts = judge_scenes(batch) if verify else [KEPT] * len(batch)
+    return [v if v != KEPT or ok else _UNFIT for v, ok in zip(verdicts, fits.tolist(), strict=True)]
+
+
+def _fits(scenes: Tensor, normalizer: Normalizer) -> Tensor:
+    """(B,) bool: whether normalising and back gives the scene; it does not where a constant feature varies."""
+    return ((normalizer.unnormalize(normalizer.normalize(scenes)) - scenes).abs().amax(dim=(1, 2))) < 1e-4
+
+
+def shard_journal(job: Job) -> Journal:
+    """The journal of a shard, beside its file."""
+    path = Path(job.path)
+    return Journal(path.with_name(f".{path.name}.journal"))
