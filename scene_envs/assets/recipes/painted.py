@@ -1,0 +1,142 @@
+"""Visual surfaces that change around their axis: fruit with a red cheek, a can with a wave, a printed box."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+
+from scene_envs.assets.base import Array
+from scene_envs.assets.shapes import Profile, circle
+from scene_envs.assets.surfaces import Color, arc, join, surface
+
+Cells = NDArray[np.int64]
+"""Indices into the colours of a surface, one per cell."""
+
+Paint = Callable[[Array, Array], Cells]
+"""From the angles (1, S) rad and the heights (P, 1) m of cells, bottom to top along the profile, to their colours."""
+
+
+def curve(points: Profile, samples: int = 24) -> Array:
+    """(samples, 2): a smooth half section through the points (r, z), m, never beyond the axis."""
+    through = arc([(r, 0.0, z) for r, z in points], samples)[:, [0, 2]]
+    return np.column_stack([np.maximum(through[:, 0], 0.0), np.maximum(through[:, 1], 0.0)])
+
+
+def revolve(
+    profile: ArrayLike,
+    colors: Sequence[Color],
+    paint: Paint,
+    *,
+    segments: int = 32,
+    swell: Callable[[Array, Array], Array] | None = None,
+) -> trimesh.Trimesh:
+    """Revolve a smooth half section about z and paint it cell by cell.
+
+    Args:
+        profile: (P, 2) points (r, z), m, with the outside on the right, as for
+            :func:`~scene_envs.assets.surfaces.lathe`.
+        colors: the colours ``paint`` chooses from.
+        paint: colour index per cell, from the angle and the height of its middle.
+        segments: cells around.
+        swell: factor on the radius from angle (rad) and height (m), for lobes and spouts.
+    """
+    section = np.asarray(profile, dtype=np.float64)
+    angles = 2.0 * np.pi * np.arange(segments) / segments
+    radius = np.repeat(section[:, :1], segments, axis=1)
+    if swell is not None:
+        radius = radius * swell(angles[None, :], section[:, 1:])
+    unit = circle(segments)
+    points = np.stack(
+        [radius * unit[:, 0], radius * unit[:, 1], np.repeat(section[:, 1:], segments, axis=1)], axis=-1
+    )  # (P, segments, 3)
+    middle = 0.5 * (section[1:, 1:] + section[:-1, 1:])
+    chosen = np.broadcast_to(paint(angles[None, :] + np.pi / segments, middle), (len(middle), segments))
+    return _painted(points, _normals(points, section), chosen, colors)
+
+
+def sleeve(radius: float, levels: ArrayLike, colors: Sequence[Color]) -> trimesh.Trimesh:
+    """The wall of a cylinder in bands whose edges may wave.
+
+    Args:
+        radius: m.
+        levels: (K, segments) heights (m) of the edges of the bands, bottom first, one per angle.
+        colors: K - 1 colours.
+    """
+    heights = np.asarray(levels, dtype=np.float64)
+    unit = circle(heights.shape[1])
+    points = np.stack(
+        [
+            np.broadcast_to(radius * unit[:, 0], heights.shape),
+            np.broadcast_to(radius * unit[:, 1], heights.shape),
+            heights,
+        ],
+        axis=-1,
+    )
+    normals = np.broadcast_to(np.column_stack([unit, np.zeros(len(unit))]), points.shape)
+    bands = np.repeat(np.arange(len(heights) - 1)[:, None], heights.shape[1], axis=1)
+    return _painted(points, normals, bands, colors)
+
+
+def loft(loops: ArrayLike, colors: Sequence[Color]) -> trimesh.Trimesh:
+    """A closed body between convex outlines, all counter-clockwise seen from above, bottom first.
+
+    Args:
+        loops: (K, P, 3) outlines, m; the first and the last are flat and filled in.
+        colors: K + 1 colours: the underside, K - 1 walls, the top.
+    """
+    outlines = np.asarray(loops, dtype=np.float64)
+    walls = []
+    for low, high, color in zip(outlines[:-1], outlines[1:], colors[1:-1], strict=True):
+        quads = np.stack([low, np.roll(low, -1, axis=0), np.roll(high, -1, axis=0), high], axis=1)
+        facing = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
+        facing /= np.linalg.norm(facing, axis=1, keepdims=True)
+        corner = facing + np.roll(facing, 1, axis=0)
+        corner /= np.linalg.norm(corner, axis=1, keepdims=True)
+        normals = np.stack([corner, np.roll(corner, -1, axis=0), np.roll(corner, -1, axis=0), corner], axis=1)
+        first = 4 * np.arange(len(quads))[:, None]
+        faces = np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])])
+        walls.append(surface(quads.reshape(-1, 3), faces, color, normals.reshape(-1, 3)))
+    return join(sheet(outlines[0, ::-1], colors[0]), *walls, sheet(outlines[-1], colors[-1]))
+
+
+def sheet(outline: ArrayLike, color: Color) -> trimesh.Trimesh:
+    """A flat convex face (P, 3), counter-clockwise seen from its front: a lid, a label, a letter's stroke."""
+    points = np.asarray(outline, dtype=np.float64)
+    corner = np.arange(1, len(points) - 1)
+    return surface(points, np.stack([np.zeros_like(corner), corner, corner + 1], axis=1), color)
+
+
+def _normals(points: Array, section: Array) -> Array:
+    """(P, S, 3) unit normals of a revolved grid; on the axis, that of the axis."""
+    along = np.gradient(points, axis=0)
+    around = np.roll(points, -1, axis=1) - np.roll(points, 1, axis=1)
+    normals = np.cross(around, along)
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    steps = np.gradient(section, axis=0)
+    tangent = np.stack([-steps[:, 1], steps[:, 0]], axis=-1)
+    up = np.zeros_like(points)
+    up[..., 2] = np.where(tangent[:, 1] >= 0, -1.0, 1.0)[:, None]
+    return np.where(length > 1e-12, normals / np.maximum(length, 1e-12), up)
+
+
+def _painted(points: Array, normals: Array, chosen: Cells, colors: Sequence[Color]) -> trimesh.Trimesh:
+    """A grid of points (P, S, 3), closed around, with one colour per cell (P - 1, S)."""
+    rows, segments = points.shape[:2]
+    grid = np.arange(rows * segments).reshape(rows, segments)
+    a, b = grid[:-1], np.roll(grid[:-1], -1, axis=1)
+    d, c = grid[1:], np.roll(grid[1:], -1, axis=1)
+    flat, shading = points.reshape(-1, 3), normals.reshape(-1, 3)
+    meshes = []
+    for index in np.unique(chosen):
+        cells = chosen == index
+        faces = np.concatenate(
+            [np.stack([a[cells], b[cells], c[cells]], axis=1), np.stack([a[cells], c[cells], d[cells]], axis=1)]
+        )
+        corners = flat[faces]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        used, faces = np.unique(faces[area > 1e-12], return_inverse=True)
+        meshes.append(surface(flat[used], faces.reshape(-1, 3), colors[int(index)], shading[used]))
+    return join(*meshes)
