@@ -1,6 +1,5 @@
 """Scene grammars: distributions over structures and exact poses, one short file per scene type."""
 
-from scene_envs.grammars import dimsum_table as _dimsum_table  # noqa: F401  (registers itself)
 from scene_envs.grammars.containers import Filling, Heap, Standing
 from scene_envs.grammars.dsl import (
     NOTHING,

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
+from importlib import import_module
 
 import numpy as np
 import torch
@@ -121,6 +122,17 @@ class Grammar:
             scene[slot, 12 + self._category[pose.asset]] = 1.0
 
 
+_BUILT_IN = (
+    "breakfast_table_high_clutter",
+    "breakfast_table_low_clutter",
+    "dimsum_table",
+    "living_room_shelf",
+    "pantry_shelf",
+    "restaurant_high_clutter",
+    "restaurant_low_clutter",
+)
+"""Modules of this package that register a grammar when they are imported."""
+
 _REGISTRY: dict[str, Callable[[], Grammar]] = {}
 
 
@@ -134,6 +146,12 @@ def register_grammar(name: str) -> Callable[[Callable[[], Grammar]], Callable[[]
     return register
 
 
+@cache
+def _load_built_in() -> None:
+    for name in _BUILT_IN:
+        import_module(f"scene_envs.grammars.{name}")
+
+
 def get_grammar(scene_type: str | SceneType | Grammar) -> Grammar:
     """A fresh grammar by its name (built-in grammars are called like their scene type)."""
     if isinstance(scene_type, Grammar):
@@ -143,6 +161,7 @@ def get_grammar(scene_type: str | SceneType | Grammar) -> Grammar:
 
 def grammar_factory(name: str) -> Callable[[], Grammar]:
     """The function registered as ``name``; raises UnknownNameError with the nearest known name."""
+    _load_built_in()
     if name not in _REGISTRY:
         load_plugins()
     if name not in _REGISTRY:
@@ -152,5 +171,6 @@ def grammar_factory(name: str) -> Callable[[], Grammar]:
 
 def list_grammars() -> list[str]:
     """Names of all registered grammars, those of installed packages included, sorted."""
+    _load_built_in()
     load_plugins()
     return sorted(_REGISTRY)

@@ -1,0 +1,23 @@
+"""Restaurant, low clutter: one to four laid tables and up to three shelves.
+
+Probabilities follow the scene grammar of the paper's dataset (Pfaff et al., CoRL 2025); the number of tables is
+drawn from what its rejection leaves.
+"""
+
+from __future__ import annotations
+
+from scene_envs.grammars.dsl import Geometric
+from scene_envs.grammars.grammar import Grammar, register_grammar
+from scene_envs.grammars.restaurant import exactly, floor, laid, shelves, stack_of_three
+from scene_envs.scene_types import get_scene_type
+
+TABLE = laid(Geometric(0.6, 1, 4), another=0.25, lid=0.4, nothing=0.35, setting=0.5, empty=0.4)
+
+
+@register_grammar("restaurant_low_clutter")
+def restaurant_low_clutter() -> Grammar:
+    """The whole room."""
+    tables = exactly((0.44, 1), (0.39, 2), (0.13, 3), (0.04, 4), table=TABLE)
+    room = floor(tables, shelves(Geometric(0.25, 0, 3)))
+    conditions = {"no stack of 3": stack_of_three}
+    return Grammar("restaurant_low_clutter", get_scene_type("restaurant_low_clutter"), [room], conditions)

@@ -1,0 +1,22 @@
+"""The shelf: where its four tiers are, and what keeps clear of its boards."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from scene_envs.grammars.surface import Region
+from scene_envs.grammars.towers import Node, Surface
+
+TIER_HEIGHTS = (-0.3915, -0.1232, 0.1392, 0.4075)
+"""z of the upper side of each board (m), bottom first, in the frame of the shelf."""
+HALF_DEPTH, HALF_WIDTH = 0.140, 0.284
+"""Half of the clear depth and width of a tier, m."""
+TIER = Region(HALF_DEPTH, HALF_WIDTH, overhang=0.0, x=0.008)
+
+
+def tiers(inner: Node, top: Node) -> Sequence[Surface]:
+    """The four boards, the three inner ones alike."""
+    return [
+        *(Surface([inner], TIER, height=height) for height in TIER_HEIGHTS[:3]),
+        Surface([top], TIER, height=TIER_HEIGHTS[3]),
+    ]
