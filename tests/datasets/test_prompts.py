@@ -8,7 +8,18 @@ import numpy as np
 import pytest
 import torch
 
-from scene_envs.datasets.prompts import SceneFacts, describe, describe_all, parse_prompt, scene_facts
+from scene_envs.datasets.prompts import (
+    NameCount,
+    ObjectCount,
+    PairCount,
+    Reference,
+    SideClaim,
+    SupportCount,
+    describe,
+    describe_all,
+    parse_prompt,
+    scene_facts,
+)
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch
@@ -24,8 +35,8 @@ def test_prompts_are_true_and_say_what_their_kind_says(batch: SceneBatch, kind: 
     prompts = describe(batch, np.random.default_rng(0), kinds=[kind])
     facts = [parse_prompt(prompt, batch.scene_type) for prompt in prompts]
     assert all(claim.holds(scene) for claim, scene in zip(facts, scene_facts(batch), strict=True))
-    field = {"count": "count", "names": "objects", "relations": "on_top"}[kind]
-    assert all(getattr(claim, field) is not None for claim in facts)
+    what = {"count": ObjectCount, "names": NameCount, "relations": PairCount | SupportCount | SideClaim}[kind]
+    assert all(isinstance(claim, what) for prompt in facts for claim in prompt.claims)
 
 
 def test_the_parser_can_tell_true_from_false(batch: SceneBatch) -> None:
@@ -40,7 +51,7 @@ def test_the_parser_can_tell_true_from_false(batch: SceneBatch) -> None:
 def test_kinds_are_mixed_and_seeded(batch: SceneBatch) -> None:
     prompts = describe(batch, np.random.default_rng(0))
     assert prompts == describe(batch, np.random.default_rng(0))
-    kinds = Counter("count" if "objects" in p else "relations" if "on top" in p else "names" for p in prompts)
+    kinds = Counter("count" if "objects" in p else "relations" if "where" in p else "names" for p in prompts)
     assert min(kinds[kind] for kind in ("count", "names", "relations")) >= 40
 
 
@@ -58,7 +69,8 @@ def test_facts_of_a_scene_built_by_hand() -> None:
     (facts,) = scene_facts(built)
     assert facts.count == 7
     assert facts.objects == {"table": 1, "steamer bottom": 2, "steamer lid": 1, "teapot": 1, "plate": 2}
-    assert facts.on_top == {("steamer bottom", "steamer bottom"): 1, ("steamer lid", "steamer bottom"): 1}
+    held = {(facts.names[i], facts.names[j]) for i, j in enumerate(facts.held.support) if j > 0}
+    assert held == {("steamer bottom", "steamer bottom"), ("steamer lid", "steamer bottom")}
     prompts = {describe(built, np.random.default_rng(seed), kinds=["names"])[0] for seed in range(400)}
     assert "A scene with two plates." in prompts
     assert "A scene with a teapot." in prompts
@@ -76,17 +88,10 @@ def test_names_are_read_in_english(text: str, expected: dict[str, int]) -> None:
 
 
 def test_relations_are_read_in_english() -> None:
-    text = (
-        "A scene with two steamer lids each on top of a steamer bottom and a steamer bottom on top of a steamer bottom."
-    )
-    expected = {("steamer lid", "steamer bottom"): 2, ("steamer bottom", "steamer bottom"): 1}
-    assert parse_prompt(text, "dimsum_table").on_top == expected
-
-
-def test_a_claim_about_numbers_is_exact() -> None:
-    scene = SceneFacts(5, Counter(cup=4, table=1), Counter())
-    assert parse_prompt("A scene with four cups.", "dimsum_table").holds(scene)
-    assert not parse_prompt("A scene with three cups.", "dimsum_table").holds(scene)
+    text = "A scene where two steamer lids are each on top of a steamer bottom and a cup is in the second cup from the left."
+    lids, cup = parse_prompt(text, "dimsum_table").claims
+    assert lids == PairCount("steamer lid", 2, False, "steamer bottom")
+    assert cup == SupportCount("cup", 1, True, Reference("cup", 2, "left"))
 
 
 @pytest.mark.parametrize("text", ["Tea for two", "A scene with two unicorns.", "A scene with a plates."])

@@ -1,0 +1,245 @@
+"""What a prompt claims, claim by claim, and whether a scene bears it out."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_envs.datasets.prompts.facts import SceneFacts
+
+Side = Literal["left", "right", "front", "back", "next"]
+"""Relations between two things that share a table, a tier or the floor."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """One thing: "the teapot", "the second cup from the left", "the lamp on the top shelf".
+
+    Attributes:
+        name: display name.
+        ordinal: which one, counted from ``edge``; 0 when it is the only one.
+        edge: left, right, front or back; empty without an ordinal.
+        place: where it is counted; None for the whole scene.
+    """
+
+    name: str
+    ordinal: int = 0
+    edge: str = ""
+    place: Place | None = None
+
+    def resolve(self, scene: SceneFacts) -> int:
+        """Index of the thing, or -1 when there is none, or several where it says there is one."""
+        members = scene.named(self.name)
+        if self.place is not None:
+            members = members[self.place.holds(scene)[members]]
+        if not self.ordinal:
+            return int(members[0]) if len(members) == 1 else -1
+        if not 2 <= len(members) >= self.ordinal:
+            return -1
+        order = scene.along(self.edge)[members]
+        ranks = np.argsort(-order, kind="stable")
+        near = np.sort(np.abs(order - order[ranks[self.ordinal - 1]]))[1]
+        return int(members[ranks[self.ordinal - 1]]) if near >= scene.tolerances.order else -1
+
+
+@dataclass(frozen=True)
+class Place:
+    """A table, a shelf, or one tier of it: "the second table from the left", "the top shelf".
+
+    Attributes:
+        unit: the piece of furniture.
+        tier: counted from the top from 0, or from the bottom from -1; None for the whole thing.
+    """
+
+    unit: Reference
+    tier: int | None = None
+
+    def holds(self, scene: SceneFacts) -> NDArray[np.bool_]:
+        """(n,) bool: objects that are there, directly or on top of or in others."""
+        unit = self.unit.resolve(scene)
+        here = (scene.held.place == unit) & (unit >= 0)
+        if self.tier is None or unit < 0:
+            return here
+        tier = self.tier if self.tier >= 0 else self.tier + int(scene.tiers[unit])
+        return here & (scene.held.tier == tier) & (0 <= tier < scene.tiers[unit])
+
+
+@dataclass(frozen=True)
+class ClaimCheck:
+    """How one claim fares in one scene.
+
+    Attributes:
+        claim: what was claimed.
+        expected: the number it gives; 1 for a relation between two things.
+        found: the number in the scene; for a relation 1 when it holds, else 0.
+        score: 1 when it holds; below that the smaller number over the larger, and for a relation that does not
+            hold a quarter for each of its two things that is there.
+        slots: slots of the objects it speaks of, as far as they are there.
+    """
+
+    claim: Claim
+    expected: int
+    found: int
+    score: float
+    slots: tuple[int, ...]
+
+    @property
+    def holds(self) -> bool:
+        """Whether the claim is true."""
+        return self.expected == self.found
+
+    @property
+    def mismatch(self) -> int:
+        """Objects too many or too few."""
+        return abs(self.expected - self.found)
+
+
+@dataclass(frozen=True)
+class ObjectCount:
+    """ "12 objects": objects in the scene, welded ones included."""
+
+    number: int
+
+    def check(self, scene: SceneFacts) -> ClaimCheck:
+        """Compare with ``scene``."""
+        return _count(self, self.number, scene, np.arange(scene.count))
+
+
+@dataclass(frozen=True)
+class NameCount:
+    """ "three cups": objects of that display name."""
+
+    name: str
+    number: int
+
+    def check(self, scene: SceneFacts) -> ClaimCheck:
+        """Compare with ``scene``."""
+        return _count(self, self.number, scene, scene.named(self.name))
+
+
+@dataclass(frozen=True)
+class PlaceCount:
+    """ "three cups are on the second table from the left": also those on or in other things there."""
+
+    name: str
+    number: int
+    place: Place
+
+    def check(self, scene: SceneFacts) -> ClaimCheck:
+        """Compare with ``scene``."""
+        members = scene.named(self.name)
+        return _count(self, self.number, scene, members[self.place.holds(scene)[members]])
+
+
+@dataclass(frozen=True)
+class SupportCount:
+    """ "two apples are in the bowl", "a mug is on top of the second plate from the left": one certain thing holds them.
+
+    On top of means directly on it; in means in it, directly or on top of what lies there.
+    """
+
+    name: str
+    number: int
+    inside: bool
+    landmark: Reference
+
+    def check(self, scene: SceneFacts) -> ClaimCheck:
+        """Compare with ``scene``."""
+        holder = self.landmark.resolve(scene)
+        members = scene.named(self.name) if holder >= 0 else np.empty(0, dtype=np.int64)
+        return _count(self, self.number, scene, members[_holder(scene, self.inside)[members] == holder])
+
+
+@dataclass(frozen=True)
+class PairCount:
+    """ "two steamer lids are each on top of a steamer bottom": things of one kind held by things of another."""
+
+    name: str
+    number: int
+    inside: bool
+    under: str
+
+    def check(self, scene: SceneFacts) -> ClaimCheck:
+        """Compare with ``scene``."""
+        members = scene.named(self.name)
+        held = np.isin(_holder(scene, self.inside)[members], scene.named(self.under))
+        return _count(self, self.number, scene, members[held])
+
+
+@dataclass(frozen=True)
+class SideClaim:
+    """ "the lamp is to the left of the bowl": both things share a table, a tier or the floor."""
+
+    subject: Reference
+    side: Side
+    landmark: Reference
+
+    def check(self, scene: SceneFacts) -> ClaimCheck:
+        """Compare with ``scene``."""
+        first, second = self.subject.resolve(scene), self.landmark.resolve(scene)
+        there = [index for index in (first, second) if index >= 0]
+        holds = len(there) == 2 and (
+            scene.is_next_to(first, second) if self.side == "next" else scene.is_aside(self.side, first, second)
+        )
+        score = 1.0 if holds else 0.25 * len(there)
+        return ClaimCheck(self, 1, int(holds), score, tuple(int(slot) for slot in scene.slots[there]))
+
+
+Claim = ObjectCount | NameCount | PlaceCount | SupportCount | PairCount | SideClaim
+
+
+@dataclass(frozen=True)
+class PromptFacts:
+    """What one prompt claims.
+
+    Attributes:
+        claims: the claims, in the order of the text.
+
+    >>> from scene_envs.datasets import parse_prompt, scene_facts
+    >>> from scene_envs.scene import SceneBatch
+    >>> (scene,) = scene_facts(SceneBatch.empty("dimsum_table", 1))
+    >>> prompt = parse_prompt("A scene with a table and two cups.", "dimsum_table")
+    >>> prompt.holds(scene), prompt.score(scene), [check.mismatch for check in prompt.check(scene)]
+    (False, 0.5, [0, 2])
+    """
+
+    claims: tuple[Claim, ...]
+
+    @property
+    def count(self) -> int | None:
+        """The number of objects claimed; None when the prompt says nothing about it."""
+        return next((claim.number for claim in self.claims if isinstance(claim, ObjectCount)), None)
+
+    @property
+    def objects(self) -> Counter[str] | None:
+        """Display name to number as claimed; None when the prompt is no list of names."""
+        named = Counter({claim.name: claim.number for claim in self.claims if isinstance(claim, NameCount)})
+        return named or None
+
+    def check(self, scene: SceneFacts) -> tuple[ClaimCheck, ...]:
+        """Each claim with its truth, the numbers claimed and found, and the slots it speaks of."""
+        return tuple(claim.check(scene) for claim in self.claims)
+
+    def holds(self, scene: SceneFacts) -> bool:
+        """Whether every claim is true of ``scene``; numbers are exact for what is named."""
+        return all(check.holds for check in self.check(scene))
+
+    def score(self, scene: SceneFacts) -> float:
+        """Mean of the claims' scores, in [0, 1]; 1 exactly when every claim holds."""
+        return float(np.mean([check.score for check in self.check(scene)]))
+
+
+def _count(claim: Claim, number: int, scene: SceneFacts, members: NDArray[np.int64] | Sequence[int]) -> ClaimCheck:
+    found = len(members)
+    score = min(number, found) / max(number, found, 1) if number != found else 1.0
+    return ClaimCheck(claim, number, found, score, tuple(int(slot) for slot in scene.slots[members]))
+
+
+def _holder(scene: SceneFacts, inside: bool) -> NDArray[np.int64]:
+    """(n,) what each thing lies in, or what it stands on; -1 for none."""
+    return scene.held.inside if inside else np.where(scene.held.contained, -1, scene.held.support)

@@ -1,0 +1,210 @@
+"""The facts of a scene that prompts can speak of, from poses and asset geometry alone."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_envs.datasets.prompts.shapes import library_shapes
+from scene_envs.datasets.prompts.supports import Contacts, Holding, Placed
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import SceneBatch
+from scene_envs.scene_types import SceneType, get_scene_type
+
+Array = NDArray[np.float64]
+
+SIDES = ("left", "right", "front", "back")
+"""Directions of the viewer. Front is toward the viewer, or toward the lower edge of a view from above."""
+
+_CHUNK = 64
+"""Scenes that are worked on together."""
+_FURNITURE = 0.5
+"""Things at least this high (m) are furniture."""
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """When a relation holds.
+
+    Attributes:
+        contact: surfaces this far (m) apart, or into each other, touch.
+        aside: least offset (m) of two centres to the left, right, front or back.
+        cone: that offset is at least this many times the offset across.
+        beside: largest horizontal distance (m) of two bounding boxes that are next to each other.
+        beside_furniture: the same between pieces of furniture (0.5 m high or more).
+        order: least difference (m) between neighbours in an order such as "the second cup from the left".
+
+    Raises:
+        InvalidInputError: contact is not in (0, 0.03] m.
+    """
+
+    contact: float = 0.01
+    aside: float = 0.02
+    cone: float = 1.0
+    beside: float = 0.05
+    beside_furniture: float = 0.5
+    order: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.contact <= 0.03:
+            raise InvalidInputError(f"contact must lie in (0, 0.03] m, got {self.contact}")
+
+
+NOMINAL = Tolerances()
+"""What checks use."""
+STRICT = Tolerances(contact=0.005, aside=0.03, cone=1.25, beside=0.04, beside_furniture=0.4, order=0.02)
+LOOSE = Tolerances(contact=0.015, beside=0.06, beside_furniture=0.6)
+"""Prompts are written only when they hold under all three, so that no prompt hangs on a millimetre."""
+
+
+@dataclass(frozen=True, eq=False)
+class SceneFacts:
+    """What prompts can say about one scene of n objects. Indices are into these n objects.
+
+    Attributes:
+        names: (n,) display names.
+        slots: (n,) slots of the scene.
+        positions: (n, 3) centres of mass in m: to the viewer's right, to the front, up.
+        boxes: (n, 2, 3) lowest and highest corner along the same axes.
+        fixed: (n,) bool, welded things such as tables, shelves and floors.
+        tiers: (n,) tiers of each thing, 0 for what has none.
+        held: what holds each object.
+        tolerances: when a relation holds.
+
+    >>> (facts,) = scene_facts(SceneBatch.empty("dimsum_table", 1))
+    >>> facts.count, facts.objects
+    (1, Counter({'table': 1}))
+    """
+
+    names: tuple[str, ...]
+    slots: NDArray[np.int64]
+    positions: Array
+    boxes: Array
+    fixed: NDArray[np.bool_]
+    tiers: NDArray[np.int64]
+    held: Holding
+    tolerances: Tolerances = NOMINAL
+
+    @property
+    def count(self) -> int:
+        """Objects, welded ones included."""
+        return len(self.names)
+
+    @cached_property
+    def objects(self) -> Counter[str]:
+        """Display name to number."""
+        return Counter(self.names)
+
+    @cached_property
+    def _of_name(self) -> dict[str, NDArray[np.int64]]:
+        names = np.array(self.names)
+        return {name: np.flatnonzero(names == name) for name in self.objects}
+
+    def named(self, name: str) -> NDArray[np.int64]:
+        """Indices of the objects called ``name``."""
+        return self._of_name.get(name, np.empty(0, dtype=np.int64))
+
+    def along(self, side: str) -> Array:
+        """(n,) positions along a direction of :data:`SIDES`, m."""
+        axis, sign = {"left": (0, -1.0), "right": (0, 1.0), "front": (1, 1.0), "back": (1, -1.0)}[side]
+        return sign * self.positions[:, axis]
+
+    def together(self, first: int, second: int) -> bool:
+        """Whether two objects share a table, a tier or the floor, and neither carries the other."""
+        place, tier = self.held.place, self.held.tier
+        same = first != second and place[first] >= 0 and place[first] == place[second] and tier[first] == tier[second]
+        return bool(same) and not (self.carries(first, second) or self.carries(second, first))
+
+    def carries(self, lower: int, upper: int) -> bool:
+        """Whether the chain of supports below ``upper`` goes through ``lower``."""
+        below = int(self.held.support[upper])
+        while below >= 0 and below != lower:
+            below = int(self.held.support[below])
+        return below == lower and below >= 0
+
+    def is_aside(self, side: str, first: int, second: int) -> bool:
+        """Whether ``first`` is to the given side of ``second``."""
+        offset = self.positions[first] - self.positions[second]
+        across = abs(offset[1 if side in ("left", "right") else 0])
+        ahead = float(self.along(side)[first] - self.along(side)[second])
+        limits = self.tolerances
+        return ahead >= limits.aside and ahead >= limits.cone * across and self.together(first, second)
+
+    def is_next_to(self, first: int, second: int) -> bool:
+        """Whether two objects are close at the same height."""
+        low, high = self.boxes[:, 0], self.boxes[:, 1]
+        gaps = np.maximum(low[first] - high[second], low[second] - high[first])
+        tall = min(high[first, 2] - low[first, 2], high[second, 2] - low[second, 2]) >= _FURNITURE
+        reach = self.tolerances.beside_furniture if tall else self.tolerances.beside
+        near = gaps[2] < 0.0 and np.hypot(*np.maximum(gaps[:2], 0.0)) <= reach
+        return bool(near) and self.together(first, second)
+
+
+def viewer_axes(scene_type: str | SceneType) -> Array:
+    """(3, 3): rows are the viewer's right, front and up in the world frame, from the scene type's camera.
+
+    All sides are horizontal or vertical in the world: right is the image's right, front is toward the viewer (for
+    a shelf) or toward the lower edge of the image (for a view from above).
+
+    >>> viewer_axes("dimsum_table").round(6).tolist()
+    [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    camera = get_scene_type(scene_type).camera
+    right = np.cross(np.subtract(camera.target, camera.position), camera.up)
+    right[2] = 0.0
+    right /= np.linalg.norm(right)
+    up = np.array([0.0, 0.0, 1.0])
+    return np.stack([right, np.cross(right, up), up]) + 0.0
+
+
+def scene_facts(batch: SceneBatch, tolerances: Tolerances = NOMINAL) -> list[SceneFacts]:
+    """What can be said about each scene of ``batch``."""
+    return facts_under(batch, [tolerances])[0]
+
+
+def facts_under(batch: SceneBatch, tolerances: Sequence[Tolerances]) -> list[list[SceneFacts]]:
+    """The facts of each scene under each of several tolerances; geometry is computed once."""
+    result: list[list[SceneFacts]] = [[] for _ in tolerances]
+    for start in range(0, len(batch), _CHUNK):
+        for facts, part in zip(result, _chunk(batch[start : start + _CHUNK], tolerances), strict=True):
+            facts += part
+    return result
+
+
+def _chunk(batch: SceneBatch, tolerances: Sequence[Tolerances]) -> list[list[SceneFacts]]:
+    shapes = library_shapes(batch.scene_type.library)
+    display = [asset.display_name for asset in batch.scene_type.library]
+    categories = batch.categories.cpu().numpy()
+    scene, slot = np.nonzero(categories != len(display))
+    translations = batch.translations.double().cpu().numpy()[scene, slot]
+    rotations = batch.rotations.double().cpu().numpy()[scene, slot]
+    welded = batch.scene_type.welded_categories
+    placed = Placed.of(shapes, scene, categories[scene, slot], translations, rotations, welded)
+    axes = viewer_axes(batch.scene_type)
+    positions = placed.center @ axes.T
+    points = placed.points @ axes.T
+    boxes = np.stack([points.min(axis=1), points.max(axis=1)], axis=1)
+    tiers = np.isfinite(shapes.tiers[placed.category]).sum(axis=1)
+    contacts = Contacts.of(shapes, placed)
+    parts = [slice(*np.searchsorted(scene, (row, row + 1))) for row in range(len(batch))]
+    return [
+        [
+            SceneFacts(
+                tuple(display[c] for c in placed.category[part]),
+                slot[part],
+                positions[part],
+                boxes[part],
+                placed.fixed[part],
+                tiers[part],
+                holding.part(part),
+                limits,
+            )
+            for part in parts
+        ]
+        for limits, holding in ((limits, contacts.holding(limits.contact)) for limits in tolerances)
+    ]

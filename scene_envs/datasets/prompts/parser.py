@@ -1,0 +1,171 @@
+"""Reads prompts back into their claims."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from functools import lru_cache
+
+from scene_envs.datasets.prompts.claims import (
+    Claim,
+    NameCount,
+    ObjectCount,
+    PairCount,
+    Place,
+    PlaceCount,
+    PromptFacts,
+    Reference,
+    Side,
+    SideClaim,
+    SupportCount,
+)
+from scene_envs.datasets.prompts.facts import SIDES
+from scene_envs.datasets.prompts.language import NUMBERS, ORDINALS, Nouns
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene_types import SceneType, get_scene_type
+
+_SIDES: dict[str, Side] = {
+    "to the left of": "left",
+    "to the right of": "right",
+    "in front of": "front",
+    "behind": "back",
+    "next to": "next",
+}
+_INSIDE = {"on top of": False, "in": True}
+_ENDS = ("top", "bottom")
+_COUNTS = {"a": 1, "an": 1, **{word: number for number, word in enumerate(NUMBERS)}}
+_ORDINALS = {word: number for number, word in enumerate(ORDINALS, start=1)}
+
+
+def parse_prompt(text: str, scene_type: str | SceneType) -> PromptFacts:
+    """Read a prompt made by :func:`describe`, or written by hand in the same English, into its claims.
+
+    Capitals and the full stop do not matter, and numbers may be words or digits.
+
+    Raises:
+        InvalidInputError: the text is not such a prompt; the place where reading stopped is named.
+
+    >>> parse_prompt("A scene with 12 objects.", "dimsum_table").count
+    12
+    >>> parse_prompt("A scene where the teapot is behind the second cup from the left.", "dimsum_table").claims[0].side
+    'back'
+    """
+    return _Reader(text, _words(get_scene_type(scene_type))).prompt()
+
+
+class _Words:
+    """Display names and plurals of a scene type."""
+
+    def __init__(self, scene_type: SceneType) -> None:
+        nouns = Nouns(scene_type)
+        self.name = {name.lower(): name for name in nouns.plural}
+        self.plural = {plural.lower(): name for name, plural in nouns.plural.items()}
+
+
+@lru_cache(maxsize=32)
+def _words(scene_type: SceneType) -> _Words:
+    return _Words(scene_type)
+
+
+class _Reader:
+    """Recursive descent over the text; every method reads one phrase and moves on."""
+
+    def __init__(self, text: str, words: _Words) -> None:
+        self.text = text
+        self.rest = re.sub(r"\s+", " ", text).strip().lower().removesuffix(".").rstrip()
+        self.words = words
+
+    def prompt(self) -> PromptFacts:
+        self.need(["a scene"], "'A scene with …' or 'A scene where …'")
+        read = self.amount if self.need(["with", "where"], "'with' or 'where'") == "with" else self.clause
+        claims = [read()]
+        while self.rest:
+            self.need([", and", ",", "and"], "a comma, 'and' or the end")
+            claims.append(read())
+        if len(claims) > 1 and any(isinstance(claim, ObjectCount) for claim in claims):
+            raise self.error("only one number of objects, with nothing beside it")
+        return PromptFacts(tuple(claims))
+
+    def amount(self) -> Claim:
+        number = self.number()
+        if self.take(["object" if number == 1 else "objects"]):
+            return ObjectCount(number)
+        return NameCount(self.noun(plural=number != 1), number)
+
+    def clause(self) -> Claim:
+        if self.rest.startswith("the "):
+            subject = self.reference()
+            self.need(["is"], "'is'")
+            side = _SIDES[self.need(_SIDES, "a side, such as 'to the left of' or 'behind'")]
+            return SideClaim(subject, side, self.reference())
+        number = self.number()
+        name = self.noun(plural=number != 1)
+        self.need(["is" if number == 1 else "are"], "'is' for one thing and 'are' for several")
+        each = self.take(["each"])
+        how = self.need(_INSIDE if each else [*_INSIDE, "on"], "'on', 'on top of' or 'in'")
+        if how == "on":
+            return PlaceCount(name, number, self.place())
+        if not each and self.rest.startswith("the "):
+            return SupportCount(name, number, _INSIDE[how], self.reference())
+        self.need(["a", "an"], "a thing with 'a' or 'an'")
+        return PairCount(name, number, _INSIDE[how], self.noun(plural=False))
+
+    def reference(self, *, placed: bool = True) -> Reference:
+        self.need(["the"], "'the' and a thing")
+        ordinal = _ORDINALS.get(self.take(_ORDINALS), 0)
+        name = self.noun(plural=False)
+        edge = self.edge() if ordinal else ""
+        at_place = placed and not self.rest.startswith("on top of") and self.take(["on"])
+        return Reference(name, ordinal, edge, self.place() if at_place else None)
+
+    def place(self) -> Place:
+        """Tiers first; what is no tier is a piece of furniture."""
+        before = self.rest
+        self.need(["the"], "'the' and a place")
+        ordinal = _ORDINALS.get(self.take(_ORDINALS), 1)
+        end = self.take(_ENDS)
+        word = self.take(["shelf", "tier"])
+        if word and not end and self.take(["from the"]):
+            end = self.take(_ENDS)
+        if not word or not end:
+            self.rest = before
+            return Place(self.reference(placed=False))
+        tier = ordinal - 1 if end == "top" else -ordinal
+        if word == "shelf":
+            return Place(Reference("shelf"), tier)
+        self.need(["of"], "'of' and the thing the tier belongs to")
+        return Place(self.reference(placed=False), tier)
+
+    def number(self) -> int:
+        digits = re.match(r"\d+\b", self.rest)
+        if digits:
+            self.rest = self.rest[digits.end() :].lstrip()
+            return int(digits.group())
+        return _COUNTS[self.need(_COUNTS, "a number")]
+
+    def noun(self, *, plural: bool) -> str:
+        names = self.words.plural if plural else self.words.name
+        kind = "plural" if plural else "singular"
+        return names[self.need(names, f"a {kind} name of this scene type: {', '.join(names)}")]
+
+    def edge(self) -> str:
+        self.need(["from the"], "'from the left', 'right', 'front' or 'back'")
+        return self.need(SIDES, "'left', 'right', 'front' or 'back'")
+
+    def take(self, options: Iterable[str]) -> str:
+        """The longest of ``options`` that comes next as whole words, or the empty string."""
+        for words in sorted(options, key=len, reverse=True):
+            if self.rest.startswith(words) and not re.match(r"[\w-]", self.rest[len(words) :]):
+                self.rest = self.rest[len(words) :].lstrip()
+                return words
+        return ""
+
+    def need(self, options: Iterable[str], what: str) -> str:
+        found = self.take(options)
+        if not found:
+            raise self.error(what)
+        return found
+
+    def error(self, what: str) -> InvalidInputError:
+        where = f"at {self.rest!r}" if self.rest else "at its end"
+        return InvalidInputError(f"cannot read the prompt {self.text!r} {where}; expected {what}")

@@ -1,0 +1,194 @@
+"""What holds each object of a batch: which thing it stands on or lies in, and on which tier."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_envs.datasets.prompts.shapes import LibraryShapes
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+_LARGEST = 0.03
+"""No tolerance of contacts may be larger than this (m)."""
+_UPRIGHT = 0.85
+"""Cosine of the tilt up to which a thing carries others."""
+_STEEPNESS = 20.0
+"""Foot points lie as far out as they can, where 1 m outward is worth 1/20 m upward."""
+_DIRECTIONS = np.stack([np.cos(np.arange(8) * np.pi / 4.0), np.sin(np.arange(8) * np.pi / 4.0)])  # (2, 8)
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """n objects of several scenes, one after the other.
+
+    Attributes:
+        scene: (n,) index of the scene, ascending.
+        category: (n,).
+        rotation: (n, 3, 3) asset frame to world.
+        translation: (n, 3) m.
+        center: (n, 3) centre of mass, world frame, m.
+        points: (n, V, 3) extreme points, world frame, m.
+        feet: (n, 9, 3) eight low points all round and their mean, m.
+        fixed: (n,) bool, static or welded.
+    """
+
+    scene: Index
+    category: Index
+    rotation: Array
+    translation: Array
+    center: Array
+    points: Array
+    feet: Array
+    fixed: Mask
+
+    @classmethod
+    def of(
+        cls,
+        shapes: LibraryShapes,
+        scene: Index,
+        category: Index,
+        translation: Array,
+        rotation: Array,
+        welded: Sequence[int] = (),
+    ) -> Placed:
+        """Objects from their poses."""
+        points = shapes.points[category] @ rotation.swapaxes(1, 2) + translation[:, None]
+        center = np.einsum("nij,nj->ni", rotation, shapes.center[category]) + translation
+        height = points[..., 2] - points[..., 2].min(axis=1, keepdims=True)
+        outward = points[..., :2] @ _DIRECTIONS - _STEEPNESS * height[..., None]  # (n, V, 8)
+        feet = np.take_along_axis(points, outward.argmax(axis=1)[..., None], axis=1)
+        feet = np.concatenate([feet, feet.mean(axis=1, keepdims=True)], axis=1)
+        fixed = shapes.static[category] | np.isin(category, welded)
+        return cls(scene, category, rotation, translation, center, points, feet, fixed)
+
+
+@dataclass(frozen=True, eq=False)
+class Holding:
+    """What holds each of n objects; indices are into the same n.
+
+    Attributes:
+        support: (n,) the thing it stands on or lies in; -1 for none.
+        contained: (n,) bool: it lies in it.
+        inside: (n,) the innermost container it lies in, directly or on top of what lies there; -1 for none.
+        place: (n,) the first fixed thing down the chain of supports; -1 for none.
+        tier: (n,) tier of that thing from the top; -1 where it has none.
+    """
+
+    support: Index
+    contained: Mask
+    inside: Index
+    place: Index
+    tier: Index
+
+    def part(self, rows: slice) -> Holding:
+        """What holds the objects of ``rows``, which are whole scenes; indices count from their first object."""
+        pointers = (np.maximum(column[rows] - rows.start, -1) for column in (self.support, self.inside, self.place))
+        support, inside, place = pointers
+        return Holding(support, self.contained[rows], inside, place, self.tier[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """M pairs of an object and what may hold it, with heights (m) from which any tolerance gives a :class:`Holding`."""
+
+    shapes: LibraryShapes
+    objects: Placed
+    upper: Index
+    lower: Index
+    gap: Array  # (M, 9) height of the feet above the upper side of the lower thing
+    tier: Index  # (M,) nearest tier from the top, -1 where there are none
+    over: Mask  # (M,) the centre of mass is above the lower thing
+    above_rim: Array  # (M,) height of the mean foot above the rim of a container; inf where there is none
+    above_well: Array  # (M,) height of the mean foot above the container's inside
+
+    @classmethod
+    def of(cls, shapes: LibraryShapes, objects: Placed) -> Contacts:
+        """All pairs whose bounding boxes allow a contact."""
+        upper, lower = _near_pairs(objects)
+        category = objects.category[lower]
+
+        def local(points: Array) -> Array:
+            offset = points - objects.translation[lower].reshape(len(lower), *(1,) * (points.ndim - 2), 3)
+            return np.einsum("m...i,mij->m...j", offset, objects.rotation[lower])
+
+        feet, center = local(objects.feet[upper]), local(objects.center[upper])
+        many = np.broadcast_to(category[:, None], feet.shape[:2])
+        gap = feet[..., 2] - shapes.wide[shapes.cells(many, feet)]
+        tier = np.full(len(upper), -1)
+        tiered = np.isfinite(shapes.tiers[category, 0])
+        if tiered.any():
+            levels = feet[tiered, :, 2, None] - shapes.tiers[category[tiered], None, :]  # (T, 9, L)
+            nearest = np.nanargmin(np.abs(levels[:, -1]), axis=-1)
+            tier[tiered] = nearest
+            on_level = np.take_along_axis(levels, nearest[:, None, None], axis=-1)[..., 0]
+            gap[tiered] = np.where(np.isfinite(gap[tiered]), on_level, np.inf)
+        inside = shapes.top[shapes.cells(category, feet[:, -1])]
+        return cls(
+            shapes,
+            objects,
+            upper,
+            lower,
+            gap,
+            tier,
+            shapes.covered[shapes.cells(category, center)],
+            np.where(np.isfinite(inside), feet[:, -1, 2] - shapes.rim[category], np.inf),
+            feet[:, -1, 2] - inside,
+        )
+
+    def holding(self, tolerance: float) -> Holding:
+        """What holds each object when surfaces up to ``tolerance`` (m) apart, or into each other, touch."""
+        size = self.shapes.bounds[self.objects.category[self.lower]]
+        thickness = size[:, 1, 2] - size[:, 0, 2]
+        into = np.minimum(tolerance, 0.5 * thickness)
+        touches = (self.gap <= tolerance) & (self.gap >= -into[:, None])  # (M, 9)
+        rests = self.over & touches.any(axis=1)
+        contained = (self.above_rim <= -tolerance) & (self.above_well >= -tolerance)
+        height = np.where(touches, self.objects.feet[self.upper, :, 2] - self.gap, -np.inf).max(axis=1)
+        height = np.where(contained, self.objects.feet[self.upper, -1, 2] - self.above_well, height)
+        return self._chains(np.flatnonzero(rests | contained), contained, height)
+
+    def _chains(self, held: Index, contained: Mask, height: Array) -> Holding:
+        """Keep the highest thing below each object and follow it down."""
+        count = len(self.objects.category)
+        support = np.full(count, -1)
+        is_in, tier = np.zeros(count, dtype=bool), np.full(count, -1)
+        held = held[np.argsort(height[held], kind="stable")]  # later, higher ones overwrite
+        support[self.upper[held]] = self.lower[held]
+        is_in[self.upper[held]] = contained[held]
+        tier[self.upper[held]] = self.tier[held]
+        static = np.append(self.objects.fixed, True)  # index -1 ends every chain
+        place, inside = support.copy(), np.where(is_in, support, -1)
+        base = np.arange(count)
+        while (going := np.flatnonzero(~static[place])).size:
+            base[going] = place[going]
+            climbs = going[inside[going] < 0]
+            inside[climbs] = np.where(is_in[place[climbs]], support[place[climbs]], -1)
+            place[going] = support[place[going]]
+        return Holding(support, is_in, inside, place, np.where(place >= 0, tier[base], -1))
+
+
+def _near_pairs(objects: Placed) -> tuple[Index, Index]:
+    """(upper, lower): pairs of one scene whose boxes allow that the first rests on or in the second."""
+    low, high = objects.points.min(axis=1), objects.points.max(axis=1)
+    uppers, lowers = [], []
+    starts = np.flatnonzero(np.diff(objects.scene, prepend=-1))
+    for start, stop in zip(starts, np.append(starts[1:], len(objects.scene)), strict=True):
+        a, b = low[start:stop, None], low[None, start:stop]
+        top_a, top_b = high[start:stop, None], high[None, start:stop]
+        near = (a[..., 2] <= top_b[..., 2] + _LARGEST) & (top_a[..., 2] > b[..., 2])
+        fixed_a, fixed_b = objects.fixed[start:stop, None], objects.fixed[None, start:stop]
+        near &= np.where(fixed_a == fixed_b, a[..., 2] > b[..., 2] + 1e-4, fixed_b)  # so that no chain is a circle
+        near &= (a[..., 0] <= top_b[..., 0]) & (b[..., 0] <= top_a[..., 0])
+        near &= (a[..., 1] <= top_b[..., 1]) & (b[..., 1] <= top_a[..., 1])
+        near &= objects.rotation[None, start:stop, 2, 2] > _UPRIGHT
+        np.fill_diagonal(near, False)
+        first, second = np.nonzero(near)
+        uppers.append(first + start)
+        lowers.append(second + start)
+    return np.concatenate([*uppers, np.empty(0, dtype=np.int64)]), np.concatenate([*lowers, np.empty(0, np.int64)])

@@ -1,0 +1,252 @@
+"""Chooses what to say of a scene, and says it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeVar, get_args
+
+import numpy as np
+
+from scene_envs.datasets.prompts.claims import (
+    Claim,
+    NameCount,
+    ObjectCount,
+    PairCount,
+    Place,
+    PlaceCount,
+    Reference,
+    Side,
+    SideClaim,
+    SupportCount,
+)
+from scene_envs.datasets.prompts.facts import LOOSE, NOMINAL, SIDES, STRICT, SceneFacts, facts_under
+from scene_envs.datasets.prompts.language import Nouns
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import SceneBatch
+
+_T = TypeVar("_T")
+
+KINDS = ("count", "names", "relations")
+"""The kinds of prompts."""
+
+_MOST_NAMES = 10
+"""Names in one prompt at most."""
+_MOST_RELATIONS = 4
+"""Relations in one prompt at most."""
+_LAST_ORDINAL = 5
+"""Nobody counts further than the fifth."""
+_TRIES = 8
+"""Draws for each relation, and for a prompt that differs from the others of its scene."""
+
+
+def describe(batch: SceneBatch, rng: np.random.Generator, *, kinds: Sequence[str] = KINDS) -> list[str]:
+    """One prompt per scene, of a random kind among those that have something to say.
+
+    Raises:
+        InvalidInputError: an unknown kind.
+    """
+    unknown = sorted(set(kinds) - set(KINDS))
+    if unknown or not kinds:
+        raise InvalidInputError(f"unknown kinds of prompts {unknown}; choose from {list(KINDS)}")
+    return [writer.write(kinds[int(rng.integers(len(kinds)))]) for writer in _writers(batch, rng)]
+
+
+def describe_all(batch: SceneBatch, rng: np.random.Generator, *, count: int = 3) -> list[tuple[str, ...]]:
+    """``count`` prompts per scene, of different kinds and without duplicates where the scene has that much to say.
+
+    Raises:
+        InvalidInputError: ``count`` is not positive.
+    """
+    if count < 1:
+        raise InvalidInputError(f"count must be at least 1 prompt per scene, got {count}")
+    return [writer.write_all(count) for writer in _writers(batch, rng)]
+
+
+def _writers(batch: SceneBatch, rng: np.random.Generator) -> list[_Writer]:
+    nouns = Nouns(batch.scene_type)
+    views = zip(*facts_under(batch, [NOMINAL, STRICT, LOOSE]), strict=True)
+    return [_Writer(scene, (strict, loose), nouns, rng) for scene, strict, loose in views]
+
+
+@dataclass(frozen=True, eq=False)
+class _Writer:
+    """Writes about one scene, seen under the nominal and under other tolerances."""
+
+    scene: SceneFacts
+    others: tuple[SceneFacts, ...]
+    nouns: Nouns
+    rng: np.random.Generator
+
+    def write(self, kind: str) -> str:
+        """A prompt of ``kind``, or a count when there is nothing else to say."""
+        claims: list[Claim] = []
+        if kind == "names":
+            claims = [NameCount(name, self.scene.objects[name]) for name in self._names()]
+        elif kind == "relations":
+            claims = self._relations()
+        return self.nouns.sentence(claims or [ObjectCount(self.scene.count)])
+
+    def write_all(self, count: int) -> tuple[str, ...]:
+        """One prompt of each kind in turn; further ones are names and relations."""
+        prompts: list[str] = []
+        for turn in range(count):
+            wanted = KINDS[turn] if turn < len(KINDS) else KINDS[1 + turn % 2]
+            for attempt in range(_TRIES):
+                prompt = self.write(wanted if attempt < _TRIES // 2 else "names")
+                if prompt not in prompts:
+                    break
+            prompts.append(prompt)
+        return tuple(prompts)
+
+    def _names(self) -> list[str]:
+        """All display names, or with even chance some, at most ten, in random order; not furniture alone."""
+        names = sorted(self.scene.objects)
+        whole = self.rng.random() < 0.5
+        size = len(names) if whole or len(names) < 2 else int(self.rng.integers(1, len(names) + 1))
+        chosen = [names[i] for i in self.rng.permutation(len(names))[: min(size, _MOST_NAMES)]]
+        free = sorted({self.scene.names[i] for i in np.flatnonzero(~self.scene.fixed)})
+        return chosen if set(free) & set(chosen) or not free else [*chosen[1:], self._pick(free)]
+
+    def _relations(self) -> list[Claim]:
+        """Up to four relations of families drawn with equal chances, each true under every tolerance."""
+        families: list[Callable[[], Claim | None]] = []
+        families += [self._pair] if self._pairs else []
+        families += [self._hold] if self._holds else []
+        families += [self._stay] if self._stays else []
+        families += [self._aside] if self._neighbors else []
+        claims: list[Claim] = []
+        if families:
+            for _ in range(int(self.rng.integers(1, _MOST_RELATIONS + 1))):
+                for _ in range(_TRIES):
+                    claim = self._pick(families)()
+                    if claim is not None and claim not in claims and self._is_clear(claim):
+                        claims.append(claim)
+                        break
+        return claims
+
+    def _is_clear(self, claim: Claim) -> bool:
+        return claim.check(self.scene).holds and all(claim.check(view).holds for view in self.others)
+
+    # -- what is held ---------------------------------------------------------------------------------
+
+    @cached_property
+    def _pairs(self) -> Counter[tuple[str, bool, str]]:
+        """(upper name, inside, lower name) of free things to the number of such pairs."""
+        scene, pairs = self.scene, Counter[tuple[str, bool, str]]()
+        for upper, lower in enumerate(scene.held.support):
+            if lower >= 0 and not scene.fixed[lower] and not scene.held.contained[upper]:
+                pairs[scene.names[upper], False, scene.names[lower]] += 1
+            if (box := scene.held.inside[upper]) >= 0:
+                pairs[scene.names[upper], True, scene.names[box]] += 1
+        return pairs
+
+    def _pair(self) -> Claim:
+        name, inside, under = self._pick(sorted(self._pairs))
+        return PairCount(name, self._pairs[name, inside, under], inside, under)
+
+    @cached_property
+    def _holds(self) -> Counter[tuple[str, bool, int]]:
+        """(upper name, inside, index of the lower thing) to the number of such pairs."""
+        scene, holds = self.scene, Counter[tuple[str, bool, int]]()
+        for upper, lower in enumerate(scene.held.support):
+            if lower >= 0 and not scene.fixed[lower] and not scene.held.contained[upper]:
+                holds[scene.names[upper], False, int(lower)] += 1
+            if (box := scene.held.inside[upper]) >= 0:
+                holds[scene.names[upper], True, int(box)] += 1
+        return holds
+
+    def _hold(self) -> Claim | None:
+        name, inside, lower = self._pick(sorted(self._holds))
+        landmark = self._refer(lower)
+        return None if landmark is None else SupportCount(name, self._holds[name, inside, lower], inside, landmark)
+
+    # -- where things are -----------------------------------------------------------------------------
+
+    @cached_property
+    def _stays(self) -> Counter[tuple[str, int, int]]:
+        """(name, place, tier) to numbers, where a scene has more than one place to be."""
+        held = self.scene.held
+        stays = Counter(
+            (self.scene.names[i], int(held.place[i]), int(held.tier[i]))
+            for i in np.flatnonzero((held.place >= 0) & ~self.scene.fixed)
+        )
+        several = int(self.scene.fixed.sum()) > 1 or self.scene.tiers.any()
+        return stays if several else Counter()
+
+    def _stay(self) -> Claim | None:
+        name, unit, tier = self._pick(sorted(self._stays))
+        place = self._place(unit, tier)
+        return None if place is None else PlaceCount(name, self._stays[name, unit, tier], place)
+
+    def _place(self, unit: int, tier: int) -> Place | None:
+        """How to speak of a place; tiers count from the nearer end. The floor and its like need no name."""
+        reference = self._refer(unit, placed=False)
+        tiers = int(self.scene.tiers[unit])
+        if reference is None or (tiers and tier < 0):
+            return None
+        if not tiers:
+            return Place(reference)
+        return Place(reference, tier if 2 * tier < tiers else tier - tiers)
+
+    # -- sides ----------------------------------------------------------------------------------------
+
+    @cached_property
+    def _neighbors(self) -> list[tuple[int, int]]:
+        """Pairs of things that share a place."""
+        held = self.scene.held
+        place, tier = held.place, held.tier
+        same = (place[:, None] == place) & (tier[:, None] == tier) & (place >= 0)
+        np.fill_diagonal(same, False)
+        return [(int(i), int(j)) for i, j in np.argwhere(same)]
+
+    def _aside(self) -> Claim | None:
+        first, second = self._pick(self._neighbors)
+        sides = [side for side in get_args(Side) if self._is_side(side, first, second)]
+        subject, landmark = self._refer(first), self._refer(second)
+        if not sides or subject is None or landmark is None:
+            return None
+        return SideClaim(subject, self._pick(sides), landmark)
+
+    def _is_side(self, side: Side, first: int, second: int) -> bool:
+        views = (self.scene, *self.others)
+        if side == "next":
+            return all(view.is_next_to(first, second) for view in views)
+        return all(view.is_aside(side, first, second) for view in views)
+
+    # -- speaking of one thing ------------------------------------------------------------------------
+
+    def _refer(self, index: int, *, placed: bool = True) -> Reference | None:
+        """The simplest words that single out one thing under every tolerance; None when there are none."""
+        name = self.scene.names[index]
+        if self.scene.objects[name] == 1:
+            return Reference(name)
+        places: list[Place | None] = [None]
+        if placed and self._stays:
+            unit, tier = int(self.scene.held.place[index]), int(self.scene.held.tier[index])
+            place = self._place(unit, tier) if unit >= 0 else None
+            places = [place] if place is not None else []
+        for place in places:
+            found = [Reference(name, place=place), *self._ordinals(index, name, place)]
+            clear = [reference for reference in found if self._names_one(reference, index)]
+            if clear:
+                return self._pick(clear) if clear[0].ordinal else clear[0]
+        return None
+
+    def _ordinals(self, index: int, name: str, place: Place | None) -> list[Reference]:
+        members = self.scene.named(name)
+        if place is not None:
+            members = members[place.holds(self.scene)[members]]
+        edges = SIDES[:2] if place is not None and place.tier is not None else SIDES
+        ranks = [1 + int((self.scene.along(edge)[members] > self.scene.along(edge)[index]).sum()) for edge in edges]
+        highest = min(1 + min(ranks), _LAST_ORDINAL)
+        named = zip(edges, ranks, strict=True)
+        return [Reference(name, rank, edge, place) for edge, rank in named if rank <= highest]
+
+    def _names_one(self, reference: Reference, index: int) -> bool:
+        return all(reference.resolve(view) == index for view in (self.scene, *self.others))
+
+    def _pick(self, items: Sequence[_T]) -> _T:
+        return items[int(self.rng.integers(len(items)))]
