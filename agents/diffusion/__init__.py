@@ -1,17 +1,29 @@
 """Diffusion processes, noise schedules and step tables."""
 
+from agents.diffusion.categorical import (
+    CATEGORICAL_KERNELS,
+    CategoricalProcess,
+    CategoricalSchedule,
+    make_categorical_schedule,
+    sample_categorical,
+)
 from agents.diffusion.gaussian import PREDICTIONS, GaussianProcess, Preconditioning, lognormal_timesteps
 from agents.diffusion.residual import ResidualVariance
 from agents.diffusion.schedules import NoiseSchedule, make_schedule
 from agents.diffusion.step_tables import StepTable
 
 __all__ = [
+    "CATEGORICAL_KERNELS",
     "PREDICTIONS",
+    "CategoricalProcess",
+    "CategoricalSchedule",
     "GaussianProcess",
     "NoiseSchedule",
     "Preconditioning",
     "ResidualVariance",
     "StepTable",
     "lognormal_timesteps",
+    "make_categorical_schedule",
     "make_schedule",
+    "sample_categorical",
 ]

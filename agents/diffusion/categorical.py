@@ -1,0 +1,220 @@
+"""Discrete diffusion on categories (D3PM; Austin et al. 2021): absorbing, uniform and mask-and-replace kernels.
+
+All three kernels are of one family that is closed under composition, so that strides of any length have posteriors in
+closed form and few-step chains have exact log-probabilities. From s to t a category
+
+    is kept with probability k, is absorbed by the mask token with probability m,
+    and is replaced by a uniformly drawn category with the rest, 1 - k - m.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from scene_envs.errors import InvalidInputError, unknown_name
+
+_TINY = 1e-30
+
+
+@dataclass(frozen=True)
+class CategoricalSchedule:
+    """Cumulative rates of a kernel at t = 0..T.
+
+    Attributes:
+        name: ``"absorbing"``, ``"uniform"`` or ``"mask_and_replace"``.
+        keep: (T + 1,) float64, probability that a category has not been touched; 1 at t = 0.
+        mask: (T + 1,) float64, probability that it is the mask token; 0 at t = 0.
+
+    >>> schedule = make_categorical_schedule("absorbing", 10)
+    >>> round(float(schedule.keep[5]), 3), round(float(schedule.mask[5]), 3)
+    (0.5, 0.5)
+    """
+
+    name: str
+    keep: Tensor
+    mask: Tensor
+
+    @property
+    def num_timesteps(self) -> int:
+        """T."""
+        return self.keep.shape[0] - 1
+
+
+def _absorbing(num_timesteps: int) -> tuple[Tensor, Tensor]:
+    """Masked at a constant rate of the original categories, all of them at T (Austin et al. 2021, app. A.2.2)."""
+    mask = torch.linspace(0, 1, num_timesteps + 1, dtype=torch.float64)
+    return 1.0 - mask, mask
+
+
+def _uniform(num_timesteps: int) -> tuple[Tensor, Tensor]:
+    """Resampled along a squared cosine (Hoogeboom et al. 2021), never masked."""
+    t = torch.arange(num_timesteps + 1, dtype=torch.float64) / num_timesteps
+    keep = torch.cos(t * math.pi / 2) ** 2
+    keep[0], keep[-1] = 1.0, 0.0
+    return keep, torch.zeros_like(keep)
+
+
+def _mask_and_replace(num_timesteps: int) -> tuple[Tensor, Tensor]:
+    """The paper's: keep falls from 0.99999 to 9e-6 and mask rises from 9e-6 to 0.99999, linearly over 1..T."""
+    keep = torch.linspace(0.99999, 0.000009, num_timesteps, dtype=torch.float64)
+    mask = torch.linspace(0.000009, 0.99999, num_timesteps, dtype=torch.float64)
+    one = torch.ones(1, dtype=torch.float64)
+    return torch.cat([one, keep]), torch.cat([0.0 * one, mask])
+
+
+CATEGORICAL_KERNELS: dict[str, Callable[[int], tuple[Tensor, Tensor]]] = {
+    "absorbing": _absorbing,
+    "uniform": _uniform,
+    "mask_and_replace": _mask_and_replace,
+}
+
+
+def make_categorical_schedule(name: str, num_timesteps: int = 1000) -> CategoricalSchedule:
+    """The schedule of the kernel called ``name`` with T = ``num_timesteps``."""
+    if name not in CATEGORICAL_KERNELS:
+        raise unknown_name("categorical kernel", name, CATEGORICAL_KERNELS)
+    if num_timesteps < 2:
+        raise InvalidInputError(f"a categorical schedule needs at least 2 timesteps, got {num_timesteps}")
+    return CategoricalSchedule(name, *CATEGORICAL_KERNELS[name](num_timesteps))
+
+
+class CategoricalProcess:
+    """Discrete diffusion over K categories and a mask token, whose index is K.
+
+    States are int64 indices in 0..K; data are in 0..K-1. Distributions over states have K + 1 entries.
+
+    Args:
+        schedule: cumulative rates.
+        categories: K.
+
+    >>> process = CategoricalProcess(make_categorical_schedule("absorbing", 4), 3)
+    >>> process.marginal(torch.tensor([1]), torch.tensor([2]))
+    tensor([[0.0000, 0.5000, 0.0000, 0.5000]])
+    """
+
+    def __init__(self, schedule: CategoricalSchedule, categories: int) -> None:
+        self.schedule = schedule
+        self.categories = categories
+
+    # -- forward --------------------------------------------------------------------------------
+
+    def rates(self, start: Tensor | int, end: Tensor | int) -> tuple[Tensor, Tensor]:
+        """keep and mask probability of the stride ``start`` -> ``end`` (start < end), float64."""
+        keep, mask = self.schedule.keep, self.schedule.mask
+        kept = keep[end] / keep[start].clamp(min=_TINY)
+        masked = 1.0 - (1.0 - mask[end]) / (1.0 - mask[start]).clamp(min=_TINY)
+        masked = masked.clamp(0.0, 1.0)
+        return torch.minimum(kept, 1.0 - masked), masked
+
+    def transition(self, start: int, end: int) -> Tensor:
+        """(K + 1, K + 1) float64, row i the distribution of the state at ``end`` given state i at ``start``."""
+        keep, mask = self.rates(start, end)
+        k = self.categories
+        matrix = torch.zeros(k + 1, k + 1, dtype=torch.float64)
+        matrix[:k, :k] = (1.0 - keep - mask) / k
+        matrix[:k, :k] += keep * torch.eye(k, dtype=torch.float64)
+        matrix[:k, k] = mask
+        matrix[k, k] = 1.0
+        return matrix
+
+    def marginal(self, x0: Tensor, t: Tensor) -> Tensor:
+        """q(x_t | x_0) (..., K + 1) of data ``x0`` (...), int64, at timesteps ``t`` that broadcast against it."""
+        keep, mask = (rate[t.cpu()].to(x0.device, torch.float32) for rate in (self.schedule.keep, self.schedule.mask))
+        keep, mask = torch.broadcast_tensors(_fit(keep, x0), _fit(mask, x0))
+        spread = ((1.0 - keep - mask).clamp(min=0.0) / self.categories).unsqueeze(-1)
+        kept = keep.unsqueeze(-1) * F.one_hot(x0, self.categories)
+        return torch.cat([(kept + spread).expand(*x0.shape, self.categories), mask.expand(x0.shape)[..., None]], dim=-1)
+
+    def add_noise(self, x0: Tensor, t: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """A sample of q(x_t | x_0), int64 like ``x0``."""
+        return sample_categorical(self.marginal(x0, t), generator)
+
+    def prior(self) -> Tensor:
+        """(K + 1,) distribution of x_T: the marginal of uniformly drawn data."""
+        keep, mask = self.schedule.keep[-1], self.schedule.mask[-1]
+        spread = torch.full((self.categories,), float(1.0 - mask) / self.categories)
+        return torch.cat([spread, mask.float().reshape(1)]) + 0.0 * keep.float()
+
+    # -- reverse --------------------------------------------------------------------------------
+
+    def posterior(self, x_t: Tensor, x0_probs: Tensor, t: Tensor | int, previous: Tensor | int) -> Tensor:
+        """p(x_s | x_t) = sum over x_0 of q(x_s | x_t, x_0) p(x_0 | x_t) for a stride t -> s (Austin et al., Eq. 4).
+
+        With w(x_0) = p(x_0) / q(x_t | x_0) it is q(x_t | x_s) times the mean of q(x_s | x_0) under w: linear in K.
+        An x_0 that cannot lead to x_t has no part in it.
+
+        Args:
+            x_t: (B, ...) int64 states at t.
+            x0_probs: (B, ..., K) the denoiser's distribution of the data.
+            t: where the strides start, int or (B,).
+            previous: where they end, s; at 0 the result is ``x0_probs`` itself.
+
+        Returns:
+            (B, ..., K + 1) probabilities, rows sum to one; differentiable in ``x0_probs``.
+        """
+        t, previous = torch.as_tensor(t), torch.as_tensor(previous)
+        keep_s, mask_s = self._rates_at(previous, x_t)
+        keep_t, mask_t = self._rates_at(t, x_t)
+        keep_ts, mask_ts = (
+            _fit(rate.to(x_t.device), x_t).unsqueeze(-1) for rate in self.rates(previous.cpu(), t.cpu())
+        )
+        k, masked = self.categories, (x_t == self.categories).unsqueeze(-1)
+        here = F.one_hot(x_t.clamp(max=k - 1), k).double()
+        likelihood = torch.where(masked, mask_t, keep_t * here + (1.0 - keep_t - mask_t) / k)  # q(x_t | x_0)
+        weight = torch.where(likelihood > _TINY, x0_probs.double() / likelihood.clamp(min=_TINY), 0.0)
+        weight = weight / weight.sum(dim=-1, keepdim=True).clamp(min=_TINY)
+        back = torch.where(masked, mask_ts, keep_ts * here + (1.0 - keep_ts - mask_ts) / k)  # q(x_t | x_s)
+        states = back * (keep_s * weight + (1.0 - keep_s - mask_s) / k)
+        mask = torch.where(masked, mask_s, torch.zeros_like(mask_s))
+        joint = torch.cat([states, mask.expand(*states.shape[:-1], 1)], dim=-1)
+        result: Tensor = (joint / joint.sum(dim=-1, keepdim=True).clamp(min=_TINY)).to(x0_probs.dtype)
+        return result
+
+    def _rates_at(self, t: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Cumulative keep and mask at ``t``, shaped (B, ..., 1) for states ``like`` (B, ...)."""
+        keep, mask = (rate[t.cpu()].to(like.device) for rate in (self.schedule.keep, self.schedule.mask))
+        return _fit(keep, like).unsqueeze(-1), _fit(mask, like).unsqueeze(-1)
+
+    def log_prob(self, x_s: Tensor, probs: Tensor) -> Tensor:
+        """(...) log-probability of the states ``x_s`` under ``probs`` (..., K + 1)."""
+        return probs.gather(-1, x_s.unsqueeze(-1)).squeeze(-1).clamp(min=_TINY).log()
+
+    # -- training -------------------------------------------------------------------------------
+
+    def loss(self, x0: Tensor, x_t: Tensor, t: Tensor, logits: Tensor, auxiliary: float = 5e-4) -> Tensor:
+        """(B, ...) bound of one timestep: KL of the posteriors, or -log p(x_0) at t = 1, plus an auxiliary term.
+
+        Args:
+            x0: (B, ...) data.
+            x_t: (B, ...) states at t.
+            t: (B,) timesteps, 1..T.
+            logits: (B, ..., K) of x_0.
+            auxiliary: weight of the cross-entropy of x_0 (Austin et al. 2021, Eq. 5; the paper's is 5e-4).
+        """
+        log_x0 = F.log_softmax(logits, dim=-1)
+        cross_entropy = -log_x0.gather(-1, x0.unsqueeze(-1)).squeeze(-1)
+        truth = F.one_hot(x0, self.categories).to(logits.dtype)
+        q, p = (self.posterior(x_t, probs, t, t - 1) for probs in (truth, log_x0.exp()))
+        divergence = (q * (q.clamp(min=_TINY).log() - p.clamp(min=_TINY).log())).sum(dim=-1)
+        bound = torch.where(_fit(t.to(x0.device), x0) == 1, cross_entropy, divergence)
+        return bound + auxiliary * cross_entropy
+
+
+def sample_categorical(probs: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    """One index per row of ``probs`` (..., K), int64."""
+    flat = probs.reshape(-1, probs.shape[-1])
+    uniform = torch.rand(flat.shape[0], 1, generator=generator, device=flat.device, dtype=flat.dtype)
+    cumulative = flat.cumsum(dim=-1)
+    index = (cumulative < uniform * cumulative[:, -1:]).sum(dim=-1)
+    return index.clamp(max=probs.shape[-1] - 1).reshape(probs.shape[:-1])
+
+
+def _fit(rate: Tensor, like: Tensor) -> Tensor:
+    """``rate`` (B,) or () with trailing dimensions to broadcast against ``like`` (B, ...)."""
+    return rate.reshape(rate.shape + (1,) * (like.ndim - rate.ndim)) if rate.ndim else rate

@@ -1,0 +1,131 @@
+"""Discrete diffusion: rows, composition, posteriors by Bayes' rule, few steps against the whole chain."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from agents.diffusion.categorical import (
+    CATEGORICAL_KERNELS,
+    CategoricalProcess,
+    make_categorical_schedule,
+    sample_categorical,
+)
+from agents.diffusion.step_tables import StepTable
+from scene_envs.errors import InvalidInputError, UnknownNameError
+
+K, T = 5, 20
+KERNELS = sorted(CATEGORICAL_KERNELS)
+
+
+def _process(name: str, steps: int = T) -> CategoricalProcess:
+    return CategoricalProcess(make_categorical_schedule(name, steps), K)
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_rows_sum_to_one_and_rates_start_at_the_data(name: str) -> None:
+    process = _process(name)
+    for start in range(T):
+        for end in range(start + 1, T + 1):
+            matrix = process.transition(start, end)
+            assert float(matrix.min()) >= -1e-12
+            torch.testing.assert_close(matrix.sum(dim=1), torch.ones(K + 1, dtype=torch.float64))
+    assert process.schedule.keep[0] == 1
+    assert process.schedule.mask[0] == 0
+    assert bool((process.schedule.keep[1:] < 1).all())
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_strides_compose(name: str) -> None:
+    process = _process(name)
+    for middle in (1, 7, 19):
+        composed = process.transition(0, middle) @ process.transition(middle, T)
+        torch.testing.assert_close(composed, process.transition(0, T), atol=1e-12, rtol=0)
+    single = process.transition(0, 1)
+    for t in range(1, T):
+        single = single @ process.transition(t, t + 1)
+    torch.testing.assert_close(single, process.transition(0, T), atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("name", KERNELS)
+@pytest.mark.parametrize(("t", "s"), [(20, 13), (13, 5), (5, 4), (2, 1), (1, 0), (20, 0)])
+def test_the_posterior_is_bayes_rule(name: str, t: int, s: int) -> None:
+    process = _process(name)
+    generator = torch.Generator().manual_seed(0)
+    p0 = torch.rand(K, generator=generator, dtype=torch.float64)
+    p0 /= p0.sum()
+    to_s, s_to_t = process.transition(0, s)[:K], process.transition(s, t)
+    if s == 0:
+        to_s, s_to_t = torch.eye(K, K + 1, dtype=torch.float64), process.transition(0, t)
+    for state in range(K + 1):
+        likelihood = process.transition(0, t)[:K, state]
+        if not (likelihood > 0).any():
+            continue
+        expected = torch.zeros(K + 1, dtype=torch.float64)
+        weights = p0 * (likelihood > 0)
+        for x0, weight in enumerate(weights / weights.sum()):
+            if weight > 0:
+                expected += weight * to_s[x0] * s_to_t[:, state] / likelihood[x0]
+        found = process.posterior(torch.tensor([state]), p0[None], t, s)[0]
+        torch.testing.assert_close(found, expected, atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_few_steps_of_the_true_denoiser_reach_the_data_whatever_their_number(name: str) -> None:
+    """With one slot and the exact p(x_0 | x_t), the marginal of every chain is the data's distribution."""
+    process = _process(name)
+    data = torch.tensor([0.4, 0.3, 0.2, 0.1, 0.0], dtype=torch.float64)
+    start = data @ process.transition(0, T)[:K]
+    for steps in (1, 2, 5, 7, T):
+        state = start
+        table = StepTable.spaced(T, steps)
+        for t, s in zip(table.timesteps.tolist(), table.previous.tolist(), strict=True):
+            joint = data[:, None] * process.transition(0, t)[:K]  # (x_0, x_t)
+            x0_probs = (joint / joint.sum(dim=0).clamp(min=1e-30)).T  # rows x_t
+            step = process.posterior(torch.arange(K + 1), x0_probs, t, s)
+            state = state @ step
+        torch.testing.assert_close(state[:K], data, atol=1e-9, rtol=0)
+        assert float(state[K]) < 1e-9
+
+
+def test_noise_is_drawn_from_the_marginal() -> None:
+    process = _process("mask_and_replace", 100)
+    x0 = torch.full((40_000,), 2)
+    t = torch.full((40_000,), 50)
+    drawn = process.add_noise(x0, t, torch.Generator().manual_seed(0)).bincount(minlength=K + 1) / 40_000
+    expected = process.marginal(x0[:1], t[:1])[0]
+    torch.testing.assert_close(drawn, expected, atol=0.01, rtol=0)
+    torch.testing.assert_close(expected.double(), process.transition(0, 50)[2], atol=1e-6, rtol=0)
+
+
+def test_sampling_follows_probabilities_and_never_draws_impossible_ones() -> None:
+    probs = torch.tensor([0.0, 0.25, 0.0, 0.75, 0.0]).expand(8000, 5)
+    counts = sample_categorical(probs, torch.Generator().manual_seed(1)).bincount(minlength=5)
+    assert counts[[0, 2, 4]].sum() == 0
+    assert float(counts[1]) / 8000 == pytest.approx(0.25, abs=0.02)
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_the_loss_is_smallest_at_the_truth_and_gradients_are_finite(name: str) -> None:
+    process = _process(name)
+    generator = torch.Generator().manual_seed(0)
+    x0 = torch.randint(K, (16, 3), generator=generator)
+    t = torch.arange(1, 17)
+    x_t = process.add_noise(x0, t, generator)
+    logits = torch.zeros(16, 3, K, requires_grad=True)
+    loss = process.loss(x0, x_t, t, logits)
+    loss.sum().backward()
+    assert logits.grad is not None
+    assert bool(torch.isfinite(logits.grad).all())
+    sure = 50.0 * torch.nn.functional.one_hot(x0, K).float()
+    assert float(process.loss(x0, x_t, t, sure).abs().max()) < 1e-5
+    assert float(loss.detach().min()) >= 0
+    first = process.loss(x0[:1], x_t[:1], t[:1], logits[:1], auxiliary=0.0)
+    torch.testing.assert_close(first, torch.full((1, 3), K).float().log())  # -log p(x_0) at t = 1
+
+
+def test_unknown_kernels_and_too_few_levels_are_refused() -> None:
+    with pytest.raises(UnknownNameError, match="did you mean 'absorbing'"):
+        make_categorical_schedule("absorbin")
+    with pytest.raises(InvalidInputError, match="at least 2"):
+        make_categorical_schedule("uniform", 1)
