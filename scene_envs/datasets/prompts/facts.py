@@ -187,8 +187,8 @@ def _chunk(batch: SceneBatch, tolerances: Sequence[Tolerances]) -> list[list[Sce
     placed = Placed.of(shapes, scene, categories[scene, slot], translations, rotations, welded)
     axes = viewer_axes(batch.scene_type)
     positions = placed.center @ axes.T
-    points = placed.points @ axes.T
-    boxes = np.stack([points.min(axis=1), points.max(axis=1)], axis=1)
+    points = axes @ placed.points
+    boxes = np.stack([points.min(axis=-1), points.max(axis=-1)], axis=1)
     tiers = np.isfinite(shapes.tiers[placed.category]).sum(axis=1)
     contacts = Contacts.of(shapes, placed)
     parts = [slice(*np.searchsorted(scene, (row, row + 1))) for row in range(len(batch))]

@@ -31,7 +31,7 @@ class LibraryShapes:
     """Shapes of C assets as padded arrays, in asset frames, m.
 
     Attributes:
-        points: (C, V, 3) extreme points.
+        points: (C, 3, V) extreme points.
         center: (C, 3) centre of mass.
         bounds: (C, 2, 3) lowest and highest corner.
         top: (C, G, G) height of the upper side per cell; -inf where there is nothing.
@@ -75,7 +75,7 @@ def library_shapes(library: AssetLibrary) -> LibraryShapes:
     most = max(1, *(len(level) for level in levels))
     wells = np.array([_hollow(asset, m) for asset, m in zip(assets, maps, strict=True)])
     return LibraryShapes(
-        points=np.stack([np.concatenate([p, np.repeat(p[:1], size - len(p), axis=0)]) for p in points]),
+        points=np.stack([np.concatenate([p, np.repeat(p[:1], size - len(p), axis=0)]).T for p in points]),
         center=np.stack([asset.center_of_mass for asset in assets]),
         bounds=np.stack([asset.bounds for asset in assets]),
         top=np.stack([m.top for m in maps]),

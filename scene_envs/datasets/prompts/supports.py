@@ -20,7 +20,7 @@ _UPRIGHT = 0.85
 """Cosine of the tilt up to which a thing carries others."""
 _STEEPNESS = 20.0
 """Foot points lie as far out as they can, where 1 m outward is worth 1/20 m upward."""
-_DIRECTIONS = np.stack([np.cos(np.arange(8) * np.pi / 4.0), np.sin(np.arange(8) * np.pi / 4.0)])  # (2, 8)
+_DIRECTIONS = np.stack([np.cos(np.arange(8) * np.pi / 4.0), np.sin(np.arange(8) * np.pi / 4.0)], axis=1)  # (8, 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class Placed:
         rotation: (n, 3, 3) asset frame to world.
         translation: (n, 3) m.
         center: (n, 3) centre of mass, world frame, m.
-        points: (n, V, 3) extreme points, world frame, m.
+        points: (n, 3, V) extreme points, world frame, m.
         feet: (n, 9, 3) eight low points all round and their mean, m.
         fixed: (n,) bool, static or welded.
     """
@@ -58,11 +58,11 @@ class Placed:
         welded: Sequence[int] = (),
     ) -> Placed:
         """Objects from their poses."""
-        points = shapes.points[category] @ rotation.swapaxes(1, 2) + translation[:, None]
+        points = rotation @ shapes.points[category] + translation[..., None]
         center = np.einsum("nij,nj->ni", rotation, shapes.center[category]) + translation
-        height = points[..., 2] - points[..., 2].min(axis=1, keepdims=True)
-        outward = points[..., :2] @ _DIRECTIONS - _STEEPNESS * height[..., None]  # (n, V, 8)
-        feet = np.take_along_axis(points, outward.argmax(axis=1)[..., None], axis=1)
+        height = points[:, 2] - points[:, 2].min(axis=-1, keepdims=True)
+        outward = _DIRECTIONS @ points[:, :2] - _STEEPNESS * height[:, None]  # (n, 8, V)
+        feet = np.take_along_axis(points, outward.argmax(axis=-1)[:, None], axis=-1).swapaxes(1, 2)
         feet = np.concatenate([feet, feet.mean(axis=1, keepdims=True)], axis=1)
         fixed = shapes.static[category] | np.isin(category, welded)
         return cls(scene, category, rotation, translation, center, points, feet, fixed)
@@ -175,7 +175,7 @@ class Contacts:
 
 def _near_pairs(objects: Placed) -> tuple[Index, Index]:
     """(upper, lower): pairs of one scene whose boxes allow that the first rests on or in the second."""
-    low, high = objects.points.min(axis=1), objects.points.max(axis=1)
+    low, high = objects.points.min(axis=-1), objects.points.max(axis=-1)
     uppers, lowers = [], []
     starts = np.flatnonzero(np.diff(objects.scene, prepend=-1))
     for start, stop in zip(starts, np.append(starts[1:], len(objects.scene)), strict=True):

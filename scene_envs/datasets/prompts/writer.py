@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import TypeVar, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scene_envs.datasets.prompts.claims import (
     Claim,
@@ -116,7 +117,7 @@ class _Writer:
         families += [self._pair] if self._pairs else []
         families += [self._hold] if self._holds else []
         families += [self._stay] if self._stays else []
-        families += [self._aside] if self._neighbors else []
+        families += [self._aside] if len(self._neighbors) else []
         claims: list[Claim] = []
         if families:
             for _ in range(int(self.rng.integers(1, _MOST_RELATIONS + 1))):
@@ -194,16 +195,16 @@ class _Writer:
     # -- sides ----------------------------------------------------------------------------------------
 
     @cached_property
-    def _neighbors(self) -> list[tuple[int, int]]:
-        """Pairs of things that share a place."""
+    def _neighbors(self) -> NDArray[np.int64]:
+        """(P, 2) things that share a place."""
         held = self.scene.held
         place, tier = held.place, held.tier
         same = (place[:, None] == place) & (tier[:, None] == tier) & (place >= 0)
         np.fill_diagonal(same, False)
-        return [(int(i), int(j)) for i, j in np.argwhere(same)]
+        return np.argwhere(same)
 
     def _aside(self) -> Claim | None:
-        first, second = self._pick(self._neighbors)
+        first, second = self._neighbors[self.rng.integers(len(self._neighbors))].tolist()
         sides = [side for side in get_args(Side) if self._is_side(side, first, second)]
         subject, landmark = self._refer(first), self._refer(second)
         if not sides or subject is None or landmark is None:
