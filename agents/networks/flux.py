@@ -40,8 +40,9 @@ class FluxConfig:
 def timestep_embedding(value: Tensor, width: int, max_period: float = 10_000.0) -> Tensor:
     """Sinusoidal embedding (B, width) of ``value`` (B,), cosines first."""
     half = width // 2
-    frequency = torch.exp(-math.log(max_period) * torch.arange(half, device=value.device) / half)
-    angle = value.float()[:, None] * frequency[None]
+    value = value if value.is_floating_point() else value.float()
+    frequency = torch.exp(-math.log(max_period) * torch.arange(half, device=value.device, dtype=value.dtype) / half)
+    angle = value[:, None] * frequency[None]
     return torch.cat([angle.cos(), angle.sin()], dim=-1)
 
 
@@ -61,13 +62,13 @@ class SingleStreamBlock(nn.Module):
         nn.init.zeros_(self.modulation.weight)
         nn.init.zeros_(self.modulation.bias)
 
-    def forward(self, tokens: Tensor, condition: Tensor) -> Tensor:
-        """Tokens (B, N, H) and condition (B, H) to tokens (B, N, H)."""
+    def forward(self, tokens: Tensor, condition: Tensor, mask: Tensor | None = None) -> Tensor:
+        """Tokens (B, N, H) and condition (B, H) to tokens (B, N, H); ``mask`` (B, 1, 1, N) is True where to attend."""
         shift, scale, gate = self.modulation(F.silu(condition)).unsqueeze(1).chunk(3, dim=-1)
         x = (1 + scale) * F.layer_norm(tokens, (self.hidden,), eps=1e-6) + shift
         qkv, mlp = self.linear1(x).split([3 * self.hidden, self.mlp_hidden], dim=-1)
         query, key, value = qkv.unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        attended = F.scaled_dot_product_attention(self.query_norm(query), self.key_norm(key), value)
+        attended = F.scaled_dot_product_attention(self.query_norm(query), self.key_norm(key), value, attn_mask=mask)
         attended = attended.transpose(1, 2).flatten(-2)
         return tokens + gate * self.linear2(torch.cat([attended, F.gelu(mlp, approximate="tanh")], dim=-1))
 

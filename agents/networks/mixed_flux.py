@@ -1,0 +1,220 @@
+"""The Flux-style transformer of the paper on mixed scenes: poses and categories in, pose output and logits out.
+
+Text tokens, when there are any, meet the slots in double-stream blocks, which have weights of their own for each
+stream, and join them in single-stream blocks (Flux; Esser et al. 2024; Pfaff et al., CoRL 2025, appendix).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from agents.networks.flux import SingleStreamBlock, timestep_embedding
+from scene_envs.errors import InvalidInputError
+
+POSE = 12
+"""Numbers of a pose: translation and rotation matrix."""
+_TIME_WIDTH = 256
+
+
+@dataclass(frozen=True)
+class MixedFluxConfig:
+    """Size of a :class:`MixedFlux`.
+
+    Attributes:
+        categories: K = C + 1, assets and *empty*; the mask token is one more.
+        hidden: width of the token streams; a multiple of ``heads``.
+        double_blocks: blocks in which text and slots have weights of their own; used only with text.
+        single_blocks: blocks on text and slots together.
+        heads: attention heads.
+        mlp_ratio: width of the MLPs over ``hidden``.
+        embedding: width of the embedding of a slot, and of what leaves the last layer.
+        pose_head: hidden width of the pose output.
+        text_width: width of the text tokens; 0 for none.
+        frequencies: octaves of Fourier features of each translation, damped by the noise (0: none, as the paper).
+        time_scale: what timesteps are multiplied by before they are embedded.
+    """
+
+    categories: int
+    hidden: int = 128
+    double_blocks: int = 2
+    single_blocks: int = 4
+    heads: int = 4
+    mlp_ratio: float = 4.0
+    embedding: int = 128
+    pose_head: int = 64
+    text_width: int = 0
+    frequencies: int = 8
+    time_scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.hidden % self.heads:
+            raise InvalidInputError(f"hidden={self.hidden} is not a multiple of heads={self.heads}")
+
+    @classmethod
+    def paper(cls, categories: int, text_width: int = 768) -> MixedFluxConfig:
+        """The size and the details of the paper: 88.3 M parameters with text."""
+        return cls(categories, 512, 5, 10, 16, 4.0, 256, POSE, text_width, 0, 1000.0)
+
+
+class DoubleStreamBlock(nn.Module):
+    """Joint attention of two streams with their own projections, norms and MLPs, gated by the condition."""
+
+    def __init__(self, hidden: int, heads: int, mlp_ratio: float) -> None:
+        super().__init__()
+        self.text = _Stream(hidden, heads, mlp_ratio)
+        self.scene = _Stream(hidden, heads, mlp_ratio)
+
+    def forward(self, scene: Tensor, text: Tensor, condition: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Slots (B, N, H) and text (B, L, H) to the same; ``mask`` (B, 1, 1, L + N) is True where to attend."""
+        scene, text = scene + self.scene.modality, text + self.text.modality
+        rates = [stream.rates(condition) for stream in (self.text, self.scene)]
+        parts = [s.heads_of(x, r) for s, x, r in zip((self.text, self.scene), (text, scene), rates, strict=True)]
+        query, key, value = (torch.cat(pair, dim=2) for pair in zip(*parts, strict=True))
+        attended = F.scaled_dot_product_attention(query, key, value, attn_mask=mask).transpose(1, 2).flatten(-2)
+        count = text.shape[1]
+        return (
+            self.scene.finish(scene, attended[:, count:], rates[1]),
+            self.text.finish(text, attended[:, :count], rates[0]),
+        )
+
+
+class _Stream(nn.Module):
+    """One side of a double-stream block."""
+
+    def __init__(self, hidden: int, heads: int, mlp_ratio: float) -> None:
+        super().__init__()
+        self.hidden, self.heads = hidden, heads
+        self.modality = nn.Parameter(torch.zeros(1, 1, hidden))
+        self.modulation = nn.Linear(hidden, 6 * hidden)
+        self.qkv = nn.Linear(hidden, 3 * hidden)
+        self.query_norm = nn.RMSNorm(hidden // heads, eps=1e-6)
+        self.key_norm = nn.RMSNorm(hidden // heads, eps=1e-6)
+        self.out = nn.Linear(hidden, hidden)
+        wide = int(hidden * mlp_ratio)
+        self.mlp = nn.Sequential(nn.Linear(hidden, wide), nn.GELU(approximate="tanh"), nn.Linear(wide, hidden))
+        nn.init.zeros_(self.modulation.weight)
+        nn.init.zeros_(self.modulation.bias)
+
+    def rates(self, condition: Tensor) -> tuple[Tensor, ...]:
+        """Shift, scale and gate of the attention, then of the MLP, (B, 1, H) each."""
+        return self.modulation(F.silu(condition)).unsqueeze(1).chunk(6, dim=-1)  # type: ignore[no-any-return]
+
+    def heads_of(self, x: Tensor, rates: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, Tensor]:
+        """Query, key and value (B, heads, N, width)."""
+        x = (1 + rates[1]) * F.layer_norm(x, (self.hidden,), eps=1e-6) + rates[0]
+        query, key, value = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        return self.query_norm(query), self.key_norm(key), value
+
+    def finish(self, x: Tensor, attended: Tensor, rates: tuple[Tensor, ...]) -> Tensor:
+        """The two gated residuals."""
+        x = x + rates[2] * self.out(attended)
+        inner = (1 + rates[4]) * F.layer_norm(x, (self.hidden,), eps=1e-6) + rates[3]
+        result: Tensor = x + rates[5] * self.mlp(inner)
+        return result
+
+
+class MixedFlux(nn.Module):
+    """Poses (B, N, 12) and category states (B, N) to a pose output (B, N, 12) and logits (B, N, K).
+
+    Permutation-equivariant in the slots. Padding of the text is masked, so it changes nothing.
+
+    >>> network = MixedFlux(MixedFluxConfig(categories=8, hidden=32, heads=2, text_width=16, frequencies=0))
+    >>> pose, states = torch.randn(2, 5, 12), torch.randint(9, (2, 5))
+    >>> out, logits = network(pose, states, torch.tensor([3.0, 7.0]), text=torch.randn(2, 4, 16))
+    >>> out.shape, logits.shape
+    (torch.Size([2, 5, 12]), torch.Size([2, 5, 8]))
+    """
+
+    def __init__(self, config: MixedFluxConfig) -> None:
+        super().__init__()
+        self.config = config
+        hidden, width = config.hidden, config.embedding
+        self.pose_in = nn.Sequential(
+            nn.Linear(POSE + 6 * config.frequencies, width), nn.SiLU(), nn.Linear(width, width)
+        )
+        self.category_in = nn.Embedding(config.categories + 1, width)
+        self.scene_in = nn.Linear(width, hidden)
+        self.time_in = nn.Sequential(nn.Linear(_TIME_WIDTH, hidden), nn.SiLU(), nn.Linear(hidden, hidden))
+        self.text_in = nn.Linear(config.text_width, hidden) if config.text_width else None
+        doubles = config.double_blocks if config.text_width else 0
+        self.double_blocks = nn.ModuleList(
+            DoubleStreamBlock(hidden, config.heads, config.mlp_ratio) for _ in range(doubles)
+        )
+        self.single_blocks = nn.ModuleList(
+            SingleStreamBlock(hidden, config.heads, config.mlp_ratio) for _ in range(config.single_blocks)
+        )
+        self.final_modulation = nn.Linear(hidden, 2 * hidden)
+        self.final = nn.Linear(hidden, width)
+        self.pose_out = nn.Sequential(nn.Linear(width, config.pose_head), nn.SiLU(), nn.Linear(config.pose_head, POSE))
+        self.logits_out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, config.categories))
+        for layer in (self.final_modulation, self.pose_out[-1], self.logits_out[-1]):
+            for parameter in layer.parameters():
+                nn.init.zeros_(parameter)
+        octaves = math.pi * 2.0 ** torch.arange(config.frequencies, dtype=torch.float32)
+        self.octaves: Tensor
+        self.register_buffer("octaves", octaves, persistent=False)
+
+    def forward(
+        self,
+        pose: Tensor,
+        states: Tensor,
+        time: Tensor,
+        *,
+        text: Tensor | None = None,
+        text_mask: Tensor | None = None,
+        position: Tensor | None = None,
+        noise_level: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Predict.
+
+        Args:
+            pose: (B, N, 12) noisy poses, as the process scales them.
+            states: (B, N) int64 in 0..K, K being the mask token.
+            time: (B,) what is embedded, times ``time_scale``: a timestep or a log noise level.
+            text: (B, L, W) text tokens; None for no text, which needs no double-stream blocks.
+            text_mask: (B, L) bool, True for real tokens.
+            position: (B, N, 3) translations in signal units, for the Fourier features.
+            noise_level: (B,) noise-to-signal ratio of ``position``.
+
+        Returns:
+            pose output (B, N, 12) and logits (B, N, K) of the clean category.
+        """
+        condition = self.time_in(_embed(time * self.config.time_scale, pose.dtype))
+        scene = self.scene_in(self.pose_in(self._pose_features(pose, position, noise_level)) + self.category_in(states))
+        count, mask = 0, None
+        if self.text_in is not None:
+            if text is None:
+                text = pose.new_zeros(pose.shape[0], 1, self.config.text_width)
+            words = self.text_in(text)
+            count = words.shape[1]
+            if text_mask is not None:
+                everywhere = text_mask.new_ones(pose.shape[:2])
+                mask = torch.cat([text_mask, everywhere], dim=1)[:, None, None]
+            for block in self.double_blocks:
+                scene, words = block(scene, words, condition, mask)
+            scene = torch.cat([words, scene], dim=1)
+        for block in self.single_blocks:
+            scene = block(scene, condition, mask)
+        scene = scene[:, count:]
+        shift, scale = self.final_modulation(F.silu(condition)).unsqueeze(1).chunk(2, dim=-1)
+        features = self.final((1 + scale) * F.layer_norm(scene, (self.config.hidden,), eps=1e-6) + shift)
+        return self.pose_out(features), self.logits_out(features)
+
+    def _pose_features(self, pose: Tensor, position: Tensor | None, noise_level: Tensor | None) -> Tensor:
+        if not self.config.frequencies:
+            return pose
+        if position is None or noise_level is None:
+            raise InvalidInputError("a network with Fourier features needs position= and noise_level=")
+        angle = position[..., None] * self.octaves  # (B, N, 3, F)
+        damping = torch.exp(-0.5 * (self.octaves * noise_level[:, None]) ** 2)[:, None, None]  # (B, 1, 1, F)
+        return torch.cat([pose, (angle.sin() * damping).flatten(-2), (angle.cos() * damping).flatten(-2)], dim=-1)
+
+
+def _embed(time: Tensor, dtype: torch.dtype) -> Tensor:
+    """(B, 256) sinusoidal embedding of (B,) values, cosines first."""
+    return timestep_embedding(time, _TIME_WIDTH).to(dtype)
