@@ -3,13 +3,31 @@
 from scene_envs.assets.recipes import (
     bowls,
     breakfast_ware,
+    cutlery,
     drinks,
     fruit,
     furniture,
+    games,
     groceries,
     plates,
+    shelf,
     steamers,
     teaware,
+    toys,
 )
 
-__all__ = ["bowls", "breakfast_ware", "drinks", "fruit", "furniture", "groceries", "plates", "steamers", "teaware"]
+__all__ = [
+    "bowls",
+    "breakfast_ware",
+    "cutlery",
+    "drinks",
+    "fruit",
+    "furniture",
+    "games",
+    "groceries",
+    "plates",
+    "shelf",
+    "steamers",
+    "teaware",
+    "toys",
+]

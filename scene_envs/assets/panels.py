@@ -1,0 +1,139 @@
+"""More coloured surfaces: boxes with patterns on their faces, lofts through sections, and meshes moved about.
+
+A pattern is a list of patches; the face is cut along their edges, so nothing overlaps and nothing flickers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike
+
+from scene_envs.assets.base import Array
+from scene_envs.assets.surfaces import Color, join, surface
+
+Face = Literal["-x", "+x", "-y", "+y", "bottom", "top"]
+FACES: tuple[Face, ...] = ("-x", "+x", "-y", "+y", "bottom", "top")
+
+
+class Patch(NamedTuple):
+    """A coloured rectangle on a face, in fractions of its width and height as seen from outside."""
+
+    left: float
+    low: float
+    right: float
+    high: float
+    color: Color
+
+
+def painted_face(
+    corner: ArrayLike, along: ArrayLike, up: ArrayLike, color: Color, patches: Sequence[Patch] = ()
+) -> trimesh.Trimesh:
+    """A rectangle with patches on it; later patches cover earlier ones.
+
+    Args:
+        corner: (3,) m, the lower left corner.
+        along: (3,) m, from there to the lower right corner.
+        up: (3,) m, from there to the upper left corner; ``along x up`` points outward.
+        color: the ground.
+        patches: what is painted on it.
+    """
+    start, right, rise = (np.asarray(v, dtype=np.float64) for v in (corner, along, up))
+    across = np.unique(np.clip([0.0, 1.0, *(e for p in patches for e in (p.left, p.right))], 0.0, 1.0))
+    upward = np.unique(np.clip([0.0, 1.0, *(e for p in patches for e in (p.low, p.high))], 0.0, 1.0))
+    u, v = 0.5 * (across[1:] + across[:-1]), 0.5 * (upward[1:] + upward[:-1])
+    palette = [color, *(patch.color for patch in patches)]
+    owner = np.zeros((len(u), len(v)), dtype=int)
+    for index, patch in enumerate(patches, start=1):
+        inside = ((u > patch.left) & (u < patch.right))[:, None] & ((v > patch.low) & (v < patch.high))[None]
+        owner[inside] = index
+    normal = np.cross(right, rise)
+    normal /= np.linalg.norm(normal)
+    meshes = []
+    for index in np.unique(owner):
+        i, j = np.nonzero(owner == index)
+        ends = np.stack([(across[i + a], upward[j + b]) for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))])  # (4, 2, cells)
+        corners = start + ends[:, 0, :, None] * right + ends[:, 1, :, None] * rise  # (4, cells, 3)
+        first = 4 * np.arange(len(i))[:, None]
+        faces = np.concatenate([first + [0, 1, 2], first + [0, 2, 3]])
+        vertices = corners.transpose(1, 0, 2).reshape(-1, 3)
+        meshes.append(surface(vertices, faces, palette[index], np.tile(normal, (len(vertices), 1))))
+    return join(*meshes)
+
+
+def painted_box(
+    size: tuple[float, float, float],
+    color: Color | Mapping[Face, Color],
+    art: Mapping[Face, Sequence[Patch]] | None = None,
+    *,
+    base: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    front: Literal["-y", "+x"] = "-y",
+) -> trimesh.Trimesh:
+    """An axis-aligned box with a colour, and perhaps a pattern, per face.
+
+    Args:
+        size: (x, y, z) m.
+        color: one colour, or one per face (all six).
+        art: patches per face.
+        base: centre of the bottom face, m.
+        front: the side from which the top is seen upright.
+    """
+    colors = color if isinstance(color, Mapping) else dict.fromkeys(FACES, color)
+    x, y, z = np.diag(np.asarray(size, dtype=np.float64))
+    low = np.asarray(base, dtype=np.float64) - 0.5 * (x + y)
+    frames: dict[Face, tuple[Array, Array, Array]] = {
+        "-x": (low + y, -y, z),
+        "+x": (low + x, y, z),
+        "-y": (low, x, z),
+        "+y": (low + x + y, -x, z),
+        "bottom": (low + y, x, -y),
+        "top": (low + z, x, y) if front == "-y" else (low + x + z, y, -x),
+    }
+    patterns = art or {}
+    return join(*(painted_face(*frames[face], colors[face], patterns.get(face, ())) for face in FACES))
+
+
+def lettering(
+    left: float, low: float, right: float, high: float, color: Color, widths: Sequence[float] = (1.0,) * 6
+) -> list[Patch]:
+    """Patches that look like a line of large letters: bars of these relative widths with gaps between."""
+    gap = 0.34
+    total = sum(widths) + gap * (len(widths) - 1)
+    patches, x = [], left
+    for width in widths:
+        step = (right - left) / total
+        patches.append(Patch(x, low, x + width * step, high, color))
+        x += (width + gap) * step
+    return patches
+
+
+def loft(sections: ArrayLike, color: Color) -> trimesh.Trimesh:
+    """A smooth skin through P sections of K points each (P, K, 3), m, with flat caps at both ends.
+
+    The points run counter-clockwise when seen from the last section looking back at the first.
+    """
+    grid = np.asarray(sections, dtype=np.float64)
+    count, around = grid.shape[:2]
+    index = np.arange(count * around).reshape(count, around)
+    a, b = index[:-1], np.roll(index[:-1], -1, axis=1)
+    d, c = index[1:], np.roll(index[1:], -1, axis=1)
+    faces = np.concatenate([np.stack([a, b, c], axis=-1).reshape(-1, 3), np.stack([a, c, d], axis=-1).reshape(-1, 3)])
+    fan = np.stack([np.zeros(around - 2, int), np.arange(1, around - 1), np.arange(2, around)], axis=1)
+    skin = surface(grid.reshape(-1, 3), faces, color)
+    return join(skin, surface(grid[0], fan[:, ::-1], color), surface(grid[-1], fan, color))
+
+
+def moved(mesh: trimesh.Trimesh, rotation: ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> trimesh.Trimesh:
+    """The mesh at another pose: rotation (3, 3), then translation (3,) m; colours are kept."""
+    turn = np.asarray(rotation, dtype=np.float64)
+    visual = mesh.visual
+    return trimesh.Trimesh(
+        vertices=mesh.vertices @ turn.T + np.asarray(translation),
+        faces=mesh.faces,
+        vertex_normals=mesh.vertex_normals @ turn.T,
+        vertex_colors=visual.vertex_colors,  # type: ignore[union-attr]
+        process=False,
+    )

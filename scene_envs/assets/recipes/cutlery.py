@@ -1,0 +1,148 @@
+"""Cutlery, lying on two flat feet: the end of the handle (toward -x) and the head (toward +x)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import trimesh
+
+from scene_envs.assets.base import Array, ConvexPart
+from scene_envs.assets.library import Model, asset_recipe
+from scene_envs.assets.panels import loft
+from scene_envs.assets.shapes import circle, convex_hull, hull_of
+from scene_envs.assets.surfaces import Color, join, surface
+
+_STEEL: Color = (196, 200, 207)
+_BRIGHT: Color = (222, 226, 231)
+_SHADE: Color = (168, 173, 182)
+_THICK = 0.0034
+"""m; thinner metal would vanish when engines shrink hulls by 1 mm."""
+
+Station = tuple[float, float, float, float]
+"""(x, width, lowest z, highest z) of a section across the length, m."""
+
+
+def _section(station: Station, y: float = 0.0) -> Array:
+    x, width, low, high = station
+    return np.array([[x, y + side * width, z] for side in (-0.5, 0.5) for z in (low, high)])
+
+
+def _beam(stations: Sequence[Station], y: float = 0.0) -> list[ConvexPart]:
+    """One part between each two neighbouring stations; they share their end faces."""
+    return [convex_hull(np.concatenate([_section(a, y), _section(b, y)])) for a, b in pairwise(stations)]
+
+
+def _skin(stations: Sequence[Station], color: Color, y: float = 0.0, samples: int = 24) -> trimesh.Trimesh:
+    """A rounded bar through the stations, y = 0 in its middle."""
+    from scipy.interpolate import PchipInterpolator
+
+    table = np.array(stations)
+    x = np.linspace(table[0, 0], table[-1, 0], samples)
+    width, low, high = PchipInterpolator(table[:, 0], table[:, 1:])(x).T
+    angles = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False) + np.pi / 16
+    ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    ring = np.sign(ring) * np.abs(ring) ** 0.6  # between an ellipse and a rectangle
+    ring /= np.abs(ring).max(axis=0)
+    sides = y + 0.5 * width[:, None] * ring[:, 0]
+    heights = 0.5 * (low + high)[:, None] + 0.5 * (high - low)[:, None] * ring[:, 1]
+    return loft(np.stack([np.broadcast_to(x[:, None], sides.shape), sides, heights], axis=-1), color)
+
+
+@asset_recipe("fork", display_name="fork", mass=0.03, color=(92, 108, 132))
+def fork() -> Model:
+    """A fork with three tines, 0.19 m long."""
+    end: Station = (-0.095, 0.017, 0.0, _THICK)
+    waist: Station = (-0.035, 0.011, 0.0, _THICK)
+    neck: Station = (0.030, 0.008, 0.012 - _THICK, 0.012)
+    foot, root = (0.046, 0.025, 0.0, 0.0036), (0.058, 0.025, 0.0, 0.0036)
+    tip = (0.095, 0.0036, 0.0028, 0.0062)
+    handle, stem = _beam([end, waist, neck])
+    head = convex_hull(np.concatenate([_section(neck), _section(foot), _section(root)]))
+    rows = (-0.0102, 0.0, 0.0102)
+    tines = [_beam([(root[0], 0.0046, 0.0, 0.0036), tip], y)[0] for y in rows]
+    shoulder = (0.040, 0.020, 0.0035, 0.0078)
+    visual = join(
+        _skin([end, (-0.07, 0.016, 0.0, _THICK), waist, (0.0, 0.008, 0.0042, 0.0076), neck], _STEEL),
+        _skin([neck, shoulder, (0.047, 0.0248, 0.0006, 0.0042), root], _STEEL, samples=12),
+        *(
+            _skin([(root[0], 0.0046, 0.0, 0.0036), (0.078, 0.0042, 0.0004, 0.0036), tip], _BRIGHT, y, samples=8)
+            for y in rows
+        ),
+    )
+    return Model(visual, [handle, stem, head, *tines], [hull_of([handle, stem]), hull_of([head, *tines])])
+
+
+@asset_recipe("knife", display_name="knife", plural="knives", mass=0.05, color=(58, 70, 92))
+def knife() -> Model:
+    """A table knife lying on its side, 0.22 m long; the edge of the blade faces -y."""
+    end, bolster = (-0.110, 0.018, 0.0, 0.008), (-0.005, 0.014, 0.0, 0.0065)
+    outline = np.array([(-0.005, -0.0068), (0.045, -0.0100), (0.080, -0.0098), (0.100, -0.0060), (0.110, 0.0035),
+                        (0.108, 0.0085), (0.090, 0.0100), (-0.005, 0.0068)])  # fmt: skip
+    handle = _beam([end, bolster])[0]
+    blade = convex_hull([(x, y, z) for x, y in outline for z in (0.0, _THICK)])
+    low, high = (np.column_stack([outline, np.full(len(outline), z)]) for z in (0.0, 0.0026))
+    inner = outline * [1.0, 1.0] + np.where(outline[:, 1:] < 0.0, [[0.0, 0.0030]], [[0.0, 0.0]])
+    flat = np.column_stack([inner, np.full(len(inner), _THICK)])
+    visual = join(
+        _skin([end, (-0.108, 0.018, 0.0, 0.008), (-0.03, 0.0145, 0.0, 0.0072), bolster], _STEEL),
+        _prism(low, high, _SHADE),
+        _prism(high, flat, _BRIGHT),
+    )
+    return Model(visual, [handle, blade], [hull_of([handle, blade])])
+
+
+def _prism(low: Array, high: Array, color: Color) -> trimesh.Trimesh:
+    """A sharp-edged skin between two outlines (K, 3), counter-clockwise from above, with its lid."""
+    count = len(low)
+    quads = np.stack([low, np.roll(low, -1, axis=0), np.roll(high, -1, axis=0), high], axis=1)
+    first = 4 * np.arange(count)[:, None]
+    sides = surface(quads.reshape(-1, 3), np.concatenate([first + [0, 1, 2], first + [0, 2, 3]]), color)
+    fan = np.stack([np.zeros(count - 2, int), np.arange(1, count - 1), np.arange(2, count)], axis=1)
+    return join(sides, surface(high, fan, color), surface(low, fan[:, ::-1], color))
+
+
+@asset_recipe("dinner_spoon", display_name="spoon", mass=0.035, color=(128, 150, 178))
+def dinner_spoon() -> Model:
+    """A table spoon, 0.19 m long."""
+    return _spoon(0.19, 0.042, 0.015)
+
+
+@asset_recipe("teaspoon", display_name="spoon", mass=0.02, color=(168, 190, 214))
+def teaspoon() -> Model:
+    """A small spoon, 0.155 m long."""
+    return _spoon(0.155, 0.032, 0.013)
+
+
+def _spoon(length: float, width: float, height: float) -> Model:
+    """Handle, stem and a bowl that is filled for physics; all sizes in m."""
+    half, reach, front = 0.5 * length, 0.34 * length, 0.60 * height
+    end = (-half, 0.40 * width, 0.0, _THICK)
+    waist = (-0.20 * length, 0.26 * width, 0.0, _THICK)
+    neck = (half - reach, 0.18 * width, height - _THICK, height)
+    handle, stem = _beam([end, waist, neck])
+    center, size = half - 0.5 * reach, np.array([0.5 * reach, 0.5 * width])
+
+    def at(outline: Array, scale: float, drop: float) -> Array:
+        """Outline (K, 2) in the unit circle to (K, 3): ``drop`` 0 is the sloping rim, 1 the table."""
+        flat = np.array([center, 0.0]) + scale * outline * size
+        rim = height - (height - front) * (flat[:, 0] - (half - reach)) / reach
+        return np.column_stack([flat, rim * (1.0 - drop)])
+
+    bowl = convex_hull(np.concatenate([_section(neck), at(circle(12), 1.0, 0.0), at(circle(8), 0.45, 1.0)]))
+    unit = circle(28)
+    outside = [
+        at(unit, scale, drop) for scale, drop in ((0.45, 1.0), (0.70, 0.80), (0.88, 0.50), (0.97, 0.2), (1.0, 0.0))
+    ]
+    inside = [
+        at(unit, scale, drop) for scale, drop in ((0.94, 0.0), (0.86, 0.26), (0.66, 0.53), (0.4, 0.66), (0.05, 0.7))
+    ]
+    visual = join(
+        _skin([end, (-0.42 * length, 0.38 * width, 0.0, _THICK), waist, (0.0, 0.19 * width, 0.3 * height, 0.3 * height + _THICK), neck,
+               (neck[0] + 0.004, 0.22 * width, height - _THICK, height)], _STEEL),
+        loft(outside, _STEEL),
+        loft([outside[-1], inside[0]], _BRIGHT),
+        loft(inside, _SHADE),
+    )  # fmt: skip
+    return Model(visual, [handle, stem, bowl], [hull_of([handle, stem]), bowl])
