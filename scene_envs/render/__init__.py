@@ -1,7 +1,8 @@
-"""Pictures of scenes, drawn in software."""
+"""Pictures of scenes, drawn in software, and a viewer for browsers."""
 
 from scene_envs.render.cameras import picture_camera
 from scene_envs.render.galleries import gallery
 from scene_envs.render.pictures import render
+from scene_envs.render.viewer import write_viewer
 
-__all__ = ["gallery", "picture_camera", "render"]
+__all__ = ["gallery", "picture_camera", "render", "write_viewer"]

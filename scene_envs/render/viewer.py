@@ -1,0 +1,183 @@
+"""A page that shows scenes in any browser: one HTML file that needs nothing else."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import os
+import re
+from collections.abc import Sequence
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from scene_envs.assets import Asset, ConvexPart
+from scene_envs.errors import InvalidInputError
+from scene_envs.render.framing import Framing, frame_scene_type
+from scene_envs.render.stage import vertex_colors
+from scene_envs.rotations import matrix_to_quaternion
+from scene_envs.scene import SceneBatch
+
+_SCRIPTS = ("math.js", "decode.js", "shaders.js", "targets.js", "renderer.js", "controls.js", "app.js")
+_FOV = 28.0
+_STEPS = 65535
+"""Positions of vertices are whole numbers up to this in the bounding box of their mesh."""
+_CONTACT, _TABLE = 0.05, 0.68
+"""Reach (m) of contact shading on a workspace of this radius (m)."""
+
+
+def write_viewer(
+    batch: SceneBatch,
+    path: str | os.PathLike[str],
+    *,
+    captions: Sequence[str] | None = None,
+    title: str | None = None,
+) -> Path:
+    """Write scenes as one HTML file that any browser with WebGL 2 draws, without a network.
+
+    The geometry of each used asset is embedded once, the scenes as poses. ``#scene=3&azimuth=-60&elevation=30`` behind
+    the address opens a scene (counted from 0) from a direction (degrees); the page keeps its address up to date.
+
+    Args:
+        batch: B scenes, at least one.
+        path: the file to write; its folder is made.
+        captions: one line per scene; the number of objects by default.
+        title: heading of the page; the name of the scene type by default.
+
+    Returns:
+        The path.
+
+    Raises:
+        InvalidInputError: no scenes, or another number of captions.
+    """
+    if len(batch) == 0:
+        raise InvalidInputError("a viewer needs at least one scene; the batch is empty")
+    if captions is None:
+        captions = [f"{count} object{'s' if count != 1 else ''}" for count in batch.counts.tolist()]
+    if len(captions) != len(batch):
+        raise InvalidInputError(f"{len(batch)} scenes need {len(batch)} captions, got {len(captions)}")
+    title = batch.scene_type.name.replace("_", " ") if title is None else title
+    page = _page(title, _viewer_data(batch, captions))
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(page, encoding="utf-8")
+    os.replace(partial, path)
+    return path
+
+
+def _page(title: str, data: dict[str, Any]) -> str:
+    """The template with everything filled in; nothing in the data can end the element that holds it."""
+    parts = {
+        "TITLE": html.escape(title),
+        "STYLE": _web("viewer.css"),
+        "SCRIPTS": "\n".join(_web(name) for name in _SCRIPTS),
+        "DATA": json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
+    }
+    return re.sub(r"@@([A-Z]+)@@", lambda found: parts[found[1]], _web("viewer.html"))
+
+
+@cache
+def _web(name: str) -> str:
+    return resources.files("scene_envs.render.web").joinpath(name).read_text(encoding="utf-8")
+
+
+def _viewer_data(batch: SceneBatch, captions: Sequence[str]) -> dict[str, Any]:
+    """What the page draws: assets in use, scenes, and how to look at them."""
+    scene_type = batch.scene_type
+    categories = batch.categories.cpu().numpy()
+    used = np.unique(categories[categories < scene_type.num_assets])
+    index_of = np.zeros(scene_type.num_assets + 1, dtype=np.uint16)
+    index_of[used] = np.arange(len(used))
+    rotations = torch.where(batch.is_empty[..., None, None], torch.eye(3).to(batch.rotations), batch.rotations)
+    quaternions = matrix_to_quaternion(rotations.detach().cpu().double()).float()
+    poses = torch.cat([batch.translations.detach().cpu(), quaternions], dim=-1).numpy()  # (B, N, 7)
+    scenes = []
+    for row, pose, caption in zip(categories, poses, captions, strict=True):
+        (slots,) = np.nonzero(row < scene_type.num_assets)
+        scenes.append(
+            {
+                "caption": str(caption),
+                "assets": _text(index_of[row[slots]]),
+                "slots": _text(slots.astype(np.uint16)),
+                "poses": _text(pose[slots].astype(np.float32)),
+            }
+        )
+    library = scene_type.library
+    assets = [_asset(library[int(c)], library[int(c)].name in scene_type.welded) for c in used]
+    return {"assets": assets, "scenes": scenes, "view": _view(frame_scene_type(scene_type))}
+
+
+def _asset(asset: Asset, welded: bool) -> dict[str, Any]:
+    mesh = asset.visual
+    small = len(mesh.vertices) <= _STEPS
+    return {
+        "name": asset.name,
+        "label": asset.display_name,
+        "color": list(asset.color),
+        "welded": welded,
+        "visual": {
+            **_positions(np.asarray(mesh.vertices)),
+            "normal": _text(np.rint(127.0 * np.asarray(mesh.vertex_normals)).astype(np.int8)),
+            "color": _text(vertex_colors(asset)),
+            "index": _text(np.asarray(mesh.faces).astype(np.uint16 if small else np.uint32)),
+        },
+        "fine": _parts(asset.fine),
+        "coarse": _parts(asset.coarse),
+    }
+
+
+def _parts(parts: Sequence[ConvexPart]) -> dict[str, Any]:
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
+    if starts[-1] > _STEPS:
+        raise InvalidInputError(f"convex parts with {starts[-1]} vertices; the viewer shows up to {_STEPS} per asset")
+    return {
+        **_positions(np.concatenate([part.vertices for part in parts])),
+        "index": _text(faces.astype(np.uint16)),
+        "faces": [len(part.faces) for part in parts],
+    }
+
+
+def _positions(vertices: NDArray[np.float64]) -> dict[str, Any]:
+    """Quantised to the bounding box: 4 um in a steamer, 0.15 mm in a floor of 10 m."""
+    low = vertices.min(axis=0)
+    size = np.maximum(vertices.max(axis=0) - low, 1e-9)
+    steps = np.rint((vertices - low) / size * _STEPS).astype(np.uint16)
+    return {"low": low.tolist(), "size": size.tolist(), "position": _text(steps)}
+
+
+def _view(framing: Framing) -> dict[str, Any]:
+    x, y, z = framing.to_camera.tolist()
+    return {
+        "points": _outermost(framing.points).round(4).tolist(),
+        "azimuth": float(np.degrees(np.arctan2(y, x))),
+        "elevation": float(np.degrees(np.arcsin(z))),
+        "fov": _FOV,
+        "light": framing.to_light.tolist(),
+        "center": framing.center.tolist(),
+        "radius": framing.radius,
+        "ground": framing.ground,
+        "contact": float(_CONTACT * np.sqrt(framing.radius / _TABLE)),
+    }
+
+
+def _outermost(points: NDArray[np.float64], directions: int = 200) -> NDArray[np.float64]:
+    """The points that are farthest in some of many directions: enough to fit a view to."""
+    step = np.arange(directions) + 0.5
+    z, angle = 1.0 - 2.0 * step / directions, step * np.pi * (3.0 - np.sqrt(5.0))
+    r = np.sqrt(1.0 - z**2)
+    sphere = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
+    return points[np.unique((points @ sphere.T).argmax(axis=0))]
+
+
+def _text(values: NDArray[Any]) -> str:
+    """Little-endian bytes as base64."""
+    little = np.ascontiguousarray(values).astype(values.dtype.newbyteorder("<"))
+    return base64.b64encode(little.tobytes()).decode("ascii")
