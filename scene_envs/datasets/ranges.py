@@ -9,10 +9,10 @@ from torch import Tensor
 from scene_envs.grammars import Grammar
 from scene_envs.normalizer import Normalizer
 
-_OBJECTS = 20_000
+_OBJECTS = 10_000
 """Objects the sample holds at least, unless that takes more than ``_SCENES``."""
 _SCENES = 4096
-_STEP = 256
+_STEP = 128
 _SEED = 20_250_101
 _UPRIGHT = 1e-6
 """A rotation entry that tells of tilt counts as zero below this."""
@@ -25,7 +25,7 @@ _PLANE = [3, 4, 6, 7]
 def fixed_normalizer(grammar: Grammar) -> Normalizer:
     """The normalizer of a grammar's scenes, a function of the grammar alone.
 
-    What varies is read off a sample of unverified scenes, empty slots included: at least 20,000 objects, or 4,096
+    What varies is read off a sample of unverified scenes, empty slots included: at least 10,000 objects, or 4,096
     scenes. x and y take the workspace's range, z and one-hots the sample's. Rotations: if any object of the sample is
     tilted, all nine entries take [-1, 1]; if objects only turn about z, the four entries that tell of tilt are
     constant (they come back exactly) and the four of the turn take [-1, 1] each if they vary.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -45,7 +46,7 @@ def run_ray(jobs: Sequence[Job], work: Work, workers: int, address: str | None, 
     with _cluster(ray, workers, address):
         queue = Queue(actor_options={"num_cpus": 0})
         task = ray.remote(num_cpus=1, max_retries=3)(_ray_shard)
-        payload = ray.put(ray.cloudpickle.dumps(work))
+        payload = ray.put(pickle.dumps((sys.path, ray.cloudpickle.dumps(work))))
         limit = 2 * max(1, int(ray.cluster_resources().get("CPU", 1)))
         waiting = list(reversed(jobs))
         running: dict[Any, Job] = {}
@@ -95,6 +96,10 @@ def _result(ray: Any, reference: Any, job: Job) -> bytes:
         cause = error.cause if isinstance(getattr(error, "cause", None), Exception) else error
         if isinstance(cause, SceneEnvsError):
             raise cause from error
+        if isinstance(cause, ImportError):
+            raise InvalidInputError(
+                f"a Ray worker cannot import what the grammar needs ({cause}); install it on every machine"
+            ) from error
         raise
     except ray.exceptions.RayError as error:
         raise PhysicsError(
@@ -116,6 +121,8 @@ _started: dict[bytes, Any] = {}
 def _ray_shard(job: Job, payload: bytes, queue: Any) -> bytes:
     if payload not in _started:
         _started.clear()
-        _started[payload] = pickle.loads(payload).start()
+        paths, work = pickle.loads(payload)
+        sys.path.extend(path for path in paths if path not in sys.path)  # where machines share a disk
+        _started[payload] = pickle.loads(work).start()
     grammar, normalizer = _started[payload]
     return make_shard(job, grammar, normalizer, lambda *message: queue.put(message))

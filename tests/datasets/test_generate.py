@@ -2,36 +2,46 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import io
 import os
+import pickle
+import signal
 import subprocess
 import sys
 import time
 from collections import Counter
-from multiprocessing import current_process
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from toy_grammars import TYPE, ToyGrammar, toy_cups
 
-from scene_envs.datasets import SceneDataset, fixed_normalizer, generate, verify_scenes
-from scene_envs.errors import InvalidInputError, UnknownNameError
-from scene_envs.grammars import Grammar, get_grammar, register_grammar
+from scene_envs.datasets import SceneDataset, StorageError, fixed_normalizer, generate, judge_scenes, verify_scenes
+from scene_envs.datasets import shards as shards_module
+from scene_envs.datasets.progress import generation_progress
+from scene_envs.errors import CorruptFileError, InvalidInputError, PhysicsError, UnknownNameError
+from scene_envs.grammars import get_grammar, register_grammar
 from scene_envs.scene import SceneBatch
+
+COUNT, SHARD = 70, 30
+HERE = str(Path(__file__).parent)
 
 
 def _hashes(folder: Path) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
 
 
-def _generate(output: Path, *, count: int = 70, workers: int = 0, **changes: object) -> None:
-    options = {"seed": 3, "verify": False, "shard_size": 30, "progress": False} | changes
-    generate("dimsum_table", count, output, workers=workers, **options)  # type: ignore[arg-type]
+def _generate(output: Path, *, grammar: str = "toy_cups", count: int = COUNT, workers: int = 0, **changes: object):
+    options = {"seed": 3, "shard_size": SHARD, "progress": False} | changes
+    return generate(grammar, count, output, workers=workers, **options)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What an undisturbed run in one process writes."""
     folder = tmp_path_factory.mktemp("reference")
     _generate(folder)
     return folder
@@ -43,6 +53,7 @@ def test_shards_hold_the_scenes_that_were_asked_for(reference: Path) -> None:
     assert dataset.complete
     sizes = [len(SceneDataset.load(path)) for path in sorted(reference.glob("*.parquet"))]
     assert sizes == [30, 30, 10]
+    assert [path.name for path in reference.iterdir() if path.name.startswith(".")] == []
 
 
 def test_scenes_are_distinct(reference: Path) -> None:
@@ -50,78 +61,187 @@ def test_scenes_are_distinct(reference: Path) -> None:
     assert len(torch.unique(tensor.flatten(1), dim=0)) == 70
 
 
-def test_a_killed_run_resumes_to_identical_files(
-    reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Killed in the middle of the second shard, with a half-written file left behind."""
-    module = sys.modules["scene_envs.datasets.generate"]  # the package exports a function of that name
+def test_every_scene_has_three_prompts(reference: Path) -> None:
+    dataset = SceneDataset.load(reference)
+    assert all(len(prompts) == 3 for prompts in dataset.prompt_sets)
+    assert dataset.prompts == [prompts[0] for prompts in dataset.prompt_sets]
 
-    class Killed(BaseException):
-        pass
 
-    calls = 0
+def test_kept_scenes_pass_physics_and_thrown_ones_are_accounted_for(reference: Path, tmp_path: Path) -> None:
+    """The toy grammar puts two cups in one place in 3/16 of its scenes."""
+    dataset = SceneDataset.load(reference)
+    assert judge_scenes(dataset.batch()) == [""] * 70
+    report = _generate(tmp_path)
+    assert report.tried == 70 + report.reasons["penetration"]
+    assert 3 <= report.reasons["penetration"] <= 40
+    assert report.reasons["toy reason"] > 10
 
-    def killed_at_third_write(*args: object) -> None:
-        nonlocal calls
-        calls += 1
-        if calls == 2:
-            (tmp_path / ".scenes-00001.parquet.partial").write_bytes(b"PAR1 half a file")
-            raise Killed
-        write(*args)  # type: ignore[arg-type]
 
-    write = module.store.write_shard
-    with monkeypatch.context() as patch:
-        patch.setattr(module.store, "write_shard", killed_at_third_write)
-        with pytest.raises(Killed):
-            _generate(tmp_path)
-    assert [path.name for path in sorted(tmp_path.glob("[!.]*.parquet"))] == ["scenes-00000.parquet"]
+# -- interruptions ----------------------------------------------------------------------------------
+
+
+_SLOW = f"""
+import sys, time
+sys.path.insert(0, {HERE!r})
+import toy_grammars
+from scene_envs.datasets import generate, shards
+judge = shards.judge_scenes
+def slowly(batch):
+    time.sleep(0.1)
+    return judge(batch)
+shards.judge_scenes = slowly
+shards._MAX_CHUNK = 4
+generate("toy_cups", {COUNT}, sys.argv[1], seed=3, shard_size={SHARD}, workers=0, progress=False)
+"""
+
+
+def test_killed_at_any_point_and_started_again_the_files_are_the_same(reference: Path, tmp_path: Path) -> None:
+    """Killed in the middle of the first shard, and the next run in the middle of the second."""
+    for shard in (0, 1):
+        process = subprocess.Popen([sys.executable, "-c", _SLOW, str(tmp_path)])
+        while process.poll() is None and not (tmp_path / f".scenes-0000{shard}.parquet.journal").exists():
+            time.sleep(0.002)
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+    assert (tmp_path / "scenes-00000.parquet").is_file()
+    assert not (tmp_path / "scenes-00001.parquet").exists()
     _generate(tmp_path)
     assert _hashes(tmp_path) == _hashes(reference)
 
 
-def test_a_run_killed_by_the_system_resumes_to_identical_files(reference: Path, tmp_path: Path) -> None:
-    options = {"seed": 3, "workers": 0, "verify": False, "shard_size": 30, "progress": False}
-    code = f"from scene_envs.datasets import generate\ngenerate('dimsum_table', 70, {str(tmp_path)!r}, **{options})"
-    process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
-    while process.poll() is None and not any(tmp_path.glob("scenes-*.parquet")):
-        time.sleep(0.005)
-    process.kill()
-    process.wait()
+def test_what_was_judged_before_a_kill_is_not_judged_again(
+    reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged = 0
+
+    class Killed(BaseException):
+        pass
+
+    def judge(batch: SceneBatch) -> list[str]:
+        nonlocal judged
+        judged += len(batch)
+        if judged > 20:
+            raise Killed
+        return judge_scenes(batch)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shards_module, "judge_scenes", judge)
+        patch.setattr(shards_module, "_MAX_CHUNK", 5)
+        with pytest.raises(Killed):
+            _generate(tmp_path)
+    (journal,) = tmp_path.glob(".*.journal")
+    known = journal.read_text().count("\n")
+    assert 10 <= known <= 20
+    journal.write_text(journal.read_text() + "penetr")  # killed while it wrote this line
+    counted = 0
+
+    def count(batch: SceneBatch) -> list[str]:
+        nonlocal counted
+        counted += len(batch)
+        return judge_scenes(batch)
+
+    monkeypatch.setattr(shards_module, "judge_scenes", count)
+    monkeypatch.setattr(shards_module, "_MAX_CHUNK", 1)
+    report = _generate(tmp_path)
+    assert counted == report.tried - known
+    assert _hashes(tmp_path) == _hashes(reference)
+
+
+def test_a_half_written_file_of_a_killed_process_is_removed(reference: Path, tmp_path: Path) -> None:
+    (tmp_path / ".scenes-00001.parquet.77.partial").write_bytes(b"PAR1 half a file")
+    _generate(tmp_path)
+    assert _hashes(tmp_path) == _hashes(reference)
+
+
+@pytest.mark.parametrize("chunk", [1, 7])
+def test_the_result_does_not_depend_on_the_size_of_chunks(
+    reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chunk: int
+) -> None:
+    monkeypatch.setattr(shards_module, "_MAX_CHUNK", chunk)
+    _generate(tmp_path)
+    assert _hashes(tmp_path) == _hashes(reference)
+
+
+def test_two_workers_write_the_same_files_and_a_dying_one_is_replaced(
+    reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SCENE_ENVS_TEST_FLAG", str(tmp_path / "died"))
+    report = _generate(tmp_path / "data", grammar="toy_mortal", workers=2)
+    assert (tmp_path / "died").exists()
+    assert report.scenes == 70
+    made, wanted = _hashes(tmp_path / "data"), _hashes(reference)
+    del made["metadata.json"], wanted["metadata.json"]  # it names the grammar
+    assert made == wanted
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EACCES])
+def test_a_disk_that_cannot_be_written_keeps_finished_shards(
+    reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    write = Path.write_bytes
+
+    def full(path: Path, content: bytes) -> int:
+        if "scenes-00001" in path.name:
+            write(path, content[:100])
+            raise OSError(number, os.strerror(number))
+        return write(path, content)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", full)
+        words = "the disk is full" if number == errno.ENOSPC else "Permission denied"
+        with pytest.raises(StorageError, match=rf"scenes-00001.*{words}.*run again to resume"):
+            _generate(tmp_path)
+    assert not list(tmp_path.glob(".*.partial"))
     assert (tmp_path / "scenes-00000.parquet").is_file()
     _generate(tmp_path)
     assert _hashes(tmp_path) == _hashes(reference)
 
 
-def _mortal_grammar() -> Grammar:
-    """Dimsum, but the first process that uses it dies; the flag file says that it happened."""
-    flag = Path(os.environ["SCENE_ENVS_TEST_FLAG"])
-    grammar = get_grammar("dimsum_table")
-    if current_process().name != "MainProcess" and not flag.exists():
-        flag.touch()
-        os._exit(1)
-    return grammar
-
-
-def test_a_worker_that_dies_is_replaced_and_nothing_is_lost(
-    reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("SCENE_ENVS_TEST_FLAG", str(tmp_path / "died"))
-    register_grammar("mortal")(_mortal_grammar)
-    generate("mortal", 30, tmp_path / "data", seed=3, workers=1, verify=False, shard_size=30, progress=False)
-    assert (tmp_path / "died").exists()
-    expected = _hashes(reference)["scenes-00000.parquet"]
-    assert _hashes(tmp_path / "data")["scenes-00000.parquet"] == expected
-
-
-def test_two_workers_write_the_same_files_as_this_process(reference: Path, tmp_path: Path) -> None:
-    _generate(tmp_path, workers=2)
-    assert _hashes(tmp_path) == _hashes(reference)
+def test_the_error_of_a_full_disk_reaches_the_parent_from_a_worker() -> None:
+    error = pickle.loads(pickle.dumps(StorageError("cannot write 'a': the disk is full")))
+    assert isinstance(error, StorageError)
+    assert "disk is full" in str(error)
 
 
 def test_a_finished_dataset_is_left_alone(reference: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in reference.iterdir()}
     _generate(reference)
     assert {path: path.stat().st_mtime_ns for path in reference.iterdir()} == before
+
+
+def test_a_broken_shard_is_named_before_work_starts(reference: Path, tmp_path: Path) -> None:
+    for path in reference.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    shard = tmp_path / "scenes-00001.parquet"
+    shard.write_bytes(shard.read_bytes()[:-50])
+    with pytest.raises(CorruptFileError, match=r"scenes-00001.*delete it"):
+        _generate(tmp_path)
+    shard.write_bytes((tmp_path / "scenes-00002.parquet").read_bytes())
+    with pytest.raises(CorruptFileError, match=r"holds 10 scenes, expected 30"):
+        _generate(tmp_path)
+    shard.unlink()
+    _generate(tmp_path)
+    assert _hashes(tmp_path) == _hashes(reference)
+
+
+# -- Ray --------------------------------------------------------------------------------------------
+
+
+def test_ray_writes_the_same_files(reference: Path, tmp_path: Path) -> None:
+    ray = pytest.importorskip("ray")
+    assert not ray.is_initialized()
+    report = _generate(tmp_path, workers=2, backend="ray")
+    assert report.scenes == 70
+    assert _hashes(tmp_path) == _hashes(reference)
+    assert not ray.is_initialized()
+
+
+def test_an_unknown_backend_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match="processes, ray"):
+        _generate(tmp_path, backend="rai")
+
+
+# -- refusals ---------------------------------------------------------------------------------------
 
 
 def test_another_seed_gives_other_scenes(reference: Path, tmp_path: Path) -> None:
@@ -140,6 +260,12 @@ def test_bad_arguments_are_named(bad: dict[str, int], tmp_path: Path) -> None:
         _generate(tmp_path, **bad)  # type: ignore[arg-type]
 
 
+def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(InvalidInputError, match="not a folder"):
+        _generate(tmp_path / "file")
+
+
 def test_an_unknown_grammar_offers_the_nearest(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="dimsum_table"):
         generate("dim_sum_table", 1, tmp_path)
@@ -147,24 +273,82 @@ def test_an_unknown_grammar_offers_the_nearest(tmp_path: Path) -> None:
 
 def test_a_grammar_that_workers_cannot_import_is_refused_with_the_remedy(tmp_path: Path) -> None:
     @register_grammar("local")
-    def local() -> Grammar:
-        return get_grammar("dimsum_table")
+    def local() -> ToyGrammar:
+        return toy_cups()
 
     with pytest.raises(InvalidInputError, match="workers=0"):
         generate("local", 2, tmp_path, workers=1, verify=False, progress=False)
 
 
+def test_a_grammar_of_which_nothing_passes_is_given_up_with_the_reasons(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shards_module, "_MAX_FRUITLESS", 40)
+    with pytest.raises(PhysicsError, match="outside workspace"):
+        _generate(tmp_path, grammar="toy_hopeless")
+
+
+# -- normalizer and verification --------------------------------------------------------------------
+
+
 def test_the_normalizer_is_fixed_by_the_grammar_and_fills_the_range(reference: Path) -> None:
-    normalizer = fixed_normalizer(get_grammar("dimsum_table"))
+    normalizer = fixed_normalizer(ToyGrammar())
     dataset = SceneDataset.load(reference)
     assert torch.equal(normalizer.scale, dataset.normalizer.scale)
-    assert normalizer.input_min[:3].tolist() == pytest.approx([-0.49, -0.49, 0.0])
-    assert normalizer.input_max[:3].tolist() == pytest.approx([0.49, 0.49, 9 * 0.091])
-    tilt = torch.tensor([5, 8, 9, 10])
-    assert normalizer.is_constant.nonzero().flatten().tolist() == tilt.tolist()
+    assert normalizer.input_min[:2].tolist() == pytest.approx([-0.4, -0.4])
+    assert normalizer.input_max[:2].tolist() == pytest.approx([0.4, 0.4])
+    assert normalizer.is_constant.nonzero().flatten().tolist() == [2, 5, 8, 9, 10]  # height, and the tilt
     normalised = normalizer.normalize(dataset.tensor)
     assert normalised.abs().max() <= 1.0
     assert set(normalised[..., 11:].unique().tolist()) == {-1.0, 1.0}
+
+
+@pytest.mark.parametrize("lean", [1.0, 0.003])
+def test_rotations_take_the_full_range_when_any_object_leans(lean: float) -> None:
+    """A cup in 300 leans: enough for all entries to vary, by its lean about one axis or any other."""
+    normalizer = fixed_normalizer(ToyGrammar(lean=lean))
+    assert normalizer.input_min[3:12].tolist() == [-1.0] * 9
+    assert normalizer.input_max[3:12].tolist() == [1.0] * 9
+    leaning = SceneBatch(torch.from_numpy(ToyGrammar(lean=1.0).sample_array(np.random.default_rng(0), 20)), TYPE)
+    torch.testing.assert_close(normalizer.unnormalize(normalizer.normalize(leaning.tensor)), leaning.tensor)
+
+
+def test_a_scene_that_the_normalizer_cannot_hold_is_thrown_away_and_counted(tmp_path: Path) -> None:
+    _generate(tmp_path, count=1, verify=False)  # its normalizer knows upright cups alone
+    (tmp_path / "scenes-00000.parquet").unlink()
+    register_grammar("toy_cups")(lambda: ToyGrammar(lean=0.5))
+    try:
+        report = _generate(tmp_path, count=1, verify=False)
+    finally:
+        register_grammar("toy_cups")(toy_cups)
+    assert report.tried == 1 + report.reasons.get("outside the normalizer", 0)
+    loaded = SceneDataset.load(tmp_path).tensor
+    assert (loaded[:, :, 11] > 0.999).any(dim=1).all()
+    assert loaded[..., [5, 8, 9, 10]].abs().max() == 0.0
+
+
+def test_objects_welded_at_generated_poses_are_normalised_like_any_other() -> None:
+    """Tables of a room stand anywhere in its workspace, turned about z."""
+
+    class Room(ToyGrammar):
+        def sample_array(self, rng: np.random.Generator, count: int) -> np.ndarray:
+            scenes = super().sample_array(rng, count)
+            scenes[:, 4] = 0.0
+            scenes[:, 4, :3] = rng.uniform([-0.4, -0.4, 0.0], [0.4, 0.4, 0.0], (count, 3))
+            angle = rng.uniform(0, 2 * np.pi, count)
+            scenes[:, 4, [3, 7]], scenes[:, 4, 4], scenes[:, 4, 6] = (
+                np.cos(angle)[:, None],
+                -np.sin(angle),
+                np.sin(angle),
+            )
+            scenes[:, 4, 11] = scenes[:, 4, 12] = 1.0
+            return scenes
+
+    room = Room()
+    normalizer = fixed_normalizer(room)  # type: ignore[arg-type]
+    scenes = torch.from_numpy(room.sample_array(np.random.default_rng(1), 100)).float()
+    assert normalizer.normalize(scenes).abs().max() <= 1.0
+    torch.testing.assert_close(normalizer.unnormalize(normalizer.normalize(scenes)), scenes)
 
 
 def test_verification_keeps_grammar_scenes_and_drops_broken_ones_with_reasons() -> None:
@@ -179,17 +363,35 @@ def test_verification_keeps_grammar_scenes_and_drops_broken_ones_with_reasons() 
     assert +reasons == {"outside workspace": 1, "penetration": 1, "moved while settling": 1}
 
 
-def test_generation_fills_shards_past_scenes_that_verification_drops(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    module = sys.modules["scene_envs.datasets.generate"]  # the package exports a function of that name
+# -- progress ---------------------------------------------------------------------------------------
 
-    def every_other(batch: SceneBatch, reasons: Counter[str]) -> torch.Tensor:
-        reasons["penetration"] += len(batch) // 2
-        return torch.arange(len(batch)) % 2 == 0
 
-    monkeypatch.setattr(module, "verify_scenes", every_other)
-    report = generate("dimsum_table", 40, tmp_path, workers=0, progress=False)
-    assert len(SceneDataset.load(tmp_path)) == 40
-    assert report.tried == 96
-    assert report.reasons["penetration"] == 48
+def test_slow_grammars_report_scene_by_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reference: Path) -> None:
+    """When a scene takes as long as a chunk may, chunks have one scene."""
+    monkeypatch.setattr(shards_module, "_CHUNK_SECONDS", 0.0)
+    chunks: list[int] = []
+
+    def judge(batch: SceneBatch) -> list[str]:
+        chunks.append(len(batch))
+        return judge_scenes(batch)
+
+    monkeypatch.setattr(shards_module, "judge_scenes", judge)
+    _generate(tmp_path, count=COUNT)
+    assert set(chunks) == {1}
+    assert _hashes(tmp_path) == _hashes(reference)
+
+
+def test_a_log_gets_lines_with_rate_and_reasons(monkeypatch: pytest.MonkeyPatch) -> None:
+    from scene_envs.datasets import progress
+
+    stream = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setattr(progress, "_EVERY", 0.0)
+    with generation_progress("Generating tea", 100, 1000, True) as report:
+        report(10, 12, {"penetration": 2})
+        report(5, 6, {"no room": 7})
+    first, second = stream.getvalue().strip().splitlines()
+    assert first.startswith("Generating tea: 110/1000, ")
+    assert first.endswith("scenes/s, penetration 2")
+    assert second.endswith("no room 7, penetration 2")
+    assert "115/1000" in second
