@@ -130,7 +130,7 @@ def projection_kernel(chunk: Chunk) -> dict[str, Any]:
     residual = np.zeros(len(chunk))
     for index in range(len(chunk)):
         objects = _objects(physics, chunk.row(index))
-        result = project_objects(physics.library, physics.collider, objects)
+        result = project_objects(physics.collider, objects, chunk.scene_type.workspace)
         translations[index, objects.slot] = result.translation
         residual[index] = result.residual_depth
     return {

@@ -1,10 +1,11 @@
 """Projection: the nearest translations at which no two objects overlap, rotations kept.
 
 With rotations fixed, "this part lies on that side of a plane with normal d" is exactly linear in the
-translations. Each overlapping object pair gets one direction, shared by all its parts, so that a thin wall
-that is straddled cannot ask for opposite moves; the nearest point under those planes is a least-distance
-problem, solved exactly (Lawson and Hanson 1974, ch. 23) with slack that costs far more than distance, so
-that a crowded scene has a best effort. FCL has the last word after every round.
+translations. Each object pair that overlaps is given a way out, the shortest straight one; the planes that
+separate its parts *there* are consistent with each other, so a thin wall that is straddled cannot ask for
+opposite moves. The nearest point under all planes is a least-distance problem, solved exactly, with slack that
+costs far more than distance, so that a crowded scene has a best effort. FCL has the last word after every round.
+Once nothing overlaps, planes are chosen anew at the solution, which can only shorten the way, until it does not.
 """
 
 from __future__ import annotations
@@ -13,49 +14,30 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
-from scene_envs.physics.collision import Collider, scene_pairs
-from scene_envs.physics.geometry import LibraryGeometry
-from scene_envs.physics.placement import Objects, object_boxes, part_pairs, place
-from scene_envs.physics.separation import separations
+from scene_envs.physics.collision import Collider
+from scene_envs.physics.placement import Objects
+from scene_envs.physics.planes import Planes, near_pairs, nearest, separating_planes
+from scene_envs.physics.ways_out import Tried, ways_out
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-Pair = tuple[int, int]
+Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 TOLERANCE = 1e-4
 """Depth (m) up to which a projected scene counts as free of overlap."""
-_CLEARANCE = 2e-5
-"""Gap (m) that planes ask for, so that rounding does not leave an overlap."""
-_REACH = 5e-3
-"""Part pairs nearer than this (m) are kept apart although they do not overlap yet."""
-_SLACK = 300.0
-"""How much more a metre of overlap costs than a metre of distance, squared in the objective."""
-_ROUNDS = 16
-_PATIENCE = 3
-"""Rounds after which a pair that still overlaps is separated vertically: up, there is always room."""
-
-
-@dataclass(frozen=True, eq=False)
-class Contacts:
-    """Near pairs of coarse parts of one scene.
-
-    Attributes:
-        first: (Q,) object rows.
-        second: (Q,) object rows, larger.
-        part_first: (Q,) part of the first object in the library.
-        part_second: (Q,) part of the second.
-        gap: (Q,) m along ``direction``.
-        direction: (Q, 3) unit, from the first part to the second.
-    """
-
-    first: Index
-    second: Index
-    part_first: Index
-    part_second: Index
-    gap: Array
-    direction: Array
+_ROUNDS = 30
+"""Rounds until what still overlaps is left as it is."""
+_REFINEMENTS = 8
+"""Rounds spent on shortening the way of a scene that is free of overlap."""
+_GAIN = 0.005
+"""Relative decrease of the squared way that makes another refinement worth it."""
+_NEGLIGIBLE = 1e-8
+"""Sum of squared ways (m^2) that is not worth shortening."""
+_INSIDE = 1e-5
+"""Objects stay this far (m) inside the workspace, so that rounding does not take them out."""
+_OUTSIDE = 0.05
+"""Objects further than this (m) outside the workspace are no part of the scene's arrangement and stay there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,164 +48,86 @@ class Projection:
     residual_depth: float
 
 
-class Planes:
-    """Separating planes of one scene: for part pairs, ``direction . (x_second - x_first) >= bound``.
-
-    Args:
-        library: geometry of the assets.
-        objects: the objects of the scene; their rotations stay as they are.
-    """
-
-    def __init__(self, library: LibraryGeometry, objects: Objects) -> None:
-        self.library, self.objects = library, objects
-        self.direction: dict[Pair, Array] = {}
-        self._bounds: dict[tuple[int, int, int, int], float] = {}
-
-    def add(self, pair: Pair, parts: list[Pair]) -> None:
-        """Separate these part pairs of an object pair along its direction."""
-        for part in parts:
-            self._bounds.setdefault((*pair, *part), self.bound(pair, part, self.direction[pair]))
-
-    def redirect(self, pair: Pair, direction: Array) -> None:
-        """Give an object pair another direction, for all its part pairs."""
-        self.direction[pair] = direction
-        for key in [key for key in self._bounds if key[:2] == pair]:
-            self._bounds[key] = self.bound(pair, key[2:], direction)
-
-    def bound(self, pair: Pair, parts: Pair, direction: Array) -> float:
-        """How far apart two objects must be along ``direction`` for these parts to be separate, m."""
-        first, second = (
-            self.library.parts[part].vertices @ (self.objects.rotation[row].T @ direction)
-            for row, part in zip(pair, parts, strict=True)
-        )
-        return float(first.max() - second.min())
-
-    def nearest(self, origin: Array) -> Array:
-        """Translations (n, 3) nearest to ``origin`` that satisfy the planes, as well as they can be."""
-        if not self._bounds:
-            return origin
-        keys = list(self._bounds)
-        rows = np.arange(len(keys))
-        first, second = np.array([key[0] for key in keys]), np.array([key[1] for key in keys])
-        normal = np.stack([self.direction[key[:2]] for key in keys])
-        bound = np.array([self._bounds[key] for key in keys]) + _CLEARANCE
-        needed = bound - np.einsum("ij,ij->i", normal, origin[second] - origin[first])
-        jacobian = np.zeros((len(keys), len(origin), 3))
-        jacobian[rows, second] += normal
-        jacobian[rows, first] -= normal
-        jacobian[:, self.objects.fixed] = 0.0
-        return origin + _least_distance(jacobian.reshape(len(keys), -1), needed).reshape(-1, 3)
-
-
-def _least_distance(matrix: Array, needed: Array) -> Array:
-    """The shortest x with ``matrix @ x + s >= needed``, slack s costing ``_SLACK`` squared.
-
-    Lawson and Hanson's least-distance programme through non-negative least squares on its dual.
-    """
-    used = np.flatnonzero(np.abs(matrix).max(axis=0) > 0)
-    if not len(used) or needed.max() <= 0:
-        return np.zeros(matrix.shape[1])
-    elastic = np.hstack([matrix[:, used], np.eye(len(needed)) / _SLACK])
-    system = np.vstack([elastic.T, needed])
-    target = np.zeros(len(system))
-    target[-1] = 1.0
-    multipliers, _ = nnls(system, target, maxiter=30 * len(needed))
-    residual = system @ multipliers - target
-    x = np.zeros(matrix.shape[1])
-    x[used] = -residual[: len(used)] / residual[-1]
-    return x
-
-
-def project_objects(library: LibraryGeometry, collider: Collider, objects: Objects) -> Projection:
+def project_objects(collider: Collider, objects: Objects, workspace: Corners) -> Projection:
     """Project the objects of one scene.
 
     Args:
-        library: geometry of the assets.
-        collider: measures overlap.
+        collider: geometry, and measures overlap.
         objects: one scene; fixed objects do not move.
+        workspace: lowest and highest corner (m) for the translations of objects in it or close to it.
     """
-    planes = Planes(library, objects)
-    best = Projection(objects.translation, np.inf)
-    current = objects
-    for round_number in range(_ROUNDS):
-        overlapping, residual = _overlapping(collider, current)
-        if residual < best.residual_depth:
+    home = objects.translation
+    bounds = _bounds(home, objects, workspace)
+    walls = _walls(home, objects, bounds)
+    best, best_way = Projection(home, np.inf), np.inf
+    tried: Tried = {}
+    current = replace(objects, translation=nearest(objects, home, walls))
+    refinements = 0
+    for _ in range(_ROUNDS):
+        first, second, residual = _overlapping(collider, current)
+        way = float(((current.translation - home) ** 2).sum())
+        is_free = residual <= 0.5 * TOLERANCE
+        gain = best_way - way
+        if residual < best.residual_depth and not is_free:
             best = Projection(current.translation, residual)
-        if not overlapping:
-            break
-        contacts = near_contacts(library, current)
-        _update(planes, contacts, current, overlapping, vertical=round_number >= _PATIENCE)
-        current = replace(current, translation=planes.nearest(objects.translation))
+        elif is_free and (way < best_way or best.residual_depth > 0.5 * TOLERANCE):
+            best, best_way = Projection(current.translation, residual), way
+        if is_free:
+            refinements += 1
+            if refinements > _REFINEMENTS or way < _NEGLIGIBLE or gain < _GAIN * way:
+                break
+        elif best_way < np.inf:
+            break  # a refinement that ran into something else: what was free of overlap stands
+        current = replace(current, translation=_round(collider, current, home, first, second, bounds, walls, tried))
     return best
 
 
-def near_contacts(library: LibraryGeometry, objects: Objects) -> Contacts:
-    """All part pairs of one scene nearer than ``_REACH``."""
-    placed = place(library, objects, "coarse")
-    low, high = object_boxes(placed)
-    first, second = scene_pairs(objects)
-    near = ((low[first] <= high[second] + _REACH) & (low[second] <= high[first] + _REACH)).all(axis=1)
-    first, second = first[near], second[near]
-    pair, a, b = part_pairs(placed, first, second)
-    near = ((placed.low[a] <= placed.high[b] + _REACH) & (placed.low[b] <= placed.high[a] + _REACH)).all(axis=1)
-    pair, a, b = pair[near], a[near], b[near]
-    gap, direction = separations(library, placed.parts, a, b)
-    near = gap < _REACH
-    pair, a, b, gap, direction = pair[near], a[near], b[near], gap[near], direction[near]
-    part = placed.parts.part
-    return Contacts(first[pair], second[pair], part[a], part[b], gap, direction)
+def _round(
+    collider: Collider,
+    current: Objects,
+    home: Array,
+    first: Index,
+    second: Index,
+    bounds: tuple[Array, Array],
+    walls: Planes,
+    tried: Tried,
+) -> Array:
+    """The next translations: overlapping pairs (``first``, ``second``) on their way out, all others kept apart."""
+    near_first, near_second = near_pairs(collider, current)
+    extra = np.zeros((len(near_first), 3))
+    if len(first):
+        count = len(current)
+        out = ways_out(collider, current, first, second, bounds, tried)
+        place_of = np.searchsorted(near_first * count + near_second, first * count + second)
+        extra[place_of] = out
+    planes = separating_planes(collider, current, near_first, near_second, extra, home)
+    return nearest(current, home, planes + walls)
 
 
-def _overlapping(collider: Collider, objects: Objects) -> tuple[set[Pair], float]:
+def _overlapping(collider: Collider, objects: Objects) -> tuple[Index, Index, float]:
     """Object pairs whose fine parts overlap beyond the tolerance, and the deepest overlap."""
     pairs = collider.pairs(objects)
     deep = pairs.depth > 0.5 * TOLERANCE
-    found = set(zip(pairs.first[deep].tolist(), pairs.second[deep].tolist(), strict=True))
-    return found, float(pairs.depth.max(initial=0.0))
+    return pairs.first[deep], pairs.second[deep], float(pairs.depth.max(initial=0.0))
 
 
-def _update(planes: Planes, contacts: Contacts, objects: Objects, overlapping: set[Pair], *, vertical: bool) -> None:
-    """Add planes for overlapping pairs, and for pairs that touch or nearly do."""
-    rows: dict[Pair, list[int]] = {}
-    for row, pair in enumerate(zip(contacts.first.tolist(), contacts.second.tolist(), strict=True)):
-        rows.setdefault(pair, []).append(row)
-    for pair, members in rows.items():
-        deepest = min(members, key=lambda row: contacts.gap[row])
-        if pair in overlapping:
-            if vertical and pair in planes.direction:
-                planes.redirect(pair, _upward(objects, pair))
-            elif pair not in planes.direction:
-                planes.direction[pair] = _shortest_way(planes, contacts, objects, pair, members)
-            inside = [row for row in members if contacts.gap[row] < _CLEARANCE]
-            planes.add(pair, [_parts(contacts, row) for row in inside])
-        elif pair not in planes.direction and contacts.gap[deepest] > -_CLEARANCE:
-            # Apart now; keep it so. (Coarse parts that overlap while fine ones do not are left alone.)
-            planes.direction[pair] = contacts.direction[deepest]
-            planes.add(pair, [_parts(contacts, deepest)])
+def _bounds(home: Array, objects: Objects, workspace: Corners) -> tuple[Array, Array]:
+    """Lowest and highest translations (n, 3); none for fixed objects and for those far outside."""
+    low, high = np.array(workspace[0]), np.array(workspace[1])
+    loose = objects.fixed | ((home < low - _OUTSIDE) | (home > high + _OUTSIDE)).any(axis=1)
+    return np.where(loose[:, None], -np.inf, low + _INSIDE), np.where(loose[:, None], np.inf, high - _INSIDE)
 
 
-def _shortest_way(planes: Planes, contacts: Contacts, objects: Objects, pair: Pair, members: list[int]) -> Array:
-    """The direction along which all overlapping parts of a pair come apart with the smallest move."""
-    inside = [row for row in members if contacts.gap[row] < 0] or members
-    offset = objects.translation[pair[1]] - objects.translation[pair[0]]
-    best, best_move = contacts.direction[inside[0]], np.inf
-    for direction in np.unique(np.round(contacts.direction[inside], 9), axis=0):
-        unit = direction / np.linalg.norm(direction)
-        move = max(planes.bound(pair, _parts(contacts, row), unit) for row in inside) - float(unit @ offset)
-        if move < best_move:
-            best, best_move = unit, move
-    return best
-
-
-def _upward(objects: Objects, pair: Pair) -> Array:
-    """Vertical, from the lower object to the higher; a fixed object counts as the lower one."""
-    first, second = pair
-    if objects.fixed[first] != objects.fixed[second]:
-        second_is_higher = bool(objects.fixed[first])
-    else:
-        second_is_higher = bool(objects.translation[second, 2] >= objects.translation[first, 2])
-    return np.array([0.0, 0.0, 1.0 if second_is_higher else -1.0])
-
-
-def _parts(contacts: Contacts, row: int) -> Pair:
-    return int(contacts.part_first[row]), int(contacts.part_second[row])
+def _walls(home: Array, objects: Objects, bounds: tuple[Array, Array]) -> Planes:
+    """The bounds as half-spaces."""
+    rows, axes, signs, limits = [], [], [], []
+    for sign, limit in ((1.0, bounds[0]), (-1.0, bounds[1])):
+        row, axis = np.nonzero(np.isfinite(limit))
+        rows.append(row)
+        axes.append(axis)
+        signs.append(np.full(len(row), sign))
+        limits.append(sign * limit[row, axis])
+    row, axis, sign = np.concatenate(rows), np.concatenate(axes), np.concatenate(signs)
+    direction = np.zeros((len(row), 3))
+    direction[np.arange(len(row)), axis] = sign
+    return Planes(np.full(len(row), -1, dtype=np.int64), row, direction, np.concatenate(limits))

@@ -7,6 +7,7 @@ nearly all pairs of a tidy scene without a call per pair.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,17 +85,58 @@ def _one_group(
     return np.where(use_a, gap_a, gap_b), np.where(use_a[:, None], normal_a, -normal_b)
 
 
+def grouped_gaps(
+    library: LibraryGeometry, placed: PlacedParts, first: Index, second: Index, shift: Array
+) -> Iterator[tuple[Index, Array, Array]]:
+    """Signed gaps of pairs of placed parts over *all* face directions of both, in groups of equal size.
+
+    Args:
+        library: geometry of the assets.
+        placed: the parts.
+        first: (P,) rows of ``placed``.
+        second: (P,) rows of ``placed``.
+        shift: (P, 3) m, from the origin of the first part's object to that of the second's.
+
+    Yields:
+        rows (Q,) of the pairs, gaps (Q, K) m, and directions (Q, K, 3) in the world, from first to second.
+    """
+    classes = library.size_class[placed.part]
+    groups = classes[first] * len(library.tables) + classes[second]
+    for group in np.unique(groups):
+        rows = np.flatnonzero(groups == group)
+        table_a, table_b = (library.tables[index] for index in divmod(int(group), len(library.tables)))
+        assert table_a is not None
+        assert table_b is not None
+        a, b = first[rows], second[rows]
+        row_a, row_b = library.row[placed.part[a]], library.row[placed.part[b]]
+        turn_a, turn_b = placed.rotation[a], placed.rotation[b]
+        gap_a, normal_a = _all_face_gaps(
+            table_a.normals[row_a], table_a.offsets[row_a], turn_a, table_b.vertices[row_b], turn_b, shift[rows]
+        )
+        gap_b, normal_b = _all_face_gaps(
+            table_b.normals[row_b], table_b.offsets[row_b], turn_b, table_a.vertices[row_a], turn_a, -shift[rows]
+        )
+        yield rows, np.concatenate([gap_a, gap_b], axis=1), np.concatenate([normal_a, -normal_b], axis=1)
+
+
 def _face_gaps(
     normals: Array, offsets: Array, rotation: Array, vertices: Array, other: Array, shift: Array
 ) -> tuple[Array, Array]:
     """Best face of the owner: (P,) gap and (P, 3) world normal; ``shift`` leads to the other part."""
+    gaps, world = _all_face_gaps(normals, offsets, rotation, vertices, other, shift)
+    best = gaps.argmax(axis=1)
+    rows = np.arange(len(best))
+    return gaps[rows, best], world[rows, best]
+
+
+def _all_face_gaps(
+    normals: Array, offsets: Array, rotation: Array, vertices: Array, other: Array, shift: Array
+) -> tuple[Array, Array]:
+    """Every face of the owner: (P, K) gaps and (P, K, 3) world normals."""
     world = rotate(rotation, normals)  # (P, K, 3)
     local = rotate(other.swapaxes(-1, -2), world)  # in the frame of the other part
     height = local[:, :, None, 0] * vertices[:, None, :, 0]
     height += local[:, :, None, 1] * vertices[:, None, :, 1]
     height += local[:, :, None, 2] * vertices[:, None, :, 2]
     along = world[..., 0] * shift[:, None, 0] + world[..., 1] * shift[:, None, 1] + world[..., 2] * shift[:, None, 2]
-    gaps = height.min(axis=2) + along - offsets  # (P, K)
-    best = gaps.argmax(axis=1)
-    rows = np.arange(len(best))
-    return gaps[rows, best], world[rows, best]
+    return height.min(axis=2) + along - offsets, world

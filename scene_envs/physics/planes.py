@@ -1,0 +1,166 @@
+"""Separating planes between the objects of one scene, and the nearest translations on the right side of all of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from scene_envs.physics.collision import Collider, scene_pairs
+from scene_envs.physics.placement import Objects, object_boxes, part_pairs, place
+from scene_envs.physics.separation import PlacedParts, grouped_gaps
+from scene_envs.physics.support import components
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+CLEARANCE = 2e-5
+"""Gap (m) that planes ask for, so that rounding does not leave an overlap."""
+_REACH = 0.02
+"""Objects nearer than this (m) are kept apart although they do not overlap."""
+_SLACK = 300.0
+"""How much more a metre of overlap costs than a metre of distance, squared in the objective."""
+_APART = 1e-6
+"""Parts whose best face plane leaves at least minus this (m) count as apart."""
+
+
+@dataclass(frozen=True, eq=False)
+class Planes:
+    """Half-spaces: ``direction . (x_second - x_first) >= bound``; object -1 is the world's origin.
+
+    Attributes:
+        first: (Q,) object rows, or -1.
+        second: (Q,) object rows.
+        direction: (Q, 3) unit.
+        bound: (Q,) m.
+    """
+
+    first: Index
+    second: Index
+    direction: Array
+    bound: Array
+
+    def __add__(self, other: Planes) -> Planes:
+        return Planes(
+            np.concatenate([self.first, other.first]),
+            np.concatenate([self.second, other.second]),
+            np.concatenate([self.direction, other.direction]),
+            np.concatenate([self.bound, other.bound]),
+        )
+
+
+def near_pairs(collider: Collider, objects: Objects) -> tuple[Index, Index]:
+    """Object pairs of one scene whose boxes are within reach of each other: (P,), (P,)."""
+    low, high = object_boxes(place(collider.library, objects, "coarse"))
+    first, second = scene_pairs(objects)
+    near = ((low[first] <= high[second] + _REACH) & (low[second] <= high[first] + _REACH)).all(axis=1)
+    return first[near], second[near]
+
+
+def separating_planes(collider: Collider, objects: Objects, first: Index, second: Index, extra: Array, home: Array) -> Planes:
+    """Planes that keep object pairs apart.
+
+    Every pair of parts gets a face plane that separates it now; among several, the one that asks for the least
+    move away from home. Coarse parts serve where they are apart already, fine ones elsewhere.
+
+    Args:
+        collider: geometry and exact distances.
+        objects: of one scene, at their current translations.
+        first: (P,) object rows.
+        second: (P,) object rows.
+        extra: (P, 3) m, added to the offset of each pair: the way out, for pairs that overlap.
+        home: (n, 3) translations that the objects would rather have, m.
+    """
+    coarse, apart = _planes_at("coarse", collider, objects, first, second, extra, home)
+    nested = np.unique(coarse.pair[~apart])
+    if not len(nested):
+        return coarse.planes(np.ones(len(coarse.pair), dtype=bool))
+    kept = coarse.planes(~np.isin(coarse.pair, nested))
+    fine, apart = _planes_at("fine", collider, objects, first[nested], second[nested], extra[nested], home)
+    return kept + fine.planes(np.ones(len(fine.pair), dtype=bool))
+
+
+@dataclass(frozen=True, eq=False)
+class _PartPlanes:
+    """One plane per near pair of parts; ``pair`` (Q,) says which object pair."""
+
+    pair: Index
+    first: Index
+    second: Index
+    direction: Array
+    bound: Array
+
+    def planes(self, rows: Mask) -> Planes:
+        """As half-spaces for the objects."""
+        return Planes(self.first[rows], self.second[rows], self.direction[rows], self.bound[rows])
+
+
+def _planes_at(
+    level: str, collider: Collider, objects: Objects, first: Index, second: Index, extra: Array, home: Array
+) -> tuple[_PartPlanes, Mask]:
+    placed = place(collider.library, objects, level)  # type: ignore[arg-type]
+    pair, a, b = part_pairs(placed, first, second)
+    move = extra[pair]
+    near = (
+        (placed.low[a] <= placed.high[b] + move + _REACH) & (placed.low[b] + move <= placed.high[a] + _REACH)
+    ).all(axis=1)
+    pair, a, b = pair[near], a[near], b[near]
+    offset = objects.translation[second] - objects.translation[first] + extra
+    away = (home[second] - home[first] - offset)[pair]
+    offset = offset[pair]
+    direction, bound, best = np.empty((len(pair), 3)), np.empty(len(pair)), np.empty(len(pair))
+    for rows, gaps, normals in grouped_gaps(collider.library, placed.parts, a, b, offset):
+        largest = gaps.max(axis=1)
+        at_home = gaps + np.einsum("qki,qi->qk", normals, away[rows])
+        separates = gaps >= np.minimum(largest, 0.0)[:, None] - _APART
+        chosen = np.where(separates, at_home, -np.inf).argmax(axis=1)
+        line = np.arange(len(rows))
+        direction[rows], best[rows] = normals[line, chosen], largest
+        bound[rows] = np.einsum("qi,qi->q", direction[rows], offset[rows]) - gaps[line, chosen] + CLEARANCE
+    return _PartPlanes(pair, first[pair], second[pair], direction, bound), best >= -_APART
+
+
+def nearest(objects: Objects, home: Array, planes: Planes) -> Array:
+    """Translations (n, 3) nearest to ``home`` that satisfy the planes, as well as they can be.
+
+    Objects that no plane connects are solved on their own.
+    """
+    result = home.copy()
+    free = ~objects.fixed
+    mobile = lambda rows: (rows >= 0) & free[rows]  # noqa: E731
+    moves_first, moves_second = mobile(planes.first), mobile(planes.second)
+    both = moves_first & moves_second
+    label = components(len(objects), planes.first[both], planes.second[both])
+    owner = np.where(moves_second, label[planes.second], label[planes.first])
+    start = np.where(planes.first[:, None] >= 0, home[planes.first], 0.0)
+    needed = planes.bound - np.einsum("qi,qi->q", planes.direction, home[planes.second] - start)
+    for block in np.unique(owner[needed > 0]):
+        rows = np.flatnonzero(owner == block)
+        members = np.flatnonzero((label == block) & free)
+        column = np.full(len(objects) + 1, -1, dtype=np.int64)
+        column[members] = np.arange(len(members))
+        matrix = np.zeros((len(rows), len(members) + 1, 3))
+        line = np.arange(len(rows))
+        matrix[line, column[planes.second[rows]]] += planes.direction[rows]
+        matrix[line, column[planes.first[rows]]] -= planes.direction[rows]
+        moved = least_distance(matrix[:, :-1].reshape(len(rows), -1), needed[rows])
+        result[members] += moved.reshape(-1, 3)
+    return result
+
+
+def least_distance(matrix: Array, needed: Array) -> Array:
+    """The shortest x with ``matrix @ x + s >= needed``, slack s costing ``_SLACK`` squared.
+
+    Lawson and Hanson's least-distance programme (1974, ch. 23) through non-negative least squares on its dual.
+    """
+    if needed.max(initial=0.0) <= 0:
+        return np.zeros(matrix.shape[1])
+    system = np.vstack([matrix.T, np.eye(len(needed)) / _SLACK, needed])
+    target = np.zeros(len(system))
+    target[-1] = 1.0
+    multipliers, _ = nnls(system, target, maxiter=30 * len(needed))
+    residual = system @ multipliers - target
+    return -residual[: matrix.shape[1]] / residual[-1]  # type: ignore[no-any-return]

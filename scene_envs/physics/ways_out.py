@@ -1,0 +1,164 @@
+"""The shortest way out of an overlap: how far one object has to go, and where, until it is free of another one.
+
+Along a straight line, two convex parts overlap during one interval, which follows from their face planes. The way
+out in a direction ends where no interval of any two parts reaches: beside the other object, above it, or in its
+hollow.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_envs.physics.collision import Collider
+from scene_envs.physics.placement import Objects, object_boxes, part_pairs, place
+from scene_envs.physics.planes import CLEARANCE
+from scene_envs.physics.separation import grouped_gaps
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_AROUND = 0.06
+"""Parts further away than this (m) are not looked at when a way is measured."""
+_OWN = 4
+"""How many face directions of the overlapping parts are tried per pair, beside the common ones."""
+_DOWN = 3.0
+"""A way down out of a fixed object counts this many times: what lies in a board belongs on it."""
+_UP = 1.4
+"""A way up counts this many times: the lower object rests on something and cannot share it."""
+_BLOCKED = 20.0
+"""A way that leaves the workspace or ends in a fixed object counts this many times."""
+_REPEATED = 2.5
+"""A way that was tried and did not help counts this many times more each time."""
+_SAME_WAY = 0.7
+"""Cosine from which two ways are the same."""
+_AXES = np.concatenate([np.eye(3), -np.eye(3)])
+
+Tried = dict[tuple[int, int], list[Array]]
+"""The ways tried for each object pair so far."""
+
+
+def ways_out(
+    collider: Collider, objects: Objects, first: Index, second: Index, bounds: tuple[Array, Array], tried: Tried
+) -> Array:
+    """(P, 3) m: what to add to the offset of each overlapping object pair to free it.
+
+    Args:
+        collider: geometry of the assets.
+        objects: of one scene.
+        first: (P,) object rows.
+        second: (P,) object rows.
+        bounds: lowest and highest translations (n, 3), (n, 3) m.
+        tried: ways that did not help; the ones returned are added.
+    """
+    placed = place(collider.library, objects, "fine")
+    pair, a, b = part_pairs(placed, first, second)
+    near = (placed.low[a] <= placed.high[b] + _AROUND) & (placed.low[b] <= placed.high[a] + _AROUND)
+    near = near.all(axis=1)
+    pair, a, b = pair[near], a[near], b[near]
+    offset = objects.translation[second] - objects.translation[first]
+    groups = list(grouped_gaps(collider.library, placed.parts, a, b, offset[pair]))
+    ways = _directions(len(first), pair, groups, offset)
+    lengths = _lengths(len(first), pair, groups, ways)
+    costs = lengths * _weights(collider, objects, first, second, ways, lengths, bounds)
+    for row, key in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
+        for old in tried.get(key, ()):
+            costs[row, ways[row] @ old > _SAME_WAY] *= _REPEATED
+    best = costs.argmin(axis=1)
+    line = np.arange(len(first))
+    for row, key in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
+        tried.setdefault(key, []).append(ways[row, best[row]])
+    return ways[line, best] * (lengths[line, best] + CLEARANCE)[:, None]  # type: ignore[no-any-return]
+
+
+def _directions(count: int, pair: Index, groups: list[tuple[Index, Array, Array]], offset: Array) -> Array:
+    """(P, D, 3) directions to try: the axes, away from and toward the other's centre, and the parts' own."""
+    ways = np.zeros((count, 8 + 2 * _OWN, 3))
+    ways[:, :6] = _AXES
+    level = offset * np.array([1.0, 1.0, 0.0])
+    length = np.linalg.norm(level, axis=1, keepdims=True)
+    level = np.where(length > 1e-6, level / np.maximum(length, 1e-6), np.array([1.0, 0.0, 0.0]))
+    ways[:, 6], ways[:, 7] = level, -level
+    ways[:, 8:] = level[:, None]
+    rows = np.concatenate([group[0] for group in groups])
+    depth, direction = np.empty(len(rows)), np.empty((len(rows), 3))
+    start = 0
+    for _, gaps, normals in groups:
+        best = gaps.argmax(axis=1)
+        line = np.arange(len(best))
+        depth[start : start + len(best)], direction[start : start + len(best)] = -gaps[line, best], normals[line, best]
+        start += len(best)
+    inside = depth > 0
+    owner, depth, direction = pair[rows][inside], depth[inside], direction[inside]
+    # The deepest parts first, then the shallowest.
+    for base, order in ((8, np.lexsort((-depth, owner))), (8 + _OWN, np.lexsort((depth, owner)))):
+        _, leading, members = np.unique(owner[order], return_index=True, return_counts=True)
+        rank = np.arange(len(order)) - np.repeat(leading, members)
+        top = order[rank < _OWN]
+        ways[owner[top], base + rank[rank < _OWN]] = direction[top]
+    return ways
+
+
+def _lengths(count: int, pair: Index, groups: list[tuple[Index, Array, Array]], ways: Array) -> Array:
+    """(P, D) m: how far to go along each way until no parts overlap."""
+    enter = np.full((len(pair), ways.shape[1]), np.inf)
+    leave = np.full_like(enter, -np.inf)
+    for rows, gaps, normals in groups:
+        speed = np.einsum("qki,qdi->qkd", normals, ways[pair[rows]])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            when = -gaps[..., None] / speed
+        never = ((np.abs(speed) < 1e-9) & (gaps[..., None] >= 0)).any(axis=1)
+        enter[rows] = np.where(speed < -1e-9, when, -np.inf).max(axis=1)
+        leave[rows] = np.where(speed > 1e-9, when, np.inf).min(axis=1)
+        enter[rows] = np.where(never, np.inf, enter[rows])
+    order = np.argsort(pair, kind="stable")
+    enter, leave, owner = enter[order], leave[order], pair[order]
+    present, starts = np.unique(owner, return_index=True)
+    length = np.zeros((count, ways.shape[1]))
+    for _ in range(24):
+        here = length[owner]
+        inside = (enter < here + 1e-7) & (leave > here + 1e-7)
+        further = np.where(inside, leave, 0.0)
+        new = np.maximum(length[present], np.maximum.reduceat(further, starts, axis=0))
+        if (new <= length[present] + 1e-9).all():
+            break
+        length[present] = new
+    return np.where(np.isfinite(length), length, 10.0)
+
+
+def _weights(
+    collider: Collider,
+    objects: Objects,
+    first: Index,
+    second: Index,
+    ways: Array,
+    lengths: Array,
+    bounds: tuple[Array, Array],
+) -> Array:
+    """(P, D) how much more a metre of each way counts."""
+    weight = np.ones(lengths.shape)
+    fixed = objects.fixed[first] | objects.fixed[second]
+    # The way of the free object, or of the upper one of two.
+    upper = np.where(
+        objects.fixed[first],
+        second,
+        np.where(
+            objects.fixed[second] | (objects.translation[first, 2] > objects.translation[second, 2]), first, second
+        ),
+    )
+    way = np.where((upper == second)[:, None, None], ways, -ways)
+    weight[fixed[:, None] & (way[..., 2] < -0.7)] *= _DOWN
+    weight[~fixed[:, None] & (np.abs(way[..., 2]) > 0.7)] *= _UP
+    target = objects.translation[upper][:, None] + way * lengths[..., None]
+    low, high = bounds
+    leaves = ((target < low[upper][:, None] - 1e-6) | (target > high[upper][:, None] + 1e-6)).any(axis=2)
+    weight[leaves & (fixed[:, None] | (way[..., 2] > 0.7))] *= _BLOCKED
+    if objects.fixed.any():
+        low, high = object_boxes(place(collider.library, objects, "coarse"))
+        boards = place(collider.library, objects[objects.fixed], "coarse")
+        rise = np.where(way[..., 2] > 0.7, lengths, 0.0)  # (P, D)
+        over = (boards.low[None, :, :2] < high[upper][:, None, :2]) & (boards.high[None, :, :2] > low[upper][:, None, :2])
+        above = over.all(axis=2) & (boards.low[None, :, 2] > 0.5 * (low[upper] + high[upper])[:, None, 2])
+        room = np.where(above, boards.low[None, :, 2] - high[upper][:, None, 2], np.inf).min(axis=1)
+        weight[(rise > np.maximum(room, 0.0)[:, None]) & ~fixed[:, None]] *= _BLOCKED
+    return weight
