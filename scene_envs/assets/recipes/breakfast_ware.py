@@ -50,6 +50,12 @@ def shared_plate() -> Model:
     return _plate(0.11, 0.020, 0.082, 0.006, (196, 152, 84), (243, 238, 226))
 
 
+def _into_wall(path: Array, depth: float) -> Array:
+    """The path of a handle, its ends ``depth`` m further toward -x, so that they do not show."""
+    inward = np.array([depth, 0.0, 0.0])
+    return np.concatenate([path[:1] - inward, path, path[-1:] - inward])
+
+
 _MUG_RADIUS, _MUG_HEIGHT, _MUG_WALL, _MUG_FLOOR = 0.040, 0.085, 0.0045, 0.006
 _MUG_SIDES = 10
 _MUG_FACE = _MUG_RADIUS * np.cos(np.pi / _MUG_SIDES)
@@ -76,9 +82,9 @@ def mug() -> Model:
                 (0.040, 0.016), (0.040, 0.0825), (0.0392, _MUG_HEIGHT), (0.0372, _MUG_HEIGHT), (0.0358, 0.083),
                 (0.0355, 0.012), (0.031, 0.0068), (0.0, _MUG_FLOOR),
             ],
-            [*[_WHITE] * 3, _TEAL_DARK, _TEAL_DARK, _TEAL_DARK, _TEAL, _TEAL, _WHITE, *[_WHITE] * 4],
+            [*[_WHITE] * 3, _TEAL_DARK, _TEAL, _TEAL, _TEAL, _TEAL, *[_WHITE] * 5],
         ),
-        tube(arc(_MUG_HANDLE, 18), 0.0045, _TEAL),
+        tube(_into_wall(arc(_MUG_HANDLE, 18), 0.001), 0.0045, _TEAL),
     )  # fmt: skip
     return Model(visual, [floor, *wall, *handle], [hull_of([floor, *wall]), hull_of(handle)])
 
@@ -114,7 +120,7 @@ def water_jug() -> Model:
         lathe([(0.0, 0.002), (0.040, 0.002), (0.042, 0.0), (0.0455, 0.0), tuple(outside[0])], _RIM),
         revolve(np.concatenate([outside, top, inside[:-1]]), [_ENAMEL, _STRIPE, _RIM], bands, segments=48, swell=lip),
         lathe([tuple(inside[-2]), (inner[0], 0.012), (0.036, 0.0075), (0.0, _JUG_FLOOR)], _ENAMEL),
-        tube(arc(_JUG_HANDLE, 20), 0.0062, _RIM),
+        tube(_into_wall(arc(_JUG_HANDLE, 20), 0.004), 0.0062, _RIM),
     )
     return Model(visual, [floor, *wall, *handle], [hull_of([floor, *wall]), hull_of(handle)])
 

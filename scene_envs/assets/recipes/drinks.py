@@ -58,9 +58,10 @@ def _lid(z: float) -> trimesh.Trimesh:
 _TEA: Color = (176, 108, 44)
 _GLASS: Color = (196, 132, 60)
 _LABEL: Color = (64, 128, 70)
-_LEAF: Color = (236, 240, 216)
+_CREAM: Color = (236, 240, 216)
 _CAP: Color = (46, 92, 58)
 
+_LABEL_RADIUS = 0.0325
 _BODY = [(0.0325, 0.0), (0.0325, 0.140), (0.015, 0.176)]
 _NECK = [(0.015, 0.176), (0.015, 0.208)]
 
@@ -69,13 +70,24 @@ _NECK = [(0.015, 0.176), (0.015, 0.208)]
 def tea_bottle() -> Model:
     """A bottle of tea with a green label and cap."""
     body, neck = solid(_BODY, 12), solid(_NECK, 12)
-    visual = lathe(
+    glass = lathe(
         [
-            (0.0, 0.004), (0.024, 0.002), (0.028, 0.0), (0.0315, 0.004), (0.0322, 0.012), (0.0322, 0.040),
-            (0.0325, 0.041), (0.0325, 0.052), (0.0325, 0.108), (0.0325, 0.119), (0.0322, 0.120), (0.0322, 0.134),
+            (0.0, 0.004), (0.024, 0.002), (0.028, 0.0), (0.0315, 0.004), (0.0320, 0.012), (0.0320, 0.040),
+            (_LABEL_RADIUS, 0.041), (_LABEL_RADIUS, 0.052), (_LABEL_RADIUS, 0.054),
+        ],
+        [*[_TEA] * 5, _LABEL, _LABEL, _LABEL],
+    )  # fmt: skip
+    shoulder = lathe(
+        [
+            (_LABEL_RADIUS, 0.106), (_LABEL_RADIUS, 0.108), (_LABEL_RADIUS, 0.119), (0.0320, 0.120), (0.0320, 0.134),
             (0.0300, 0.145), (0.0250, 0.158), (0.0185, 0.170), (0.0150, 0.178), (0.0130, 0.184), (0.0130, 0.188),
             (0.0148, 0.189), (0.0148, 0.206), (0.0135, 0.208), (0.0, 0.208),
         ],
-        [_TEA, _TEA, *[_TEA] * 3, _LABEL, _LABEL, _LEAF, _LABEL, _LABEL, _TEA, *[_TEA] * 2, *[_GLASS] * 5, *[_CAP] * 3],
+        [_LABEL, _LABEL, _LABEL, _TEA, *[_TEA] * 2, *[_GLASS] * 5, *[_CAP] * 3],
     )  # fmt: skip
-    return Model(visual, [body, neck], [body, neck])
+    angle = 2.0 * np.pi * np.arange(48) / 48
+    leaf = 0.015 * np.clip(np.cos(2.0 * angle + 2.2), 0.0, None)  # two leaves, on opposite sides
+    middle = 0.080 + 0.006 * np.sin(2.0 * angle + 2.2)
+    levels = [np.full(48, 0.054), middle - leaf, middle, middle + leaf, np.full(48, 0.106)]
+    label = sleeve(_LABEL_RADIUS, levels, [_CREAM, _LABEL, _CAP, _CREAM])
+    return Model(join(glass, label, shoulder), [body, neck], [body, neck])

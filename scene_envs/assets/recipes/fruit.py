@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import trimesh
 
@@ -36,30 +34,42 @@ def _stem(height: float, start: float, tip: float, lean: float, thickness: float
     return tube(path, [0.9 * thickness, 0.8 * thickness, 1.2 * thickness], _STEM, sides=6)
 
 
-def _cheek(height: float, turn: float = 0.6, spread: float = 0.9) -> Paint:
-    """Ground colour (0) with a sunny cheek (2) and a streaky seam between them (1)."""
+def _tones(first: Color, last: Color, count: int = 5) -> list[Color]:
+    """Colours from ``first`` to ``last`` in even steps."""
+    mixed = np.linspace(first, last, count).round().astype(int)
+    return [(int(r), int(g), int(b)) for r, g, b in mixed]
+
+
+def _cheek(spread: float) -> Paint:
+    """From the ground colour on the shaded side (0) to the cheek that the sun has seen (4), in streaks."""
 
     def paint(angle: Array, z: Array) -> Cells:
-        sun = np.cos(angle - turn) + 0.35 * np.cos(5.0 * angle + 1.0) * np.cos(9.0 * angle) + 0.5 * (z / height - 0.5)
-        return (sun > -spread).astype(np.int64) + (sun > 0.35 - spread)
+        streaks = 0.35 * np.cos(5.0 * angle + 1.0) * np.cos(13.0 * angle)
+        return np.clip(np.floor(2.5 * (np.cos(angle + 0.5) + streaks + spread)) + 1 + 0.0 * z, 0, 4).astype(np.int64)
 
     return paint
 
 
-def _specks(density: float) -> Paint:
-    """Scattered darker (1) and lighter (2) cells on a ground colour (0)."""
+def _ripening(height: float) -> Paint:
+    """From the colour at the blossom end (0) to that at the stem (4)."""
 
     def paint(angle: Array, z: Array) -> Cells:
-        shape = np.broadcast_shapes(angle.shape, z.shape)
-        draw = np.random.default_rng(7).random(shape)  # fixed: an asset looks the same every time
-        return np.where(draw < density, 1, np.where(draw > 1.0 - density, 2, 0))
+        return np.clip(np.floor(5.0 * (z / height) + 0.0 * angle), 0, 4).astype(np.int64)
 
     return paint
 
 
-def _apple(
-    diameter: float, height: float, colors: tuple[Color, Color, Color], paint: Paint, *, conical: bool = False
-) -> Model:
+def _pebbled(height: float) -> Paint:
+    """As :func:`_ripening`, one tone up or down from cell to cell."""
+
+    def paint(angle: Array, z: Array) -> Cells:
+        turns = np.random.default_rng(7).integers(-1, 2, np.broadcast_shapes(angle.shape, z.shape))
+        return np.clip(_ripening(height)(angle, z) + turns, 0, 4)
+
+    return paint
+
+
+def _apple(diameter: float, height: float, colors: list[Color], paint: Paint, *, conical: bool = False) -> Model:
     radius = diameter / 2.0
     part = solid(_scaled(_CONICAL_HULL if conical else _APPLE_HULL, radius, height), _SIDES)
 
@@ -78,32 +88,32 @@ def _apple(
 @asset_recipe("apple_gala", display_name="apple", mass=0.15, color=(236, 30, 70))
 def apple_gala() -> Model:
     """A small red apple on a yellow ground."""
-    return _apple(0.066, 0.062, ((228, 186, 92), (216, 112, 62), (198, 58, 46)), _cheek(0.062))
+    return _apple(0.066, 0.062, _tones((232, 190, 92), (196, 54, 46)), _cheek(1.0))
 
 
 @asset_recipe("apple_golden", display_name="apple", mass=0.17, color=(250, 215, 60))
 def apple_golden() -> Model:
     """A yellow apple with a few green and brown specks."""
-    return _apple(0.070, 0.068, ((232, 208, 92), (214, 196, 84), (238, 218, 116)), _specks(0.10))
+    return _apple(0.070, 0.068, _tones((238, 212, 94), (216, 204, 84)), _ripening(0.068))
 
 
 @asset_recipe("apple_green", display_name="apple", mass=0.19, color=(140, 230, 40))
 def apple_green() -> Model:
     """A green apple."""
-    return _apple(0.075, 0.070, ((142, 190, 64), (130, 180, 56), (162, 204, 88)), _specks(0.10))
+    return _apple(0.075, 0.070, _tones((162, 204, 82), (130, 182, 56)), _ripening(0.070))
 
 
 @asset_recipe("apple_red", display_name="apple", mass=0.21, color=(150, 10, 30))
 def apple_red() -> Model:
     """A dark red apple, wide at the top, with five lobes below."""
-    return _apple(0.080, 0.080, ((164, 52, 44), (148, 30, 38), (128, 18, 32)), _cheek(0.080, spread=0.75), conical=True)
+    return _apple(0.080, 0.080, _tones((170, 58, 46), (126, 18, 32)), _cheek(0.9), conical=True)
 
 
 def _pear(
     diameter: float,
     height: float,
     neck: tuple[float, float, float],
-    colors: tuple[Color, Color, Color],
+    colors: list[Color],
     paint: Paint,
 ) -> Model:
     """A pear; ``neck`` is the radius where it begins, near its top, and the height where it begins (fractions)."""
@@ -120,26 +130,26 @@ def _pear(
         (0.72 * end, 0.975), (0.30 * end, 1.0), (0.0, 0.985),
     ]  # fmt: skip
     body = revolve(curve(_scaled(section, radius, height), 28), colors, paint)
-    visual = join(body, _stem(height, 0.97, 1.04, 0.004, 0.0016))
+    visual = join(body, _stem(height, 0.97, 1.028, 0.003, 0.0016))
     return Model(visual, [lower, upper], [hull_of([lower, upper])])
 
 
 @asset_recipe("pear_bosc", display_name="pear", mass=0.19, color=(170, 130, 20))
 def pear_bosc() -> Model:
     """A brown pear with a long neck."""
-    return _pear(0.070, 0.100, (0.60, 0.36, 0.64), ((176, 130, 66), (164, 118, 58), (190, 146, 80)), _specks(0.15))
+    return _pear(0.070, 0.100, (0.60, 0.36, 0.64), _tones((160, 112, 54), (194, 152, 84)), _ripening(0.100))
 
 
 @asset_recipe("pear_anjou", display_name="pear", mass=0.19, color=(190, 210, 110))
 def pear_anjou() -> Model:
     """A green pear, egg-shaped, with a short neck."""
-    return _pear(0.068, 0.090, (0.68, 0.46, 0.70), ((178, 196, 88), (166, 186, 78), (192, 208, 108)), _specks(0.12))
+    return _pear(0.068, 0.090, (0.68, 0.46, 0.70), _tones((196, 208, 104), (162, 184, 76)), _ripening(0.090))
 
 
 @asset_recipe("pear_red", display_name="pear", mass=0.20, color=(190, 40, 110))
 def pear_red() -> Model:
     """A squat red pear with a narrow neck."""
-    return _pear(0.075, 0.085, (0.56, 0.38, 0.68), ((196, 92, 62), (176, 50, 50), (150, 30, 44)), _cheek(0.085))
+    return _pear(0.075, 0.085, (0.56, 0.38, 0.68), _tones((206, 112, 66), (150, 30, 44)), _cheek(0.8))
 
 
 _AVOCADO = [(0.0, 0.02), (0.20, 0.005), (0.36, 0.0), (0.66, 0.04), (0.93, 0.21), (1.0, 0.38), (0.945, 0.53),
@@ -147,38 +157,30 @@ _AVOCADO = [(0.0, 0.02), (0.20, 0.005), (0.36, 0.0), (0.66, 0.04), (0.93, 0.21),
 _AVOCADO_HULL = [(0.46, 0.0), (0.94, 0.19), (1.0, 0.42), (0.82, 0.70), (0.40, 1.0)]
 
 
-def _avocado(diameter: float, height: float, colors: tuple[Color, Color, Color], bumps: float, density: float) -> Model:
+def _avocado(diameter: float, height: float, colors: list[Color], paint: Paint, bumps: float) -> Model:
     part = solid(_scaled(_AVOCADO_HULL, diameter / 2.0, height), _SIDES)
-    body = revolve(
-        curve(_scaled(_AVOCADO, diameter / 2.0, height), 26),
-        colors,
-        _specks(density),
-        segments=36,
-        swell=_pebbles(bumps),
-    )
+
+    def pebbles(angle: Array, z: Array) -> Array:
+        return 1.0 - bumps * (0.5 + 0.5 * np.cos(11.0 * angle + 400.0 * z) * np.cos(7.0 * angle - 900.0 * z))
+
+    profile = curve(_scaled(_AVOCADO, diameter / 2.0, height), 26)
+    body = revolve(profile, colors, paint, segments=36, swell=pebbles)
     return Model(join(body, _stem(height, 0.97, 1.012, 0.0, 0.0028)), [part], [part])
-
-
-def _pebbles(size: float) -> Callable[[Array, Array], Array]:
-    def swell(angle: Array, z: Array) -> Array:
-        return 1.0 - size * (0.5 + 0.5 * np.cos(11.0 * angle + 400.0 * z) * np.cos(7.0 * angle - 900.0 * z))
-
-    return swell
 
 
 @asset_recipe("avocado_a", display_name="avocado", mass=0.22, color=(20, 110, 60))
 def avocado_a() -> Model:
     """A smooth green avocado."""
-    return _avocado(0.065, 0.100, ((84, 112, 48), (74, 100, 42), (104, 130, 62)), 0.01, 0.12)
+    return _avocado(0.065, 0.100, _tones((74, 100, 42), (104, 130, 62)), _ripening(0.100), 0.01)
 
 
 @asset_recipe("avocado_b", display_name="avocado", mass=0.20, color=(40, 60, 30))
 def avocado_b() -> Model:
     """A small dark avocado with a pebbled skin."""
-    return _avocado(0.060, 0.095, ((58, 56, 44), (46, 44, 38), (74, 76, 54)), 0.04, 0.28)
+    return _avocado(0.060, 0.095, _tones((54, 50, 42), (74, 78, 52)), _pebbled(0.095), 0.04)
 
 
 @asset_recipe("avocado_c", display_name="avocado", mass=0.33, color=(90, 140, 30))
 def avocado_c() -> Model:
     """A large bright green avocado."""
-    return _avocado(0.082, 0.120, ((112, 148, 62), (100, 136, 54), (138, 168, 84)), 0.01, 0.14)
+    return _avocado(0.082, 0.120, _tones((104, 140, 52), (146, 172, 84)), _ripening(0.120), 0.01)
