@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
+import trimesh
 
 from scene_envs.assets.base import Array
 from scene_envs.assets.library import Model, asset_recipe
@@ -50,15 +54,16 @@ def shared_plate() -> Model:
     return _plate(0.11, 0.020, 0.082, 0.006, (196, 152, 84), (243, 238, 226))
 
 
-def _into_wall(path: Array, depth: float) -> Array:
-    """The path of a handle, its ends ``depth`` m further toward -x, so that they do not show."""
-    inward = np.array([depth, 0.0, 0.0])
-    return np.concatenate([path[:1] - inward, path, path[-1:] - inward])
+def _handle(path: Sequence[tuple[float, float, float]], radius: float, color: Color) -> trimesh.Trimesh:
+    """A round handle along ``path``, whose ends reach 2 mm into the wall so that they do not show."""
+    first, *middle, last = path
+    inward = [(first[0] - 0.002, *first[1:]), *middle, (last[0] - 0.002, *last[1:])]
+    return tube(arc(inward, 20), radius, color)
 
 
 _MUG_RADIUS, _MUG_HEIGHT, _MUG_WALL, _MUG_FLOOR = 0.040, 0.085, 0.0045, 0.006
 _MUG_SIDES = 10
-_MUG_FACE = _MUG_RADIUS * np.cos(np.pi / _MUG_SIDES)
+_MUG_FACE = _MUG_RADIUS * math.cos(math.pi / _MUG_SIDES)
 """Distance (m) from the axis of the flat face that the handle stands on."""
 _MUG_HANDLE = [(_MUG_FACE, 0.0, 0.068), (0.058, 0.0, 0.068), (0.068, 0.0, 0.045), (0.058, 0.0, 0.020),
                (_MUG_FACE, 0.0, 0.020)]  # fmt: skip
@@ -84,7 +89,7 @@ def mug() -> Model:
             ],
             [*[_WHITE] * 3, _TEAL_DARK, _TEAL, _TEAL, _TEAL, _TEAL, *[_WHITE] * 5],
         ),
-        tube(_into_wall(arc(_MUG_HANDLE, 18), 0.001), 0.0045, _TEAL),
+        _handle(_MUG_HANDLE, 0.0045, _TEAL),
     )  # fmt: skip
     return Model(visual, [floor, *wall, *handle], [hull_of([floor, *wall]), hull_of(handle)])
 
@@ -120,7 +125,7 @@ def water_jug() -> Model:
         lathe([(0.0, 0.002), (0.040, 0.002), (0.042, 0.0), (0.0455, 0.0), tuple(outside[0])], _RIM),
         revolve(np.concatenate([outside, top, inside[:-1]]), [_ENAMEL, _STRIPE, _RIM], bands, segments=48, swell=lip),
         lathe([tuple(inside[-2]), (inner[0], 0.012), (0.036, 0.0075), (0.0, _JUG_FLOOR)], _ENAMEL),
-        tube(_into_wall(arc(_JUG_HANDLE, 20), 0.004), 0.0062, _RIM),
+        _handle(_JUG_HANDLE, 0.0062, _RIM),
     )
     return Model(visual, [floor, *wall, *handle], [hull_of([floor, *wall]), hull_of(handle)])
 
