@@ -6,11 +6,12 @@ A pattern is a list of patches; the face is cut along their edges, so nothing ov
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal, NamedTuple
+from itertools import pairwise
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import trimesh
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from scene_envs.assets.base import Array
 from scene_envs.assets.surfaces import Color, join, surface
@@ -53,15 +54,41 @@ def painted_face(
     normal = np.cross(right, rise)
     normal /= np.linalg.norm(normal)
     meshes = []
-    for index in np.unique(owner):
-        i, j = np.nonzero(owner == index)
-        ends = np.stack([(across[i + a], upward[j + b]) for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))])  # (4, 2, cells)
-        corners = start + ends[:, 0, :, None] * right + ends[:, 1, :, None] * rise  # (4, cells, 3)
-        first = 4 * np.arange(len(i))[:, None]
-        faces = np.concatenate([first + [0, 1, 2], first + [0, 2, 3]])
-        vertices = corners.transpose(1, 0, 2).reshape(-1, 3)
-        meshes.append(surface(vertices, faces, palette[index], np.tile(normal, (len(vertices), 1))))
+    for index, cells in _rectangles(owner).items():
+        left, low, end, high = np.array(cells).T
+        ends = [(across[a], upward[b]) for a, b in ((left, low), (end, low), (end, high), (left, high))]
+        corners = np.stack([start + u[:, None] * right + v[:, None] * rise for u, v in ends], axis=1)  # (cells, 4, 3)
+        normals = np.tile(normal, (4 * len(cells), 1))
+        meshes.append(surface(corners.reshape(-1, 3), quad_faces(len(cells)), palette[index], normals))
     return join(*meshes)
+
+
+def _rectangles(owner: NDArray[np.int64]) -> dict[int, list[tuple[int, int, int, int]]]:
+    """Cells of one owner joined to rectangles (left, low, right, high), exclusive above: strips of equal width."""
+    joined: dict[int, list[tuple[int, int, int, int]]] = {}
+    open_strips: dict[tuple[int, int, int], int] = {}
+    for j in range(owner.shape[1] + 1):
+        strips: set[tuple[int, int, int]] = set()
+        if j < owner.shape[1]:
+            starts = np.concatenate([[0], np.flatnonzero(np.diff(owner[:, j])) + 1, [len(owner)]])
+            strips = {(int(owner[a, j]), int(a), int(b)) for a, b in pairwise(starts)}
+        for strip in sorted(set(open_strips) - strips):
+            index, a, b = strip
+            joined.setdefault(index, []).append((a, open_strips.pop(strip), b, j))
+        for strip in strips:
+            open_strips.setdefault(strip, j)
+    return joined
+
+
+def quad_faces(count: int) -> NDArray[np.int64]:
+    """(2 count, 3): two triangles for each of ``count`` quadrilaterals with corners 4 k .. 4 k + 3."""
+    first = 4 * np.arange(count)[:, None]
+    return np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])])
+
+
+def fan(count: int) -> NDArray[np.int64]:
+    """(count - 2, 3): triangles of a convex outline of ``count`` corners."""
+    return np.stack([np.zeros(count - 2, dtype=np.int64), np.arange(1, count - 1), np.arange(2, count)], axis=1)
 
 
 def painted_box(
@@ -110,8 +137,8 @@ def lettering(
     return patches
 
 
-def loft(sections: ArrayLike, color: Color) -> trimesh.Trimesh:
-    """A smooth skin through P sections of K points each (P, K, 3), m, with flat caps at both ends.
+def loft(sections: ArrayLike, color: Color, *, caps: tuple[bool, bool] = (True, True)) -> trimesh.Trimesh:
+    """A smooth skin through P sections of K points each (P, K, 3), m, with flat caps at its first and last end.
 
     The points run counter-clockwise when seen from the last section looking back at the first.
     """
@@ -121,19 +148,20 @@ def loft(sections: ArrayLike, color: Color) -> trimesh.Trimesh:
     a, b = index[:-1], np.roll(index[:-1], -1, axis=1)
     d, c = index[1:], np.roll(index[1:], -1, axis=1)
     faces = np.concatenate([np.stack([a, b, c], axis=-1).reshape(-1, 3), np.stack([a, c, d], axis=-1).reshape(-1, 3)])
-    fan = np.stack([np.zeros(around - 2, int), np.arange(1, around - 1), np.arange(2, around)], axis=1)
-    skin = surface(grid.reshape(-1, 3), faces, color)
-    return join(skin, surface(grid[0], fan[:, ::-1], color), surface(grid[-1], fan, color))
+    ends = [surface(grid[0], fan(around)[:, ::-1], color), surface(grid[-1], fan(around), color)]
+    return join(
+        surface(grid.reshape(-1, 3), faces, color), *(end for end, kept in zip(ends, caps, strict=True) if kept)
+    )
 
 
 def moved(mesh: trimesh.Trimesh, rotation: ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> trimesh.Trimesh:
     """The mesh at another pose: rotation (3, 3), then translation (3,) m; colours are kept."""
     turn = np.asarray(rotation, dtype=np.float64)
-    visual = mesh.visual
+    visual: Any = mesh.visual
     return trimesh.Trimesh(
         vertices=mesh.vertices @ turn.T + np.asarray(translation),
         faces=mesh.faces,
         vertex_normals=mesh.vertex_normals @ turn.T,
-        vertex_colors=visual.vertex_colors,  # type: ignore[union-attr]
+        vertex_colors=visual.vertex_colors,
         process=False,
     )

@@ -10,7 +10,7 @@ import trimesh
 
 from scene_envs.assets.base import Array, ConvexPart
 from scene_envs.assets.library import Model, asset_recipe
-from scene_envs.assets.panels import loft
+from scene_envs.assets.panels import fan, loft, quad_faces
 from scene_envs.assets.shapes import circle, convex_hull, hull_of
 from scene_envs.assets.surfaces import Color, join, surface
 
@@ -34,14 +34,14 @@ def _beam(stations: Sequence[Station], y: float = 0.0) -> list[ConvexPart]:
     return [convex_hull(np.concatenate([_section(a, y), _section(b, y)])) for a, b in pairwise(stations)]
 
 
-def _skin(stations: Sequence[Station], color: Color, y: float = 0.0, samples: int = 24) -> trimesh.Trimesh:
+def _skin(stations: Sequence[Station], color: Color, y: float = 0.0, samples: int = 14) -> trimesh.Trimesh:
     """A rounded bar through the stations, y = 0 in its middle."""
     from scipy.interpolate import PchipInterpolator
 
     table = np.array(stations)
     x = np.linspace(table[0, 0], table[-1, 0], samples)
     width, low, high = PchipInterpolator(table[:, 0], table[:, 1:])(x).T
-    angles = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False) + np.pi / 16
+    angles = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False) + np.pi / 12
     ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     ring = np.sign(ring) * np.abs(ring) ** 0.6  # between an ellipse and a rectangle
     ring /= np.abs(ring).max(axis=0)
@@ -65,9 +65,9 @@ def fork() -> Model:
     shoulder = (0.040, 0.020, 0.0035, 0.0078)
     visual = join(
         _skin([end, (-0.07, 0.016, 0.0, _THICK), waist, (0.0, 0.008, 0.0042, 0.0076), neck], _STEEL),
-        _skin([neck, shoulder, (0.047, 0.0248, 0.0006, 0.0042), root], _STEEL, samples=12),
+        _skin([neck, shoulder, (0.047, 0.0248, 0.0006, 0.0042), root], _STEEL, samples=8),
         *(
-            _skin([(root[0], 0.0046, 0.0, 0.0036), (0.078, 0.0042, 0.0004, 0.0036), tip], _BRIGHT, y, samples=8)
+            _skin([(root[0], 0.0046, 0.0, 0.0036), (0.078, 0.0042, 0.0004, 0.0036), tip], _BRIGHT, y, samples=5)
             for y in rows
         ),
     )
@@ -82,9 +82,11 @@ def knife() -> Model:
                         (0.108, 0.0085), (0.090, 0.0100), (-0.005, 0.0068)])  # fmt: skip
     handle = _beam([end, bolster])[0]
     blade = convex_hull([(x, y, z) for x, y in outline for z in (0.0, _THICK)])
-    low, high = (np.column_stack([outline, np.full(len(outline), z)]) for z in (0.0, 0.0026))
-    inner = outline * [1.0, 1.0] + np.where(outline[:, 1:] < 0.0, [[0.0, 0.0030]], [[0.0, 0.0]])
-    flat = np.column_stack([inner, np.full(len(inner), _THICK)])
+    edge = _rounded(outline)
+    ground = edge + np.where(edge[:, 1:] < 0.0, [[0.0, 0.0028]], [[0.0, 0.0]])  # the bevel along the cutting edge
+    low, high, flat = (
+        np.column_stack([line, np.full(len(line), z)]) for line, z in ((edge, 0.0), (edge, 0.0012), (ground, 0.0024))
+    )
     visual = join(
         _skin([end, (-0.108, 0.018, 0.0, 0.008), (-0.03, 0.0145, 0.0, 0.0072), bolster], _STEEL),
         _prism(low, high, _SHADE),
@@ -97,10 +99,16 @@ def _prism(low: Array, high: Array, color: Color) -> trimesh.Trimesh:
     """A sharp-edged skin between two outlines (K, 3), counter-clockwise from above, with its lid."""
     count = len(low)
     quads = np.stack([low, np.roll(low, -1, axis=0), np.roll(high, -1, axis=0), high], axis=1)
-    first = 4 * np.arange(count)[:, None]
-    sides = surface(quads.reshape(-1, 3), np.concatenate([first + [0, 1, 2], first + [0, 2, 3]]), color)
-    fan = np.stack([np.zeros(count - 2, int), np.arange(1, count - 1), np.arange(2, count)], axis=1)
-    return join(sides, surface(high, fan, color), surface(low, fan[:, ::-1], color))
+    sides = surface(quads.reshape(-1, 3), quad_faces(count), color)
+    return join(sides, surface(high, fan(count), color), surface(low, fan(count)[:, ::-1], color))
+
+
+def _rounded(outline: Array, rounds: int = 2) -> Array:
+    """A closed outline (K, 2) with its corners cut off ``rounds`` times (Chaikin); it stays inside the first one."""
+    for _ in range(rounds):
+        ahead = np.roll(outline, -1, axis=0)
+        outline = np.stack([0.8 * outline + 0.2 * ahead, 0.2 * outline + 0.8 * ahead], axis=1).reshape(-1, 2)
+    return outline
 
 
 @asset_recipe("dinner_spoon", display_name="spoon", mass=0.035, color=(128, 150, 178))
@@ -139,10 +147,19 @@ def _spoon(length: float, width: float, height: float) -> Model:
         at(unit, scale, drop) for scale, drop in ((0.94, 0.0), (0.86, 0.26), (0.66, 0.53), (0.4, 0.66), (0.05, 0.7))
     ]
     visual = join(
-        _skin([end, (-0.42 * length, 0.38 * width, 0.0, _THICK), waist, (0.0, 0.19 * width, 0.3 * height, 0.3 * height + _THICK), neck,
-               (neck[0] + 0.004, 0.22 * width, height - _THICK, height)], _STEEL),
-        loft(outside, _STEEL),
-        loft([outside[-1], inside[0]], _BRIGHT),
-        loft(inside, _SHADE),
-    )  # fmt: skip
+        _skin(
+            [
+                end,
+                (-0.42 * length, 0.38 * width, 0.0, _THICK),
+                waist,
+                (0.0, 0.19 * width, 0.3 * height, 0.3 * height + _THICK),
+                neck,
+                (neck[0] + 0.004, 0.22 * width, height - _THICK, height),
+            ],
+            _STEEL,
+        ),
+        loft(outside, _STEEL, caps=(True, False)),
+        loft([outside[-1], inside[0]], _BRIGHT, caps=(False, False)),
+        loft(inside, _SHADE, caps=(False, True)),
+    )
     return Model(visual, [handle, stem, bowl], [hull_of([handle, stem]), bowl])

@@ -6,7 +6,7 @@ import numpy as np
 
 from scene_envs.assets.library import Model, asset_recipe
 from scene_envs.assets.panels import Patch, painted_box
-from scene_envs.assets.shapes import box, hull_of, solid
+from scene_envs.assets.shapes import box, solid
 from scene_envs.assets.surfaces import Color, join, lathe, planks
 
 _TOP_RADIUS, _TOP_THICKNESS, _HEIGHT = 0.625, 0.03, 0.785
@@ -59,8 +59,8 @@ def breakfast_table() -> Model:
         painted_box((0.75, 1.50, 0.04), _ASH_EDGE, {"top": boards}, base=(0.0, 0.0, -0.04)),
         *(painted_box((0.06, 0.06, _LEG), _ASH_EDGE, base=(x, y, -0.04 - _LEG)) for x, y in places),
     )
-    parts = [top, *legs]
-    return Model(visual, parts, [hull_of(parts)])
+    parts = [top, *legs]  # no coarse hull: a solid block would hide that the top is a face to stand on
+    return Model(visual, parts, parts)
 
 
 @asset_recipe("chair", display_name="chair", mass=6.0, color=(84, 52, 32))

@@ -46,7 +46,7 @@ def board_game_s() -> Model:
     return _lidded((0.20, 0.264, 0.060), plum, plum, top, label)
 
 
-@asset_recipe("board_game_xl", display_name="board game", mass=1.10, color=(128, 20, 44))
+@asset_recipe("board_game_xl", display_name="board game", mass=1.10, color=(150, 0, 72))
 def board_game_xl() -> Model:
     """A long game box; its long side is along x."""
     night, wine, cream, gold = (34, 40, 62), (150, 32, 46), (238, 226, 196), (206, 166, 88)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+import trimesh
 
 from scene_envs.assets.library import Model, asset_recipe
 from scene_envs.assets.panels import Patch, lettering, loft, moved, painted_box
@@ -58,6 +61,7 @@ def book() -> Model:
     size = (0.14, 0.05, 0.21)
     cover, cream, paper, line = (186, 66, 50), (246, 236, 212), (240, 232, 214), (222, 210, 186)
     board, inset = 0.003, 0.004
+    aside = 0.5 * (size[1] - board)
     front = [
         Patch(0.10, 0.58, 0.90, 0.90, cream),
         *lettering(0.18, 0.78, 0.82, 0.86, cover, (1, 0.8, 1)),
@@ -72,13 +76,16 @@ def book() -> Model:
         *(Patch(0.30, z, 0.72, z + h, cream) for z, h in ((0.30, 0.07), (0.385, 0.05), (0.45, 0.07), (0.535, 0.05))),
         Patch(0.24, 0.70, 0.78, 0.80, (236, 184, 72)),
     ]
+    blurb = [
+        Patch(0.12, z, 0.88 - 0.2 * (k == 0), z + 0.018, cream) for k, z in enumerate(np.arange(0.46, 0.86, 0.055))
+    ]
+    blurb += [Patch(0.58, 0.08, 0.88, 0.20, cream)]
+    blurb += lettering(0.62, 0.10, 0.84, 0.18, (60, 50, 44), (0.4, 0.7, 0.3, 0.5, 0.8, 0.4, 0.6))
     sheets = [Patch(x, 0.0, x + 0.06, 1.0, line) for x in np.arange(0.04, 0.95, 0.15)]
     pages = (size[0] - board - inset, size[1] - 2.0 * board, size[2] - 2.0 * inset)
     visual = join(
-        *(
-            painted_box((size[0], board, size[2]), cover, {face: front}, base=(0.0, side * 0.5 * (size[1] - board), 0.0))
-            for face, side in (("-y", -1.0), ("+y", 1.0))
-        ),
+        painted_box((size[0], board, size[2]), cover, {"-y": front}, base=(0.0, -aside, 0.0)),
+        painted_box((size[0], board, size[2]), cover, {"+y": blurb}, base=(0.0, aside, 0.0)),
         painted_box((board, pages[1], size[2]), cover, {"+x": spine}, base=(0.5 * (size[0] - board), 0.0, 0.0)),
         painted_box(pages, paper, {"-x": sheets, "top": sheets}, base=(0.5 * (inset - board), 0.0, inset), front="+x"),
     )  # fmt: skip
@@ -94,8 +101,8 @@ def lamp() -> Model:
     stem = solid([(0.004, 0.012), (0.004, 0.052)], 8)
     shade = solid([(0.028, 0.052), (0.017, 0.10)], 16)
     visual = join(
-        lathe([(0.0, 0.0), (0.0195, 0.0), (0.020, 0.001), (0.020, 0.006), (0.015, 0.009), (0.012, 0.012), (0.006, 0.0135),
-               (0.004, 0.018), (0.0055, 0.024), (0.004, 0.030), (0.0035, 0.054)], brass, segments=28),
+        lathe([(0.0, 0.0), (0.0195, 0.0), (0.020, 0.001), (0.020, 0.006), (0.015, 0.009), (0.012, 0.012),
+               (0.006, 0.0135), (0.004, 0.018), (0.0055, 0.024), (0.004, 0.030), (0.0035, 0.054)], brass, segments=28),
         lathe([(0.0, 0.054), (0.025, 0.054), (0.0278, 0.052), (0.028, 0.0525), (0.0272, 0.056), (0.0179, 0.096),
                (0.017, 0.0995), (0.0165, 0.10), (0.0, 0.098)],
               [bulb, trim, trim, trim, linen, trim, trim, bulb], segments=32),
@@ -103,7 +110,7 @@ def lamp() -> Model:
     return Model(visual, [base, stem, shade], [hull_of([base, stem, shade])])
 
 
-@asset_recipe("speaker", display_name="speaker", mass=0.60, color=(40, 40, 48))
+@asset_recipe("speaker", display_name="speaker", mass=0.60, color=(72, 44, 100))
 def speaker() -> Model:
     """A round loudspeaker lying along x on a flat 36 mm wide, so that it does not roll."""
     half = 0.0875
@@ -111,20 +118,21 @@ def speaker() -> Model:
                         (0.018, 0.075), (-0.018, 0.075), (-0.030, 0.065), (-0.035, 0.049), (-0.035, 0.026),
                         (-0.030, 0.010)])  # fmt: skip
     part = convex_hull([(x, y, z) for x in (-half, half) for y, z in section])
-    cloth, rubber, badge = (52, 60, 72), (30, 31, 36), (230, 96, 44)
-    rings: Color = (96, 100, 110)
-    middle = np.array([0.0, 0.0375])
+    cloth, rubber, badge, cone = (52, 60, 72), (30, 31, 36), (230, 96, 44), (96, 100, 110)
+    turns = 2.0 * np.pi * (np.arange(28) + 0.5) / 28
+    ring = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    ring /= (np.abs(ring) ** 3).sum(axis=1, keepdims=True) ** (1.0 / 3.0)  # as the section, without its corners
+    ring *= np.array([0.035, 0.0375]) / np.abs(ring).max(axis=0)
 
-    def skin(stations: list[tuple[float, float]], color: Color):  # type: ignore[no-untyped-def]
-        return loft([[(x, *(middle + scale * (point - middle))) for point in section] for x, scale in stations], color)
+    def skin(stations: Sequence[tuple[float, float]], color: Color, side: float = 1.0) -> trimesh.Trimesh:
+        """A skin through scaled copies of the section at these (x, scale)."""
+        rings = [[(x, scale * y, 0.0375 + scale * z) for y, z in ring] for x, scale in stations]
+        return moved(loft(rings, color), np.diag([side, side, 1.0]))
 
     visual = join(
         skin([(-0.070, 1.0), (0.070, 1.0)], cloth),
-        *(
-            moved(skin([(0.068, 1.0), (0.080, 1.0), (0.0855, 0.93)], rubber), np.diag([side, side, 1.0]))
-            for side in (1.0, -1.0)
-        ),
-        *(moved(skin([(0.0850, 0.80), (half, 0.78)], rings), np.diag([side, side, 1.0])) for side in (1.0, -1.0)),
+        *(skin([(0.068, 1.0), (0.080, 1.0), (0.084, 0.97), (0.0855, 0.92)], rubber, side) for side in (1.0, -1.0)),
+        *(skin([(0.0850, 0.80), (half, 0.78)], cone, side) for side in (1.0, -1.0)),
         painted_box((0.042, 0.0012, 0.018), badge, base=(0.0, -0.0346, 0.029)),
     )
     return Model(visual, [part], [part])

@@ -43,7 +43,7 @@ def stacking_ring() -> Model:
     visual = join(
         lathe([(0.0, 0.0), (0.038, 0.0), (0.040, 0.002), (0.040, _BASE - 0.002), (0.038, _BASE), (0.0, _BASE)], wood),
         *(
-            lathe([(0.0, z), *_bulge(r, z, _RING, 0.007, 9), (0.0, z + _RING)], color, segments=32)
+            lathe([(0.0, z), *_bulge(r, z, _RING, 0.007, 7), (0.0, z + _RING)], color, segments=28)
             for (r, color), z in zip(_RINGS, levels, strict=False)
         ),
         lathe([(0.0, low), (0.0065, low), *head], (238, 82, 92), segments=24),
@@ -84,7 +84,8 @@ def toy_train() -> Model:
             _TO_X,
             (0.0, 0.0, axis),
         ),
-        lathe([(0.0045, 0.046), (0.0045, 0.0525), (0.0058, 0.0535), (0.0058, 0.0545), (0.0, 0.0545)], black, segments=16),
+        lathe([(0.0045, 0.046), (0.0045, 0.0525), (0.0058, 0.0535), (0.0058, 0.0545), (0.0, 0.0545)], black,
+              segments=16),
         *(
             moved(mesh, to_y @ np.diag([1.0, side, side]), (x, side * 0.018, 0.009))
             for x in (-0.027, 0.027)
