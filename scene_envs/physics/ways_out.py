@@ -22,6 +22,8 @@ _AROUND = 0.06
 """Parts further away than this (m) are not looked at when a way is measured."""
 _OWN = 4
 """How many face directions of the overlapping parts are tried per pair, beside the common ones."""
+_STEPS = 6
+"""Parts that a walk leaves, one after the other."""
 _DOWN = 3.0
 """A way down out of a fixed object counts this many times: what lies in a board belongs on it."""
 _UP = 1.4
@@ -58,7 +60,8 @@ def ways_out(
     pair, a, b = pair[near], a[near], b[near]
     offset = objects.translation[second] - objects.translation[first]
     groups = list(grouped_gaps(collider.library, placed.parts, a, b, offset[pair]))
-    ways = _directions(len(first), pair, groups, offset)
+    down = np.where(objects.fixed[first], -1.0, np.where(objects.fixed[second], 1.0, 0.0))
+    ways = _directions(len(first), pair, groups, offset, down)
     lengths = _lengths(len(first), pair, groups, ways)
     costs = lengths * _weights(collider, objects, first, second, ways, lengths, bounds)
     for row, key in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
@@ -71,9 +74,14 @@ def ways_out(
     return ways[line, best] * (lengths[line, best] + CLEARANCE)[:, None]  # type: ignore[no-any-return]
 
 
-def _directions(count: int, pair: Index, groups: list[tuple[Index, Array, Array]], offset: Array) -> Array:
-    """(P, D, 3) directions to try: the axes, away from and toward the other's centre, and the parts' own."""
-    ways = np.zeros((count, 8 + 2 * _OWN, 3))
+def _directions(
+    count: int, pair: Index, groups: list[tuple[Index, Array, Array]], offset: Array, down: Array
+) -> Array:
+    """(P, D, 3) directions to try: the axes, away from and toward the other's centre, the parts' own, a walk's.
+
+    ``down`` (P,) is the sign of the z of a way that takes the free object of a pair with a fixed one down.
+    """
+    ways = np.zeros((count, 9 + 2 * _OWN, 3))
     ways[:, :6] = _AXES
     level = offset * np.array([1.0, 1.0, 0.0])
     length = np.linalg.norm(level, axis=1, keepdims=True)
@@ -96,7 +104,31 @@ def _directions(count: int, pair: Index, groups: list[tuple[Index, Array, Array]
         rank = np.arange(len(order)) - np.repeat(leading, members)
         top = order[rank < _OWN]
         ways[owner[top], base + rank[rank < _OWN]] = direction[top]
+    walk = _walk(count, pair, groups, down)
+    length = np.linalg.norm(walk, axis=1)
+    ways[length > 0, -1] = walk[length > 0] / length[length > 0, None]
     return ways
+
+
+def _walk(count: int, pair: Index, groups: list[tuple[Index, Array, Array]], down: Array) -> Array:
+    """(P, 3) m: out of the deepest parts, then out of those that are deepest then, and so on; out of corners."""
+    walk = np.zeros((count, 3))
+    for _ in range(_STEPS):
+        depth, direction = np.zeros(len(pair)), np.zeros((len(pair), 3))
+        for rows, gaps, normals in groups:
+            now = gaps + np.einsum("qki,qi->qk", normals, walk[pair[rows]])
+            downward = normals[..., 2] * down[pair[rows], None] > 0.7
+            best = np.where(downward & (now < 0), _DOWN * now, now).argmax(axis=1)
+            line = np.arange(len(rows))
+            depth[rows], direction[rows] = -now[line, best], normals[line, best]
+        order = np.lexsort((-depth, pair))
+        owner, leading = np.unique(pair[order], return_index=True)
+        deepest = order[leading]
+        inside = depth[deepest] > 1e-7
+        if not inside.any():
+            break
+        walk[owner[inside]] += (direction[deepest] * (depth[deepest] + 1e-7)[:, None])[inside]
+    return walk
 
 
 def _lengths(count: int, pair: Index, groups: list[tuple[Index, Array, Array]], ways: Array) -> Array:
