@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 
 from scene_envs.datasets.prompts.claims import (
@@ -45,7 +46,7 @@ class Nouns:
 
     def __init__(self, scene_type: SceneType) -> None:
         self.plural = {asset.display_name: asset.plural for asset in scene_type.library}
-        self.article = {asset.display_name: asset.article for asset in scene_type.library}
+        self.article = {name: article(name) for name in self.plural}
 
     def counted(self, number: int, name: str) -> str:
         """A number of things: "a cup", "two cups"."""
@@ -68,7 +69,8 @@ class Nouns:
                 each = "" if number == 1 else " each"
                 return f"{self._are(number, name)}{each} {_held(inside)} {self.counted(1, under)}"
             case SideClaim(subject, side, landmark):
-                return f"{say_reference(subject)} is {SIDE_PHRASES[side]} {say_reference(landmark)}"
+                beside = say_reference(landmark, near=subject.place)
+                return f"{say_reference(subject)} is {SIDE_PHRASES[side]} {beside}"
         raise AssertionError(claim)
 
     def sentence(self, claims: Sequence[Claim]) -> str:
@@ -80,26 +82,39 @@ class Nouns:
         return f"{self.counted(number, name)} {'is' if number == 1 else 'are'}"
 
 
-def say_reference(reference: Reference) -> str:
-    """One thing: "the second cup from the left on the top shelf"."""
+def article(name: str) -> str:
+    """The indefinite article, by sound.
+
+    >>> article("apple"), article("utensil crock"), article("plate")
+    ('an', 'a', 'a')
+    """
+    return "an" if re.match(r"(?!u[nst]|eu|one)[aeiou]|hour|hono|heir", name, re.IGNORECASE) else "a"
+
+
+def say_reference(reference: Reference, *, near: Place | None = None) -> str:
+    """One thing: "the second cup from the left on the top shelf", or "… on the same shelf" when that is ``near``."""
     first = f"{ORDINALS[reference.ordinal - 1]} " if reference.ordinal else ""
     last = f" from the {reference.edge}" if reference.ordinal else ""
-    where = f" on {say_place(reference.place)}" if reference.place else ""
+    place = reference.place
+    where = f" on {say_place(place) if place != near else f'the same {place_word(place)}'}" if place else ""
     return f"the {first}{reference.name}{last}{where}"
 
 
-def say_place(place: Place) -> str:
-    """A table, shelf or tier: "the second table from the left", "the top shelf", "the second tier from the top of …".
+def place_word(place: Place) -> str:
+    """What kind of place it is; tiers are called shelves where they belong to the one thing called a shelf."""
+    if place.tier is None:
+        return place.unit.name
+    return "shelf" if place.unit == Reference("shelf") else "tier"
 
-    Tiers are called shelves where they belong to the one thing called a shelf.
-    """
+
+def say_place(place: Place) -> str:
+    """A table, shelf or tier: "the second table from the left", "the top shelf", "the top tier of the shelf"."""
     if place.tier is None:
         return say_reference(place.unit)
-    alone = place.unit == Reference("shelf")
+    word = place_word(place)
     end, count = ("top", place.tier) if place.tier >= 0 else ("bottom", -1 - place.tier)
-    word = "shelf" if alone else "tier"
     tier = f"the {ORDINALS[count]} {word} from the {end}" if count else f"the {end} {word}"
-    return tier if alone else f"{tier} of {say_reference(place.unit)}"
+    return tier if word == "shelf" else f"{tier} of {say_reference(place.unit)}"
 
 
 def join(phrases: Iterable[str]) -> str:

@@ -20,7 +20,7 @@ from scene_envs.datasets.prompts.claims import (
     SupportCount,
 )
 from scene_envs.datasets.prompts.facts import SIDES
-from scene_envs.datasets.prompts.language import NUMBERS, ORDINALS, Nouns
+from scene_envs.datasets.prompts.language import NUMBERS, ORDINALS, Nouns, place_word
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene_types import SceneType, get_scene_type
 
@@ -97,7 +97,7 @@ class _Reader:
             subject = self.reference()
             self.need(["is"], "'is'")
             side = _SIDES[self.need(_SIDES, "a side, such as 'to the left of' or 'behind'")]
-            return SideClaim(subject, side, self.reference())
+            return SideClaim(subject, side, self.reference(near=subject.place))
         number = self.number()
         name = self.noun(plural=number != 1)
         self.need(["is" if number == 1 else "are"], "'is' for one thing and 'are' for several")
@@ -110,12 +110,15 @@ class _Reader:
         self.need(["a", "an"], "a thing with 'a' or 'an'")
         return PairCount(name, number, _INSIDE[how], self.noun(plural=False))
 
-    def reference(self, *, placed: bool = True) -> Reference:
+    def reference(self, *, near: Place | None = None, placed: bool = True) -> Reference:
         self.need(["the"], "'the' and a thing")
         ordinal = _ORDINALS.get(self.take(_ORDINALS), 0)
         name = self.noun(plural=False)
         edge = self.edge() if ordinal else ""
         at_place = placed and not self.rest.startswith("on top of") and self.take(["on"])
+        if near and at_place and self.take(["the same"]):
+            self.need([place_word(near)], f"{place_word(near)!r}")
+            return Reference(name, ordinal, edge, near)
         return Reference(name, ordinal, edge, self.place() if at_place else None)
 
     def place(self) -> Place:

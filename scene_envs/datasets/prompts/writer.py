@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeVar, get_args
@@ -118,15 +118,26 @@ class _Writer:
         families += [self._hold] if self._holds else []
         families += [self._stay] if self._stays else []
         families += [self._aside] if len(self._neighbors) else []
-        claims: list[Claim] = []
+        claims: dict[Hashable, Claim] = {}
         if families:
             for _ in range(int(self.rng.integers(1, _MOST_RELATIONS + 1))):
                 for _ in range(_TRIES):
                     claim = self._pick(families)()
-                    if claim is not None and claim not in claims and self._is_clear(claim):
-                        claims.append(claim)
+                    if claim is not None and self._topic(claim) not in claims and self._is_clear(claim):
+                        claims[self._topic(claim)] = claim
                         break
-        return claims
+        return list(claims.values())
+
+    def _topic(self, claim: Claim) -> Hashable:
+        """What a relation is about; a prompt speaks of each topic once."""
+        match claim:
+            case PairCount(name, _, _, under):
+                return name, under
+            case SupportCount(name, _, _, landmark):
+                return name, landmark.name
+            case SideClaim(subject, _, landmark):
+                return frozenset((subject.resolve(self.scene), landmark.resolve(self.scene)))
+        return claim
 
     def _is_clear(self, claim: Claim) -> bool:
         return claim.check(self.scene).holds and all(claim.check(view).holds for view in self.others)
@@ -168,14 +179,11 @@ class _Writer:
 
     @cached_property
     def _stays(self) -> Counter[tuple[str, int, int]]:
-        """(name, place, tier) to numbers, where a scene has more than one place to be."""
-        held = self.scene.held
-        stays = Counter(
-            (self.scene.names[i], int(held.place[i]), int(held.tier[i]))
-            for i in np.flatnonzero((held.place >= 0) & ~self.scene.fixed)
-        )
-        several = int(self.scene.fixed.sum()) > 1 or self.scene.tiers.any()
-        return stays if several else Counter()
+        """(name, place, tier) to numbers, where a scene has more than one place to be; the floor is no place."""
+        held, scene = self.scene.held, self.scene
+        named = (held.place[held.place] >= 0) | (scene.tiers[held.place] > 0)
+        there = np.flatnonzero((held.place >= 0) & named & ~scene.fixed)
+        return Counter((scene.names[i], int(held.place[i]), int(held.tier[i])) for i in there)
 
     def _stay(self) -> Claim | None:
         name, unit, tier = self._pick(sorted(self._stays))
@@ -183,7 +191,7 @@ class _Writer:
         return None if place is None else PlaceCount(name, self._stays[name, unit, tier], place)
 
     def _place(self, unit: int, tier: int) -> Place | None:
-        """How to speak of a place; tiers count from the nearer end. The floor and its like need no name."""
+        """How to speak of a place; tiers count from the nearer end."""
         reference = self._refer(unit, placed=False)
         tiers = int(self.scene.tiers[unit])
         if reference is None or (tiers and tier < 0):
@@ -224,23 +232,27 @@ class _Writer:
         name = self.scene.names[index]
         if self.scene.objects[name] == 1:
             return Reference(name)
-        places: list[Place | None] = [None]
-        if placed and self._stays:
+        place = None
+        if placed and not self._live_together(name):
             unit, tier = int(self.scene.held.place[index]), int(self.scene.held.tier[index])
             place = self._place(unit, tier) if unit >= 0 else None
-            places = [place] if place is not None else []
-        for place in places:
-            found = [Reference(name, place=place), *self._ordinals(index, name, place)]
-            clear = [reference for reference in found if self._names_one(reference, index)]
-            if clear:
-                return self._pick(clear) if clear[0].ordinal else clear[0]
-        return None
+            if place is None:
+                return None
+        if place is not None and self._names_one(only := Reference(name, place=place), index):
+            return only
+        clear = [ordinal for ordinal in self._ordinals(index, name, place) if self._names_one(ordinal, index)]
+        return self._pick(clear) if clear else None
+
+    def _live_together(self, name: str) -> bool:
+        """Whether all things of that name are on one table, tier or floor."""
+        members, held = self.scene.named(name), self.scene.held
+        return len(set(zip(held.place[members].tolist(), held.tier[members].tolist(), strict=True))) == 1
 
     def _ordinals(self, index: int, name: str, place: Place | None) -> list[Reference]:
         members = self.scene.named(name)
         if place is not None:
             members = members[place.holds(self.scene)[members]]
-        edges = SIDES[:2] if place is not None and place.tier is not None else SIDES
+        edges = SIDES[:2] if self.scene.held.tier[index] >= 0 else SIDES
         ranks = [1 + int((self.scene.along(edge)[members] > self.scene.along(edge)[index]).sum()) for edge in edges]
         highest = min(1 + min(ranks), _LAST_ORDINAL)
         named = zip(edges, ranks, strict=True)
