@@ -12,6 +12,8 @@ COMMANDS = {
     "sample": "draw scenes and pictures from a prior",
     "search": "search for one scene that scores high, at inference time",
     "project": "make scenes simulation-ready: project out of penetration, then settle",
+    "export": "write scenes for simulators and viewers: URDF, SDF, Drake, MJCF, USD, GLB, arrays",
+    "view": "write a page that shows scenes in a browser: a dataset, samples, a prior or a grammar",
     "evaluate": "measure the samples of a prior against real scenes",
     "priors": "list the priors that ship with the package",
     "rewards": "list the rewards, those of installed packages included",

@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from agents.commands.export import export_scenes
 from agents.commands.scenes import draw_scenes, make_ready, reward_figures
 
 if TYPE_CHECKING:
@@ -24,11 +25,14 @@ class SampleConfig:
         seed: of the noise.
         reward: scores the samples, for metrics.json; null for none.
         project: also make the samples simulation-ready (project out of penetration, then settle).
+        export: formats to write the scenes in, as drake or [drake, mjcf], the simulation-ready ones with
+            project=true; null for none. See scene-envs export.
         pictures: how many scenes the galleries show; 0 draws none.
         batch_size: scenes denoised at once.
         workers: physics worker processes; 0 computes in this one.
         device: torch device.
-        output: folder for scenes.safetensors, gallery.png and, with project=true, ready.safetensors and ready.png.
+        output: folder for scenes.safetensors, gallery.png and, with project=true, ready.safetensors and ready.png;
+            exported scenes go to export/ in it.
     """
 
     prior: str = "dimsum_table"
@@ -38,6 +42,7 @@ class SampleConfig:
     seed: int = 0
     reward: Any = "feasible_objects"
     project: bool = False
+    export: Any = None
     pictures: int = 12
     batch_size: int = 64
     workers: int = 2
@@ -54,8 +59,11 @@ def run(settings: SampleConfig, run: Run) -> None:
     """Draw, score, save and picture the scenes."""
     from agents.prior import ScenePrior
     from rewards import resolve_reward
+    from scene_envs.export import resolve_formats
     from scene_envs.physics import PhysicsPool
+    from scene_envs.scene import SceneBatch
 
+    formats = None if settings.export is None else resolve_formats(settings.export)
     reward = None if settings.reward is None else resolve_reward(settings.reward)
     prior = ScenePrior.load(settings.prior).to(settings.device)
     started = time.perf_counter()
@@ -81,5 +89,8 @@ def run(settings: SampleConfig, run: Run) -> None:
         draw_scenes(batch, settings.pictures, run, "gallery.png")
         if settings.project:
             metrics["ready"] = make_ready(batch, settings.pictures, pool, run)
+            batch = SceneBatch.load(run.directory / "ready.safetensors")
+        if formats is not None:
+            metrics["export"] = export_scenes(batch, formats, run.directory / "export", pool, run)
     run.write_metrics(metrics)
     run.say(f"written to {run.directory}")

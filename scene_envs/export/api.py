@@ -13,7 +13,7 @@ from typing import Any
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.export.asset_files import AssetFiles
 from scene_envs.export.formats import get_format, resolve_formats
-from scene_envs.export.placed import place
+from scene_envs.export.placed import identifier, place
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
 
@@ -75,7 +75,8 @@ def export(
     placed = place(batch)
     root = Path(output)
     manifest = _claim(root, batch, friction)
-    files = AssetFiles(root / "assets", batch.scene_type.library.assets, friction)
+    package = f"{identifier(batch.scene_type.name)}_{manifest['digest'][:8]}"
+    files = AssetFiles(root / "assets", batch.scene_type.library.assets, friction, package)
     digits = max(3, len(str(len(placed) - 1)))
     scenes = []
     for scene in placed:

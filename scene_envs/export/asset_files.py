@@ -26,15 +26,18 @@ class AssetFiles:
         folder: the ``assets`` folder.
         assets: all assets that may be asked for; they settle the names.
         friction: friction coefficient that formats write into their files.
+        package: a name for the whole export, for formats whose paths need one.
 
     Attributes:
         root: the ``assets`` folder.
         friction: as given.
+        package: as given.
     """
 
-    def __init__(self, folder: Path, assets: Sequence[Asset], friction: float) -> None:
+    def __init__(self, folder: Path, assets: Sequence[Asset], friction: float, package: str) -> None:
         self.root = folder
         self.friction = friction
+        self.package = package
         self._names = identifiers(asset.name for asset in assets)
         self._done: dict[tuple[str, str], Any] = {}
 
@@ -84,7 +87,8 @@ def visual_mesh(asset: Asset) -> trimesh.Trimesh:
     if mesh is not None and len(mesh.faces):
         return mesh
     parts = [trimesh.Trimesh(part.vertices, part.faces, process=False) for part in asset.fine]
-    joined: trimesh.Trimesh = trimesh.util.concatenate(parts)
+    joined = trimesh.util.concatenate(parts)
+    assert isinstance(joined, trimesh.Trimesh)
     joined.visual = trimesh.visual.ColorVisuals(joined, vertex_colors=np.array([*asset.color, 255], dtype=np.uint8))
     return joined
 

@@ -35,7 +35,7 @@ _Dumper.add_representer(float, _represent_float)
 
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     """``scene.dmd.yaml``; its package is the whole export, whose ``package.xml`` is written here too."""
-    package = write_package(files.root.parent)
+    package = write_package(files)
     directives: list[dict[str, Any]] = []
     for thing in scene.objects:
         directives += _directives(thing, files, package)
@@ -45,19 +45,18 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     return path
 
 
-def write_package(root: Path) -> str:
-    """The name in ``package.xml`` of the export folder ``root``; made from the folder's name where there is none yet."""
-    path = root / "package.xml"
+def write_package(files: AssetFiles) -> str:
+    """The name in ``package.xml`` of the export folder, which is written unless the folder has one already."""
+    path = files.root.parent / "package.xml"
     if path.exists():
-        found = re.search(r"<name>([^<]+)</name>", path.read_text())
+        found = re.search(r"<name>\s*([^<\s]+)\s*</name>", path.read_text())
         if found:
             return found[1]
-    name = "".join(c if c.isascii() and c.isalnum() else "_" for c in root.resolve().name) or "scenes"
     path.write_text(
-        f'<?xml version="1.0"?>\n<package format="2">\n  <name>{name}</name>\n  <version>1.0.0</version>\n'
+        f'<?xml version="1.0"?>\n<package format="2">\n  <name>{files.package}</name>\n  <version>1.0.0</version>\n'
         "  <description>Scenes and their assets.</description>\n</package>\n"
     )
-    return name
+    return files.package
 
 
 def _directives(thing: PlacedObject, files: AssetFiles, package: str) -> list[dict[str, Any]]:

@@ -119,7 +119,11 @@ def resolve_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
 
     Raises:
         UnknownNameError: no such format.
+        MissingDependencyError: one needs a package that is not installed.
         InvalidInputError: none are given.
+
+    >>> resolve_formats(["mjcf", "npz", "mjcf"])
+    ('mjcf', 'npz')
     """
     if formats == "all":
         return tuple(f.name for f in _FORMATS.values() if not f.requires or find_spec(f.requires) is not None)
@@ -127,5 +131,5 @@ def resolve_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
     if not names:
         raise InvalidInputError(f"formats is empty; give at least one of {', '.join(list_formats())}")
     for name in names:
-        get_format(name)
+        get_format(name).writer()
     return names

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from trimesh.exchange.gltf import export_glb
 
 from scene_envs.export.asset_files import AssetFiles, visual_mesh
 from scene_envs.export.placed import PlacedScene
@@ -23,5 +24,5 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     for thing in scene.objects:
         graph.graph.update(thing.name, "z_up", matrix=thing.matrix, geometry=files.name(thing.asset))
     path = folder / "scene.glb"
-    path.write_bytes(graph.export(file_type="glb", include_normals=True))
+    path.write_bytes(export_glb(graph, include_normals=True))
     return path

@@ -16,7 +16,7 @@ from scene_envs.scene_types import Camera
 TIMESTEP = 0.002
 """s."""
 _CONTACT = {"solref": "0.004 1", "solimp": "0.95 0.99 0.001"}
-"""As stiff as the time step allows: objects at rest sink by micrometres, where MuJoCo's defaults let them sink 0.1 mm."""
+"""As stiff as the time step allows: objects at rest sink by micrometres, by 0.1 mm under MuJoCo's defaults."""
 
 
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
@@ -33,7 +33,7 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     ET.SubElement(visual, "geom", type="mesh", contype="0", conaffinity="0", group="2", mass="0")
     collision = ET.SubElement(defaults, "default", {"class": "collision"})
     friction = f"{number(files.friction)} 0.005 0.0001"
-    ET.SubElement(collision, "geom", type="mesh", group="3", mass="0", friction=friction, **_CONTACT)
+    ET.SubElement(collision, "geom", {"type": "mesh", "group": "3", "mass": "0", "friction": friction, **_CONTACT})
     shared, world = ET.SubElement(root, "asset"), ET.SubElement(root, "worldbody")
     _add_view(root, shared, world, scene.scene_type.camera)
     for asset in scene.assets:
@@ -55,9 +55,7 @@ def _add_asset(parent: ET.Element, asset: Asset, files: AssetFiles) -> None:
 
 def _add_body(world: ET.Element, thing: PlacedObject, files: AssetFiles) -> None:
     asset, name = thing.asset, files.name(thing.asset)
-    body = ET.SubElement(
-        world, "body", name=thing.name, pos=numbers(thing.translation), quat=numbers(thing.quaternion)
-    )
+    body = ET.SubElement(world, "body", name=thing.name, pos=numbers(thing.translation), quat=numbers(thing.quaternion))
     if not thing.welded:
         ET.SubElement(body, "freejoint", name=thing.name)
         moments, axes = principal_inertia(asset.inertia)
@@ -79,8 +77,17 @@ def _add_view(root: ET.Element, shared: ET.Element, world: ET.Element, camera: C
     visual = ET.SubElement(root, "visual")
     ET.SubElement(visual, "headlight", ambient="0.35 0.35 0.35", diffuse="0.35 0.35 0.35", specular="0 0 0")
     ET.SubElement(visual, "quality", shadowsize="4096")
-    ET.SubElement(shared, "texture", type="skybox", builtin="flat", rgb1="0.95 0.95 0.95", width="16", height="16")
-    ET.SubElement(world, "light", pos="0.6 -0.9 3", dir="-0.2 0.3 -1", directional="true", diffuse="0.4 0.4 0.4")
+    ET.SubElement(
+        shared,
+        "texture",
+        type="skybox",
+        builtin="flat",
+        rgb1="0.95 0.95 0.95",
+        rgb2="0.95 0.95 0.95",
+        width="16",
+        height="16",
+    )
+    ET.SubElement(world, "light", pos="0.6 -0.9 3", dir="-0.2 0.3 -1", directional="true", diffuse="0.3 0.3 0.3")
     backward = np.subtract(camera.position, camera.target)
     right = np.cross(camera.up, backward)
     up = np.cross(backward, right)

@@ -131,14 +131,18 @@ def identifiers(names: Iterable[str]) -> dict[str, str]:
     """
     found: dict[str, str] = {}
     for name in names:
-        base = re.sub(r"\W", "_", name, flags=re.ASCII) or "_"
-        base = f"_{base}" if base[0].isdigit() else base
-        free, number = base, 1
+        free, repeat = identifier(name), 1
         while free in found.values():
-            number += 1
-            free = f"{base}_{number}"
+            repeat += 1
+            free = f"{identifier(name)}_{repeat}"
         found[name] = free
     return found
+
+
+def identifier(name: str) -> str:
+    """``name`` with everything but letters, digits and underscores replaced; it does not start with a digit."""
+    plain = re.sub(r"\W", "_", name, flags=re.ASCII) or "_"
+    return f"_{plain}" if plain[0].isdigit() else plain
 
 
 def exact_rotations(matrices: NDArray[np.floating]) -> Array:

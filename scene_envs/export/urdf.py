@@ -72,7 +72,9 @@ def _write(asset: Asset, files: AssetFiles, parts: list[Path], path: Path) -> Pa
     inertial = ET.SubElement(link, "inertial")
     ET.SubElement(inertial, "origin", xyz=numbers(asset.center_of_mass), rpy="0 0 0")
     ET.SubElement(inertial, "mass", value=number(asset.mass))
-    moments = {f"i{a}{b}": number(asset.inertia[i, j]) for i, a in enumerate("xyz") for j, b in enumerate("xyz") if i <= j}
+    moments = {
+        f"i{a}{b}": number(asset.inertia[i, j]) for i, a in enumerate("xyz") for j, b in enumerate("xyz") if i <= j
+    }
     ET.SubElement(inertial, "inertia", moments)
     visual = ET.SubElement(ET.SubElement(link, "visual"), "geometry")
     ET.SubElement(visual, "mesh", filename=relative(files.visual(asset), path.parent))

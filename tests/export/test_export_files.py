@@ -1,0 +1,249 @@
+"""The folder an export leaves: its layout, names, precision, errors, and formats of one's own."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+import sys
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from export_scenes import DIMSUM, laid_scene
+from scipy.spatial.transform import Rotation
+
+from scene_envs.errors import InvalidInputError, MissingDependencyError, UnknownNameError
+from scene_envs.export import AssetFiles, export, formats, get_format, list_formats, place, register_format
+from scene_envs.export.placed import angle_axis, exact_rotations, quaternion
+from scene_envs.physics.geometry import PartGeometry
+from scene_envs.scene import SceneBatch
+
+TEXT = ("urdf", "sdf", "drake", "mjcf")
+
+
+def content(folder) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+# -- layout ------------------------------------------------------------------------------------------
+
+
+def test_each_scene_has_a_folder_and_assets_are_shared(folder, batch):
+    names = {path.name for path in folder.iterdir()}
+    assert names >= {"assets", "export.json", "package.xml", "scene_000", "scene_003"}
+    assert len([name for name in names if name.startswith("scene_")]) == len(batch)
+    used = {name for row in batch.names() for name in row}
+    assert {path.name for path in (folder / "assets").iterdir()} == used
+    expected = {"objects.json", "world.sdf", "scene.dmd.yaml", "scene.xml", "scene.glb", "scene.npz", "scene.pkl"}
+    assert expected <= {path.name for path in (folder / "scene_000").iterdir()}
+    parts = sorted((folder / "assets" / "teacup").glob("part_*.obj"))
+    assert len(parts) == len(DIMSUM.library["teacup"].fine)
+
+
+def test_no_file_names_a_place_outside_the_folder(folder):
+    for name, data in content(folder).items():
+        assert b"written here" not in data, name
+        for target in re.findall(rb'(?:filename|file|urdf|uri)["=:> ]+([^"<]+)', data) if name[-3:] != "glb" else ():
+            assert not target.startswith(b"/"), name
+
+
+def test_duplicates_have_names_of_their_own(scenes):
+    names = [thing.name for thing in scenes[0].objects]
+    assert len(set(names)) == len(names)
+    assert {"teacup_0", "teacup_1", "cafe_table_0"} <= set(names)
+    assert [thing.name for thing in scenes[0].objects if thing.welded] == ["cafe_table_0"]
+
+
+def test_parts_are_the_librarys_and_bullets_are_a_millimetre_smaller(folder):
+    files = folder / "assets" / "teapot"
+    for index, part in enumerate(DIMSUM.library["teapot"].fine):
+        exact = trimesh.load(files / f"part_{index:02d}.obj", process=False)
+        np.testing.assert_allclose(exact.vertices, part.vertices, atol=1e-12)
+        assert exact.is_watertight
+        assert exact.volume > 0
+        inset = trimesh.load(files / f"inset_{index:02d}.obj", process=False)
+        gaps = PartGeometry.of(part).offsets[:, None] - PartGeometry.of(part).normals @ inset.vertices.T
+        np.testing.assert_allclose(gaps.min(axis=1), 1e-3, atol=1e-9)
+
+
+def test_visual_meshes_keep_their_shape_and_colours(folder):
+    asset = DIMSUM.library["teapot"]
+    mesh = trimesh.load(folder / "assets" / "teapot" / "visual.obj", process=False, maintain_order=True)
+    np.testing.assert_allclose(mesh.bounds, asset.visual.bounds, atol=1e-6)
+    palette = np.asarray(mesh.visual.material.image)
+    assert {tuple(rgb) for rgb in palette.reshape(-1, 3).tolist()} - {(0, 0, 0)} == {
+        tuple(rgb) for rgb in np.unique(asset.visual.visual.face_colors[:, :3], axis=0).tolist()
+    }
+    shown = np.asarray(mesh.visual.to_color().vertex_colors)[mesh.faces][:, 0, :3]
+    np.testing.assert_array_equal(shown, asset.visual.visual.face_colors[:, :3])
+
+
+def test_text_formats_are_well_formed_and_small(folder):
+    for path in [*folder.rglob("*.sdf"), *folder.rglob("*.urdf"), *folder.rglob("*.xml")]:
+        ET.parse(path)
+    one = sum(path.stat().st_size for path in (folder / "scene_000").iterdir())
+    assert one < 1e6
+    assert sum(path.stat().st_size for path in (folder / "assets").rglob("*") if path.is_file()) < 4e6
+
+
+# -- precision ---------------------------------------------------------------------------------------
+
+
+def test_rotations_become_exact_without_moving():
+    truth = Rotation.random(200, rng=np.random.default_rng(0)).as_matrix()
+    single = truth.astype(np.float32)
+    exact = exact_rotations(single)
+    error = exact.swapaxes(-1, -2) @ exact - np.eye(3)
+    assert np.abs(error).max() < 1e-15
+    assert np.abs(exact - single).max() < 2e-7
+    np.testing.assert_allclose(np.linalg.det(exact), 1.0, atol=1e-15)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-8, 0.5, np.pi / 2, np.pi - 1e-8, np.pi])
+def test_angle_axis_and_quaternion_are_exact_at_every_angle(angle):
+    for axis in ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.6, -0.48, 0.64], [-0.6, 0.8, 0.0]):
+        rotation = Rotation.from_rotvec(angle * np.array(axis)).as_matrix()
+        degrees, direction = angle_axis(rotation)
+        back = Rotation.from_rotvec(np.radians(degrees) * direction).as_matrix()
+        np.testing.assert_allclose(back, rotation, atol=1e-14)
+        back = Rotation.from_quat(quaternion(rotation), scalar_first=True).as_matrix()
+        np.testing.assert_allclose(back, rotation, atol=1e-14)
+
+
+def test_translations_are_written_to_the_last_bit(folder, scenes):
+    text = (folder / "scene_003" / "scene.xml").read_text()
+    for thing in scenes[3].objects:
+        found = re.search(rf'<body name="{thing.name}" pos="([^"]*)"', text)
+        assert [float(x) for x in found[1].split()] == thing.translation.tolist()
+
+
+# -- calls -------------------------------------------------------------------------------------------
+
+
+def test_the_report_says_what_was_written(tmp_path):
+    report = export(laid_scene(), tmp_path / "out", ["mjcf", "npz", "mjcf"])
+    assert report.formats == ("mjcf", "npz")
+    assert report.scenes[0]["mjcf"] == tmp_path / "out" / "scene_000" / "scene.xml"
+    assert all(path.is_file() for path in report.scenes[0].values())
+    assert set(report.assets) == set(laid_scene().names()[0])
+    written = sum(len(data) for name, data in content(tmp_path / "out").items() if name != "export.json")
+    assert report.size == written
+
+
+def test_formats_can_be_added_and_the_same_call_changes_nothing(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    export(laid_scene(), tmp_path, "mjcf")
+    export(laid_scene(), tmp_path, TEXT)
+    before = content(tmp_path)
+    export(laid_scene(), tmp_path, TEXT)
+    assert content(tmp_path) == before
+    assert before["notes.txt"] == b"mine"
+    assert json.loads(before["export.json"])["formats"] == sorted(TEXT)
+
+
+def test_an_interrupted_export_goes_on(tmp_path, monkeypatch):
+    def fail(scene, files, folder):
+        raise OSError("No space left on device")
+
+    monkeypatch.setitem(formats._FORMATS, "npz", formats.ExportFormat("npz", "", fail))
+    with pytest.raises(OSError, match="No space"):
+        export(laid_scene(), tmp_path / "out", ["mjcf", "npz"])
+    monkeypatch.undo()
+    export(laid_scene(), tmp_path / "out", ["mjcf", "npz"])
+    assert (tmp_path / "out" / "scene_000" / "scene.npz").exists()
+
+
+def test_other_scenes_are_not_overwritten(tmp_path):
+    export(laid_scene(), tmp_path / "one", "npz")
+    other = laid_scene()
+    other = other.with_poses(other.translations + 0.01, other.rotations)
+    with pytest.raises(InvalidInputError, match="export of other scenes"):
+        export(other, tmp_path / "one", "npz")
+    with pytest.raises(InvalidInputError, match="export of other scenes"):
+        export(laid_scene(), tmp_path / "one", "npz", friction=0.9)
+    (tmp_path / "two" / "assets").mkdir(parents=True)
+    with pytest.raises(InvalidInputError, match="already holds 'assets'"):
+        export(laid_scene(), tmp_path / "two", "npz")
+    (tmp_path / "three").write_text("")
+    with pytest.raises(InvalidInputError, match="is a file"):
+        export(laid_scene(), tmp_path / "three", "npz")
+
+
+def test_wrong_input_is_named(tmp_path):
+    with pytest.raises(UnknownNameError, match="did you mean 'mjcf'"):
+        export(laid_scene(), tmp_path / "out", ["mjfc"])
+    with pytest.raises(InvalidInputError, match="formats is empty"):
+        export(laid_scene(), tmp_path / "out", [])
+    with pytest.raises(InvalidInputError, match="friction"):
+        export(laid_scene(), tmp_path / "out", friction=float("nan"))
+    tensor = laid_scene().tensor.clone()
+    tensor[0, 3, 3:12] *= 1.1
+    with pytest.raises(InvalidInputError, match="scene 0, slot 3"):
+        export(SceneBatch(tensor, DIMSUM), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_only_usd_needs_a_package_and_says_which(tmp_path, monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(formats, "find_spec", lambda name: None if name == "pxr" else find(name))
+    with pytest.raises(MissingDependencyError, match="pip install usd-core"):
+        export(laid_scene(), tmp_path / "out", "usd")
+    assert not (tmp_path / "out").exists()
+    report = export(laid_scene(), tmp_path / "out")
+    assert set(report.formats) == {*TEXT, "glb", "npz", "pickle"}
+
+
+def test_writing_needs_no_simulator(tmp_path, monkeypatch):
+    for name in ("pybullet", "mujoco", "pydrake", "pxr"):
+        monkeypatch.setitem(sys.modules, name, None)  # importing it fails
+    export(laid_scene(), tmp_path / "out", [*TEXT, "glb", "npz", "pickle"])
+
+
+def test_no_scenes_and_empty_scenes_are_fine(tmp_path):
+    assert export(SceneBatch(torch.zeros(0, 3, DIMSUM.features), DIMSUM), tmp_path / "none", TEXT).scenes == ()
+    empty = torch.zeros(1, 3, DIMSUM.features)
+    empty[..., -1] = 1.0
+    export(SceneBatch(empty, DIMSUM), tmp_path / "empty")
+    assert np.load(tmp_path / "empty" / "scene_000" / "scene.npz")["translations"].shape == (0, 3)
+
+
+# -- a format of one's own ---------------------------------------------------------------------------
+
+
+def test_a_format_of_ones_own_gets_poses_and_meshes(tmp_path, monkeypatch):
+    monkeypatch.setattr(formats, "_FORMATS", dict(formats._FORMATS))
+
+    @register_format("height_list", summary="heights")
+    def heights(scene, files: AssetFiles, folder):
+        path = folder / "heights.txt"
+        lines = [f"{o.name} {o.translation[2]:.3f} {len(files.parts(o.asset))}" for o in scene.objects]
+        path.write_text("\n".join(lines))
+        return path
+
+    assert "height_list" in list_formats()
+    assert get_format("height_list").summary == "heights"
+    report = export(laid_scene(), tmp_path, ["height_list"])
+    assert "steamer_lid_0 0.182 14" in report.scenes[0]["height_list"].read_text()
+    with pytest.raises(InvalidInputError, match="letters, digits"):
+        register_format("my format")
+
+
+def test_an_installed_package_can_offer_a_format(tmp_path, monkeypatch):
+    point = importlib.metadata.EntryPoint(
+        "their_arrays", "scene_envs.export.arrays:write_npz", formats.ENTRY_POINT_GROUP
+    )
+    monkeypatch.setattr(formats, "entry_points", lambda group: [point] if group == formats.ENTRY_POINT_GROUP else [])
+    assert "their_arrays" in list_formats()
+    assert export(laid_scene(), tmp_path, "their_arrays").scenes[0]["their_arrays"].name == "scene.npz"
+
+
+def test_single_precision_rotations_and_names_survive_odd_asset_names():
+    from scene_envs.export.placed import identifiers
+
+    names = identifiers(["tea cup", "tea-cup", "tea_cup", "3d.part", ""])
+    assert len(set(names.values())) == 5
+    assert all(name.isidentifier() for name in names.values())
+    assert place(laid_scene())[0].objects[1].rotation.dtype == np.float64
