@@ -17,10 +17,12 @@ class GenerateConfig:
         scene: scene type whose grammar is used.
         count: scenes to keep.
         seed: of the grammar; with the same seed and shard_size, the same dataset.
-        workers: worker processes; 0 works in this one.
+        workers: worker processes; 0 works in this one. With Ray, CPUs of the cluster that is started here.
         verify: keep only scenes that pass physics.
         shard_size: scenes per parquet file.
-        progress: show a progress bar.
+        progress: show a progress bar with scenes/s and why scenes were thrown away.
+        backend: processes of this machine, or ray.
+        address: of a running Ray cluster; null starts one on this machine.
         output: the dataset folder; finished shards found there are kept.
     """
 
@@ -31,6 +33,8 @@ class GenerateConfig:
     verify: bool = True
     shard_size: int = 2000
     progress: bool = True
+    backend: str = "processes"
+    address: str | None = None
     output: str = ""
 
 
@@ -52,6 +56,8 @@ def run(settings: GenerateConfig, run: Run) -> None:
         verify=settings.verify,
         shard_size=settings.shard_size,
         progress=settings.progress,
+        backend=settings.backend,
+        address=settings.address,
     )
     run.write_metrics({**asdict(report), "output": str(report.output)})
     run.say(f"{report.scenes} scenes of {report.tried} tried, in {report.seconds:.0f} s: {report.output}")

@@ -134,9 +134,9 @@ def storage_error(path: Path, error: OSError) -> StorageError:
     """What to raise when ``path`` could not be written."""
     full = error.errno in (errno.ENOSPC, errno.EDQUOT)
     reason = "the disk is full" if full else error.strerror or str(error)
-    remedy = "make room" if full else "make the folder writable"
+    remedy = "make room" if full else "put that right"
     return StorageError(
-        f"cannot write {str(path)!r}: {reason}; finished files are kept, {remedy} and run again to resume"
+        f"cannot write {str(path)!r}: {reason}; finished files are kept; {remedy} and run again to resume"
     )
 
 

@@ -80,9 +80,9 @@ def run_processes(jobs: Sequence[Job], work: Work, workers: int, report: Report)
         ) from error
     context = get_context("spawn")
     for _ in range(_RESTARTS):
-        queue = context.Queue()
+        queue, stop = context.Queue(), context.Event()
         left = [job for job in jobs if not Path(job.path).is_file()]
-        executor = ProcessPoolExecutor(workers, context, _start_worker, (payload, queue))
+        executor = ProcessPoolExecutor(workers, context, _start_worker, (payload, queue, stop))
         try:
             futures = [executor.submit(_work, job) for job in left]
             _follow(futures, queue, report)
@@ -90,7 +90,8 @@ def run_processes(jobs: Sequence[Job], work: Work, workers: int, report: Report)
         except BrokenProcessPool:
             continue  # the shards that were under way go on
         finally:
-            executor.shutdown(wait=False, cancel_futures=True)
+            stop.set()  # after an error, the other workers end with their chunk
+            executor.shutdown(cancel_futures=True)
             queue.close()
     raise PhysicsError(
         f"worker processes died {_RESTARTS} times while generating (out of memory?); finished shards are kept, "
@@ -107,8 +108,6 @@ def _follow(futures: list[Future[int]], queue: Any, report: Report) -> None:
         for future in [future for future in pending if future.done()]:
             future.result()
             pending.discard(future)
-    while not queue.empty():  # a worker cannot exit before its last reports are read
-        queue.get()
 
 
 # -- in the worker ------------------------------------------------------------------------------------
@@ -116,10 +115,15 @@ def _follow(futures: list[Future[int]], queue: Any, report: Report) -> None:
 _worker: dict[str, Any] = {}
 
 
-def _start_worker(payload: bytes, queue: Any) -> None:
+class _Stopped(Exception):
+    """The run is over; nobody waits for this shard."""
+
+
+def _start_worker(payload: bytes, queue: Any, stop: Any) -> None:
+    queue.cancel_join_thread()  # reports that nobody reads must not hold the process
     Thread(target=_exit_with_parent, args=(os.getppid(),), daemon=True).start()
     grammar, normalizer = pickle.loads(payload).start()
-    _worker.update(grammar=grammar, normalizer=normalizer, queue=queue)
+    _worker.update(grammar=grammar, normalizer=normalizer, queue=queue, stop=stop)
 
 
 def _exit_with_parent(parent: int) -> None:
@@ -130,5 +134,10 @@ def _exit_with_parent(parent: int) -> None:
 
 
 def _work(job: Job) -> int:
-    write_shard_of(job, _worker["grammar"], _worker["normalizer"], lambda *message: _worker["queue"].put(message))
+    def report(*message: Any) -> None:
+        if _worker["stop"].is_set():
+            raise _Stopped
+        _worker["queue"].put(message)
+
+    write_shard_of(job, _worker["grammar"], _worker["normalizer"], report)
     return job.index

@@ -10,17 +10,22 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
+from toy_grammars import TYPE, toy_scenes
 
-from scene_envs.datasets import SceneDataset, describe, fixed_normalizer
-from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
-from scene_envs.grammars import get_grammar
+from scene_envs.datasets import SceneDataset, describe_all, read_metadata
+from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.normalizer import Normalizer
 
 
 @pytest.fixture(scope="module")
 def dataset() -> SceneDataset:
-    grammar, rng = get_grammar("dimsum_table"), np.random.default_rng(0)
-    batch = grammar.sample(rng, 40)
-    return SceneDataset(batch.tensor, describe(batch, rng), fixed_normalizer(grammar), batch.scene_type)
+    batch = toy_scenes(40)
+    low, high = torch.tensor([-0.4, -0.4, 0.0] + [-1.0] * 9 + [0.0] * 4), torch.tensor([0.4, 0.4, 0.5] + [1.0] * 13)
+    for constant in (5, 8, 9, 10):
+        low[constant] = high[constant] = 0.0
+    low[11] = 0.0
+    sets = describe_all(batch, np.random.default_rng(0))
+    return SceneDataset.from_sets(batch.tensor, sets, Normalizer.from_range(low, high), TYPE)
 
 
 @pytest.fixture
@@ -31,9 +36,10 @@ def folder(dataset: SceneDataset, tmp_path: Path) -> Path:
 def test_save_and_load_give_the_same_scenes(dataset: SceneDataset, folder: Path) -> None:
     loaded = SceneDataset.load(folder)
     assert loaded.prompts == dataset.prompts
+    assert loaded.prompt_sets == dataset.prompt_sets
     assert loaded.scene_type is dataset.scene_type
     torch.testing.assert_close(loaded.tensor, dataset.tensor, atol=1e-7, rtol=0)
-    constant = [5, 8, 9, 10, 11, *range(12, 20)]
+    constant = [5, 8, 9, 10, 11, *range(12, 16)]
     assert torch.equal(loaded.tensor[..., constant], dataset.tensor[..., constant])
     on_table = dataset.tensor[..., 2] == 0
     assert (loaded.tensor[..., 2][on_table] == 0).all()
@@ -44,49 +50,12 @@ def test_hugging_face_datasets_reads_the_shards(dataset: SceneDataset, folder: P
 
     files = sorted(map(str, folder.glob("*.parquet")))
     loaded = datasets.load_dataset("parquet", data_files=files, cache_dir=str(tmp_path / "cache"))["train"]
-    assert loaded.column_names == ["scenes", "language_annotation"]
+    assert loaded.column_names == ["scenes", "language_annotation", "language_annotations"]
     assert loaded["language_annotation"][:] == dataset.prompts
+    assert [tuple(prompts) for prompts in loaded["language_annotations"][:]] == dataset.prompt_sets
     scenes = torch.tensor(loaded[:]["scenes"])
-    assert scenes.shape == (40, 34, 20)
+    assert scenes.shape == (40, 5, 16)
     torch.testing.assert_close(scenes, dataset.normalizer.normalize(dataset.tensor))
-
-
-def test_a_file_written_by_hugging_face_datasets_loads(dataset: SceneDataset, folder: Path, tmp_path: Path) -> None:
-    import datasets
-
-    features = datasets.Features(
-        {"scenes": datasets.Array2D((34, 20), "float32"), "language_annotation": datasets.Value("string")}
-    )
-    scenes = dataset.normalizer.normalize(dataset.tensor).numpy()
-    rows = {"scenes": list(scenes), "language_annotation": dataset.prompts}
-    datasets.Dataset.from_dict(rows, features=features).to_parquet(tmp_path / "theirs.parquet")
-    (tmp_path / "metadata.json").write_bytes((folder / "metadata.json").read_bytes())
-    loaded = SceneDataset.load(tmp_path / "theirs.parquet")
-    torch.testing.assert_close(loaded.tensor, dataset.tensor, atol=1e-7, rtol=0)
-
-
-def test_categories_are_matched_by_path_not_by_index(dataset: SceneDataset, folder: Path) -> None:
-    """A file whose assets come in reverse order, under other paths, holds the same scenes."""
-    order = [*range(12), *range(18, 11, -1), 19]
-    path = folder / "metadata.json"
-    metadata = json.loads(path.read_text())
-    metadata["model_paths"] = [f"package://other/{Path(p).name}.sdf" for p in reversed(metadata["model_paths"])]
-    path.write_text(json.dumps(metadata))
-    normalised = dataset.normalizer.normalize(dataset.tensor)[..., order].numpy()
-    for file in folder.glob("*.parquet"):
-        file.unlink()
-    table = pa.table({"scenes": normalised.tolist(), "language_annotation": dataset.prompts})
-    pq.write_table(table, folder / "a.parquet")
-    torch.testing.assert_close(SceneDataset.load(folder).tensor, dataset.tensor, atol=1e-7, rtol=0)
-
-
-def test_other_asset_names_need_aliases(dataset: SceneDataset, folder: Path) -> None:
-    path = folder / "metadata.json"
-    path.write_text(path.read_text().replace("assets/teacup", "assets/coffee_cup_white"))
-    with pytest.raises(UnknownNameError, match="coffee_cup_white"):
-        SceneDataset.load(folder)
-    loaded = SceneDataset.load(folder, aliases={"coffee_cup_white": "teacup"})
-    torch.testing.assert_close(loaded.tensor, dataset.tensor, atol=1e-7, rtol=0)
 
 
 def test_limit_reads_a_prefix(dataset: SceneDataset, folder: Path) -> None:
@@ -94,6 +63,31 @@ def test_limit_reads_a_prefix(dataset: SceneDataset, folder: Path) -> None:
     assert len(loaded) == 10
     assert loaded.prompts == dataset.prompts[:10]
     assert not loaded.complete
+
+
+def test_a_dataset_with_one_prompt_per_scene_has_the_published_columns(dataset: SceneDataset, tmp_path: Path) -> None:
+    one = SceneDataset(dataset.tensor, dataset.prompts, dataset.normalizer, TYPE)
+    assert one.prompt_sets == [(prompt,) for prompt in dataset.prompts]
+    file = one.save(tmp_path) / "scenes-00000.parquet"
+    assert pq.read_schema(file).names == ["scenes", "language_annotation"]
+    assert SceneDataset.load(tmp_path).prompt_sets == one.prompt_sets
+
+
+def test_prompt_sets_that_contradict_the_prompts_are_refused(dataset: SceneDataset) -> None:
+    sets = [("Something else.",)] * 40
+    with pytest.raises(InvalidInputError, match="prompt_sets"):
+        SceneDataset(dataset.tensor, dataset.prompts, dataset.normalizer, TYPE, {}, sets)
+
+
+def test_metadata_alone_tells_what_a_dataset_holds(folder: Path, dataset: SceneDataset) -> None:
+    for file in folder.glob("*.parquet"):
+        file.unlink()
+    info = read_metadata(folder)
+    assert info.stems == ("cafe_table", "dinner_plate", "teacup")
+    assert info.welded_model_paths == ("scene_envs/assets/cafe_table",)
+    assert (info.slots, info.features, info.scene_type, info.count) == (5, 16, "toy_cups", 40)
+    assert torch.equal(info.normalizer.scale, dataset.normalizer.scale)
+    assert info.categories_in(TYPE).tolist() == [0, 1, 2, 3]
 
 
 def test_split_is_disjoint_seeded_and_covers_all(dataset: SceneDataset) -> None:
@@ -130,23 +124,39 @@ def test_a_truncated_parquet_file_is_named(folder: Path) -> None:
 
 def test_a_missing_column_is_named(folder: Path) -> None:
     path = folder / "scenes-00000.parquet"
-    pq.write_table(pq.read_table(path).drop_columns("language_annotation"), path)
+    pq.write_table(pq.read_table(path).drop_columns(["language_annotation"]), path)
     with pytest.raises(CorruptFileError, match="language_annotation"):
         SceneDataset.load(folder)
 
 
 def test_scenes_of_the_wrong_width_are_refused(folder: Path) -> None:
     path = folder / "scenes-00000.parquet"
-    pq.write_table(pa.table({"scenes": [[[0.0] * 19] * 34], "language_annotation": ["A scene."]}), path)
-    with pytest.raises(CorruptFileError, match="20 features"):
+    pq.write_table(pa.table({"scenes": [[[0.0] * 15] * 5], "language_annotation": ["A scene."]}), path)
+    with pytest.raises(CorruptFileError, match="expected 16 features"):
         SceneDataset.load(folder)
 
 
-@pytest.mark.parametrize("content", ["{not json", '{"model_paths": []}'])
+@pytest.mark.parametrize("content", ["{not json", '{"model_paths": []}', "[]"])
 def test_broken_metadata_is_named(folder: Path, content: str) -> None:
     (folder / "metadata.json").write_text(content)
     with pytest.raises(CorruptFileError, match=r"metadata\.json"):
         SceneDataset.load(folder)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("translation_vec_len", 7, "translation_vec_len is 7, expected 3"),
+        ("model_path_vec_len", 3, "model_path_vec_len is 3, expected 4"),
+        ("model_paths", ["a/cafe_table"], "model_path_vec_len is 4, expected 2"),
+        ("normalizer_state", {"params": {}}, "normalizer_state lacks"),
+    ],
+)
+def test_contradicting_metadata_is_named(folder: Path, key: str, value: object, words: str) -> None:
+    path = folder / "metadata.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
+    with pytest.raises(CorruptFileError, match=words):
+        read_metadata(folder)
 
 
 def test_saving_into_a_used_folder_is_refused(dataset: SceneDataset, folder: Path) -> None:
