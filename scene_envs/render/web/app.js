@@ -273,10 +273,11 @@ Object.assign(document.body.dataset, { scenes: scenes.length });
 if (renderer) redraw();
 else showText();
 
-// For scripts: the state, and the slots seen in the canvas.
+// For scripts: the state, drawing at once, and the slots seen in the canvas (row by row from below).
 window.sceneViewer = {
   state,
   showScene,
+  draw,
   camera: cameraNow,
   size: () => [canvas.width, canvas.height],
   slots: () => renderer.slots(cameraNow(), look(), 0, 0, canvas.width, canvas.height),
