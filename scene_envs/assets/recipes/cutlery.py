@@ -34,12 +34,20 @@ def _beam(stations: Sequence[Station], y: float = 0.0) -> list[ConvexPart]:
     return [convex_hull(np.concatenate([_section(a, y), _section(b, y)])) for a, b in pairwise(stations)]
 
 
+def _grip(end: Station) -> list[Station]:
+    """Stations that round the end of a handle off, seen from above."""
+    x, width, low, high = end
+    return [
+        (x + along * width, across * width, low, high) for along, across in ((0.0, 0.45), (0.06, 0.72), (0.2, 0.94))
+    ]
+
+
 def _skin(stations: Sequence[Station], color: Color, y: float = 0.0, samples: int = 14) -> trimesh.Trimesh:
     """A rounded bar through the stations, y = 0 in its middle."""
     from scipy.interpolate import PchipInterpolator
 
     table = np.array(stations)
-    x = np.linspace(table[0, 0], table[-1, 0], samples)
+    x = np.unique([*np.linspace(table[0, 0], table[-1, 0], samples), *table[:, 0]])
     width, low, high = PchipInterpolator(table[:, 0], table[:, 1:])(x).T
     angles = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False) + np.pi / 12
     ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -64,7 +72,7 @@ def fork() -> Model:
     tines = [_beam([(root[0], 0.0046, 0.0, 0.0036), tip], y)[0] for y in rows]
     shoulder = (0.040, 0.020, 0.0035, 0.0078)
     visual = join(
-        _skin([end, (-0.07, 0.016, 0.0, _THICK), waist, (0.0, 0.008, 0.0042, 0.0076), neck], _STEEL),
+        _skin([*_grip(end), (-0.07, 0.016, 0.0, _THICK), waist, (0.0, 0.008, 0.0042, 0.0076), neck], _STEEL),
         _skin([neck, shoulder, (0.047, 0.0248, 0.0006, 0.0042), root], _STEEL, samples=8),
         *(
             _skin([(root[0], 0.0046, 0.0, 0.0036), (0.078, 0.0042, 0.0004, 0.0036), tip], _BRIGHT, y, samples=5)
@@ -82,13 +90,13 @@ def knife() -> Model:
                         (0.108, 0.0085), (0.090, 0.0100), (-0.005, 0.0068)])  # fmt: skip
     handle = _beam([end, bolster])[0]
     blade = convex_hull([(x, y, z) for x, y in outline for z in (0.0, _THICK)])
-    edge = _rounded(outline)
+    edge = _rounded(outline - np.array([[0.012, 0.0]]) * (outline[:, :1] < 0.0))  # starts inside the handle
     ground = edge + np.where(edge[:, 1:] < 0.0, [[0.0, 0.0028]], [[0.0, 0.0]])  # the bevel along the cutting edge
     low, high, flat = (
         np.column_stack([line, np.full(len(line), z)]) for line, z in ((edge, 0.0), (edge, 0.0012), (ground, 0.0024))
     )
     visual = join(
-        _skin([end, (-0.108, 0.018, 0.0, 0.008), (-0.03, 0.0145, 0.0, 0.0072), bolster], _STEEL),
+        _skin([*_grip(end), (-0.100, 0.0177, 0.0, 0.008), (-0.03, 0.0145, 0.0, 0.0072), bolster], _STEEL),
         _prism(low, high, _SHADE),
         _prism(high, flat, _BRIGHT),
     )
@@ -139,25 +147,14 @@ def _spoon(length: float, width: float, height: float) -> Model:
         return np.column_stack([flat, rim * (1.0 - drop)])
 
     bowl = convex_hull(np.concatenate([_section(neck), at(circle(12), 1.0, 0.0), at(circle(8), 0.45, 1.0)]))
-    unit = circle(28)
-    outside = [
-        at(unit, scale, drop) for scale, drop in ((0.45, 1.0), (0.70, 0.80), (0.88, 0.50), (0.97, 0.2), (1.0, 0.0))
-    ]
-    inside = [
-        at(unit, scale, drop) for scale, drop in ((0.94, 0.0), (0.86, 0.26), (0.66, 0.53), (0.4, 0.66), (0.05, 0.7))
-    ]
+    shell = ((0.45, 1.0), (0.70, 0.80), (0.88, 0.50), (0.97, 0.2), (1.0, 0.0))
+    dish = ((0.94, 0.0), (0.86, 0.26), (0.66, 0.53), (0.4, 0.66), (0.05, 0.7))
+    outside, inside = ([at(circle(24), scale, drop) for scale, drop in steps] for steps in (shell, dish))
+    hold: Station = (-0.42 * length, 0.38 * width, 0.0, _THICK)
+    arch: Station = (0.0, 0.19 * width, 0.3 * height, 0.3 * height + _THICK)
+    rim: Station = (neck[0] + 0.004, 0.22 * width, height - _THICK, height)
     visual = join(
-        _skin(
-            [
-                end,
-                (-0.42 * length, 0.38 * width, 0.0, _THICK),
-                waist,
-                (0.0, 0.19 * width, 0.3 * height, 0.3 * height + _THICK),
-                neck,
-                (neck[0] + 0.004, 0.22 * width, height - _THICK, height),
-            ],
-            _STEEL,
-        ),
+        _skin([*_grip(end), hold, waist, arch, neck, rim], _STEEL),
         loft(outside, _STEEL, caps=(True, False)),
         loft([outside[-1], inside[0]], _BRIGHT, caps=(False, False)),
         loft(inside, _SHADE, caps=(False, True)),
