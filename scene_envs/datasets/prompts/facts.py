@@ -155,7 +155,7 @@ def viewer_axes(scene_type: str | SceneType) -> Array:
     [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     """
     camera = get_scene_type(scene_type).camera
-    right = np.cross(np.subtract(camera.target, camera.position), camera.up)
+    right = np.cross(np.subtract(camera.target, camera.position, dtype=float), camera.up)
     right[2] = 0.0
     right /= np.linalg.norm(right)
     up = np.array([0.0, 0.0, 1.0])

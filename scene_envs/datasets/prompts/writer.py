@@ -119,13 +119,13 @@ class _Writer:
         families += [self._stay] if self._stays else []
         families += [self._aside] if len(self._neighbors) else []
         claims: dict[Hashable, Claim] = {}
-        if families:
-            for _ in range(int(self.rng.integers(1, _MOST_RELATIONS + 1))):
-                for _ in range(_TRIES):
-                    claim = self._pick(families)()
-                    if claim is not None and self._topic(claim) not in claims and self._is_clear(claim):
-                        claims[self._topic(claim)] = claim
-                        break
+        wanted = int(self.rng.integers(1, _MOST_RELATIONS + 1)) if families else 0
+        for _ in range(_TRIES * (wanted + 2)):
+            if len(claims) == wanted:
+                break
+            claim = self._pick(families)()
+            if claim is not None and self._topic(claim) not in claims and self._is_clear(claim):
+                claims[self._topic(claim)] = claim
         return list(claims.values())
 
     def _topic(self, claim: Claim) -> Hashable:
