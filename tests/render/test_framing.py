@@ -1,0 +1,111 @@
+"""Picture cameras see what matters, also of scene types that nobody has framed by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scene_envs.errors import InvalidInputError, UnknownNameError
+from scene_envs.render import picture_camera
+from scene_envs.render.cameras import light_camera
+from scene_envs.render.framing import fit_camera, frame_scene_type
+from scene_envs.scene_types import Camera, FixedObject, SceneType, get_scene_type, list_scene_types
+
+BUILT_IN = list_scene_types()
+
+
+def in_image(points, camera):
+    """(P, 2): x and y in -1..1 across the image, and depth (m), by the textbook."""
+    position, target = np.array(camera.position), np.array(camera.target)
+    forward = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(forward, camera.up)
+    right /= np.linalg.norm(right)
+    offset = np.asarray(points) - position
+    depth = offset @ forward
+    slope = np.tan(np.radians(camera.fov_y) / 2.0)
+    across = offset @ right / depth / (slope * camera.width / camera.height)
+    return np.stack([across, offset @ np.cross(right, forward) / depth / slope], axis=1), depth
+
+
+def fixed_vertices(scene_type):
+    vertices = []
+    for fixed in scene_type.fixed:
+        rotation = np.reshape(fixed.rotation, (3, 3))
+        vertices += [
+            p.vertices @ rotation.T + np.array(fixed.translation) for p in scene_type.library[fixed.asset].fine
+        ]
+    return np.concatenate(vertices)
+
+
+def own_type(name, fixed=(), workspace=((-0.15, -0.30, -0.42), (0.15, 0.30, 0.62)), assets=("teacup", "shelf")):
+    camera = Camera((0.0, 0.0, 2.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+    welded = tuple({f.asset for f in fixed})
+    return SceneType(name, assets, 5, workspace, welded, tuple(fixed), camera)
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+@pytest.mark.parametrize(("width", "height"), [(480, 360), (200, 400), (900, 300)])
+def test_the_support_is_seen_whole_and_fills_the_picture(name, width, height):
+    scene_type = get_scene_type(name)
+    camera = picture_camera(scene_type, width, height)
+    points = frame_scene_type(scene_type).points
+    places, depth = in_image(points, camera)
+    assert (depth > 0).all()
+    assert np.abs(places).max() <= 0.951
+    assert (np.ptp(places, axis=0) >= 1.899).any()  # from border to border in one direction
+    vertices = fixed_vertices(scene_type)
+    top = vertices if "shelf" in name else vertices[vertices[:, 2] > vertices[:, 2].max() - 0.03]
+    assert np.abs(in_image(top, camera)[0]).max() <= 0.951
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_the_lamp_sees_everything_that_the_picture_shows(name):
+    scene_type = get_scene_type(name)
+    places, depth = in_image(frame_scene_type(scene_type).points, light_camera(scene_type))
+    assert np.abs(places).max() < 1.0
+    assert (depth > 0).all()
+
+
+@pytest.mark.parametrize("yaw", [0.0, 90.0, 180.0, 270.0])
+def test_a_shelf_is_seen_from_its_open_side_whichever_way_it_faces(yaw):
+    a = np.radians(yaw)
+    rotation = (np.cos(a), -np.sin(a), 0.0, np.sin(a), np.cos(a), 0.0, 0.0, 0.0, 1.0)
+    framing = frame_scene_type(own_type(f"shelf_{yaw}", [FixedObject("shelf", rotation=rotation)]))
+    open_side = np.array([np.cos(a), np.sin(a), 0.0])
+    assert framing.to_camera @ open_side > 0.8
+    assert framing.to_light @ open_side > 0.3  # the lamp shines into it
+    assert 0.1 < framing.to_camera[2] < 0.5
+
+
+def test_a_vessel_is_looked_into_from_above_and_open_ground_at_an_angle():
+    crate = own_type(
+        "crate", [FixedObject("fruit_bowl")], ((-0.1, -0.1, 0.0), (0.1, 0.1, 0.12)), ("apple_gala", "fruit_bowl")
+    )
+    assert frame_scene_type(crate).to_camera[2] > 0.75
+    ground = own_type("ground", (), ((-1.0, -2.0, 0.5), (1.0, 2.0, 1.5)), ("teacup",))
+    framing = frame_scene_type(ground)
+    assert framing.ground == 0.5
+    assert 0.5 < framing.to_camera[2] < 0.8
+    assert framing.to_camera[0] > abs(framing.to_camera[1])  # the longer side lies across the picture
+    corners = [[x, y, 0.5] for x in (-1, 1) for y in (-2, 2)]
+    assert np.abs(in_image(corners, picture_camera(ground))[0]).max() <= 0.951
+
+
+def test_fitted_cameras_are_as_near_as_they_can_be():
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(40, 3)) * [1.0, 0.3, 0.2]
+    toward = np.array([0.48, -0.6, 0.64])
+    position, target = fit_camera(points, toward, 40.0, 1.5, 0.1)
+    np.testing.assert_allclose(np.cross(position - target, toward), 0.0, atol=1e-9)
+    camera = Camera(tuple(position), tuple(target), (0.0, 0.0, 1.0), 150, 100, 40.0)
+    places = in_image(points, camera)[0]
+    assert np.abs(places).max() == pytest.approx(0.9)
+    assert places[:, 0].max() == pytest.approx(0.9)
+    assert places[:, 0].min() == pytest.approx(-0.9)
+
+
+def test_wrong_arguments_are_named():
+    with pytest.raises(UnknownNameError, match="did you mean 'dimsum_table'"):
+        picture_camera("dimsum_tabel")
+    with pytest.raises(InvalidInputError, match="height=0"):
+        picture_camera("dimsum_table", 10, 0)
