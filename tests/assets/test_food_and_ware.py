@@ -13,7 +13,7 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 
 from scene_envs.assets import get_library, list_assets
-from scene_envs.physics import equilibrium, feasibility, penetration, settle
+from scene_envs.physics import equilibrium, feasibility, penetration, project, settle
 from scene_envs.physics.geometry import PartGeometry
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import Camera, FixedObject, SceneType, get_scene_type, list_scene_types
@@ -221,6 +221,8 @@ def test_inertias_of_box_and_can_are_the_textbook_ones(library):
 def test_visual_mesh_shows_what_collides(library, name):
     asset = library[name]
     np.testing.assert_allclose(asset.visual.bounds, asset.bounds, atol=0.0045)
+    beyond = [asset.visual.vertices @ p.normals.T - p.offsets for p in map(PartGeometry.of, asset.fine)]
+    assert np.min([b.max(axis=1) for b in beyond], axis=0).max() < 0.005  # m outside of all parts
     assert len(asset.visual.faces) <= 3000
     assert len(np.unique(asset.visual.visual.vertex_colors, axis=0)) <= 12  # colours share a palette of 256
     np.testing.assert_allclose(np.linalg.norm(asset.visual.vertex_normals, axis=1), 1.0, atol=1e-6)
@@ -302,7 +304,9 @@ def test_things_stand_on_plates_and_in_bowls(kitchen):
     layouts += [
         [("bowl", 0.0, 0.0, 0.0), (fruit, 0.004, 0.0, 0.006)] for fruit in loads if fruit not in ("bowl", "bread_slice")
     ]
-    layouts += [[("fruit_bowl", 0.0, 0.0, 0.0), ("apple_gala", 0.012, 0.0, 0.006)]]
+    layouts += [
+        [("fruit_bowl", 0.0, 0.0, 0.0), (name, 0.010, 0.0, 0.006)] for name in NAMES if name[:5] in ("apple", "pear_")
+    ]
     batch = scenes(kitchen, *layouts)
     assert float(penetration(batch).depth.max()) <= 1e-6
     result = feasibility(batch, duration=0.5)
@@ -310,7 +314,26 @@ def test_things_stand_on_plates_and_in_bowls(kitchen):
     assert float(result.displacement.max()) <= 3e-4
 
 
-def test_bread_and_plates_stack(kitchen):
+def test_projection_leaves_things_on_plates_and_in_bowls(kitchen):
+    rng = np.random.default_rng(0)
+    layouts = []
+    for below, above in (
+        ("bowl", "apple_gala"),
+        ("fruit_bowl", "apple_gala"),
+        ("plate", "pear_bosc"),
+        ("plate", "bowl"),
+    ):
+        for _ in range(10):
+            shift = rng.normal(0.0, 0.01, (2, 3)) * [1.0, 1.0, 0.5]
+            layouts.append([(below, *shift[0]), (above, *(shift[1] + [0.0, 0.0, 0.006]))])
+    projected = project(scenes(kitchen, *layouts))
+    assert projected.converged.all()
+    offset = projected.batch.translations[:, 2] - projected.batch.translations[:, 1]
+    assert float(offset[:, :2].norm(dim=1).max()) < 0.06
+    assert float(offset[:, 2].max()) < 0.06
+
+
+def test_bread_stacks(kitchen):
     pile = [("bread_slice", 0.0, 0.0, 0.016 * level) for level in range(4)]
     result = feasibility(scenes(kitchen, pile), duration=0.5)
     assert float(penetration(scenes(kitchen, pile)).depth.max()) <= 1e-6

@@ -56,9 +56,12 @@ def shared_plate() -> Model:
 
 def _handle(path: Sequence[tuple[float, float, float]], radius: float, color: Color) -> trimesh.Trimesh:
     """A round handle along ``path``, whose ends reach 2 mm into the wall so that they do not show."""
-    first, *middle, last = path
-    inward = [(first[0] - 0.002, *first[1:]), *middle, (last[0] - 0.002, *last[1:])]
-    return tube(arc(inward, 20), radius, color)
+    points = np.array(path)
+    points[[0, -1], 0] -= 0.002
+    low, high = points[:-1], points[1:]
+    thirds = np.stack([(2.0 * low + high) / 3.0, (low + 2.0 * high) / 3.0], axis=1).reshape(-1, 3)
+    knots = np.concatenate([points[:1], thirds[1:-1], points[-1:]])  # rounds the corners, does not run past them
+    return tube(arc(knots.tolist(), 20), radius, color)
 
 
 _MUG_RADIUS, _MUG_HEIGHT, _MUG_WALL, _MUG_FLOOR = 0.040, 0.085, 0.0045, 0.006
@@ -95,8 +98,8 @@ def mug() -> Model:
 
 
 _JUG_FOOT, _JUG_RADIUS, _JUG_HEIGHT, _JUG_WALL, _JUG_FLOOR = 0.046, 0.0525, 0.182, 0.005, 0.007
-_JUG_HANDLE = [(0.0514, 0.0, 0.145), (0.078, 0.0, 0.145), (0.089, 0.0, 0.118), (0.080, 0.0, 0.050),
-               (0.0480, 0.0, 0.050)]  # fmt: skip
+_JUG_HANDLE = [(0.0514, 0.0, 0.145), (0.076, 0.0, 0.145), (0.089, 0.0, 0.102), (0.076, 0.0, 0.055),
+               (0.0482, 0.0, 0.055)]  # fmt: skip
 _ENAMEL: Color = (232, 238, 240)
 _RIM: Color = (44, 82, 140)
 _STRIPE: Color = (96, 140, 190)
