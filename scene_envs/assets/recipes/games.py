@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 from scene_envs.assets.library import Model, asset_recipe
 from scene_envs.assets.panels import Face, Patch, lettering, painted_box
@@ -14,7 +15,12 @@ _WHITE: Color = (248, 246, 240)
 
 
 def _lidded(
-    size: tuple[float, float, float], lid: Color, sides: Color, top: Sequence[Patch], label: Sequence[Patch]
+    size: tuple[float, float, float],
+    lid: Color,
+    sides: Color,
+    top: Sequence[Patch],
+    label: Sequence[Patch],
+    front: Literal["-y", "+x"] = "-y",
 ) -> Model:
     """A box in a lid that leaves a strip of its tray to be seen."""
     strip = 0.16
@@ -26,7 +32,7 @@ def _lidded(
     walls: tuple[Face, ...] = ("-x", "+x", "-y", "+y")
     art: dict[Face, Sequence[Patch]] = {face: [*raised, tray] for face in walls}
     part = box(size)
-    return Model(painted_box(size, colors, {**art, "top": top}), [part], [part])
+    return Model(painted_box(size, colors, {**art, "top": top}, front=front), [part], [part])
 
 
 @asset_recipe("board_game_s", display_name="board game", mass=0.90, color=(150, 60, 170))
@@ -43,7 +49,7 @@ def board_game_s() -> Model:
         Patch(0.24, 0.18, 0.45, 0.26, gold),
     ]
     label = [Patch(0.0, 0.24, 1.0, 0.76, gold), *lettering(0.25, 0.36, 0.75, 0.66, plum)]
-    return _lidded((0.20, 0.264, 0.060), plum, plum, top, label)
+    return _lidded((0.20, 0.264, 0.060), plum, plum, top, label, front="+x")
 
 
 @asset_recipe("board_game_xl", display_name="board game", mass=1.10, color=(150, 0, 72))
