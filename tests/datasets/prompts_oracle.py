@@ -44,8 +44,7 @@ class Oracle:
         self.position = batch.translations[0].double().numpy()[present]
         self.rotation = batch.rotations[0].double().numpy()[present]
         self.corners = [
-            hull(asset).points @ r.T + t
-            for asset, r, t in zip(self.assets, self.rotation, self.position, strict=True)
+            hull(asset).points @ r.T + t for asset, r, t in zip(self.assets, self.rotation, self.position, strict=True)
         ]
         self.low = np.array([c.min(axis=0) for c in self.corners])
         self.high = np.array([c.max(axis=0) for c in self.corners])
@@ -81,9 +80,7 @@ class Oracle:
 
     def find(self, reference: Reference) -> int:
         """Index of the one thing meant."""
-        members = [
-            i for i in self.named(reference.name) if reference.place is None or self.is_at(i, reference.place)
-        ]
+        members = [i for i in self.named(reference.name) if reference.place is None or self.is_at(i, reference.place)]
         if not reference.ordinal:
             (only,) = members
             return only
