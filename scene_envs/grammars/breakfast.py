@@ -17,7 +17,7 @@ from scene_envs.grammars.wishes import Gaussian, Uniform, Wish, Yaw
 TABLE = Region(0.2575, 0.60, overhang=0.10)
 """Frames stay 10 cm from the edge of the table, so that nothing hangs over it."""
 
-CROCK_RADIUS = 0.057
+CROCK_RADIUS = 0.055
 """Inner radius of the utensil crock, m."""
 
 ALONG = Yaw(std=0.06)

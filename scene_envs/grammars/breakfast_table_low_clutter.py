@@ -39,7 +39,7 @@ def shared(crock_present: float) -> Node:
     return Group(crock(crock_present), shared_plates(0.7, 2, 0.2), shared_bowls(0.7, 2), cereal(0.3), jugs(0.6))
 
 
-USUAL = Group(two_places(0.36, 0.14, 0.50), shared(0.18))
+USUAL = Group(two_places(0.29, 0.11, 0.60), shared(0.18))
 FEAST = Group(two_places(0.90, 0.10, 0.00), shared(0.90))
 
 

@@ -10,7 +10,7 @@ from scene_envs.grammars.breakfast import at_least
 from scene_envs.grammars.containers import Heap
 from scene_envs.grammars.dsl import NOTHING, Geometric, Group, Object, OneOf, Repeat, Tiers
 from scene_envs.grammars.grammar import Grammar, register_grammar
-from scene_envs.grammars.shelf import HALF_DEPTH, HALF_WIDTH, tiers
+from scene_envs.grammars.shelf import HALF_DEPTH, HALF_WIDTH, MIDDLE, tiers
 from scene_envs.grammars.surface import Region
 from scene_envs.grammars.towers import Node, Surface
 from scene_envs.grammars.wishes import Uniform
@@ -18,7 +18,7 @@ from scene_envs.scene_types import get_scene_type
 
 FRUIT = ("apple_gala", "apple_golden", "apple_green", "apple_red", "pear_anjou", "pear_bosc", "pear_red",
          "avocado_a", "avocado_b", "avocado_c")  # fmt: skip
-ANYWHERE = Uniform(HALF_DEPTH, HALF_WIDTH, x=0.008)
+ANYWHERE = Uniform(HALF_DEPTH, HALF_WIDTH, x=MIDDLE)
 
 
 def goods(p: float) -> Node:
@@ -42,6 +42,6 @@ def pantry(p: float) -> Node:
 @register_grammar("pantry_shelf")
 def pantry_shelf() -> Grammar:
     """Shelves from nearly empty to packed."""
-    shelves = OneOf((0.02, pantry(0.93)), (0.90, pantry(0.64)), (0.08, pantry(0.5)))
+    shelves = OneOf((0.02, pantry(0.93)), (0.90, pantry(0.65)), (0.08, pantry(0.5)))
     room = Surface([shelves], Region(1.0, 1.0))
     return Grammar("pantry_shelf", get_scene_type("pantry_shelf"), [room], at_least(2))

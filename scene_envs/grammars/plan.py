@@ -52,6 +52,13 @@ class Rectangle:
 Plan = Disc | Rectangle
 
 
+def inscribed(plan: Plan) -> float:
+    """Radius (m) of the largest disc about the frame that lies within the plan; 0 when the frame is outside."""
+    if isinstance(plan, Disc):
+        return plan.radius
+    return max(0.0, min(plan.half_x - abs(plan.center_x), plan.half_y - abs(plan.center_y)))
+
+
 class Placed(NamedTuple):
     """A plan at a place: frame (x, y) in m, cosine and sine of its yaw."""
 

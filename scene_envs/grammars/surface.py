@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_envs.grammars.plan import Disc, Placed, Plan, meet
+from scene_envs.grammars.plan import Disc, Placed, Plan, inscribed, meet
 from scene_envs.grammars.wishes import Wish, Yaw
 
 _DRAWS = 24
@@ -59,6 +59,15 @@ class Region:
             for x, y in child.corners()
         )
 
+    def limits(self, foot: float) -> tuple[float, float, float]:
+        """Bounds (m) for the frame of a child whose footprint holds a disc of radius ``foot``.
+
+        Returns:
+            largest distance from the centre of the rectangle in x and in y, and from the support's origin.
+        """
+        over = min(0.0, self.overhang - foot)
+        return self.half_x + over, self.half_y + over, max(0.0, self.radius - foot)
+
     @cached_property
     def _cells(self) -> tuple[NDArray[np.float64], float, float]:
         nx, ny = (min(_MOST_CELLS, max(1, math.ceil(2 * half / _CELL))) for half in (self.half_x, self.half_y))
@@ -90,6 +99,16 @@ class Outline:
     keep_out: tuple[Plan, ...]
     footprint: tuple[Plan, ...]
 
+    @cached_property
+    def core(self) -> float:
+        """Radius (m) of a disc about the frame that lies within the keep-out, whatever the yaw."""
+        return max(inscribed(plan) for plan in self.keep_out)
+
+    @cached_property
+    def foot(self) -> float:
+        """Radius (m) of a disc about the frame that lies within the footprint, whatever the yaw."""
+        return max(inscribed(plan) for plan in self.footprint)
+
 
 @dataclass
 class FreeSurface:
@@ -106,6 +125,7 @@ class FreeSurface:
 
     region: Region
     _placed: list[Placed] = field(default_factory=list)
+    _cores: list[tuple[float, float, float]] = field(default_factory=list)
 
     def mark(self) -> int:
         """How many plans stand here, for :meth:`reset`."""
@@ -113,7 +133,7 @@ class FreeSurface:
 
     def reset(self, mark: int) -> None:
         """Take away what was placed since :meth:`mark`."""
-        del self._placed[mark:]
+        del self._placed[mark:], self._cores[mark:]
 
     def fit(self, x: float, y: float, yaws: Sequence[float], outline: Outline) -> list[Placed] | None:
         """The child's keep-outs at (x, y) with one yaw (rad) per level, if it fits there; else None."""
@@ -139,14 +159,39 @@ class FreeSurface:
         Returns:
             x, y (m) and the yaw (rad) of each of its ``levels``.
         """
+        region = self.region
+        half_x, half_y, radius = region.limits(outline.foot)
+        keep_out = outline.core
         for _ in range(_DRAWS):
             x, y = wish.draw(rng)
-            yaws = tuple(yaw.draw(rng) for _ in range(levels))
-            child = self.fit(x, y, yaws, outline)
-            if child is not None:
-                self._placed += child
-                return x, y, yaws
+            if abs(x - region.x) > half_x or abs(y - region.y) > half_y or x * x + y * y > radius * radius:
+                continue
+            if self._is_taken(x, y, keep_out):
+                continue
+            spot = self._settle(x, y, yaw, outline, rng, levels)
+            if spot is not None:
+                return spot
         return self._place_in_cells(wish, yaw, outline, rng, levels)
+
+    def _is_taken(self, x: float, y: float, core: float) -> bool:
+        """Whether a disc of radius ``core`` (m) at (x, y) meets another child's inner disc: a quick, generous test."""
+        for other_x, other_y, other in self._cores:
+            dx, dy, reach = x - other_x, y - other_y, core + other
+            if dx * dx + dy * dy < reach * reach:
+                return True
+        return False
+
+    def _settle(
+        self, x: float, y: float, yaw: Yaw, outline: Outline, rng: np.random.Generator, levels: int
+    ) -> tuple[float, float, tuple[float, ...]] | None:
+        """Keep the child at (x, y), turned at random, if it fits there."""
+        yaws = tuple(yaw.draw(rng) for _ in range(levels))
+        child = self.fit(x, y, yaws, outline)
+        if child is None:
+            return None
+        self._placed += child
+        self._cores += [(*placed.center(), _inner(placed.plan)) for placed in child]
+        return x, y, yaws
 
     def _place_in_cells(
         self, wish: Wish, yaw: Yaw, outline: Outline, rng: np.random.Generator, levels: int
@@ -164,29 +209,24 @@ class FreeSurface:
         for _ in range(_DRAWS):
             x, y = candidates[np.searchsorted(cumulative, rng.random() * cumulative[-1], side="right")]
             x, y = float(x + (rng.random() - 0.5) * wide), float(y + (rng.random() - 0.5) * deep)
-            yaws = tuple(yaw.draw(rng) for _ in range(levels))
-            child = self.fit(x, y, yaws, outline)
-            if child is not None:
-                self._placed += child
-                return x, y, yaws
+            if not self._is_taken(x, y, outline.core):
+                spot = self._settle(x, y, yaw, outline, rng, levels)
+                if spot is not None:
+                    return spot
         return None
 
     def _roomy(self, cells: NDArray[np.float64], outline: Outline) -> NDArray[np.bool_]:
         """(P,) cells that are not ruled out by circles within the plans: a quick, generous test."""
-        inner = max(_inscribed(plan) for plan in outline.keep_out)
-        foot = max(_inscribed(plan) for plan in outline.footprint)
+        inner, foot = outline.core, outline.foot
         region = self.region
         free = np.hypot(cells[:, 0], cells[:, 1]) + foot <= region.radius
         free &= np.abs(cells[:, 0] - region.x) + foot <= region.half_x + region.overhang + region.cell_size[0]
         free &= np.abs(cells[:, 1] - region.y) + foot <= region.half_y + region.overhang + region.cell_size[1]
-        for other in self._placed:
-            x, y = other.center()
-            free &= (cells[:, 0] - x) ** 2 + (cells[:, 1] - y) ** 2 >= (inner + _inscribed(other.plan)) ** 2
+        for x, y, other in self._cores:
+            free &= (cells[:, 0] - x) ** 2 + (cells[:, 1] - y) ** 2 >= (inner + other) ** 2
         return free
 
 
-def _inscribed(plan: Plan) -> float:
-    """Radius (m) of a disc about the frame that lies within the plan, whatever its yaw."""
-    if isinstance(plan, Disc):
-        return plan.radius
-    return max(0.0, min(plan.half_x - abs(plan.center_x), plan.half_y - abs(plan.center_y)))
+def _inner(plan: Plan) -> float:
+    """Radius (m) of the largest disc about the centre of the plan."""
+    return plan.radius if isinstance(plan, Disc) else min(plan.half_x, plan.half_y)
