@@ -23,6 +23,8 @@ _REACH = 0.02
 """Objects nearer than this (m) are kept apart although they do not overlap."""
 _SLACK = 300.0
 """How much more a metre of overlap costs than a metre of distance, squared in the objective."""
+_MET = 1e-7
+"""A plane broken by less than this (m) is met."""
 _APART = 1e-6
 """Parts whose best face plane leaves at least minus this (m) count as apart."""
 
@@ -155,12 +157,19 @@ def least_distance(matrix: Array, needed: Array) -> Array:
     """The shortest x with ``matrix @ x + s >= needed``, slack s costing ``_SLACK`` squared.
 
     Lawson and Hanson's least-distance programme (1974, ch. 23) through non-negative least squares on its dual.
+    Most rows are met by themselves: they join only when a solution without them breaks them.
     """
-    if needed.max(initial=0.0) <= 0:
-        return np.zeros(matrix.shape[1])
-    system = np.vstack([matrix.T, np.eye(len(needed)) / _SLACK, needed])
-    target = np.zeros(len(system))
-    target[-1] = 1.0
-    multipliers, _ = nnls(system, target, maxiter=30 * len(needed))
-    residual = system @ multipliers - target
-    return -residual[: matrix.shape[1]] / residual[-1]  # type: ignore[no-any-return]
+    x = np.zeros(matrix.shape[1])
+    used = needed > 0
+    broken = used
+    while broken.any():
+        used = used | broken
+        rows = np.flatnonzero(used)
+        system = np.vstack([matrix[rows].T, np.eye(len(rows)) / _SLACK, needed[rows]])
+        target = np.zeros(len(system))
+        target[-1] = 1.0
+        multipliers, _ = nnls(system, target, maxiter=30 * len(rows))
+        residual = system @ multipliers - target
+        x = -residual[: matrix.shape[1]] / residual[-1]
+        broken = ~used & (matrix @ x < needed - _MET)
+    return x

@@ -27,7 +27,9 @@ Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
 TOLERANCE = 1e-4
 """Depth (m) up to which a projected scene counts as free of overlap."""
 _ROUNDS = 30
-"""Rounds until what still overlaps is left as it is."""
+"""Rounds until what still overlaps is left as it is,"""
+_PATIENCE = 10
+"""or rounds without any improvement."""
 _REFINEMENTS = 8
 """Rounds spent on shortening the way of a scene that is free of overlap."""
 _GAIN = 0.005
@@ -62,20 +64,23 @@ def project_objects(collider: Collider, objects: Objects, workspace: Corners) ->
     best, best_way = Projection(home, np.inf), np.inf
     tried: Tried = {}
     current = replace(objects, translation=nearest(objects, home, walls))
-    refinements = 0
+    refinements = waited = 0
     for _ in range(_ROUNDS):
         first, second, residual = _overlapping(collider, current)
         way = float(((current.translation - home) ** 2).sum())
         is_free = residual <= 0.5 * TOLERANCE
         gain = best_way - way
+        waited += 1
         if residual < best.residual_depth and not is_free:
-            best = Projection(current.translation, residual)
+            best, waited = Projection(current.translation, residual), 0
         elif is_free and (way < best_way or best.residual_depth > 0.5 * TOLERANCE):
             best, best_way = Projection(current.translation, residual), way
         if is_free:
             refinements += 1
             if refinements > _REFINEMENTS or way < _NEGLIGIBLE or gain < _GAIN * way:
                 break
+        elif waited > _PATIENCE:
+            break
         elif best_way < np.inf:
             break  # a refinement that ran into something else: what was free of overlap stands
         current = replace(current, translation=_round(collider, current, home, first, second, bounds, walls, tried))
