@@ -32,10 +32,10 @@ def scenes(name: str) -> SceneBatch:
 
 
 def many(name: str) -> SceneBatch:
-    """The scenes, and ten more of each: in disorder (3 cm, 5 degrees), mirrored, and with objects missing."""
+    """The scenes, and six more of each: in disorder (3 cm, 5 degrees), mirrored, and with objects missing."""
     base = scenes(name)
     result = [base]
-    for seed in range(10):
+    for seed in range(6):
         scene = jittered(base, 0.03, 5.0, seed)
         mirror = torch.tensor([1.0, -1.0 if seed % 2 else 1.0, 1.0])
         free = scene.is_free[..., None]

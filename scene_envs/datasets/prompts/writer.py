@@ -16,15 +16,15 @@ from scene_envs.datasets.prompts.claims import (
     NameCount,
     ObjectCount,
     PairCount,
-    Place,
     PlaceCount,
     Reference,
     Side,
     SideClaim,
     SupportCount,
 )
-from scene_envs.datasets.prompts.facts import LOOSE, NOMINAL, SIDES, STRICT, SceneFacts, facts_under
+from scene_envs.datasets.prompts.facts import LOOSE, NOMINAL, STRICT, SceneFacts, facts_under
 from scene_envs.datasets.prompts.language import Nouns
+from scene_envs.datasets.prompts.speaker import Speaker
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
@@ -37,8 +37,6 @@ _MOST_NAMES = 10
 """Names in one prompt at most."""
 _MOST_RELATIONS = 4
 """Relations in one prompt at most."""
-_LAST_ORDINAL = 5
-"""Nobody counts further than the fifth."""
 _TRIES = 8
 """Draws for each relation, and for a prompt that differs from the others of its scene."""
 
@@ -68,18 +66,23 @@ def describe_all(batch: SceneBatch, rng: np.random.Generator, *, count: int = 3)
 
 def _writers(batch: SceneBatch, rng: np.random.Generator) -> list[_Writer]:
     nouns = Nouns(batch.scene_type)
-    views = zip(*facts_under(batch, [NOMINAL, STRICT, LOOSE]), strict=True)
-    return [_Writer(scene, (strict, loose), nouns, rng) for scene, strict, loose in views]
+    views = zip(*facts_under(batch, [STRICT, NOMINAL, LOOSE]), strict=True)
+    return [_Writer(seen, Speaker(seen), nouns, rng) for seen in views]
 
 
 @dataclass(frozen=True, eq=False)
 class _Writer:
-    """Writes about one scene, seen under the nominal and under other tolerances."""
+    """Writes about one scene, seen under strict, nominal and loose tolerances."""
 
-    scene: SceneFacts
-    others: tuple[SceneFacts, ...]
+    views: tuple[SceneFacts, ...]
+    speaker: Speaker
     nouns: Nouns
     rng: np.random.Generator
+
+    @property
+    def scene(self) -> SceneFacts:
+        """The scene as prompts are checked against it."""
+        return self.views[1]
 
     def write(self, kind: str) -> str:
         """A prompt of ``kind``, or a count when there is nothing else to say."""
@@ -140,28 +143,13 @@ class _Writer:
         return claim
 
     def _is_clear(self, claim: Claim) -> bool:
-        return claim.check(self.scene).holds and all(claim.check(view).holds for view in self.others)
+        return all(claim.check(view).holds for view in self.views)
 
     # -- what is held ---------------------------------------------------------------------------------
 
     @cached_property
-    def _pairs(self) -> Counter[tuple[str, bool, str]]:
-        """(upper name, inside, lower name) of free things to the number of such pairs."""
-        scene, pairs = self.scene, Counter[tuple[str, bool, str]]()
-        for upper, lower in enumerate(scene.held.support):
-            if lower >= 0 and not scene.fixed[lower] and not scene.held.contained[upper]:
-                pairs[scene.names[upper], False, scene.names[lower]] += 1
-            if (box := scene.held.inside[upper]) >= 0:
-                pairs[scene.names[upper], True, scene.names[box]] += 1
-        return pairs
-
-    def _pair(self) -> Claim:
-        name, inside, under = self._pick(sorted(self._pairs))
-        return PairCount(name, self._pairs[name, inside, under], inside, under)
-
-    @cached_property
     def _holds(self) -> Counter[tuple[str, bool, int]]:
-        """(upper name, inside, index of the lower thing) to the number of such pairs."""
+        """(upper name, inside, index of a free lower thing) to the number of such pairs."""
         scene, holds = self.scene, Counter[tuple[str, bool, int]]()
         for upper, lower in enumerate(scene.held.support):
             if lower >= 0 and not scene.fixed[lower] and not scene.held.contained[upper]:
@@ -169,6 +157,18 @@ class _Writer:
             if (box := scene.held.inside[upper]) >= 0:
                 holds[scene.names[upper], True, int(box)] += 1
         return holds
+
+    @cached_property
+    def _pairs(self) -> Counter[tuple[str, bool, str]]:
+        """(upper name, inside, lower name) to the number of such pairs."""
+        pairs = Counter[tuple[str, bool, str]]()
+        for (name, inside, lower), number in self._holds.items():
+            pairs[name, inside, self.scene.names[lower]] += number
+        return pairs
+
+    def _pair(self) -> Claim:
+        name, inside, under = self._pick(sorted(self._pairs))
+        return PairCount(name, self._pairs[name, inside, under], inside, under)
 
     def _hold(self) -> Claim | None:
         name, inside, lower = self._pick(sorted(self._holds))
@@ -187,18 +187,9 @@ class _Writer:
 
     def _stay(self) -> Claim | None:
         name, unit, tier = self._pick(sorted(self._stays))
-        place = self._place(unit, tier)
+        places = self.speaker.places(unit, tier)
+        place = self._pick(places) if places else None
         return None if place is None else PlaceCount(name, self._stays[name, unit, tier], place)
-
-    def _place(self, unit: int, tier: int) -> Place | None:
-        """How to speak of a place; tiers count from the nearer end."""
-        reference = self._refer(unit, placed=False)
-        tiers = int(self.scene.tiers[unit])
-        if reference is None or (tiers and tier < 0):
-            return None
-        if not tiers:
-            return Place(reference)
-        return Place(reference, tier if 2 * tier < tiers else tier - tiers)
 
     # -- sides ----------------------------------------------------------------------------------------
 
@@ -214,52 +205,20 @@ class _Writer:
     def _aside(self) -> Claim | None:
         first, second = self._neighbors[self.rng.integers(len(self._neighbors))].tolist()
         sides = [side for side in get_args(Side) if self._is_side(side, first, second)]
-        subject, landmark = self._refer(first), self._refer(second)
-        if not sides or subject is None or landmark is None:
+        subject = self._refer(first) if sides else None
+        landmark = self._refer(second) if subject is not None else None
+        if subject is None or landmark is None:
             return None
         return SideClaim(subject, self._pick(sides), landmark)
 
     def _is_side(self, side: Side, first: int, second: int) -> bool:
-        views = (self.scene, *self.others)
         if side == "next":
-            return all(view.is_next_to(first, second) for view in views)
-        return all(view.is_aside(side, first, second) for view in views)
+            return all(view.is_next_to(first, second) for view in self.views)
+        return all(view.is_aside(side, first, second) for view in self.views)
 
-    # -- speaking of one thing ------------------------------------------------------------------------
-
-    def _refer(self, index: int, *, placed: bool = True) -> Reference | None:
-        """The simplest words that single out one thing under every tolerance; None when there are none."""
-        name = self.scene.names[index]
-        if self.scene.objects[name] == 1:
-            return Reference(name)
-        place = None
-        if placed and not self._live_together(name):
-            unit, tier = int(self.scene.held.place[index]), int(self.scene.held.tier[index])
-            place = self._place(unit, tier) if unit >= 0 else None
-            if place is None:
-                return None
-        if place is not None and self._names_one(only := Reference(name, place=place), index):
-            return only
-        clear = [ordinal for ordinal in self._ordinals(index, name, place) if self._names_one(ordinal, index)]
-        return self._pick(clear) if clear else None
-
-    def _live_together(self, name: str) -> bool:
-        """Whether all things of that name are on one table, tier or floor."""
-        members, held = self.scene.named(name), self.scene.held
-        return len(set(zip(held.place[members].tolist(), held.tier[members].tolist(), strict=True))) == 1
-
-    def _ordinals(self, index: int, name: str, place: Place | None) -> list[Reference]:
-        members = self.scene.named(name)
-        if place is not None:
-            members = members[place.holds(self.scene)[members]]
-        edges = SIDES[:2] if self.scene.held.tier[index] >= 0 else SIDES
-        ranks = [1 + int((self.scene.along(edge)[members] > self.scene.along(edge)[index]).sum()) for edge in edges]
-        highest = min(1 + min(ranks), _LAST_ORDINAL)
-        named = zip(edges, ranks, strict=True)
-        return [Reference(name, rank, edge, place) for edge, rank in named if rank <= highest]
-
-    def _names_one(self, reference: Reference, index: int) -> bool:
-        return all(reference.resolve(view) == index for view in (self.scene, *self.others))
+    def _refer(self, index: int) -> Reference | None:
+        references = self.speaker.references(index)
+        return self._pick(references) if references else None
 
     def _pick(self, items: Sequence[_T]) -> _T:
         return items[int(self.rng.integers(len(items)))]

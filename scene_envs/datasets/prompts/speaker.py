@@ -1,0 +1,81 @@
+"""Words that single out one thing or one place of a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from scene_envs.datasets.prompts.claims import Place, Reference
+from scene_envs.datasets.prompts.facts import SIDES, SceneFacts
+
+_LAST_ORDINAL = 5
+"""Nobody counts further than the fifth."""
+
+
+@dataclass(frozen=True, eq=False)
+class Speaker:
+    """Speaks of things so that they are found in every one of several views of a scene.
+
+    Attributes:
+        views: the facts of one scene under several tolerances.
+    """
+
+    views: Sequence[SceneFacts]
+    _known: dict[int, list[Reference]] = field(default_factory=dict, repr=False)
+
+    @property
+    def scene(self) -> SceneFacts:
+        """Any view; names and positions are the same in all."""
+        return self.views[0]
+
+    def references(self, index: int) -> list[Reference]:
+        """The simplest ways to speak of one thing; empty when there are none.
+
+        Its name alone; or its name and place; or its rank from the sides where that is lowest.
+        """
+        if index not in self._known:
+            self._known[index] = self._references(index)
+        return self._known[index]
+
+    def places(self, unit: int, tier: int) -> list[Place]:
+        """Ways to speak of a thing as a place, or of one of its tiers, counted from the nearer end."""
+        tiers = int(self.scene.tiers[unit])
+        if tiers and tier < 0:
+            return []
+        nearer = None if not tiers else tier if 2 * tier < tiers else tier - tiers
+        return [Place(reference, nearer) for reference in self.references(unit) if reference.place is None]
+
+    def _references(self, index: int) -> list[Reference]:
+        scene = self.scene
+        name = scene.names[index]
+        if scene.objects[name] == 1:
+            return [Reference(name)]
+        places: list[Place | None] = [None]
+        if not scene.fixed[index] and not self._live_together(name):
+            unit, tier = int(scene.held.place[index]), int(scene.held.tier[index])
+            places = [*self.places(unit, tier)] if unit >= 0 else []
+        found = [Reference(name, place=place) for place in places if place is not None]
+        clear = [reference for reference in found if self._is_clear(reference, index)]
+        if clear:
+            return clear
+        ranked = [reference for place in places for reference in self._ranked(index, name, place)]
+        return [reference for reference in ranked if self._is_clear(reference, index)]
+
+    def _live_together(self, name: str) -> bool:
+        """Whether all things of that name are on one table, tier or floor."""
+        members, held = self.scene.named(name), self.scene.held
+        return len(set(zip(held.place[members].tolist(), held.tier[members].tolist(), strict=True))) == 1
+
+    def _ranked(self, index: int, name: str, place: Place | None) -> list[Reference]:
+        """References by rank, from the side where it is lowest, and from others where it is at most one higher."""
+        members = self.scene.named(name)
+        if place is not None:
+            members = members[place.holds(self.scene)[members]]
+        edges = SIDES[:2] if self.scene.held.tier[index] >= 0 else SIDES
+        along = {edge: self.scene.along(edge) for edge in edges}
+        ranks = {edge: 1 + int((along[edge][members] > along[edge][index]).sum()) for edge in edges}
+        highest = min(1 + min(ranks.values()), _LAST_ORDINAL)
+        return [Reference(name, rank, edge, place) for edge, rank in ranks.items() if rank <= highest]
+
+    def _is_clear(self, reference: Reference, index: int) -> bool:
+        return all(reference.resolve(view) == index for view in self.views)
