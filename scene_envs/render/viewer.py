@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 
 from scene_envs.assets import Asset, ConvexPart
 from scene_envs.errors import InvalidInputError
-from scene_envs.render.framing import Framing, frame_scene_type
+from scene_envs.render.framing import frame_scene_type
 from scene_envs.render.stage import vertex_colors
 from scene_envs.rotations import matrix_to_quaternion
 from scene_envs.scene import SceneBatch
+from scene_envs.scene_types import SceneType
 
 _SCRIPTS = ("math.js", "decode.js", "shaders.js", "targets.js", "renderer.js", "controls.js", "app.js")
 _FOV = 28.0
@@ -111,7 +112,7 @@ def _viewer_data(batch: SceneBatch, captions: Sequence[str]) -> dict[str, Any]:
         )
     library = scene_type.library
     assets = [_asset(library[int(c)], library[int(c)].name in scene_type.welded) for c in used]
-    return {"assets": assets, "scenes": scenes, "view": _view(frame_scene_type(scene_type))}
+    return {"assets": assets, "scenes": scenes, "view": _view(scene_type)}
 
 
 def _asset(asset: Asset, welded: bool) -> dict[str, Any]:
@@ -153,12 +154,14 @@ def _positions(vertices: NDArray[np.float64]) -> dict[str, Any]:
     return {"low": low.tolist(), "size": size.tolist(), "position": _text(steps)}
 
 
-def _view(framing: Framing) -> dict[str, Any]:
+def _view(scene_type: SceneType) -> dict[str, Any]:
+    framing = frame_scene_type(scene_type)
     x, y, z = framing.to_camera.tolist()
     return {
         "points": _outermost(framing.points).round(4).tolist(),
         "azimuth": float(np.degrees(np.arctan2(y, x))),
         "elevation": float(np.degrees(np.arcsin(z))),
+        "workspace": [list(corner) for corner in scene_type.workspace],
         "fov": _FOV,
         "light": framing.to_light.tolist(),
         "center": framing.center.tolist(),

@@ -10,7 +10,7 @@ import torch
 
 from scene_envs.errors import InvalidInputError, MissingDependencyError, UnknownNameError
 from scene_envs.render import gallery, picture_camera, render
-from scene_envs.render.stage import get_stage, load_pybullet
+from scene_envs.render.stage import get_stage, load_pybullet, make_palette, vertex_colors
 from scene_envs.rotations import yaw_matrix
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import Camera, get_scene_type
@@ -138,6 +138,25 @@ def test_wrong_arguments_are_named():
         render(scene(), width=0)
     with pytest.raises(InvalidInputError, match=r"\(1, 8\); got \(1, 3\)"):
         render(scene(), highlight=torch.zeros(1, 3, dtype=torch.bool))
+
+
+def test_palettes_are_exact_as_long_as_they_fit_and_close_where_they_do_not():
+    few = np.array([0x123456, 0xFFFFFF, 0x123456, 0x000000])
+    palette, mask = make_palette(few, 3)
+    assert (palette.tolist(), mask) == ([0x000000, 0x123456, 0xFFFFFF], 0xFFFFFF)
+    many = np.random.default_rng(0).integers(0, 1 << 24, 20_000)
+    palette, mask = make_palette(many, 1024)
+    assert len(palette) <= 1024
+    stand_in = palette[np.searchsorted(palette, many & mask)]
+    for shift in (0, 8, 16):
+        assert np.abs((many >> shift & 255) - (stand_in >> shift & 255)).max() < 32
+
+
+def test_the_largest_library_keeps_its_colors():
+    room = get_scene_type("restaurant_high_clutter")
+    colors = np.unique(np.concatenate([vertex_colors(asset) for asset in room.library]), axis=0)
+    assert len(colors) < 1024
+    assert make_palette(colors.astype(np.int64) @ [1 << 16, 1 << 8, 1], 1024)[1] == 0xFFFFFF
 
 
 def test_missing_pybullet_is_said_clearly(monkeypatch):

@@ -5,7 +5,13 @@ const data = JSON.parse(element("data").textContent);
 const scenes = data.scenes.map(decodeScene);
 const canvas = element("canvas");
 const state = {
-  scene: 0, camera: null /* the first view */, colors: "natural", shape: "visual", background: "light", selected: -1, hovered: -1,
+  scene: 0,
+  camera: null, // the first view
+  colors: "natural",
+  shape: "visual",
+  background: "light",
+  selected: -1,
+  hovered: -1,
   hidden: new Set(),
 };
 let renderer = null;
@@ -25,9 +31,19 @@ const look = () => ({
   selected: state.selected,
 });
 
-function homeView(aspect = canvas.clientWidth / Math.max(1, canvas.clientHeight)) {
-  const { points, azimuth, elevation, fov } = data.view;
-  return fitView(points, azimuth, elevation, fov, aspect, 0.06);
+// What a view of a scene should hold: the support, and the objects in the workspace.
+function pointsToSee(objects) {
+  const [low, high] = data.view.workspace;
+  const inside = objects.filter(({ translation }) => translation.every((v, i) => low[i] <= v && v <= high[i]));
+  const free = inside.filter(({ asset }) => !data.assets[asset].welded);
+  return [...data.view.points, ...free.flatMap((object) => boxCorners(data.assets[object.asset].visual, object))];
+}
+
+const viewAspect = () => canvas.clientWidth / Math.max(1, canvas.clientHeight);
+
+function homeView(index = state.scene, aspect = viewAspect()) {
+  const { azimuth, elevation, fov } = data.view;
+  return fitView(pointsToSee(scenes[index]), azimuth, elevation, fov, aspect, 0.05);
 }
 
 const cameraNow = () => state.camera || homeView();
@@ -41,7 +57,8 @@ function ownCamera() {
 function draw() {
   waiting = false;
   const sharpness = Math.min(window.devicePixelRatio || 1, 2);
-  const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((size) => Math.max(1, Math.round(size * sharpness)));
+  const pixels = (size) => Math.max(1, Math.round(size * sharpness));
+  const [width, height] = [pixels(canvas.clientWidth), pixels(canvas.clientHeight)];
   if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
   renderer.draw(cameraNow(), look());
   const error = renderer.gl.getError();
@@ -81,6 +98,9 @@ function showLegend() {
   const order = Array.from(counts.keys()).sort((a, b) => data.assets[a].label.localeCompare(data.assets[b].label));
   element("legend").replaceChildren(...order.map((index) => {
     const asset = data.assets[index];
+    const shared = data.assets.some((other) => other !== asset && other.label === asset.label);
+    const exact = document.createElement("small");
+    exact.textContent = shared ? asset.name : "";
     const row = document.createElement("li");
     row.className = state.hidden.has(index) ? "off" : "";
     row.title = `${asset.name}: click to hide or show`;
@@ -90,7 +110,7 @@ function showLegend() {
     const many = document.createElement("span");
     many.className = "how-many";
     many.textContent = counts.get(index);
-    row.append(swatch, asset.label, many);
+    row.append(swatch, asset.label, exact, many);
     row.addEventListener("click", () => {
       if (!state.hidden.delete(index)) state.hidden.add(index);
       if (renderer) renderer.setObjects(scenes[state.scene], state.hidden);
@@ -206,7 +226,7 @@ function makeStrip() {
     const tile = due.shift();
     const index = Number(tile.dataset.scene);
     renderer.setObjects(scenes[index], new Set());
-    const view = homeView(tile.width / tile.height);
+    const view = homeView(index, tile.width / tile.height);
     const plain = { ...look(), colors: "natural", shape: "visual", hovered: -1, selected: -1 };
     tile.getContext("2d").putImageData(renderer.snapshot(view, plain, tile.width, tile.height), 0, 0);
     renderer.setObjects(scenes[state.scene], state.hidden);

@@ -31,8 +31,7 @@ function reset() {
 }
 
 function lookDown() {
-  const { points, fov } = data.view;
-  state.camera = fitView(points, 0, 89.9, fov, canvas.width / Math.max(1, canvas.height), 0.06);
+  state.camera = fitView(pointsToSee(scenes[state.scene]), 0, 89.9, data.view.fov, viewAspect(), 0.05);
   changed();
 }
 

@@ -66,6 +66,17 @@ function fitView(points, azimuth, elevation, fovY, aspect, margin) {
   return { azimuth, elevation, target, distance: away - middle };
 }
 
+// The vector v turned by a quaternion (w, x, y, z).
+function turnVector([w, ...axis], v) {
+  return add(v, scale(cross(axis, add(cross(axis, v), scale(v, w))), 2));
+}
+
+// The corners of the bounding box of a mesh, where an object has them.
+function boxCorners({ low, size }, { translation, quaternion }) {
+  const corners = [0, 1, 2, 3, 4, 5, 6, 7].map((k) => low.map((value, i) => value + ((k >> i) & 1) * size[i]));
+  return corners.map((corner) => add(translation, turnVector(quaternion, corner)));
+}
+
 // Roll, pitch, yaw in degrees of a quaternion (w, x, y, z): rotations about the fixed x, y and z axes, in this order.
 function rollPitchYaw([w, x, y, z]) {
   const degrees = (value) => (value * 180) / Math.PI;

@@ -1,6 +1,6 @@
 // Drawing with WebGL 2: one instanced draw per asset, a depth image from the sun, ambient occlusion, a picking image.
 
-const SUN_PIXELS = 2048;
+const SUN_PIXELS = { table: 2048, room: 4096 };
 const BACKDROPS = {
   light: { upper: [0.98, 0.976, 0.97], lower: [0.875, 0.89, 0.91], shadow: 0.24 },
   dark: { upper: [0.16, 0.175, 0.2], lower: [0.085, 0.09, 0.105], shadow: 0.5 },
@@ -162,7 +162,7 @@ class Renderer {
     if (this.sunFor === look.shape) return;
     const gl = this.gl;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.sun.frame);
-    gl.viewport(0, 0, SUN_PIXELS, SUN_PIXELS);
+    gl.viewport(0, 0, this.sun.pixels, this.sun.pixels);
     gl.enable(gl.DEPTH_TEST);
     gl.clear(gl.DEPTH_BUFFER_BIT);
     gl.enable(gl.POLYGON_OFFSET_FILL);
@@ -175,15 +175,17 @@ class Renderer {
   makeSun() {
     const gl = this.gl;
     const { light, center, radius } = this.view;
-    const half = 1.25 * radius;
+    const half = 1.15 * radius;
+    const pixels = Math.min(radius > 2 ? SUN_PIXELS.room : SUN_PIXELS.table, gl.getParameter(gl.MAX_TEXTURE_SIZE));
     const side = Math.abs(light[2]) > 0.99 ? [1, 0, 0] : unit(cross([0, 0, 1], light));
     const view = viewMatrix([side, cross(light, side), light], add(center, scale(light, 3 * radius)));
-    const depth = makeTexture(gl, gl.DEPTH_COMPONENT24, SUN_PIXELS, SUN_PIXELS);
+    const depth = makeTexture(gl, gl.DEPTH_COMPONENT24, pixels, pixels);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_COMPARE_MODE, gl.COMPARE_REF_TO_TEXTURE);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.LINEAR);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
     const frame = makeFrame(gl, { depth });
-    return { depth, frame, matrix: multiply(orthographic(half, 6 * radius), view), texel: (2 * half) / SUN_PIXELS };
+    const matrix = multiply(orthographic(half, 6 * radius), view);
+    return { depth, frame, pixels, matrix, texel: (2 * half) / pixels };
   }
 
   // The mesh of an asset in one of its shapes, made when it is first drawn.

@@ -31,7 +31,7 @@ uniform mat4 sunMatrix;
 uniform float texel;  // m
 
 float sunlight(vec3 point, vec3 normal) {
-  vec3 at = (sunMatrix * vec4(point + 2.0 * texel * normal, 1.0)).xyz * 0.5 + 0.5;
+  vec3 at = (sunMatrix * vec4(point + 1.5 * texel * normal, 1.0)).xyz * 0.5 + 0.5;
   if (any(lessThan(at, vec3(0.0))) || any(greaterThan(at, vec3(1.0)))) return 1.0;
   vec2 pixel = 1.0 / vec2(textureSize(sunDepth, 0));
   float light = 0.0;
