@@ -24,6 +24,8 @@ _ONE_HOT = 0.1
 """How far a one-hot entry may be from 0 or 1."""
 _ROTATION = 0.05
 """How far entries of R^T R may be from the identity; what is further than 1e-5 is projected to SO(3)."""
+_KEYS_AT_ONCE = 1024
+"""Scenes whose keys are computed together: small enough for the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,6 +175,11 @@ def scene_keys(tensor: Tensor) -> NDArray[np.uint64]:
 
     Rows of a dataset that repeat a scene with another prompt have one key. The poses must be equal to the last bit.
     """
+    chunks = [_chunk_keys(chunk) for chunk in tensor.split(_KEYS_AT_ONCE)]
+    return np.concatenate(chunks) if chunks else np.empty(0, dtype=np.uint64)
+
+
+def _chunk_keys(tensor: Tensor) -> NDArray[np.uint64]:
     words = (tensor.float() + 0.0).contiguous().numpy().view(np.uint32).astype(np.uint64)  # + 0.0: no minus zero
     hashed = np.zeros(words.shape[:2], dtype=np.uint64)
     with np.errstate(over="ignore"):

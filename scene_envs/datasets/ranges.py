@@ -10,9 +10,10 @@ from scene_envs.grammars import Grammar
 from scene_envs.normalizer import Normalizer
 
 _OBJECTS = 10_000
-"""Objects the sample holds at least, unless that takes more than ``_SCENES``."""
+"""Objects the sample holds at least while all of them stand upright, unless that takes more than ``_SCENES``."""
 _SCENES = 4096
 _STEP = 128
+"""Scenes drawn at a time; as many are enough once a tilted object was seen."""
 _SEED = 20_250_101
 _UPRIGHT = 1e-6
 """A rotation entry that tells of tilt counts as zero below this."""
@@ -25,10 +26,11 @@ _PLANE = [3, 4, 6, 7]
 def fixed_normalizer(grammar: Grammar) -> Normalizer:
     """The normalizer of a grammar's scenes, a function of the grammar alone.
 
-    What varies is read off a sample of unverified scenes, empty slots included: at least 10,000 objects, or 4,096
-    scenes. x and y take the workspace's range, z and one-hots the sample's. Rotations: if any object of the sample is
-    tilted, all nine entries take [-1, 1]; if objects only turn about z, the four entries that tell of tilt are
-    constant (they come back exactly) and the four of the turn take [-1, 1] each if they vary.
+    x and y take the workspace's range, one-hots [0, 1], z the range of a sample of unverified scenes, empty slots
+    included. Rotations: if any object of the sample is tilted, all nine entries take [-1, 1]; if objects only turn
+    about z, the four entries that tell of tilt are constant (they come back exactly) and the four of the turn take
+    [-1, 1] each if they vary. The sample has 128 scenes, or, as long as nothing in it is tilted, 10,000 objects
+    (4,096 scenes at most), so that a rare tilt is not taken for none.
     """
     low, high, tilted = _ranges(grammar)
     grammar.reasons.clear()
@@ -50,7 +52,7 @@ def _ranges(grammar: Grammar) -> tuple[Tensor, Tensor, bool]:
     low, high = torch.full((features,), torch.inf), torch.full((features,), -torch.inf)
     objects = scenes = 0
     tilted = False
-    while objects < _OBJECTS and scenes < _SCENES:
+    while scenes == 0 or (not tilted and objects < _OBJECTS and scenes < _SCENES):
         flat = torch.from_numpy(grammar.sample_array(rng, _STEP)).flatten(0, 1)
         present = flat[flat[:, -1] < 0.5]
         low, high = torch.minimum(low, flat.amin(dim=0)), torch.maximum(high, flat.amax(dim=0))
