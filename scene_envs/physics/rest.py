@@ -152,7 +152,7 @@ class Statics:
         best[upper[good]] = True
         still = best & (support >= 0) & ~objects.fixed & upright
         rise = np.maximum(rise, -0.5 * GRAVITY * duration**2)
-        self._clear(objects, pairs, contacts, rise, still)
+        self._clear(objects, pairs, contacts, support, rise, still)
         while True:  # what stands on something that has to be simulated has to be simulated
             lost = still & ~(still | objects.fixed)[np.maximum(support, 0)]
             if not lost.any():
@@ -215,7 +215,9 @@ class Statics:
         good[q] |= at_rim
         return good
 
-    def _clear(self, objects: Objects, pairs: ObjectPairs, contacts: Contacts, rise: Array, still: Mask) -> None:
+    def _clear(
+        self, objects: Objects, pairs: ObjectPairs, contacts: Contacts, support: Index, rise: Array, still: Mask
+    ) -> None:
         """Strike from ``still``, in place, what meets something on its way."""
         while True:
             moved = np.where(still, rise, 0.0)
@@ -235,6 +237,7 @@ class Statics:
             low[falling, 2] += rise[falling]
             first, second = scene_pairs(objects)
             keep = (falling[first] | falling[second]) & ~(objects.fixed[first] | objects.fixed[second])
+            keep &= (support[first] != second) & (support[second] != first)
             first, second = first[keep], second[keep]
             meets = ((low[first] <= high[second] + NEAR) & (low[second] <= high[first] + NEAR)).all(axis=1)
             still[first[meets & falling[first]]] = False
