@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_envs.datasets.prompts.shapes import library_shapes
-from scene_envs.datasets.prompts.supports import Contacts, Holding, Placed
+from scene_envs.datasets.prompts.supports import LARGEST_CONTACT, Contacts, Holding, Placed
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
@@ -32,7 +32,8 @@ class Tolerances:
     """When a relation holds.
 
     Attributes:
-        contact: surfaces this far (m) apart, or into each other, touch.
+        contact: surfaces this far (m) apart, or into each other, touch; what touches nothing is on the table or
+            tier within three times as much.
         aside: least offset (m) of two centres to the left, right, front or back.
         cone: that offset is at least this many times the offset across.
         beside: largest horizontal distance (m) of two bounding boxes that are next to each other.
@@ -51,8 +52,8 @@ class Tolerances:
     order: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.contact <= 0.03:
-            raise InvalidInputError(f"contact must lie in (0, 0.03] m, got {self.contact}")
+        if not 0.0 < self.contact <= LARGEST_CONTACT:
+            raise InvalidInputError(f"contact must lie in (0, {LARGEST_CONTACT}] m, got {self.contact}")
 
 
 NOMINAL = Tolerances()

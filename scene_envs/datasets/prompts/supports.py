@@ -14,8 +14,10 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-_LARGEST = 0.03
+LARGEST_CONTACT = 0.03
 """No tolerance of contacts may be larger than this (m)."""
+_FAR = 3.0
+"""What touches nothing is still on a table or tier within so many times the tolerance."""
 _UPRIGHT = 0.85
 """Cosine of the tilt up to which a thing carries others."""
 _STEEPNESS = 20.0
@@ -142,35 +144,40 @@ class Contacts:
         )
 
     def holding(self, tolerance: float) -> Holding:
-        """What holds each object when surfaces up to ``tolerance`` (m) apart, or into each other, touch."""
+        """What holds each object when surfaces up to ``tolerance`` (m) apart, or into each other, touch.
+
+        For what touches nothing, three times the tolerance decides on the place and tier alone.
+        """
+        support, contained, tier = self._lower(tolerance)
+        far, _, far_tier = self._lower(_FAR * tolerance)
+        loose = support < 0
+        below, tier = np.where(loose, far, support), np.where(loose, far_tier, tier)
+        fixed = np.append(self.objects.fixed, True)  # index -1 ends every chain
+        place, inside, base = below.copy(), np.where(contained, support, -1), np.arange(len(below))
+        while (going := np.flatnonzero(~fixed[place])).size:
+            base[going] = place[going]
+            climbs = going[inside[going] < 0]
+            inside[climbs] = np.where(contained[place[climbs]], support[place[climbs]], -1)
+            place[going] = below[place[going]]
+        return Holding(support, contained, inside, place, np.where(place >= 0, tier[base], -1))
+
+    def _lower(self, tolerance: float) -> tuple[Index, Mask, Index]:
+        """The highest thing below each object, whether it lies in that, and the tier; (n,) each."""
         size = self.shapes.bounds[self.objects.category[self.lower]]
         thickness = size[:, 1, 2] - size[:, 0, 2]
         into = np.minimum(tolerance, 0.5 * thickness)
         touches = (self.gap <= tolerance) & (self.gap >= -into[:, None])  # (M, 9)
-        rests = self.over & touches.any(axis=1)
-        contained = (self.above_rim <= -tolerance) & (self.above_well >= -tolerance)
+        inside = (self.above_rim <= -tolerance) & (self.above_well >= -tolerance)
         height = np.where(touches, self.objects.feet[self.upper, :, 2] - self.gap, -np.inf).max(axis=1)
-        height = np.where(contained, self.objects.feet[self.upper, -1, 2] - self.above_well, height)
-        return self._chains(np.flatnonzero(rests | contained), contained, height)
-
-    def _chains(self, held: Index, contained: Mask, height: Array) -> Holding:
-        """Keep the highest thing below each object and follow it down."""
-        count = len(self.objects.category)
-        support = np.full(count, -1)
-        is_in, tier = np.zeros(count, dtype=bool), np.full(count, -1)
+        height = np.where(inside, self.objects.feet[self.upper, -1, 2] - self.above_well, height)
+        held = np.flatnonzero((self.over & touches.any(axis=1)) | inside)
         held = held[np.argsort(height[held], kind="stable")]  # later, higher ones overwrite
+        count = len(self.objects.category)
+        support, contained, tier = np.full(count, -1), np.zeros(count, dtype=bool), np.full(count, -1)
         support[self.upper[held]] = self.lower[held]
-        is_in[self.upper[held]] = contained[held]
+        contained[self.upper[held]] = inside[held]
         tier[self.upper[held]] = self.tier[held]
-        static = np.append(self.objects.fixed, True)  # index -1 ends every chain
-        place, inside = support.copy(), np.where(is_in, support, -1)
-        base = np.arange(count)
-        while (going := np.flatnonzero(~static[place])).size:
-            base[going] = place[going]
-            climbs = going[inside[going] < 0]
-            inside[climbs] = np.where(is_in[place[climbs]], support[place[climbs]], -1)
-            place[going] = support[place[going]]
-        return Holding(support, is_in, inside, place, np.where(place >= 0, tier[base], -1))
+        return support, contained, tier
 
 
 def _near_pairs(objects: Placed) -> tuple[Index, Index]:
@@ -181,7 +188,7 @@ def _near_pairs(objects: Placed) -> tuple[Index, Index]:
     for start, stop in zip(starts, np.append(starts[1:], len(objects.scene)), strict=True):
         a, b = low[start:stop, None], low[None, start:stop]
         top_a, top_b = high[start:stop, None], high[None, start:stop]
-        near = (a[..., 2] <= top_b[..., 2] + _LARGEST) & (top_a[..., 2] > b[..., 2])
+        near = (a[..., 2] <= top_b[..., 2] + _FAR * LARGEST_CONTACT) & (top_a[..., 2] > b[..., 2])
         fixed_a, fixed_b = objects.fixed[start:stop, None], objects.fixed[None, start:stop]
         near &= np.where(fixed_a == fixed_b, a[..., 2] > b[..., 2] + 1e-4, fixed_b)  # so that no chain is a circle
         near &= (a[..., 0] <= top_b[..., 0]) & (b[..., 0] <= top_a[..., 0])
