@@ -9,12 +9,12 @@ import numpy as np
 
 from scene_envs.export.asset_files import AssetFiles
 from scene_envs.export.placed import PlacedObject, PlacedScene, number, numbers
-from scene_envs.export.urdf import relative, write_xml
+from scene_envs.export.urdf import DRAKE, drake_contact, relative, write_xml
 
 
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     """``world.sdf``: one model per object, static when it is welded; poses are quaternions."""
-    root = ET.Element("sdf", {"version": "1.9", "xmlns:drake": "http://drake.mit.edu"})
+    root = ET.Element("sdf", {"version": "1.9", "xmlns:drake": DRAKE})
     world = ET.SubElement(root, "world", name=f"{scene.scene_type.name}_{scene.index}")
     light = ET.SubElement(world, "light", type="directional", name="sun")
     _text(light, "pose", "0 0 10 0 0 0")
@@ -49,6 +49,9 @@ def _add_model(world: ET.Element, thing: PlacedObject, files: AssetFiles, folder
         ode = ET.SubElement(ET.SubElement(ET.SubElement(collision, "surface"), "friction"), "ode")
         _text(ode, "mu", number(files.friction))
         _text(ode, "mu2", number(files.friction))
+        proximity = ET.SubElement(collision, "drake:proximity_properties")
+        for tag, value in drake_contact(asset, files.friction).items():
+            _text(proximity, f"drake:{tag}", "" if value is None else number(value))
 
 
 def _add_mesh(parent: ET.Element, path: Path, folder: Path) -> ET.Element:

@@ -13,7 +13,10 @@ from scene_envs.export.placed import PlacedScene, number, numbers
 
 BULLET_MARGIN = 1e-3
 """Bullet grows each convex mesh by this much (m); the parts of its URDF are smaller by as much."""
-_DRAKE = "http://drake.mit.edu"
+DRAKE = "http://drake.mit.edu"
+"""Name space of what Drake alone reads."""
+_MODULUS = 1e8
+"""Hydroelastic modulus (Pa): objects at rest sink by micrometres."""
 
 
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
@@ -51,6 +54,18 @@ def bullet_urdf(asset: Asset, files: AssetFiles) -> Path:
     return path
 
 
+def drake_contact(asset: Asset, friction: float) -> dict[str, float | None]:
+    """Contact properties for Drake, tag to value.
+
+    Contact is hydroelastic: over a patch, where its point contact has one point per pair of parts, on which a box
+    rocks. The static ones are rigid, all others compliant.
+    """
+    shape: dict[str, float | None] = {"rigid_hydroelastic": None}
+    if not asset.static:
+        shape = {"compliant_hydroelastic": None, "hydroelastic_modulus": _MODULUS}
+    return {**shape, "mu_static": friction, "mu_dynamic": friction}
+
+
 def relative(path: Path, folder: Path) -> str:
     """``path`` as seen from ``folder``, with forward slashes."""
     return Path(os.path.relpath(path, folder)).as_posix()
@@ -65,7 +80,7 @@ def write_xml(root: ET.Element, path: Path) -> Path:
 
 def _write(asset: Asset, files: AssetFiles, parts: list[Path], path: Path) -> Path:
     name = files.name(asset)
-    root = ET.Element("robot", {"name": name, "xmlns:drake": _DRAKE})
+    root = ET.Element("robot", {"name": name, "xmlns:drake": DRAKE})
     link = ET.SubElement(root, "link", name=name)
     contact = ET.SubElement(link, "contact")  # read by PyBullet
     ET.SubElement(contact, "lateral_friction", value=number(files.friction))
@@ -83,6 +98,6 @@ def _write(asset: Asset, files: AssetFiles, parts: list[Path], path: Path) -> Pa
         mesh = ET.SubElement(ET.SubElement(collision, "geometry"), "mesh", filename=relative(part, path.parent))
         ET.SubElement(mesh, "drake:declare_convex")
         proximity = ET.SubElement(collision, "drake:proximity_properties")
-        for coefficient in ("drake:mu_static", "drake:mu_dynamic"):
-            ET.SubElement(proximity, coefficient, value=number(files.friction))
+        for tag, value in drake_contact(asset, files.friction).items():
+            ET.SubElement(proximity, f"drake:{tag}", {} if value is None else {"value": number(value)})
     return write_xml(root, path)

@@ -145,11 +145,27 @@ def _welded_name(name):
     return "cafe_table_0" if name == "WorldModelInstance" else name
 
 
-def test_drake_leaves_a_laid_table_still(folder, scenes):
+@DRAKE
+def test_drake_rubs_as_we_do_and_has_contact_patches(folder, name):
+    _, graph, _, _ = drake_scene(folder, 0, name)
+    from pydrake.geometry import Role
+
+    inspector = graph.model_inspector()
+    geometries = inspector.GetAllGeometryIds(Role.kProximity)
+    assert len(geometries) > 100
+    for geometry in geometries:
+        properties = inspector.GetProximityProperties(geometry)
+        friction = properties.GetProperty("material", "coulomb_friction")
+        assert (friction.static_friction(), friction.dynamic_friction()) == (0.6, 0.6)
+        assert properties.HasProperty("hydroelastic", "compliance_type")
+
+
+@DRAKE
+def test_drake_leaves_a_laid_table_still(folder, scenes, name):
+    plant, _, diagram, context = drake_scene(folder, 0, name)
     from pydrake.systems.analysis import Simulator
 
-    plant, _, diagram, context = drake_scene(folder, 0, "scene.dmd.yaml")
-    Simulator(diagram, context).AdvanceTo(0.5)
+    Simulator(diagram, context).AdvanceTo(0.1)
     assert (moved(scenes[0], drake_poses(plant, context, scenes[0])) < STILL).all()
 
 
