@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -76,6 +77,10 @@ class SceneType:
     asset_folders: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        if isinstance(self.asset_folders, str):
+            raise InvalidInputError(f"scene type {self.name!r}: asset_folders is a tuple of paths, got one string")
+        folders = tuple(os.path.abspath(os.path.expanduser(folder)) for folder in self.asset_folders)
+        object.__setattr__(self, "asset_folders", folders)  # absolute: workers may run elsewhere
         for asset in (*self.welded, *(f.asset for f in self.fixed)):
             if asset not in self.assets:
                 raise InvalidInputError(f"scene type {self.name!r}: welded asset {asset!r} is not among its assets")
@@ -102,7 +107,7 @@ class SceneType:
         """The assets themselves, built on first use and shared between scene types."""
         from scene_envs.assets import get_library
 
-        return get_library(self.assets)
+        return get_library(self.assets, self.asset_folders)
 
 
 _REGISTRY: dict[str, SceneType] = {}

@@ -1,6 +1,19 @@
-"""The asset library: procedural models with visual mesh, convex parts and mass."""
+"""The asset library: procedural models with visual mesh, convex parts and mass, and users' own files."""
 
 from scene_envs.assets.base import Asset, AssetLibrary, ConvexPart
+from scene_envs.assets.importing import AssetReport, ImportReport, import_report, load_library
 from scene_envs.assets.library import Model, asset_recipe, get_library, list_assets
 
-__all__ = ["Asset", "AssetLibrary", "ConvexPart", "Model", "asset_recipe", "get_library", "list_assets"]
+__all__ = [
+    "Asset",
+    "AssetLibrary",
+    "AssetReport",
+    "ConvexPart",
+    "ImportReport",
+    "Model",
+    "asset_recipe",
+    "get_library",
+    "import_report",
+    "list_assets",
+    "load_library",
+]

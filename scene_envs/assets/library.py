@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -81,13 +82,33 @@ def list_assets() -> list[str]:
     return sorted(_RECIPES)
 
 
-def get_library(names: Sequence[str]) -> AssetLibrary:
+def class_colors() -> list[tuple[int, int, int]]:
+    """Class colours (r, g, b) of all assets that can be built."""
+    _load_recipes()
+    return [entry.color for entry in _RECIPES.values()]
+
+
+def get_library(names: Sequence[str], folders: Sequence[str | os.PathLike[str]] = ()) -> AssetLibrary:
     """The assets called ``names``, in this order; each is built once per process.
 
+    Args:
+        names: asset names in category order.
+        folders: of users' own assets, searched in this order before the built-in ones.
+
     Raises:
-        UnknownNameError: no recipe has that name; the nearest known one is offered.
+        UnknownNameError: neither a folder nor a recipe has that name; the nearest known one is offered.
+        InvalidInputError: a folder or one of its entries is wrong.
+        CorruptFileError: a file of a folder cannot be read.
     """
-    return AssetLibrary(tuple(_build(name) for name in names))
+    if not folders:
+        return AssetLibrary(tuple(_build(name) for name in names))
+    from scene_envs.assets.importing.user_library import find_asset, folder_index
+
+    own = [name for folder in folders for name in folder_index(folder).names]
+    for name in names:
+        if name not in own and name not in list_assets():
+            raise unknown_name("asset", name, [*own, *list_assets()])
+    return AssetLibrary(tuple(find_asset(name, folders) or _build(name) for name in names))
 
 
 @cache

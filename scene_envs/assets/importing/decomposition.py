@@ -1,0 +1,192 @@
+"""Concave meshes as convex parts, by CoACD, kept on disk.
+
+CoACD: Wei et al., "Approximate Convex Decomposition for 3D Meshes with Collision-Aware Concavity and Tree
+Search", SIGGRAPH 2022.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import logging
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from scene_envs.assets.base import Array, ConvexPart
+from scene_envs.assets.importing.hulls import MOST_CORNERS, concavity, few_cornered_hull, has_volume
+from scene_envs.assets.importing.mesh_files import bare
+from scene_envs.errors import InvalidInputError, MissingDependencyError
+
+if TYPE_CHECKING:
+    import trimesh
+
+Method = Literal["auto", "coacd", "convex"]
+METHODS: tuple[Method, ...] = ("auto", "coacd", "convex")
+_LOGGER = logging.getLogger(__name__)
+_VERSION = 1
+"""Of what is kept on disk."""
+_MOST_BODIES = 128
+"""Closed bodies of one mesh that are taken one by one."""
+
+
+def cache_folder() -> Path:
+    """Where decompositions are kept: ``$SCENE_ENVS_CACHE``, else ``scene_envs`` in the user's cache folder."""
+    if chosen := os.environ.get("SCENE_ENVS_CACHE"):
+        return Path(chosen).expanduser()
+    if os.name == "nt" and (local := os.environ.get("LOCALAPPDATA")):
+        return Path(local) / "scene_envs" / "cache"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "scene_envs"
+
+
+def convex_parts(
+    mesh: trimesh.Trimesh, method: Method, tolerance: float, threshold: float, what: str
+) -> tuple[list[ConvexPart], list[str], list[str]]:
+    """The convex parts of one mesh.
+
+    Closed bodies are taken one by one: convex ones keep their shape, concave ones are decomposed. A surface
+    that is not closed is decomposed as a whole.
+
+    Args:
+        mesh: triangles, m.
+        method: ``"convex"`` takes one hull of everything; ``"coacd"`` insists on CoACD where a body is concave;
+            ``"auto"`` falls back to a hull without CoACD.
+        tolerance: m; a body nowhere deeper than this below its hull is convex.
+        threshold: CoACD's concavity, relative to the size of the body.
+        what: name of the mesh, for messages.
+
+    Returns:
+        parts, notes and warnings.
+
+    Raises:
+        InvalidInputError: the mesh spans no volume.
+        MissingDependencyError: ``"coacd"`` without the package.
+    """
+    surface = bare(mesh)
+    if not len(surface.faces) or not has_volume(np.asarray(surface.vertices)):
+        raise InvalidInputError(f"{what} spans no volume (all its corners lie in one plane), so it cannot collide")
+    if method == "convex":
+        return [_hull(surface.vertices, tolerance)], [], []
+    bodies, dropped = _bodies(surface, tolerance)
+    notes = [f"{what}: {dropped} flat piece(s) left out of the collision parts"] if dropped else []
+    warnings: list[str] = []
+    parts: list[ConvexPart] = []
+    for body in bodies:
+        hull = _hull(body.vertices, tolerance)
+        if _depth(body, hull) <= tolerance:
+            parts.append(hull)
+            continue
+        pieces = _decompose(body, method, threshold, what)
+        if pieces is None:
+            warnings.append(
+                f"{what} is concave and is taken as its hull, because CoACD is not installed "
+                "(`pip install 'scene-envs[decomposition]'`)"
+            )
+            parts.append(hull)
+            continue
+        parts += [_hull(piece, tolerance) for piece in pieces]
+    return parts, notes, sorted(set(warnings))
+
+
+def _bodies(surface: trimesh.Trimesh, tolerance: float) -> tuple[list[trimesh.Trimesh], int]:
+    """Closed or convex bodies of a surface and the number of flat pieces; the whole when not all are bodies."""
+    pieces: list[Any] = list(surface.split(only_watertight=False))
+    solid = [piece for piece in pieces if has_volume(np.asarray(piece.vertices))]
+    if not solid or len(solid) > _MOST_BODIES:
+        return [surface], 0
+    for piece in solid:
+        closed = piece.is_watertight and piece.volume > 0
+        if not closed and _depth(piece, _hull(piece.vertices, tolerance)) > tolerance:
+            return [surface], 0
+    return solid, len(pieces) - len(solid)
+
+
+def _hull(points: Array, tolerance: float) -> ConvexPart:
+    return few_cornered_hull(np.asarray(points, dtype=np.float64), 0.25 * tolerance)[0]
+
+
+def _depth(body: trimesh.Trimesh, hull: ConvexPart) -> float:
+    return concavity(np.concatenate([body.vertices, body.triangles_center]), hull)
+
+
+def _decompose(body: trimesh.Trimesh, method: Method, threshold: float, what: str) -> list[Array] | None:
+    """Corners of the convex pieces of a concave body, from the cache where possible; None without CoACD."""
+    settings = {
+        "threshold": threshold,
+        "max_convex_hull": 32,
+        "preprocess_resolution": 30,
+        "resolution": 1000,
+        "mcts_nodes": 10,
+        "mcts_iterations": 30,
+        "mcts_max_depth": 2,
+        "max_ch_vertex": MOST_CORNERS,
+        "decimate": True,
+        "seed": 0,
+    }
+    path = cache_folder() / "decompositions" / f"{_key(body, settings)}.npz"
+    pieces = _read(path)
+    if pieces is not None:
+        return pieces
+    try:
+        import coacd
+    except ImportError as error:
+        if method == "coacd":
+            raise MissingDependencyError(
+                f"{what} asks for CoACD, which is not installed; `pip install 'scene-envs[decomposition]'`"
+            ) from error
+        return None
+    _LOGGER.info("decomposing %s (%d triangles); the result is kept in %s", what, len(body.faces), path.parent)
+    coacd.set_log_level("error")
+    size = float(body.scale)  # CoACD's numerics want a size near 1
+    found = coacd.run_coacd(coacd.Mesh(np.asarray(body.vertices) / size, np.asarray(body.faces)), **settings)
+    pieces = [np.asarray(vertices) * size for vertices, _ in found if has_volume(np.asarray(vertices))]
+    if not pieces:
+        raise InvalidInputError(f"CoACD found no convex parts in {what}; set `decomposition: convex` for it")
+    _write(path, pieces)
+    return pieces
+
+
+# -- the cache ------------------------------------------------------------------------------------
+
+
+def _key(body: trimesh.Trimesh, settings: dict[str, Any]) -> str:
+    """Hash of what goes into the decomposition."""
+    digest = hashlib.sha256(json.dumps([_VERSION, settings], sort_keys=True).encode())
+    digest.update(np.ascontiguousarray(body.vertices, dtype="<f8").tobytes())
+    digest.update(np.ascontiguousarray(body.faces, dtype="<i8").tobytes())
+    return digest.hexdigest()
+
+
+def _read(path: Path) -> list[Array] | None:
+    """The pieces in a cache file; None when there is none, or one that is damaged (which is then made anew)."""
+    try:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as stored:
+            vertices, counts = np.asarray(stored["vertices"]), np.asarray(stored["counts"])
+        if vertices.shape != (int(counts.sum()), 3) or not np.isfinite(vertices).all() or not (counts >= 4).all():
+            raise ValueError("its arrays do not fit together")
+    except FileNotFoundError:
+        return None
+    except Exception as error:
+        _LOGGER.warning("the kept decomposition %s is damaged (%s) and is made anew", path, error)
+        return None
+    return list(np.split(vertices, np.cumsum(counts)[:-1]))
+
+
+def _write(path: Path, pieces: Sequence[Array]) -> None:
+    """Keep the pieces; a cache that cannot be written costs time, not the result."""
+    partial = ""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, partial = tempfile.mkstemp(dir=path.parent, suffix=".partial")
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, vertices=np.concatenate(pieces), counts=np.array([len(piece) for piece in pieces]))
+        os.replace(partial, path)
+    except OSError as error:
+        _LOGGER.warning("a decomposition could not be kept in %s: %s", path.parent, error)
+        if partial:
+            Path(partial).unlink(missing_ok=True)

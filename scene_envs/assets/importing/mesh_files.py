@@ -1,0 +1,206 @@
+"""Reading mesh files: triangles with a colour per corner, checked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_envs.assets.base import Array
+from scene_envs.assets.importing.model import Color
+from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
+
+if TYPE_CHECKING:
+    import trimesh
+
+MESH_SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
+"""Mesh files that can be read."""
+
+_GREY: Color = (176, 176, 170)
+_UNSET = (102, 102, 102)
+"""What trimesh gives a mesh with texture coordinates and no material."""
+_SMOOTH = float(np.cos(np.radians(40.0)))
+"""Faces that meet at less than 40 degrees are shaded as one curved surface."""
+_MOST_SMOOTHED = 100_000
+"""Triangles up to which corners are smoothed."""
+_SAMPLES = np.array(
+    [[a, b, 4 - a - b] for a in range(5) for b in range(5 - a)], dtype=np.float64
+) / 4.0  # fmt: skip
+"""Barycentric points (15, 3) at which a texture is read to colour a triangle."""
+_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+
+
+def read_mesh(path: Path) -> list[trimesh.Trimesh]:
+    """The meshes of a file, each with merged positions' worth of triangles, z up, in the unit of the file.
+
+    Objects of an OBJ and nodes of a scene stay apart. glTF is y up by its specification and is turned; COLLADA
+    says which way is up and how long its unit is, and both are applied.
+
+    Raises:
+        InvalidInputError: no such file, or a format that cannot be read.
+        CorruptFileError: the file cannot be read, holds no triangles, or a coordinate that is not finite.
+        MissingDependencyError: COLLADA without pycollada.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        raise InvalidInputError(
+            f"{path}: meshes of type {suffix or '(none)'!r} cannot be read; known: {', '.join(MESH_SUFFIXES)}"
+        )
+    if not path.is_file():
+        raise InvalidInputError(f"{path} does not exist")
+    _check_content(path)
+    import trimesh
+
+    options: dict[str, Any] = {"split_objects": True} if suffix == ".obj" else {}
+    try:
+        scene: Any = trimesh.load_scene(str(path), process=False, **options)
+        pieces = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"{path} needs a package that is not installed ({error}); COLLADA files need "
+            "`pip install 'scene-envs[collada]'`"
+        ) from error
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise CorruptFileError(f"{path} cannot be read as a {suffix[1:].upper()} mesh: {reason}") from error
+    if not pieces:
+        raise CorruptFileError(f"{path} holds no triangles")
+    for mesh in pieces:
+        _check_mesh(mesh, path)
+    turn = _axes(path)
+    for mesh in pieces:
+        mesh.vertices = mesh.vertices @ turn.T
+    return pieces
+
+
+def _check_content(path: Path) -> None:
+    try:
+        with path.open("rb") as file:
+            start = file.read(64)
+    except OSError as error:
+        raise CorruptFileError(f"{path} cannot be read: {error.strerror or error}") from error
+    if not start:
+        raise CorruptFileError(f"{path} is empty")
+    if start.startswith(b"version https://git-lfs"):
+        raise CorruptFileError(f"{path} is a Git LFS pointer, not the mesh itself; fetch it with `git lfs pull`")
+
+
+def _check_mesh(mesh: trimesh.Trimesh, path: Path) -> None:
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    if not np.isfinite(vertices).all():
+        row = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
+        raise CorruptFileError(f"{path}: vertex {row} is {vertices[row].tolist()}; coordinates must be finite")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise CorruptFileError(f"{path}: a triangle refers to vertex {int(faces.max())} of {len(vertices)}")
+
+
+def _axes(path: Path) -> Array:
+    """(3, 3): file axes and unit to z up and metres, where the format defines them."""
+    suffix = path.suffix.lower()
+    if suffix in (".glb", ".gltf"):
+        return _Y_UP
+    if suffix != ".dae":
+        return np.eye(3)
+    asset = ElementTree.parse(path).getroot().find("{*}asset")
+    up = (asset.findtext("{*}up_axis") or "Y_UP").strip() if asset is not None else "Y_UP"
+    unit = asset.find("{*}unit") if asset is not None else None
+    meter = float(unit.get("meter", "1")) if unit is not None else 1.0
+    turns = {"X_UP": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), "Z_UP": np.eye(3)}
+    return meter * turns.get(up, _Y_UP)
+
+
+def bare(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The surface alone: equal corners merged, triangles without area left out."""
+    import trimesh
+
+    plain = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    plain.merge_vertices()
+    plain.update_faces(plain.nondegenerate_faces())
+    plain.remove_unreferenced_vertices()
+    return plain
+
+
+def has_color(mesh: trimesh.Trimesh) -> bool:
+    """Whether the file gives the mesh a colour of its own."""
+    visual: Any = mesh.visual
+    if visual.kind == "texture":
+        return _image(visual.material) is not None or tuple(visual.material.main_color[:3]) != _UNSET
+    return visual.kind is not None
+
+
+def _image(material: Any) -> Any:
+    return getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
+
+
+def painted(mesh: trimesh.Trimesh, color: Color | None) -> trimesh.Trimesh:
+    """The mesh with a colour and a normal per vertex: its own, else ``color``, else grey."""
+    import trimesh
+
+    faces = np.asarray(mesh.faces)
+    colors = _corner_colors(mesh) if color is None or has_color(mesh) else None
+    if colors is None:
+        colors = np.tile(np.array(color or _GREY, dtype=np.uint8), (len(faces), 3, 1))
+    normals = _corner_normals(mesh)
+    corners = np.asarray(mesh.vertices)[faces].reshape(-1, 3)
+    rows = np.column_stack([np.round(normals.reshape(-1, 3) * 1e4), colors.reshape(-1, 3)]).astype(np.int64)
+    _, point = np.unique(corners, axis=0, return_inverse=True)
+    _, first, index = np.unique(
+        np.column_stack([point.reshape(-1), rows]), axis=0, return_index=True, return_inverse=True
+    )
+    rgba = np.column_stack([colors.reshape(-1, 3)[first], np.full(len(first), 255, dtype=np.uint8)])
+    return trimesh.Trimesh(
+        vertices=corners[first],
+        faces=index.reshape(-1, 3),
+        vertex_normals=normals.reshape(-1, 3)[first],
+        vertex_colors=rgba,
+        process=False,
+    )
+
+
+def _corner_colors(mesh: trimesh.Trimesh) -> NDArray[np.uint8] | None:
+    """(F, 3, 3) uint8: the file's own colours at the corners of each triangle; None without any."""
+    visual: Any = mesh.visual
+    faces = np.asarray(mesh.faces)
+    if visual.kind == "vertex":
+        return np.asarray(visual.vertex_colors)[faces][..., :3].astype(np.uint8)
+    if visual.kind == "face":
+        return np.repeat(np.asarray(visual.face_colors)[:, None, :3], 3, axis=1).astype(np.uint8)
+    if visual.kind != "texture" or not has_color(mesh):
+        return None
+    uv = None if visual.uv is None else np.asarray(visual.uv)
+    if uv is None or _image(visual.material) is None or len(uv) != len(mesh.vertices):
+        flat = np.asarray(visual.material.main_color)[:3].astype(np.uint8)
+        return np.tile(flat, (len(faces), 3, 1))
+    points = np.einsum("sk,fkc->fsc", _SAMPLES, uv[faces])  # (F, S, 2)
+    read = np.asarray(visual.material.to_color(points.reshape(-1, 2)))[:, :3].reshape(len(faces), len(_SAMPLES), 3)
+    return np.repeat(np.rint(read.mean(axis=1, keepdims=True)), 3, axis=1).astype(np.uint8)
+
+
+def _corner_normals(mesh: trimesh.Trimesh) -> Array:
+    """(F, 3, 3): at each corner the normal of the faces around it that meet at less than 40 degrees."""
+    faces = np.asarray(mesh.faces)
+    triangles = np.asarray(mesh.vertices)[faces]
+    area = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])  # (F, 3)
+    length = np.linalg.norm(area, axis=1, keepdims=True)
+    unit = np.divide(area, length, out=np.tile([0.0, 0.0, 1.0], (len(area), 1)), where=length > 0)
+    flat = np.repeat(unit[:, None], 3, axis=1)
+    if len(faces) > _MOST_SMOOTHED:
+        return flat
+    _, point = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
+    point = point.reshape(-1)
+    order = np.argsort(point, kind="stable")
+    starts = np.searchsorted(point[order], np.arange(point.max() + 1))
+    sizes = np.diff(np.append(starts, len(order)))
+    total = np.zeros((len(point), 3))
+    own = np.repeat(unit, 3, axis=0)
+    for shift in range(int(min(sizes.max(), 64))):  # the shift-th face around every point
+        at = sizes[point] > shift
+        other = order[starts[point[at]] + shift] // 3
+        near = np.einsum("ij,ij->i", unit[other], own[at]) > _SMOOTH
+        total[at] += area[other] * near[:, None]
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    smooth = np.divide(total, length, out=own.copy(), where=length > 0)
+    return smooth.reshape(-1, 3, 3)

@@ -1,0 +1,99 @@
+"""What a model file says, whatever its format: shapes, inertials, and whether it is fixed to the world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from scene_envs.assets.base import Array
+
+Color = tuple[int, int, int]
+Kind = Literal["mesh", "box", "cylinder", "sphere", "capsule", "ellipsoid"]
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """One piece of geometry of a model.
+
+    Attributes:
+        kind: what it is.
+        size: m. Box (x, y, z), cylinder and capsule (radius, length along z without the caps), sphere (radius,),
+            ellipsoid (x, y, z radii); the scale (x, y, z) of a mesh.
+        pose: (4, 4) shape frame to model frame.
+        where: link and element, for messages.
+        path: file of a mesh.
+        color: (r, g, b) that the model gives it, or None.
+        is_convex: the model declares the mesh convex.
+    """
+
+    kind: Kind
+    size: tuple[float, ...]
+    pose: Array
+    where: str
+    path: Path | None = None
+    color: Color | None = None
+    is_convex: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Inertial:
+    """Mass (kg), centre of mass (3,) m and inertia (3, 3) kg m^2 about that centre, model axes."""
+
+    mass: float
+    center_of_mass: Array
+    inertia: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A model file at zero joint positions, in one frame.
+
+    Attributes:
+        visuals: what is seen.
+        collisions: what is touched.
+        inertials: one per link that has one.
+        static: the model is fixed to the world; None when the file does not say.
+        notes: what was read differently from what the file might mean.
+    """
+
+    visuals: tuple[Shape, ...]
+    collisions: tuple[Shape, ...]
+    inertials: tuple[Inertial, ...] = ()
+    static: bool | None = None
+    notes: tuple[str, ...] = field(default=())
+
+
+def pose_of(translation: Array, rotation: Array) -> Array:
+    """(4, 4) from a translation (3,) m and a rotation (3, 3)."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, translation
+    return pose
+
+
+def from_roll_pitch_yaw(angles: Array) -> Array:
+    """(3, 3) rotation of URDF and SDF: about the fixed axes x, then y, then z; (3,) rad."""
+    return np.asarray(Rotation.from_euler("xyz", angles).as_matrix())
+
+
+def moved_inertial(pose: Array, inertial: Inertial) -> Inertial:
+    """The inertial of a link in the frame that ``pose`` (4, 4) maps to."""
+    turn = pose[:3, :3]
+    return Inertial(
+        inertial.mass, turn @ inertial.center_of_mass + pose[:3, 3], turn @ inertial.inertia @ turn.T
+    )  # fmt: skip
+
+
+def merged_inertial(inertials: tuple[Inertial, ...]) -> Inertial:
+    """The one rigid body of several: masses add, inertias by the parallel-axis theorem."""
+    mass = sum(inertial.mass for inertial in inertials)
+    weights = [inertial.mass / mass if mass > 0 else 1.0 / len(inertials) for inertial in inertials]
+    center = sum((w * i.center_of_mass for w, i in zip(weights, inertials, strict=True)), np.zeros(3))
+    total = np.zeros((3, 3))
+    for inertial in inertials:
+        arm = inertial.center_of_mass - center
+        total += inertial.inertia + inertial.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    return Inertial(mass, center, total)

@@ -1,0 +1,65 @@
+"""What an import did, one line per asset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class AssetReport:
+    """How one file became an asset.
+
+    Attributes:
+        name: of the asset.
+        file: it was read from.
+        mass: kg; 0 for welded assets.
+        density: kg/m^3 of the solid; 0 for welded assets.
+        parts: number of fine convex parts.
+        origin: (x, y, z) m: where the origin of the file lies in the asset frame.
+        notes: what was assumed or chosen.
+        warnings: what was wrong in the file and is put right, or could not be.
+        error: why there is no asset; empty when there is one.
+    """
+
+    name: str
+    file: Path
+    mass: float = 0.0
+    density: float = 0.0
+    parts: int = 0
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    error: str = ""
+
+    def __str__(self) -> str:
+        if self.error:
+            return f"{self.name}: not imported: {self.error}"
+        weight = f"{self.mass:.4g} kg" if self.mass > 0 else "welded"
+        pieces = f"{self.parts} convex part{'s' if self.parts != 1 else ''}"
+        return "; ".join([f"{self.name}: {self.file.name}, {weight}, {pieces}", *self.warnings, *self.notes])
+
+
+@dataclass(frozen=True)
+class ImportReport:
+    """What the import of a folder did.
+
+    Attributes:
+        folder: that was read.
+        assets: one report per file.
+        notes: about the folder as a whole.
+    """
+
+    folder: Path
+    assets: tuple[AssetReport, ...]
+    notes: tuple[str, ...] = ()
+
+    def __getitem__(self, name: str) -> AssetReport:
+        """The report of the asset called ``name``; KeyError without one."""
+        for report in self.assets:
+            if report.name == name:
+                return report
+        raise KeyError(name)
+
+    def __str__(self) -> str:
+        return "\n".join([f"{self.folder}: {len(self.assets)} assets", *self.notes, *map(str, self.assets)])

@@ -1,0 +1,195 @@
+"""A folder of files as an asset library."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from xml.etree import ElementTree
+
+from scene_envs.assets.base import Asset, AssetLibrary
+from scene_envs.assets.importing.class_colors import distinct_colors
+from scene_envs.assets.importing.entries import (
+    SUFFIXES,
+    YAML_NAMES,
+    AssetEntry,
+    check_names,
+    default_entry,
+    read_entries,
+)
+from scene_envs.assets.importing.model import Color
+from scene_envs.assets.importing.report import AssetReport, ImportReport
+from scene_envs.errors import InvalidInputError, SceneEnvsError, unknown_name
+
+_LOGGER = logging.getLogger(__name__)
+_DESCRIPTIONS = (".urdf", ".sdf")
+
+
+def load_library(folder: str | os.PathLike[str]) -> AssetLibrary:
+    """All assets of a folder of URDF, SDF, OBJ, STL, GLB, PLY, OFF or COLLADA files.
+
+    ``library.yaml`` in the folder lists the assets; see :class:`AssetEntry` for its keys. Without it every
+    file that can be read becomes an asset called after it, but for meshes that a URDF or SDF of the folder
+    uses; files that cannot be read are left out, and all of this is logged. What had to be put right is
+    logged, and told by :func:`import_report`. Each file is read once per process.
+
+    Args:
+        folder: path of the folder.
+
+    Raises:
+        InvalidInputError: no such folder or no assets in it, a wrong entry, or a mesh that does not exist.
+        CorruptFileError: a file that ``library.yaml`` lists cannot be read; file and reason are named.
+        MissingDependencyError: a format or method needs a package that is not installed.
+    """
+    index = folder_index(folder)
+    assets: list[Asset] = []
+    for entry in index.entries:
+        try:
+            assets.append(index.build(entry.name))
+        except SceneEnvsError as error:
+            if index.is_listed:
+                raise
+            _LOGGER.warning("%s is left out: %s", index.folder / entry.file, error)
+    if not assets:
+        raise InvalidInputError(f"{index.folder} holds no file that can be read as an asset; the log says why")
+    return AssetLibrary(tuple(assets))
+
+
+def import_report(folder: str | os.PathLike[str]) -> ImportReport:
+    """What the import of a folder chose, put right, or could not read; ``str`` gives a line per asset.
+
+    Raises as :func:`load_library` does for the folder and its YAML; files that cannot be read are in the report.
+    """
+    index = folder_index(folder)
+    reports = []
+    for entry in index.entries:
+        try:
+            index.build(entry.name)
+            reports.append(index.report(entry.name))
+        except SceneEnvsError as error:
+            reports.append(AssetReport(entry.name, index.folder / entry.file, error=str(error)))
+    return ImportReport(index.folder, tuple(reports), index.notes)
+
+
+@dataclass(frozen=True, eq=False)
+class FolderIndex:
+    """The assets that a folder offers; each is built when it is asked for.
+
+    Attributes:
+        folder: absolute path.
+        entries: in the order of the library.
+        is_listed: whether ``library.yaml`` lists them.
+        notes: what was assumed about the folder.
+    """
+
+    folder: Path
+    entries: tuple[AssetEntry, ...]
+    is_listed: bool
+    notes: tuple[str, ...]
+
+    @property
+    def names(self) -> list[str]:
+        """Asset names, in order."""
+        return [entry.name for entry in self.entries]
+
+    def build(self, name: str) -> Asset:
+        """The asset called ``name``; raises what :func:`load_library` raises, and UnknownNameError."""
+        return self._built(name)[0]
+
+    def report(self, name: str) -> AssetReport:
+        """How the asset called ``name`` came to be."""
+        return self._built(name)[1]
+
+    def _built(self, name: str) -> tuple[Asset, AssetReport]:
+        for entry in self.entries:
+            if entry.name == name:
+                return _built(self.folder, entry, _stamp(self.folder / entry.file))
+        raise unknown_name("asset", name, self.names)
+
+
+def folder_index(folder: str | os.PathLike[str]) -> FolderIndex:
+    """What a folder offers, without reading its models.
+
+    Raises:
+        InvalidInputError: no such folder, no assets in it, or a wrong entry.
+        CorruptFileError: ``library.yaml`` cannot be read.
+    """
+    root = Path(folder).expanduser().resolve()
+    if not root.is_dir():
+        raise InvalidInputError(f"there is no folder {str(root)!r}; asset folders hold URDF, SDF or mesh files")
+    for name in YAML_NAMES:
+        if (root / name).is_file():
+            return _listed(root / name, _stamp(root / name))
+    return _unlisted(root, _stamp(root))
+
+
+def find_asset(name: str, folders: Sequence[str | os.PathLike[str]]) -> Asset | None:
+    """The asset called ``name`` from the first folder that has it, or None."""
+    for folder in folders:
+        index = folder_index(folder)
+        if name in index.names:
+            return index.build(name)
+    return None
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    """What changes when a file is written."""
+    try:
+        status = path.stat()
+    except OSError:
+        return (0, 0)
+    return status.st_mtime_ns, status.st_size
+
+
+@cache
+def _listed(path: Path, stamp: tuple[int, int]) -> FolderIndex:
+    return FolderIndex(path.parent, _colored(read_entries(path)), True, ())
+
+
+@cache
+def _unlisted(folder: Path, stamp: tuple[int, int]) -> FolderIndex:
+    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    used = {mesh for path in files if path.suffix.lower() in _DESCRIPTIONS for mesh in _named_files(path)}
+    entries = [default_entry(str(path.relative_to(folder))) for path in files if path.name not in used]
+    if not entries:
+        raise InvalidInputError(f"{folder} holds no {', '.join(SUFFIXES)} files")
+    check_names(entries, f"{folder} has no library.yaml, so assets are called after their files")
+    note = f"no library.yaml: {len(entries)} files, named after themselves, in metres, welded where they say so"
+    _LOGGER.info("%s: %s", folder, note)
+    return FolderIndex(folder, _colored(entries), False, (note,))
+
+
+def _named_files(path: Path) -> set[str]:
+    """Names of the meshes that a URDF or SDF uses; empty when it cannot be read."""
+    try:
+        root = ElementTree.parse(path).getroot()
+    except (ElementTree.ParseError, OSError):
+        return set()
+    texts = [element.get("filename") or "" for element in root.iter("mesh")]
+    texts += [element.text or "" for element in root.iter("uri")]
+    return {text.strip().replace("\\", "/").rsplit("/", 1)[-1] for text in texts}
+
+
+def _colored(entries: list[AssetEntry]) -> tuple[AssetEntry, ...]:
+    """Entries with a colour each, far from those of the built-in assets."""
+    from scene_envs.assets.library import class_colors
+
+    chosen: list[Color] = [entry.color for entry in entries if entry.color is not None]
+    fresh = iter(distinct_colors(len(entries) - len(chosen), (*class_colors(), *chosen)))
+    return tuple(
+        entry if entry.color is not None else dataclasses.replace(entry, color=next(fresh)) for entry in entries
+    )
+
+
+@cache
+def _built(folder: Path, entry: AssetEntry, stamp: tuple[int, int]) -> tuple[Asset, AssetReport]:
+    from scene_envs.assets.importing.build import build_asset  # with trimesh, which the import of this package spares
+
+    asset, report = build_asset(folder / entry.file, entry)
+    level = logging.WARNING if report.warnings else logging.INFO
+    _LOGGER.log(level, "%s", report)
+    return asset, report
