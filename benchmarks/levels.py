@@ -3,8 +3,8 @@
     python benchmarks/levels.py [--scenes 1000] [--seed 0] [--types ...]
 
 Scenes of all types, a third each as generated and with *precise* and *rough* noise (2 mm sideways and 0.4 mm in height,
-10 mm and 2 mm), judged three times: as ``feasibility`` does; with every hollow object simulated with its fine parts; and
-with nothing at rest, so that every object is simulated, with fine parts. Counts objects whose verdict differs.
+10 mm and 2 mm), judged three times: as ``feasibility`` does; with every hollow object simulated with its fine parts;
+and with nothing at rest, so that every object is simulated, with fine parts. Counts objects whose verdict differs.
 """
 
 from __future__ import annotations
@@ -87,14 +87,14 @@ def main() -> None:
                 quick = 1e3 * float(normal.displacement[scene, slot]), 1e3 * float(normal.rotation[scene, slot])
                 who[f"{asset} {verdict}"] += 1
                 print(
-                    f"{name} {noise} scene {scene} slot {slot} {asset}: {verdict}, moves {quick[0]:.2f} mm {quick[1]:.1f} mrad;"
-                    f" simulated {moved:.2f} mm {turned:.1f} mrad"
+                    f"{name} {noise} scene {scene} slot {slot} {asset}: {verdict}, "
+                    f"moves {quick[0]:.2f} mm {quick[1]:.1f} mrad; simulated {moved:.2f} mm {turned:.1f} mrad"
                 )
             objects += int(batch.is_free.sum())
             total.update(counts)
             table.add_row(
                 name, noise, str(len(batch)), str(int(batch.is_free.sum())), f"{int(normal.counts.sum())}",
-                str(counts["fine"]), str(counts["simulated"]), f"{len(batch) / spent[0]:.0f}", f"{len(batch) / spent[1]:.1f}",
+                str(counts["fine"]), str(counts["simulated"]), *(f"{len(batch) / seconds:.0f}" for seconds in spent),
             )  # fmt: skip
     console = Console()
     console.print(table)

@@ -3,12 +3,12 @@
     python benchmarks/projection.py [--count 40] [--small 20] [--starts 6] [--seed 0] [--types ...]
 
 *Each type*: generated scenes whose free objects were moved by Gaussian noise of 1 and 2 cm along every axis. Times
-are CPU time of one thread, scene by scene. *Small scenes*: 2 to 8 free objects that overlap, cut out of
-the jittered scenes, solved by projection and by scipy's SLSQP: least sum of squared translations, the signed distance of
-every near pair of convex parts (FCL) at least the clearance that projection asks for, the workspace as bounds. SLSQP
-solves both the fine parts and the coarse hulls, from the given poses and from random ones 1 cm around them, and the fine
-parts once more from what projection found; its best solution that FCL finds free of overlap counts. The ratio is
-between the square roots of what both minimise. *Alone* counts the scenes that SLSQP solves without the start from ours.
+are CPU time of one thread, scene by scene. *Small scenes*: 2 to 8 free objects that overlap, cut out of the jittered
+scenes, solved by projection and by scipy's SLSQP: least sum of squared translations, the signed distance of every near
+pair of convex parts (FCL) at least the clearance that projection asks for, the workspace as bounds. SLSQP solves both
+the fine parts and the coarse hulls, from the given poses and from random ones 1 cm around them, and the fine parts
+once more from what projection found; its best solution that FCL finds free of overlap counts. The ratio is between the
+square roots of what both minimise. *Alone* counts the scenes that SLSQP solves without the start from ours.
 """
 
 from __future__ import annotations
@@ -38,8 +38,6 @@ Array = NDArray[np.float64]
 
 _AROUND = 0.03
 """Parts within this distance (m) of each other at the start are constraints of the NLP."""
-_LOCAL = 0.05
-"""Neighbours (m) that a small scene takes from a large one."""
 
 
 def jittered(batch: SceneBatch, scale: float, generator: torch.Generator) -> SceneBatch:
@@ -102,7 +100,7 @@ class SmallProgram:
                 int(parts.part[i]), parts.rotation[i], parts.translation[i],
                 int(parts.part[j]), parts.rotation[j], parts.translation[j],
             )  # fmt: skip
-            if abs(distance) > abs(gap[row]) + 1e-6 and distance > 0 or distance < 0 and distance > gap[row] + 1e-6:
+            if (distance > 0 and distance > gap[row] + 1e-6) or gap[row] + 1e-6 < distance < 0:
                 way = on_b - on_a if distance > 0 else on_a - on_b
                 gap[row], normal[row] = distance, way / max(np.linalg.norm(way), 1e-12)
         line = np.arange(len(gap))
@@ -159,7 +157,9 @@ def compare(batch: SceneBatch, starts: int, rng: np.random.Generator) -> tuple[l
     for index in range(len(batch)):
         one = batch[index]
         objects = objects_of(one)
-        fine, coarse = (SmallProgram(physics, objects, batch.scene_type.workspace, level) for level in ("fine", "coarse"))
+        fine, coarse = (
+            SmallProgram(physics, objects, batch.scene_type.workspace, level) for level in ("fine", "coarse")
+        )
         projected = objects_of(project(one).batch).translation[fine.free].ravel()
         ours = fine.way(projected)
         tries = [fine.home, *(fine.home + 0.01 * rng.standard_normal(len(fine.home)) for _ in range(starts - 1))]
@@ -227,7 +227,17 @@ def main() -> None:
             measure_type(name, options.count, options.seed, table)
         console.print(table)
     if options.small:
-        columns = ("scene type", "scenes", "mean", "10 %", "median", "90 %", "largest", "solved by projection", "by SLSQP alone")
+        columns = (
+            "scene type",
+            "scenes",
+            "mean",
+            "10 %",
+            "median",
+            "90 %",
+            "largest",
+            "solved by projection",
+            "by SLSQP alone",
+        )
         table = Table(*columns, title="way of projection / way of SLSQP, 2 to 8 objects, jitter 2 cm")
         for name in options.types:
             measure_small(name, options.small, options.starts, options.seed, table)

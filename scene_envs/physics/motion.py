@@ -25,7 +25,7 @@ _LOGGER = logging.getLogger(__name__)
 _SEGMENT = 0.25
 """Seconds after which settling looks again at which shapes it needs, and whether anything still moves."""
 _FAR, _MARGIN = 2e-3, 1e-3
-"""An object that moved further than this (m) may have met others, whose boxes are within that distance (m) of its way."""
+"""What moved further than this (m) may have met others, whose boxes are within that distance (m) of its way."""
 _MEETINGS = 4
 """How often to look again with what was met."""
 _STILL, _STILL_ANGLE = 5e-5, 5e-4

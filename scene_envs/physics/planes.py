@@ -10,7 +10,7 @@ from scipy.optimize import nnls
 
 from scene_envs.physics.collision import Collider, scene_pairs
 from scene_envs.physics.placement import Objects, object_boxes, part_pairs, place
-from scene_envs.physics.separation import PlacedParts, grouped_gaps
+from scene_envs.physics.separation import grouped_gaps
 from scene_envs.physics.support import components
 
 Array = NDArray[np.float64]
@@ -62,7 +62,9 @@ def near_pairs(collider: Collider, objects: Objects) -> tuple[Index, Index]:
     return first[near], second[near]
 
 
-def separating_planes(collider: Collider, objects: Objects, first: Index, second: Index, extra: Array, home: Array) -> Planes:
+def separating_planes(
+    collider: Collider, objects: Objects, first: Index, second: Index, extra: Array, home: Array
+) -> Planes:
     """Planes that keep object pairs apart.
 
     Every pair of parts gets a face plane that separates it now; among several, the one that asks for the least
@@ -106,9 +108,9 @@ def _planes_at(
     placed = place(collider.library, objects, level)  # type: ignore[arg-type]
     pair, a, b = part_pairs(placed, first, second)
     move = extra[pair]
-    near = (
-        (placed.low[a] <= placed.high[b] + move + _REACH) & (placed.low[b] + move <= placed.high[a] + _REACH)
-    ).all(axis=1)
+    near = ((placed.low[a] <= placed.high[b] + move + _REACH) & (placed.low[b] + move <= placed.high[a] + _REACH)).all(
+        axis=1
+    )
     pair, a, b = pair[near], a[near], b[near]
     offset = objects.translation[second] - objects.translation[first] + extra
     away = (home[second] - home[first] - offset)[pair]

@@ -60,20 +60,20 @@ def project_objects(collider: Collider, objects: Objects, workspace: Corners) ->
     """
     home = objects.translation
     bounds = _bounds(home, objects, workspace)
-    walls = _walls(home, objects, bounds)
-    best, best_way = Projection(home, np.inf), np.inf
+    walls = _walls(bounds)
+    best, best_way, least = Projection(home, np.inf), np.inf, np.inf
     tried: Tried = {}
     current = replace(objects, translation=nearest(objects, home, walls))
     refinements = waited = 0
     for _ in range(_ROUNDS):
-        first, second, residual = _overlapping(collider, current)
+        first, second, residual, total = _overlapping(collider, current)
         way = float(((current.translation - home) ** 2).sum())
         is_free = residual <= 0.5 * TOLERANCE
         gain = best_way - way
         waited += 1
-        if residual < best.residual_depth and not is_free:
-            best, waited = Projection(current.translation, residual), 0
-        elif is_free and (way < best_way or best.residual_depth > 0.5 * TOLERANCE):
+        if total < least and not is_free and best_way == np.inf:
+            best, least, waited = Projection(current.translation, residual), total, 0
+        elif is_free and way < best_way:
             best, best_way = Projection(current.translation, residual), way
         if is_free:
             refinements += 1
@@ -109,11 +109,11 @@ def _round(
     return nearest(current, home, planes + walls)
 
 
-def _overlapping(collider: Collider, objects: Objects) -> tuple[Index, Index, float]:
-    """Object pairs whose fine parts overlap beyond the tolerance, and the deepest overlap."""
+def _overlapping(collider: Collider, objects: Objects) -> tuple[Index, Index, float, float]:
+    """Object pairs whose fine parts overlap beyond the tolerance, the deepest overlap, and the sum of them all."""
     pairs = collider.pairs(objects)
     deep = pairs.depth > 0.5 * TOLERANCE
-    return pairs.first[deep], pairs.second[deep], float(pairs.depth.max(initial=0.0))
+    return pairs.first[deep], pairs.second[deep], float(pairs.depth.max(initial=0.0)), float(pairs.depth.sum())
 
 
 def _bounds(home: Array, objects: Objects, workspace: Corners) -> tuple[Array, Array]:
@@ -123,16 +123,12 @@ def _bounds(home: Array, objects: Objects, workspace: Corners) -> tuple[Array, A
     return np.where(loose[:, None], -np.inf, low + _INSIDE), np.where(loose[:, None], np.inf, high - _INSIDE)
 
 
-def _walls(home: Array, objects: Objects, bounds: tuple[Array, Array]) -> Planes:
+def _walls(bounds: tuple[Array, Array]) -> Planes:
     """The bounds as half-spaces."""
-    rows, axes, signs, limits = [], [], [], []
-    for sign, limit in ((1.0, bounds[0]), (-1.0, bounds[1])):
-        row, axis = np.nonzero(np.isfinite(limit))
-        rows.append(row)
-        axes.append(axis)
-        signs.append(np.full(len(row), sign))
-        limits.append(sign * limit[row, axis])
-    row, axis, sign = np.concatenate(rows), np.concatenate(axes), np.concatenate(signs)
+    low, high = (np.nonzero(np.isfinite(limit)) for limit in bounds)
+    row, axis = np.concatenate([low[0], high[0]]), np.concatenate([low[1], high[1]])
+    sign = np.repeat([1.0, -1.0], [len(low[0]), len(high[0])])
+    limits = np.concatenate([bounds[0][low], -bounds[1][high]])
     direction = np.zeros((len(row), 3))
     direction[np.arange(len(row)), axis] = sign
-    return Planes(np.full(len(row), -1, dtype=np.int64), row, direction, np.concatenate(limits))
+    return Planes(np.full(len(row), -1, dtype=np.int64), row, direction, limits)

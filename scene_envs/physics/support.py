@@ -1,4 +1,4 @@
-"""Who can touch whom: when coarse shapes give the same verdict, how high stacks are, what must be simulated together."""
+"""Who touches whom: when coarse shapes give the same verdict, how high stacks are, what is simulated together."""
 
 from __future__ import annotations
 

@@ -55,8 +55,7 @@ def ways_out(
     """
     placed = place(collider.library, objects, "fine")
     pair, a, b = part_pairs(placed, first, second)
-    near = (placed.low[a] <= placed.high[b] + _AROUND) & (placed.low[b] <= placed.high[a] + _AROUND)
-    near = near.all(axis=1)
+    near = ((placed.low[a] <= placed.high[b] + _AROUND) & (placed.low[b] <= placed.high[a] + _AROUND)).all(axis=1)
     pair, a, b = pair[near], a[near], b[near]
     offset = objects.translation[second] - objects.translation[first]
     groups = list(grouped_gaps(collider.library, placed.parts, a, b, offset[pair]))
@@ -74,9 +73,7 @@ def ways_out(
     return ways[line, best] * (lengths[line, best] + CLEARANCE)[:, None]  # type: ignore[no-any-return]
 
 
-def _directions(
-    count: int, pair: Index, groups: list[tuple[Index, Array, Array]], offset: Array, down: Array
-) -> Array:
+def _directions(count: int, pair: Index, groups: list[tuple[Index, Array, Array]], offset: Array, down: Array) -> Array:
     """(P, D, 3) directions to try: the axes, away from and toward the other's centre, the parts' own, a walk's.
 
     ``down`` (P,) is the sign of the z of a way that takes the free object of a pair with a fixed one down.
@@ -189,7 +186,9 @@ def _weights(
         low, high = object_boxes(place(collider.library, objects, "coarse"))
         boards = place(collider.library, objects[objects.fixed], "coarse")
         rise = np.where(way[..., 2] > 0.7, lengths, 0.0)  # (P, D)
-        over = (boards.low[None, :, :2] < high[upper][:, None, :2]) & (boards.high[None, :, :2] > low[upper][:, None, :2])
+        over = (boards.low[None, :, :2] < high[upper][:, None, :2]) & (
+            boards.high[None, :, :2] > low[upper][:, None, :2]
+        )
         above = over.all(axis=2) & (boards.low[None, :, 2] > 0.5 * (low[upper] + high[upper])[:, None, 2])
         room = np.where(above, boards.low[None, :, 2] - high[upper][:, None, 2], np.inf).min(axis=1)
         weight[(rise > np.maximum(room, 0.0)[:, None]) & ~fixed[:, None]] *= _BLOCKED

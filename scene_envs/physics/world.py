@@ -216,7 +216,8 @@ class World:
 
         Returns:
             rotation (n, 3, 3) and translation (n, 3) m afterwards, the angle turned (n,) in radians, and which
-            objects (n,) came to rest and left before the end. Objects that Bullet lost to a numerical failure come back as NaN.
+            objects (n,) came to rest and left before the end. Objects that Bullet lost to a numerical failure
+            come back as NaN.
         """
         bullet, client = self._bullet, self._client
         category, fixed, count = objects.category, objects.fixed, len(objects)
