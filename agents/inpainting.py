@@ -54,8 +54,7 @@ def inpaint(
     for step in range(len(table)):
         noisy_known = prior.process.add_noise(known_x0, table.timesteps[step], _noise(generators, known_x0))
         x = prior.clamp(torch.where(keep, noisy_known, x))
-        mean, std = prior.posterior(x, step, table)
-        x = mean + std * _noise(generators, known_x0)
+        x = prior.transition(x, step, table).from_noise(_noise(generators, known_x0))
     changed = mask.clone()
     changed[:, : len(prior.scene_type.fixed)] = False
     regenerated = prior.decode(x).tensor

@@ -14,8 +14,10 @@ from torch import Generator, Tensor, nn
 from agents.denoiser import Denoiser, PriorConfig
 from agents.diffusion import (
     GaussianProcess,
+    GaussianStep,
     Preconditioning,
     ResidualVariance,
+    ReverseStep,
     StepTable,
     lognormal_timesteps,
     make_schedule,
@@ -136,6 +138,10 @@ class ScenePrior(nn.Module):
         noise = torch.randn(count, slots, self.scene_type.features, generator=generator, device=self._fixed.device)
         return self.clamp(noise)
 
+    def transition(self, x_t: Tensor, step: int, table: StepTableLike) -> ReverseStep:
+        """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters."""
+        return GaussianStep(*self.posterior(x_t, step, table))
+
     def posterior(self, x_t: Tensor, step: int, table: StepTableLike) -> tuple[Tensor, Tensor]:
         """Mean (B, N, D) and std (N, D) of x_{t-1} given x_t; differentiable in the network's parameters.
 
@@ -156,9 +162,8 @@ class ScenePrior(nn.Module):
         table = self.step_table(num_steps)
         x = self.initial(count, self.config.slots if slots is None else slots, generator)
         for step in range(len(table)):
-            mean, std = self.posterior(x, step, table)
             noise = torch.randn(x.shape, generator=generator, device=x.device)
-            x = mean + std * noise
+            x = self.transition(x, step, table).from_noise(noise)
         return x
 
     def sample(

@@ -23,8 +23,8 @@ from rich.table import Table
 from tensordict import TensorDict
 from torch import Tensor
 
+from agents.diffusion import gaussian_log_prob
 from agents.post_training import DDPOSFLoss, DenoisingPolicy, gradient_weights
-from agents.post_training.policy import gaussian_log_prob
 from agents.prior import ScenePrior, tiny_prior
 
 MEBIBYTE = 2**20

@@ -257,8 +257,7 @@ class DenoisingCore:
 
     def _transition(self, x_t: Tensor, action: Tensor, step: int) -> Tensor:
         if self.action_mode == "noise":
-            mean, std = self.prior.posterior(x_t, step, self.table)
-            action = mean + std * action
+            action = self.prior.transition(x_t, step, self.table).from_noise(action)
         return self.prior.clamp(action).clamp(-STATE_BOUND, STATE_BOUND)
 
     def _check_running(self, rows: IntArray) -> None:

@@ -79,10 +79,10 @@ class PriorLike(Protocol):
         """``x`` with its known entries (fixed welded slots, constant features) set to their values."""
         ...
 
-    def posterior(self, x_t: Tensor, step: int, table: StepTableLike) -> tuple[Tensor, Tensor]:
-        """Mean (B, N, D) and std (N, D) of x_{t-1} given x_t at ``table.timesteps[step]``.
+    def transition(self, x_t: Tensor, step: int, table: StepTableLike) -> Any:
+        """p(x_{t-1} | x_t) at ``table.timesteps[step]``, an object like ``agents.diffusion.ReverseStep``.
 
-        The std is 0 on known entries, and everywhere at the last step, which is deterministic.
+        Known entries are certain; at the last step all are.
         """
         ...
 

@@ -9,6 +9,13 @@ from agents.diffusion.categorical import (
 )
 from agents.diffusion.gaussian import PREDICTIONS, GaussianProcess, Preconditioning, lognormal_timesteps
 from agents.diffusion.residual import ResidualVariance
+from agents.diffusion.reverse_steps import (
+    GaussianStep,
+    MixedStep,
+    ReverseStep,
+    concatenate_steps,
+    gaussian_log_prob,
+)
 from agents.diffusion.schedules import NoiseSchedule, make_schedule
 from agents.diffusion.step_tables import StepTable
 
@@ -18,10 +25,15 @@ __all__ = [
     "CategoricalProcess",
     "CategoricalSchedule",
     "GaussianProcess",
+    "GaussianStep",
+    "MixedStep",
     "NoiseSchedule",
     "Preconditioning",
     "ResidualVariance",
+    "ReverseStep",
     "StepTable",
+    "concatenate_steps",
+    "gaussian_log_prob",
     "lognormal_timesteps",
     "make_categorical_schedule",
     "make_schedule",

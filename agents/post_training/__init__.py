@@ -4,7 +4,7 @@ from agents.post_training.advantages import compute_advantages
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.guard import Guard, GuardReading
 from agents.post_training.losses import DDPOSFLoss
-from agents.post_training.policy import DenoisingPolicy, gaussian_log_prob, gradient_weights
+from agents.post_training.policy import DenoisingPolicy, gradient_weights
 from agents.post_training.steering import steer
 from agents.post_training.trainer import PostTrainer, PostTrainResult, post_train
 
@@ -17,7 +17,6 @@ __all__ = [
     "PostTrainResult",
     "PostTrainer",
     "compute_advantages",
-    "gaussian_log_prob",
     "gradient_weights",
     "post_train",
     "steer",

@@ -2,37 +2,14 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Generator, Tensor
 
+from agents.diffusion import ReverseStep, concatenate_steps
 from scene_envs.errors import InvalidInputError
 from scene_envs.protocols import PriorLike, StepTableLike
-
-
-def gaussian_log_prob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
-    """Log-density of independent normals, summed over features; entries with std 0 are left out.
-
-    Args:
-        x: (B, N, D) where it is evaluated.
-        mean: (B, N, D).
-        std: (N, D), not negative. An entry with std 0 is certain: it carries no probability and no gradient.
-
-    Returns:
-        (B, N) nats, one sum per slot.
-
-    >>> x, std = torch.zeros(1, 1, 2), torch.tensor([[1.0, 0.0]])
-    >>> round(float(gaussian_log_prob(x, torch.zeros(1, 1, 2), std)), 4)
-    -0.9189
-    """
-    random = std > 0
-    safe = torch.where(random, std, torch.ones_like(std))
-    z = (x - mean) / safe
-    log_density = -0.5 * z.square() - safe.log() - 0.5 * math.log(2 * math.pi)
-    return torch.where(random, log_density, torch.zeros_like(log_density)).sum(dim=-1)
 
 
 class DenoisingPolicy(TensorDictModuleBase):
@@ -78,39 +55,38 @@ class DenoisingPolicy(TensorDictModuleBase):
             )
         return self._step_of[timestep]
 
-    def distribution(self, x_t: Tensor, step: int) -> tuple[Tensor, Tensor]:
-        """Mean (B, N, D) and std (N, D) of x_{t-1}; differentiable in the prior's parameters."""
-        parts = [self.prior.posterior(part, step, self.table) for part in x_t.split(self.chunk or x_t.shape[0])]
-        return torch.cat([mean for mean, _ in parts]), parts[0][1]
+    def distribution(self, x_t: Tensor, step: int) -> ReverseStep:
+        """p(x_{t-1} | x_t) of ``x_t`` (B, N, D); differentiable in the prior's parameters."""
+        parts = [self.prior.transition(part, step, self.table) for part in x_t.split(self.chunk or x_t.shape[0])]
+        return concatenate_steps(parts)
 
     def draw(self, x_t: Tensor, step: int, generator: Generator | None = None) -> tuple[Tensor, Tensor]:
         """An action (B, N, D) and its log-probability per slot (B, N), without gradients."""
         with torch.no_grad():
-            mean, std = self.distribution(x_t, step)
-            noise = torch.randn(mean.shape, generator=generator, device=mean.device)
-            action = mean + std * noise
-            return action, gaussian_log_prob(action, mean, std)
+            reverse = self.distribution(x_t, step)
+            action = reverse.from_noise(torch.randn(x_t.shape, generator=generator, device=x_t.device))
+            return action, reverse.log_prob(action)
 
     def log_prob(self, x_t: Tensor, step: int, action: Tensor) -> Tensor:
         """(B, N) log-probability per slot of ``action``; states and actions are taken as constants."""
-        mean, std = self.distribution(x_t.detach(), step)
-        return gaussian_log_prob(action.detach(), mean, std)
+        return self.distribution(x_t.detach(), step).log_prob(action.detach())
 
     def random_entries(self, slots: int) -> int:
-        """How many of the N·D entries of a scene the chain draws; the others are known."""
-        return int((self._std_maps(slots)[0] > 0).sum())
+        """How many random variables a step of the chain draws for a scene; the other entries are known."""
+        return self._steps(slots)[0].entries
 
     def stds(self, slots: int) -> Tensor:
         """(S,) smallest sigma of every step over its random entries, normalised units; 0 where none is random."""
         smallest = [
-            std[std > 0].amin() if bool((std > 0).any()) else std.new_zeros(()) for std in self._std_maps(slots)
+            std[std > 0].amin() if bool((std > 0).any()) else std.new_zeros(())
+            for std in (step.std for step in self._steps(slots))
         ]
         return torch.stack(smallest)
 
     @torch.no_grad()
-    def _std_maps(self, slots: int) -> list[Tensor]:
+    def _steps(self, slots: int) -> list[ReverseStep]:
         x = self.prior.initial(1, slots, None)
-        return [self.prior.posterior(x, step, self.table)[1] for step in range(len(self))]
+        return [self.distribution(x, step) for step in range(len(self))]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write an action and its log-probability; rows may be at different steps."""

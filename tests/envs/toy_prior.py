@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Generator, Tensor
 
-from agents.diffusion import StepTable
+from agents.diffusion import GaussianStep, StepTable
 from scene_envs.errors import InvalidInputError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch
@@ -62,6 +62,9 @@ class ToyPrior:
         std_map = torch.full(x_t.shape[1:], std)
         std_map[: self.fixed] = 0.0
         return self.clamp(a * x_t + b), std_map
+
+    def transition(self, x_t: Tensor, step: int, table: StepTable) -> GaussianStep:
+        return GaussianStep(*self.posterior(x_t, step, table))
 
     def inpaint(
         self, batch: SceneBatch, mask: Tensor, *, num_steps: int, generators: list[Generator] | None = None

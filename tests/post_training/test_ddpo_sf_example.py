@@ -11,7 +11,8 @@ from types import ModuleType
 import pytest
 import torch
 
-from agents.post_training import compute_advantages, gaussian_log_prob
+from agents.diffusion import gaussian_log_prob
+from agents.post_training import compute_advantages
 from agents.prior import ScenePrior, tiny_prior
 
 

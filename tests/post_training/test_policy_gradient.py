@@ -8,7 +8,8 @@ from tensordict import TensorDict
 from torch.distributions import Normal
 from toy_chain import LinearChain
 
-from agents.post_training import DDPOSFLoss, DenoisingPolicy, gaussian_log_prob, gradient_weights
+from agents.diffusion import gaussian_log_prob
+from agents.post_training import DDPOSFLoss, DenoisingPolicy, gradient_weights
 from agents.prior import tiny_prior
 from scene_envs.errors import InvalidInputError
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Generator, Tensor, nn
 
-from agents.diffusion import StepTable
+from agents.diffusion import GaussianStep, StepTable
 
 
 class LinearChain(nn.Module):
@@ -23,6 +23,6 @@ class LinearChain(nn.Module):
     def initial(self, count: int, slots: int, generator: Generator | None = None) -> Tensor:
         return torch.full((count, slots, 1), 1.5, dtype=torch.float64)
 
-    def posterior(self, x_t: Tensor, step: int, table: StepTable) -> tuple[Tensor, Tensor]:
+    def transition(self, x_t: Tensor, step: int, table: StepTable) -> GaussianStep:
         sigma = self.sigmas[step] if step < len(self.sigmas) else 0.0
-        return self.theta * x_t, torch.full(x_t.shape[1:], sigma, dtype=x_t.dtype)
+        return GaussianStep(self.theta * x_t, torch.full(x_t.shape[1:], sigma, dtype=x_t.dtype))

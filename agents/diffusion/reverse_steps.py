@@ -1,0 +1,161 @@
+"""The distribution of one reverse step: what a chain draws from, and what a policy gradient differentiates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+_TINY = 1e-30
+
+
+class ReverseStep(Protocol):
+    """p(x_s | x_t) of B scenes; differentiable in the denoiser's parameters."""
+
+    @property
+    def std(self) -> Tensor:
+        """(N, D) standard deviation of continuous entries; 0 where an entry is certain or discrete."""
+        ...
+
+    @property
+    def entries(self) -> int:
+        """How many random variables a scene's step has."""
+        ...
+
+    def from_noise(self, noise: Tensor) -> Tensor:
+        """x_s (B, N, D) from standard normal noise (B, N, D): normal noise gives exactly this distribution."""
+        ...
+
+    def log_prob(self, x: Tensor) -> Tensor:
+        """(B, N) log-probability of ``x`` (B, N, D), summed over each slot's random variables, nats."""
+        ...
+
+
+def gaussian_log_prob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """Log-density of independent normals, summed over features; entries with std 0 are left out.
+
+    Args:
+        x: (B, N, D) where it is evaluated.
+        mean: (B, N, D).
+        std: (N, D), not negative. An entry with std 0 is certain: it carries no probability and no gradient.
+
+    Returns:
+        (B, N) nats, one sum per slot.
+
+    >>> x, std = torch.zeros(1, 1, 2), torch.tensor([[1.0, 0.0]])
+    >>> round(float(gaussian_log_prob(x, torch.zeros(1, 1, 2), std)), 4)
+    -0.9189
+    """
+    random = std > 0
+    safe = torch.where(random, std, torch.ones_like(std))
+    z = (x - mean) / safe
+    log_density = -0.5 * z.square() - safe.log() - 0.5 * math.log(2 * math.pi)
+    return torch.where(random, log_density, torch.zeros_like(log_density)).sum(dim=-1)
+
+
+class GaussianStep(NamedTuple):
+    """Independent normals.
+
+    Attributes:
+        mean: (B, N, D).
+        std: (N, D); 0 marks a certain entry.
+
+    >>> step = GaussianStep(torch.zeros(1, 1, 2), torch.tensor([[1.0, 0.0]]))
+    >>> step.from_noise(torch.ones(1, 1, 2)), step.entries
+    (tensor([[[1., 0.]]]), 1)
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    @property
+    def entries(self) -> int:
+        """Random entries of a scene."""
+        return int((self.std > 0).sum())
+
+    def from_noise(self, noise: Tensor) -> Tensor:
+        """``mean + std * noise``."""
+        return self.mean + self.std * noise
+
+    def log_prob(self, x: Tensor) -> Tensor:
+        """(B, N) nats."""
+        return gaussian_log_prob(x, self.mean, self.std)
+
+
+class MixedStep(NamedTuple):
+    """Normal poses and a categorical state per slot, independent given x_t.
+
+    A state stands in the last K features of a slot as a one-hot vector; the mask token is all zeros.
+
+    Attributes:
+        mean: (B, N, P) of the pose.
+        pose_std: (N, P); 0 marks a certain entry.
+        probs: (B, N, K + 1) of the state, the mask token last.
+        random: (N,) bool, slots whose state is drawn; in the others the likeliest one is taken.
+
+    >>> probs = torch.tensor([[[0.25, 0.75, 0.0]]])
+    >>> step = MixedStep(torch.zeros(1, 1, 1), torch.ones(1, 1), probs, torch.tensor([True]))
+    >>> step.from_noise(torch.tensor([[[0.5, -2.0, 0.0]]]))  # the first noise of the state decides: Phi(-2) < 0.25
+    tensor([[[0.5000, 1.0000, 0.0000]]])
+    """
+
+    mean: Tensor
+    pose_std: Tensor
+    probs: Tensor
+    random: Tensor
+
+    @property
+    def std(self) -> Tensor:
+        """(N, P + K) standard deviation; 0 for the entries of the state."""
+        return F.pad(self.pose_std, (0, self.probs.shape[-1] - 1))
+
+    @property
+    def entries(self) -> int:
+        """Random pose entries and states of a scene."""
+        return int((self.pose_std > 0).sum() + self.random.sum())
+
+    def from_noise(self, noise: Tensor) -> Tensor:
+        """Poses shifted and scaled; states by inverting their distribution function at Phi of one noise entry."""
+        pose = self.mean.shape[-1]
+        uniform = torch.special.ndtr(noise[..., pose : pose + 1].double())
+        cumulative = self.probs.double().cumsum(dim=-1)
+        drawn = (cumulative < uniform * cumulative[..., -1:]).sum(dim=-1).clamp(max=self.probs.shape[-1] - 1)
+        state = torch.where(self.random, drawn, self.probs.argmax(dim=-1))
+        return torch.cat([self.mean + self.pose_std * noise[..., :pose], one_hot_state(state, self.probs)], dim=-1)
+
+    def log_prob(self, x: Tensor) -> Tensor:
+        """(B, N) nats: the log-density of the pose plus the log-probability of the state."""
+        pose = self.mean.shape[-1]
+        continuous = gaussian_log_prob(x[..., :pose], self.mean, self.pose_std)
+        state = state_of(x[..., pose:])
+        discrete = self.probs.gather(-1, state.unsqueeze(-1)).squeeze(-1).clamp(min=_TINY).log()
+        return continuous + torch.where(self.random, discrete, torch.zeros_like(discrete))
+
+
+def one_hot_state(state: Tensor, probs: Tensor) -> Tensor:
+    """(..., K) one-hot rows of states (...) in 0..K, with all zeros for the mask token K; dtype of ``probs``."""
+    return F.one_hot(state, probs.shape[-1])[..., :-1].to(probs.dtype)
+
+
+def state_of(one_hot: Tensor) -> Tensor:
+    """(...) int64 states of one-hot rows (..., K): the largest entry, or the mask token K where none is above 1/2."""
+    value, index = one_hot.max(dim=-1)
+    return torch.where(value > 0.5, index, torch.full_like(index, one_hot.shape[-1]))
+
+
+def concatenate_steps(parts: Sequence[ReverseStep]) -> ReverseStep:
+    """One step of several batches of the same chain at the same level."""
+    first = parts[0]
+    if len(parts) == 1:
+        return first
+    if isinstance(first, GaussianStep):
+        return GaussianStep(torch.cat([part.mean for part in parts if isinstance(part, GaussianStep)]), first.std)
+    if isinstance(first, MixedStep):
+        mixed = [part for part in parts if isinstance(part, MixedStep)]
+        mean, probs = (torch.cat([getattr(part, name) for part in mixed]) for name in ("mean", "probs"))
+        return MixedStep(mean, first.pose_std, probs, first.random)
+    raise TypeError(f"cannot concatenate steps of type {type(first).__name__}")

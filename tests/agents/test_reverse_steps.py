@@ -1,0 +1,62 @@
+"""Reverse steps: noise gives the distribution whose log-probability they state."""
+
+from __future__ import annotations
+
+import torch
+from torch.distributions import Categorical, Normal
+
+from agents.diffusion import GaussianStep, MixedStep, concatenate_steps
+from agents.diffusion.reverse_steps import one_hot_state, state_of
+
+
+def _mixed(batch: int = 1, slots: int = 2) -> MixedStep:
+    generator = torch.Generator().manual_seed(0)
+    probs = torch.rand(batch, slots, 4, generator=generator).softmax(dim=-1)
+    mean = torch.randn(batch, slots, 3, generator=generator)
+    return MixedStep(mean, torch.rand(slots, 3, generator=generator) + 0.1, probs, torch.ones(slots, dtype=torch.bool))
+
+
+def test_normal_noise_draws_the_stated_distribution() -> None:
+    step = _mixed()
+    wide = MixedStep(*(part.expand(20_000, -1, -1) if part.ndim == 3 else part for part in step))
+    x = wide.from_noise(torch.randn(20_000, 2, 6, generator=torch.Generator().manual_seed(1)))
+    torch.testing.assert_close(x[..., :3].mean(dim=0), step.mean[0], atol=0.03, rtol=0)
+    torch.testing.assert_close(x[..., :3].std(dim=0), step.pose_std, atol=0.02, rtol=0.02)
+    shares = torch.stack([(state_of(x[..., 3:]) == state).float().mean(dim=0) for state in range(4)], dim=-1)
+    torch.testing.assert_close(shares, step.probs[0], atol=0.015, rtol=0)
+
+
+def test_log_probabilities_are_those_of_torch_distributions() -> None:
+    step = _mixed(5)
+    x = step.from_noise(torch.randn(5, 2, 6, generator=torch.Generator().manual_seed(2)))
+    expected = Normal(step.mean, step.pose_std).log_prob(x[..., :3]).sum(-1)
+    expected = expected + Categorical(step.probs).log_prob(state_of(x[..., 3:]))
+    torch.testing.assert_close(step.log_prob(x), expected)
+    assert step.entries == 2 * 3 + 2
+    assert step.std.shape == (2, 6)
+
+
+def test_certain_states_take_the_likeliest_and_carry_no_probability() -> None:
+    step = _mixed(3)._replace(pose_std=torch.zeros(2, 3), random=torch.zeros(2, dtype=torch.bool))
+    x = step.from_noise(torch.randn(3, 2, 6))
+    assert (state_of(x[..., 3:]) == step.probs.argmax(dim=-1)).all()
+    assert (step.log_prob(x) == 0).all()
+    assert step.entries == 0
+
+
+def test_the_mask_token_is_all_zeros_and_comes_back() -> None:
+    states = torch.tensor([[0, 3], [2, 1]])
+    one_hot = one_hot_state(states, torch.zeros(2, 2, 4))
+    assert one_hot[0, 1].tolist() == [0.0, 0.0, 0.0]
+    assert (state_of(one_hot) == states).all()
+
+
+def test_steps_of_parts_are_the_step_of_the_whole() -> None:
+    whole = _mixed(5)
+    parts = [MixedStep(whole.mean[a:b], whole.pose_std, whole.probs[a:b], whole.random) for a, b in ((0, 2), (2, 5))]
+    together = concatenate_steps(parts)
+    noise = torch.randn(5, 2, 6)
+    assert (together.from_noise(noise) == whole.from_noise(noise)).all()
+    gaussian = GaussianStep(torch.randn(4, 2, 3), torch.rand(2, 3))
+    halves = [GaussianStep(gaussian.mean[:2], gaussian.std), GaussianStep(gaussian.mean[2:], gaussian.std)]
+    assert (concatenate_steps(halves).from_noise(noise[:4, :, :3]) == gaussian.from_noise(noise[:4, :, :3])).all()
