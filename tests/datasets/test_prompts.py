@@ -160,6 +160,14 @@ def test_two_alike_are_told_apart_by_their_order() -> None:
     assert not {clause for clause in clauses if "in the bowl" in clause or "in the first bowl from the left" in clause}
 
 
+def test_orders_are_not_repeated_as_relations() -> None:
+    """Of two cups side by side there is nothing to say but that they are next to each other."""
+    cups = build("dimsum_table", [("teacup", (0.0, -0.05, 0.0)), ("teacup", (0.0, 0.05, 0.0))])
+    texts = [describe(cups, np.random.default_rng(seed), kinds=["relations"])[0] for seed in range(40)]
+    assert any("next to" in text for text in texts)
+    assert not any("left of" in text or "right of" in text for text in texts)
+
+
 def test_no_prompts_for_no_scenes() -> None:
     empty = SceneBatch.empty("dimsum_table", 0)
     assert scene_facts(empty) == describe(empty, np.random.default_rng(0)) == []

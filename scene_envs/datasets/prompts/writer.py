@@ -35,7 +35,7 @@ KINDS = ("count", "names", "relations")
 
 _MOST_NAMES = 10
 """Names in one prompt at most."""
-_MOST_RELATIONS = 4
+_MOST_RELATIONS = 3
 """Relations in one prompt at most."""
 _TRIES = 8
 """Draws for each relation, and for a prompt that differs from the others of its scene."""
@@ -115,7 +115,7 @@ class _Writer:
         return chosen if set(free) & set(chosen) or not free else [*chosen[1:], self._pick(free)]
 
     def _relations(self) -> list[Claim]:
-        """Up to four relations of families drawn with equal chances, each true under every tolerance."""
+        """Up to three relations of families drawn with equal chances, each true under every tolerance."""
         families: list[Callable[[], Claim | None]] = []
         families += [self._pair] if self._pairs else []
         families += [self._hold] if self._holds else []
@@ -209,7 +209,8 @@ class _Writer:
         landmark = self._refer(second) if subject is not None else None
         if subject is None or landmark is None:
             return None
-        return SideClaim(subject, self._pick(sides), landmark)
+        claim = SideClaim(subject, self._pick(sides), landmark)
+        return None if _goes_without_saying(claim) else claim
 
     def _is_side(self, side: Side, first: int, second: int) -> bool:
         if side == "next":
@@ -222,3 +223,9 @@ class _Writer:
 
     def _pick(self, items: Sequence[_T]) -> _T:
         return items[int(self.rng.integers(len(items)))]
+
+
+def _goes_without_saying(claim: SideClaim) -> bool:
+    """Whether it repeats an order, as in "the first cup from the left is to the left of the second from the left"."""
+    words = {claim.subject.edge, claim.side, claim.landmark.edge}
+    return claim.subject.name == claim.landmark.name and (words <= {"left", "right"} or words <= {"front", "back"})
