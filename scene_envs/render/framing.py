@@ -64,11 +64,11 @@ def frame_scene_type(scene_type: SceneType) -> Framing:
         if side is None:
             return Framing(points, _direction(_across(extent), 52.0), _direction(_across(extent) - 85.0, 62.0), ground)
         facing = float(np.degrees(np.arctan2(side[1], side[0])))
-        return Framing(points, _direction(facing - 30.0, 15.0), _direction(facing - 62.0, 36.0), ground)
+        return Framing(points, _direction(facing - 30.0, 15.0), _direction(facing + 12.0, 30.0), ground)
     flatness = float(np.clip(2.0 - extent[2] / (0.18 * extent[:2].max()), 0.0, 1.0))  # 0: a table, 1: a room
     azimuth, elevation = _across(extent) * (1.0 - flatness) - 24.0 * flatness, 37.0 + 10.0 * flatness
     upper = vertices[vertices[:, 2] >= low[2] - 0.05 * extent[:2].max()]
-    height = min(0.5 * extent[:2].min(), 0.75 * extent[2])
+    height = min(0.6 * extent[:2].min(), 0.75 * extent[2])
     filled = _footprint(low, high, 0.7, low[2] + height)
     base = upper if len(upper) else _footprint(low, high, 1.0, low[2])
     points = np.concatenate([base, filled])

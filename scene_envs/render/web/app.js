@@ -231,7 +231,7 @@ function makeStrip() {
     tile.getContext("2d").putImageData(renderer.snapshot(view, plain, tile.width, tile.height), 0, 0);
     renderer.setObjects(scenes[state.scene], state.hidden);
     document.body.dataset.thumbnails = String(Number(document.body.dataset.thumbnails || 0) + 1);
-    if (due.length) requestAnimationFrame(paint);
+    if (due.length) setTimeout(paint, 10);
     else redraw();
   };
   const watcher = new IntersectionObserver((entries) => {
@@ -240,7 +240,7 @@ function makeStrip() {
       watcher.unobserve(entry.target);
       if (renderer) due.push(entry.target);
     }
-    if (idle && due.length) requestAnimationFrame(paint);
+    if (idle && due.length) setTimeout(paint, 10);
   }, { root: element("strip"), rootMargin: "200px" });
   scenes.forEach((_, index) => {
     const tile = document.createElement("canvas");

@@ -180,7 +180,7 @@ function listen() {
   element("next").addEventListener("click", () => showScene(state.scene + 1));
   element("slider").addEventListener("input", (event) => showScene(Number(event.target.value)));
   window.addEventListener("hashchange", readAddress);
-  new ResizeObserver(redraw).observe(canvas);
+  new ResizeObserver(() => renderer && draw()).observe(canvas); // at once: a stretched image is never shown
   canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
   canvas.addEventListener("webglcontextrestored", () => window.location.reload());
 }
