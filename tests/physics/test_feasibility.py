@@ -13,7 +13,7 @@ from simple_scenes import SIDE, TYPE, scene, turned
 
 from scene_envs.errors import MissingDependencyError
 from scene_envs.grammars import get_grammar
-from scene_envs.physics import equilibrium, feasibility, make_ready, penetration, settle
+from scene_envs.physics import equilibrium, feasibility, make_ready, penetration, project, settle
 from scene_envs.physics.motion import Physics, physics_of
 from scene_envs.physics.placement import Objects
 from scene_envs.physics.rest import Rest
@@ -192,3 +192,25 @@ def test_without_pybullet_only_settling_is_missing(monkeypatch: pytest.MonkeyPat
     with pytest.raises(MissingDependencyError, match="pip install pybullet"):
         World(physics.library)
     assert penetration(scene(*tower(2))).valid.tolist() == [True]
+
+
+@pytest.mark.parametrize("name", ["breakfast_table_high_clutter", "dimsum_table", "pantry_shelf"])
+def test_projection_before_simulation_keeps_objects_closer_to_what_was_asked(name: str) -> None:
+    """Scenes moved by 1 cm along every axis: simulation alone throws overlapping objects apart.
+
+    Projection and simulation together move them less than half as far (at most 0.3 m counted per object), and more
+    of them are ready.
+    """
+    clean = get_grammar(name).sample(np.random.default_rng(4), 2)
+    noise = 0.01 * torch.randn(clean.translations.shape, generator=torch.Generator().manual_seed(1))
+    given = clean.with_poses(clean.translations + noise * clean.is_free.unsqueeze(-1), clean.rotations)
+
+    def mean_way(after: SceneBatch) -> float:
+        way = (after.translations - given.translations).norm(dim=-1)[given.is_free]
+        return float(way.clamp(max=0.3).mean())
+
+    alone, both = settle(given, duration=1.0).batch, settle(project(given).batch, duration=1.0).batch
+    assert mean_way(both) < 0.5 * mean_way(alone)
+    ready_alone = feasibility(alone).feasible & alone.in_workspace
+    ready_both = feasibility(both).feasible & both.in_workspace
+    assert int(ready_both.sum()) > int(ready_alone.sum())
