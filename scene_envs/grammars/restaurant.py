@@ -6,7 +6,7 @@ Probabilities follow the scene grammar of the paper's dataset (Pfaff et al., CoR
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from scene_envs.grammars import dimsum_table as dimsum
 from scene_envs.grammars.dsl import Cluster, Geometric, Group, Object, OneOf, Repeat, Stack
@@ -19,31 +19,42 @@ from scene_envs.grammars.wishes import Gaussian, Line, Uniform, Yaw
 FLOOR = -0.785
 """z of the floor (m); table tops are at 0."""
 ROOM = Region(4.9, 4.9)
-KEEP_OUT = {"cafe_table": 0.64}
+KEEP_OUT = {"cafe_table": 0.72, "chair": 0.35}
+"""Circles (m) that two things on the floor never share, so that people can pass."""
 TABLES = Uniform(2.75, 3.0, x=0.25)
 WALL = Line((-4.75, -3.0), (-4.75, 3.0))
 
 
 def chairs() -> Node:
-    """Four chairs around a table, each facing it."""
-    return Group(
-        *(
-            Cluster(
-                Object("chair", Gaussian(1.1, 0.0, along=0.07, across=0.17), Yaw(0.14, (math.pi,))),
-                Gaussian(along=0.0),
-                Yaw(0.0, (quarter * math.pi / 2,)),
-            )
-            for quarter in range(4)
-        )
-    )
+    """Four chairs around a table, each facing it, in the frame of the table."""
+    chair = Object("chair", Gaussian(1.1, 0.0, along=0.07, across=0.17), Yaw(0.14, (math.pi,)))
+    center = Gaussian(along=0.0)
+    return Group(*(Cluster(chair, center, Yaw(0.0, (quarter * math.pi / 2,))) for quarter in range(4)))
 
 
-def laid(stacks: Geometric, another: float, lid: float, nothing: float, setting: float, empty: float) -> Node:
-    """A table with its chairs and what is on it."""
+def laid(
+    stacks: Geometric,
+    another: float,
+    lid: float,
+    nothing: float,
+    setting: float,
+    empty: float,
+    dishes: float = 0.6,
+    teapots: float = 0.9,
+) -> Node:
+    """A table with its chairs, places, stacks of steamers, dishes and teapots.
+
+    Args:
+        stacks: how many stacks of steamers.
+        another, lid, nothing: weights of what comes after each steamer.
+        setting, empty: weights of a plate with a cup, and of nothing, on each side of the table; a plate alone and
+            a cup alone have 0.05 each.
+        dishes, teapots: chances that there are one or two of them.
+    """
     then = {"steamer_bottom": another, "steamer_lid": lid, None: nothing}
     steamers = Repeat(Stack("steamer_bottom", then, step=dimsum.STEP, where=Gaussian(along=0.158), at_most=10), stacks)
     top = Surface(
-        [dimsum.places(setting, 0.05, 0.05, empty), dimsum.dishes(0.6), steamers, dimsum.teapots(0.9)],
+        [dimsum.places(setting, 0.05, 0.05, empty), dimsum.dishes(dishes), steamers, dimsum.teapots(teapots)],
         Region(0.475, 0.475, radius=0.625),
         keep_out=dimsum.KEEP_OUT,
         footprint=dimsum.FOOTPRINT,
@@ -52,21 +63,23 @@ def laid(stacks: Geometric, another: float, lid: float, nothing: float, setting:
     return Object("cafe_table", TABLES, on=[top], beside=chairs())
 
 
+def tables(numbers: Mapping[int, float], table: Node) -> Node:
+    """So many tables, by weight; on one of them stands a stack of at least three."""
+    conditions = {"no stack of 3": stack_of_three}
+    return OneOf(*((weight, Repeat(table, Geometric(1.0, n, n), conditions)) for n, weight in numbers.items()))
+
+
+def stack_of_three(towers: Sequence[Tower]) -> bool:
+    """Whether a stack of at least three steamers, lid included, stands somewhere."""
+    parts = (part for tower in towers for part in tower.walk())
+    return any(len(part.assets) >= 3 and part.assets[0] == "steamer_bottom" for part in parts)
+
+
 def shelves(count: Geometric) -> Node:
     """Shelves along the wall, filled like those of a living room, open to the room."""
     return Repeat(Object("shelf", WALL, Yaw(0.0), on=tiers(inner_tier(), top_tier())), count)
 
 
-def exactly(*weights: tuple[float, int], table: Node) -> Node:
-    """So many tables, by weight."""
-    return OneOf(*((weight, Group(*[table] * count)) for weight, count in weights))
-
-
 def floor(*children: Node) -> Surface:
-    """The floor with tables first, then shelves."""
+    """The floor, with what stands on it in this order."""
     return Surface(children, ROOM, keep_out=KEEP_OUT, height=FLOOR, layouts=30)
-
-
-def stack_of_three(towers: Sequence[Tower]) -> bool:
-    """Whether a stack of at least three steamers stands somewhere."""
-    return any(len(tower.assets) >= 3 and tower.assets[0] == "steamer_bottom" for tower in towers)
