@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 SIDES = ("left", "right", "front", "back")
 """Directions of the viewer. Front is toward the viewer, or toward the lower edge of a view from above."""
 
-_CHUNK = 64
+_CHUNK = 32
 """Scenes that are worked on together."""
 _FURNITURE = 0.5
 """Things at least this high (m) are furniture."""

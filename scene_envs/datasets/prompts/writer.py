@@ -166,8 +166,10 @@ class _Writer:
             pairs[name, inside, self.scene.names[lower]] += number
         return pairs
 
-    def _pair(self) -> Claim:
+    def _pair(self) -> Claim | None:
         name, inside, under = self._pick(sorted(self._pairs))
+        if self.scene.objects[under] == 1:
+            return None  # "in the bowl" rather than "in a bowl"
         return PairCount(name, self._pairs[name, inside, under], inside, under)
 
     def _hold(self) -> Claim | None:
