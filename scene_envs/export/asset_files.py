@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,7 @@ class AssetFiles:
         self.package = package
         self._names = identifiers(asset.name for asset in assets)
         self._done: dict[tuple[str, str], Any] = {}
+        self._textured: dict[str, trimesh.Trimesh] = {}
 
     def name(self, asset: Asset) -> str:
         """The asset's name as an identifier, which is also that of its folder."""
@@ -62,6 +64,12 @@ class AssetFiles:
         """``visual.obj`` with normals, its colours in ``visual.png``; one material, ``visual.mtl``."""
         path: Path = self.once(asset, "visual", lambda folder: _write_visual(visual_mesh(asset), folder))
         return path
+
+    def textured(self, asset: Asset) -> trimesh.Trimesh:
+        """The mesh with its palette in memory, for formats that embed meshes; writes nothing."""
+        if asset.name not in self._textured:
+            self._textured[asset.name] = textured_mesh(asset)
+        return self._textured[asset.name]
 
     def parts(self, asset: Asset) -> list[Path]:
         """``part_00.obj`` …, the fine convex parts."""
@@ -91,6 +99,53 @@ def visual_mesh(asset: Asset) -> trimesh.Trimesh:
     assert isinstance(joined, trimesh.Trimesh)
     joined.visual = trimesh.visual.ColorVisuals(joined, vertex_colors=np.array([*asset.color, 255], dtype=np.uint8))
     return joined
+
+
+@dataclass(frozen=True, eq=False)
+class Palette:
+    """The colours of a mesh as a texture with one cell per colour.
+
+    Attributes:
+        image: (H, W, 3) the texture.
+        uv: (K, 2) middle of each cell, v upward.
+        cells: (F,) cell of each face.
+    """
+
+    image: NDArray[np.uint8]
+    uv: Array
+    cells: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, mesh: trimesh.Trimesh) -> Palette:
+        """At most 1024 colours; more are rounded."""
+        colors, cells = np.unique(_few_colors(face_colors(mesh)), axis=0, return_inverse=True)
+        side = int(np.ceil(np.sqrt(len(colors))))
+        pixels = np.zeros((side * side, 3), dtype=np.uint8)
+        pixels[: len(colors)] = colors
+        image = pixels.reshape(side, side, 3).repeat(_CELL, axis=0).repeat(_CELL, axis=1)
+        index = np.arange(len(colors))
+        uv = np.stack([(index % side + 0.5) / side, 1.0 - (index // side + 0.5) / side], axis=1)
+        return cls(image, uv, cells.ravel())
+
+
+def textured_mesh(asset: Asset) -> trimesh.Trimesh:
+    """The asset's mesh with a palette texture on a matt material; corners of several colours are split."""
+    from PIL import Image
+
+    mesh = visual_mesh(asset)
+    palette = Palette.of(mesh)
+    corners = np.stack([mesh.faces, np.repeat(palette.cells[:, None], 3, axis=1)], axis=-1).reshape(-1, 2)
+    unique, faces = np.unique(corners, axis=0, return_inverse=True)
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=Image.fromarray(palette.image), metallicFactor=0.0, roughnessFactor=0.7
+    )
+    return trimesh.Trimesh(
+        mesh.vertices[unique[:, 0]],
+        faces.reshape(-1, 3),
+        vertex_normals=mesh.vertex_normals[unique[:, 0]],
+        visual=trimesh.visual.TextureVisuals(uv=palette.uv[unique[:, 1]], material=material),
+        process=False,
+    )
 
 
 def face_colors(mesh: trimesh.Trimesh) -> NDArray[np.uint8]:
@@ -123,20 +178,14 @@ def _write_visual(mesh: trimesh.Trimesh, folder: Path) -> Path:
     """The mesh with one texture cell per colour: most loaders read textures, and few read colours of vertices."""
     from PIL import Image
 
-    palette, cell = np.unique(_few_colors(face_colors(mesh)), axis=0, return_inverse=True)
-    side = int(np.ceil(np.sqrt(len(palette))))
-    pixels = np.zeros((side * side, 3), dtype=np.uint8)
-    pixels[: len(palette)] = palette
-    image = pixels.reshape(side, side, 3).repeat(_CELL, axis=0).repeat(_CELL, axis=1)
-    Image.fromarray(image).save(folder / "visual.png")
+    palette = Palette.of(mesh)
+    Image.fromarray(palette.image).save(folder / "visual.png")
     (folder / "visual.mtl").write_text("newmtl palette\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nmap_Kd visual.png\n")
-    index = np.arange(len(palette))
-    u, v = (index % side + 0.5) / side, 1.0 - (index // side + 0.5) / side
     lines = ["mtllib visual.mtl", "usemtl palette"]
     lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in (mesh.vertices + 0.0).tolist()]
     lines += [f"vn {x:.5g} {y:.5g} {z:.5g}" for x, y, z in (mesh.vertex_normals + 0.0).tolist()]
-    lines += [f"vt {x:.9g} {y:.9g}" for x, y in zip(u.tolist(), v.tolist(), strict=True)]
-    for (a, b, c), t in zip((mesh.faces + 1).tolist(), (cell.ravel() + 1).tolist(), strict=True):
+    lines += [f"vt {u:.9g} {v:.9g}" for u, v in palette.uv.tolist()]
+    for (a, b, c), t in zip((mesh.faces + 1).tolist(), (palette.cells + 1).tolist(), strict=True):
         lines.append(f"f {a}/{t}/{a} {b}/{t}/{b} {c}/{t}/{c}")
     path = folder / "visual.obj"
     path.write_text("\n".join(lines) + "\n")

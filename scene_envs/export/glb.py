@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from trimesh.exchange.gltf import export_glb
 
-from scene_envs.export.asset_files import AssetFiles, visual_mesh
+from scene_envs.export.asset_files import AssetFiles
 from scene_envs.export.placed import PlacedScene
 
 Y_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -20,7 +20,7 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     graph = trimesh.Scene(base_frame="world")
     graph.graph.update("z_up", "world", matrix=Y_UP)
     for asset in scene.assets:
-        graph.geometry[files.name(asset)] = visual_mesh(asset)
+        graph.geometry[files.name(asset)] = files.textured(asset)
     for thing in scene.objects:
         graph.graph.update(thing.name, "z_up", matrix=thing.matrix, geometry=files.name(thing.asset))
     path = folder / "scene.glb"

@@ -6,6 +6,7 @@ import importlib.util
 import json
 import re
 import sys
+from dataclasses import replace
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -13,11 +14,13 @@ import pytest
 import torch
 import trimesh
 from export_scenes import DIMSUM, laid_scene
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from scene_envs.errors import InvalidInputError, MissingDependencyError, UnknownNameError
-from scene_envs.export import AssetFiles, export, formats, get_format, list_formats, place, register_format
-from scene_envs.export.placed import angle_axis, exact_rotations, quaternion
+from scene_envs.export import AssetFiles, export, formats, get_format, list_formats, register_format
+from scene_envs.export.asset_files import Palette, face_colors, textured_mesh, visual_mesh
+from scene_envs.export.placed import angle_axis, exact_rotations, identifiers, quaternion
 from scene_envs.physics.geometry import PartGeometry
 from scene_envs.scene import SceneBatch
 
@@ -134,14 +137,15 @@ def test_the_report_says_what_was_written(tmp_path):
 
 
 def test_formats_can_be_added_and_the_same_call_changes_nothing(tmp_path):
+    added = ["drake", "mjcf", "sdf"]
     (tmp_path / "notes.txt").write_text("mine")
     export(laid_scene(), tmp_path, "mjcf")
-    export(laid_scene(), tmp_path, TEXT)
+    export(laid_scene(), tmp_path, added)
     before = content(tmp_path)
-    export(laid_scene(), tmp_path, TEXT)
+    export(laid_scene(), tmp_path, added)
     assert content(tmp_path) == before
     assert before["notes.txt"] == b"mine"
-    assert json.loads(before["export.json"])["formats"] == sorted(TEXT)
+    assert json.loads(before["export.json"])["formats"] == added
 
 
 def test_an_interrupted_export_goes_on(tmp_path, monkeypatch):
@@ -240,10 +244,39 @@ def test_an_installed_package_can_offer_a_format(tmp_path, monkeypatch):
     assert export(laid_scene(), tmp_path, "their_arrays").scenes[0]["their_arrays"].name == "scene.npz"
 
 
-def test_single_precision_rotations_and_names_survive_odd_asset_names():
-    from scene_envs.export.placed import identifiers
-
+def test_odd_asset_names_become_identifiers_of_their_own():
     names = identifiers(["tea cup", "tea-cup", "tea_cup", "3d.part", ""])
     assert len(set(names.values())) == 5
     assert all(name.isidentifier() for name in names.values())
-    assert place(laid_scene())[0].objects[1].rotation.dtype == np.float64
+
+
+# -- other people's meshes ---------------------------------------------------------------------------
+
+
+def odd_asset(visual):
+    part = DIMSUM.library["serving_dish"].fine[0]
+    return replace(DIMSUM.library["serving_dish"], visual=visual, fine=(part,), coarse=(part,), color=(10, 200, 30))
+
+
+def test_an_asset_without_a_mesh_shows_its_parts_in_the_class_colour():
+    mesh = visual_mesh(odd_asset(None))
+    np.testing.assert_allclose(mesh.bounds, odd_asset(None).bounds)
+    assert {tuple(rgb) for rgb in face_colors(mesh).tolist()} == {(10, 200, 30)}
+
+
+def test_textures_become_colours_and_photographs_few_enough_of_them():
+    box = trimesh.creation.box()
+    image = Image.fromarray(np.array([[[255, 0, 0], [0, 0, 255]]], dtype=np.uint8))
+    uv = np.column_stack([np.full(len(box.vertices), 0.9), np.full(len(box.vertices), 0.5)])
+    box.visual = trimesh.visual.TextureVisuals(uv=uv, image=image)
+    assert {tuple(rgb) for rgb in face_colors(box).tolist()} == {(0, 0, 255)}
+    ball = trimesh.creation.icosphere(subdivisions=5)
+    colors = np.random.default_rng(0).integers(0, 256, (len(ball.faces), 4)).astype(np.uint8)
+    ball.visual = trimesh.visual.ColorVisuals(ball, face_colors=colors)
+    palette = Palette.of(ball)
+    assert len(palette.uv) <= 1024
+    rows = ((1.0 - palette.uv[palette.cells, 1]) * len(palette.image)).astype(int)
+    shown = palette.image[rows, (palette.uv[palette.cells, 0] * palette.image.shape[1]).astype(int)]
+    assert np.abs(shown.astype(int) - colors[:, :3]).max() <= 16
+    textured = textured_mesh(odd_asset(ball))
+    np.testing.assert_allclose(textured.triangles, ball.triangles)
