@@ -6,12 +6,11 @@ import base64
 import html
 import json
 import re
-import shutil
-import subprocess
 
 import numpy as np
 import pytest
 import torch
+from browser import CHROMIUM, Browser
 
 from scene_envs.errors import InvalidInputError
 from scene_envs.render import write_viewer
@@ -21,8 +20,6 @@ from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import Camera, get_scene_type
 
 DIMSUM = get_scene_type("dimsum_table")
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
 
 
 def scenes(count=3):
@@ -110,92 +107,48 @@ def test_wrong_arguments_are_named(tmp_path):
 
 # -- in a browser --------------------------------------------------------------------------------------------------
 
-_DRIVER = """
-<script>
-const wait = () => new Promise((done) => setTimeout(done, 20));
-const press = (key) => document.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true }));
-const seen = () => {
+_SEEN = """(() => {
   const [width, height] = sceneViewer.size();
   const sums = {};
   sceneViewer.slots().forEach((slot, k) => {
     const sum = (sums[slot] = sums[slot] || [0, 0, 0]);
     sum[0] += 1; sum[1] += k % width; sum[2] += height - 1 - Math.floor(k / width);
   });
-  return { width, height, sums, camera: sceneViewer.camera() };
-};
-(async () => {
-  while (document.body.dataset.state === "loading") await wait();
-  const result = {};
-  const note = async (name) => {
-    await wait();
-    if (document.body.dataset.state === "ready") sceneViewer.draw();
-    result[name] = { ...document.body.dataset };
-  };
-  try { await (async () => { STEPS })(); } catch (problem) { result.problem = String(problem); }
-  document.body.dataset.result = JSON.stringify(result);
-})();
-</script>
-"""
+  return { width, height, sums };
+})()"""
+"""Per slot that is seen: pixels, sum of their columns, sum of their rows."""
 
 
-def drive(page, steps, *, address="", flags=(), tmp_path):
-    """Open ``page`` in a headless browser, run ``steps`` (JavaScript) there: the DOM, what they noted, the screen."""
-    copy = tmp_path / "driven.html"
-    copy.write_text(page.read_text().replace("</body>", _DRIVER.replace("STEPS", steps) + "</body>"))
-    picture = tmp_path / "screen.png"
-    command = [
-        CHROMIUM, "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader",
-        "--enable-unsafe-swiftshader", "--hide-scrollbars", "--window-size=700,560", "--virtual-time-budget=20000",
-        f"--user-data-dir={tmp_path / 'profile'}", f"--screenshot={picture}", "--dump-dom", *flags,
-        f"file://{copy}{address}",
-    ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    noted = re.search(r'data-result="(.*?)"', done.stdout)
-    assert noted, (
-        f"the page did not get through the steps: {re.findall('<body.*?>', done.stdout)}\n{done.stderr[-1500:]}"
-    )
-    result = json.loads(html.unescape(noted[1]))
-    assert "problem" not in result, result["problem"]
-    return done.stdout, result, picture
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    if CHROMIUM is None:
+        pytest.skip("no Chromium is installed")
+    browser = Browser(tmp_path_factory.mktemp("profile"))
+    yield browser
+    browser.close()
 
 
-@needs_browser
-def test_a_browser_draws_the_objects_where_they_are(tmp_path):
+def test_a_browser_draws_the_objects_where_they_are(browser, tmp_path):
     """Against the pinhole camera, and pixel by pixel against the software renderer."""
     pytest.importorskip("pybullet")
-    from PIL import Image
-
     batch = scenes()
     page = write_viewer(batch, tmp_path / "viewer.html", title="Three <scenes>")
-    steps = """
-      result.seen = seen();
-      await note("start");
-      press("ArrowLeft"); await note("left");
-      press("ArrowLeft"); press("ArrowLeft"); await note("first");
-      press("p"); press("c"); press("b"); await note("keys");
-      sceneViewer.showScene(99); await note("last");
-    """
-    dom, result, picture = drive(
-        page, steps, address="#scene=2&azimuth=-40&elevation=50&distance=3.5&target=0.1,0,0&select=4", tmp_path=tmp_path
-    )
-    assert 'data-errors="0"' in dom
-    assert "<title>Three &lt;scenes&gt;</title>" in dom
-    start = result["start"]
-    assert (start["state"], start["scenes"], start["scene"], start["selected"]) == ("ready", "3", "2", "4")
-    assert start["drawn"] == start["objects"] == "5"  # the table, the teapot, the plate and two cups
-    assert [result[name]["scene"] for name in ("left", "first", "keys", "last")] == ["1", "0", "0", "2"]
-    assert (result["first"]["drawn"], result["keys"]["background"]) == ("3", "dark")
+    shown = browser.open(page, "#scene=2&azimuth=-40&elevation=50&distance=3.5&target=0.1,0,0&select=4")
+    assert (shown["scenes"], shown["scene"], shown["selected"], shown["errors"]) == ("3", "2", "4", "0")
+    assert shown["drawn"] == shown["objects"] == "5"  # the table, the teapot, the plate and two cups
+    assert browser.run("document.title") == "Three <scenes>"
+    assert browser.exceptions == []
 
-    seen = result["seen"]
+    seen = browser.run(_SEEN)
     width, height = seen["width"], seen["height"]
     a, e = np.radians([-40.0, 50.0])
     toward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-    camera = Camera(tuple(np.array([0.1, 0.0, 0.0]) + 3.5 * toward), (0.1, 0.0, 0.0), (0.0, 0.0, 1.0), fov_y=28.0)
+    target = np.array([0.1, 0.0, 0.0])
+    camera = Camera(tuple(target + 3.5 * toward), tuple(target), (0.0, 0.0, 1.0), fov_y=28.0)
     stage = get_stage(DIMSUM.assets)
+    rotations = torch.where(batch.is_empty[2, :, None, None], torch.eye(3), batch.rotations[2])
     stage.place(
-        batch.translations[2].double().numpy(),
-        matrix_to_quaternion(torch.where(batch.is_empty[2, :, None, None], torch.eye(3), batch.rotations[2])).numpy(),
-        batch.categories[2].numpy(),
+        batch.translations[2].double().numpy(), matrix_to_quaternion(rotations).numpy(), batch.categories[2].numpy()
     )
     slots = stage.look(camera, width, height).slots
     for slot in (-1, 0, 3, 4, 5, 6):
@@ -204,44 +157,108 @@ def test_a_browser_draws_the_objects_where_they_are(tmp_path):
         assert pixels == pytest.approx(len(rows), rel=0.04, abs=12)
         np.testing.assert_allclose([y / pixels, x / pixels], [rows.mean(), columns.mean()], atol=1.0)
     right, focal = np.array([-np.sin(a), np.cos(a), 0.0]), 0.5 * height / np.tan(np.radians(14.0))
-    point = np.array([0.0, 0.3, 0.2]) + np.array([0.0, -0.8, 0.6]) * 0.011 - np.array([0.1, 0.0, 0.0])
-    depth = 3.5 - point @ toward
-    expected = [
-        width / 2 + focal * (point @ right) / depth,
-        height / 2 - focal * (point @ np.cross(toward, right)) / depth,
-    ]
+    point = np.array([0.0, 0.3, 0.2]) + np.array([0.0, -0.8, 0.6]) * 0.011 - target  # the middle of the tilted plate
+    depth, up = 3.5 - point @ toward, np.cross(toward, right)
+    expected = [width / 2 + focal * (point @ right) / depth, height / 2 - focal * (point @ up) / depth]
     pixels, x, y = seen["sums"]["4"]
     np.testing.assert_allclose([x / pixels + 0.5, y / pixels + 0.5], expected, atol=2.5)
 
-    screen = np.asarray(Image.open(picture).convert("RGB")).reshape(-1, 3)
-    assert len(np.unique(screen, axis=0)) > 500
+
+def test_the_screen_shows_a_shaded_picture_and_the_whole_table(browser, tmp_path):
+    from PIL import Image
+
+    browser.open(write_viewer(scenes(1), tmp_path / "viewer.html"))
+    assert browser.run("document.getElementById('scenes').hidden") is True  # one scene needs no strip
+    screen = np.asarray(Image.open(browser.screenshot(tmp_path / "screen.png")).convert("RGB")).astype(int)
+    width, height = browser.run("[canvas.clientWidth, canvas.clientHeight]")
+    picture = screen[:height, :width]
+    assert len(np.unique(picture @ [1 << 16, 1 << 8, 1])) > 1000
+    seen = browser.run(_SEEN)
+    assert set(seen["sums"]) == {"-1", "0", "3", "4"}
+    assert 0.15 < seen["sums"]["0"][0] / (seen["width"] * seen["height"]) < 0.6
+    slots = np.array(browser.run("Array.from(sceneViewer.slots())")).reshape(seen["height"], seen["width"])[::-1]
+    _, columns = np.nonzero(slots == 0)
+    assert 0.01 * seen["width"] < columns.min() < columns.max() < 0.99 * seen["width"]
+    wood = picture[slots == 0].mean(axis=0)
+    assert wood[0] > wood[1] > wood[2]  # brown
 
 
-@needs_browser
-def test_the_first_view_shows_the_whole_support_and_hidden_assets_are_left_out(tmp_path):
-    page = write_viewer(scenes(1), tmp_path / "viewer.html")
-    steps = """
-      result.seen = seen();
-      document.querySelectorAll("#legend li")[1].click(); await note("hidden");
-      result.rows = Array.from(document.querySelectorAll("#legend li"), (row) => row.textContent);
-    """
-    _, result, _ = drive(page, steps, tmp_path=tmp_path)
-    assert result["rows"] == ["plate1", "table1", "teapot1"]
-    assert (result["hidden"]["objects"], result["hidden"]["drawn"]) == ("3", "2")
-    width, height, sums = (result["seen"][name] for name in ("width", "height", "sums"))
-    assert set(sums) == {"-1", "0", "3", "4"}
-    assert 0.15 < sums["0"][0] / (width * height) < 0.6
+def test_keys_and_the_list_change_what_is_drawn(browser, tmp_path):
+    browser.open(write_viewer(scenes(3), tmp_path / "viewer.html"))
+    visited = []
+    for key in ("ArrowRight", "ArrowRight", "ArrowRight", "ArrowLeft", "Home", "End"):
+        browser.press(key)
+        visited.append(int(browser.shown()["scene"]))
+    assert visited == [1, 2, 2, 1, 0, 2]
+    browser.press("b")
+    assert browser.shown()["background"] == "dark"
+    before = browser.run(_SEEN)["sums"]
+    browser.press("p")
+    browser.press("c")
+    assert browser.run("[sceneViewer.state.shape, sceneViewer.state.colors]") == ["fine", "classes"]
+    after = browser.run(_SEEN)["sums"]
+    for slot in before:  # the convex parts fill nearly the same pixels
+        assert after[slot][0] == pytest.approx(before[slot][0], rel=0.1, abs=20)
+    browser.run("document.querySelectorAll('#legend li')[0].click()")  # the cups
+    shown = browser.shown()
+    assert (shown["objects"], shown["drawn"], shown["errors"]) == ("5", "3", "0")
+    rows = browser.run("Array.from(document.querySelectorAll('#legend li'), (row) => row.textContent)")
+    assert rows == ["cup2", "plate1", "table1", "teapot1"]
+    browser.run("document.querySelectorAll('#strip canvas')[1].click()")
+    assert browser.shown()["scene"] == "1"
+    browser.wait_for("location.hash.includes('scene=1')")
 
 
-@needs_browser
+def test_mouse_and_touch_move_the_camera_and_choose_objects(browser, tmp_path):
+    browser.open(write_viewer(scenes(1), tmp_path / "viewer.html"), "#azimuth=0&elevation=60&distance=3&target=0,0,0")
+    left, top = 120.0, 150.0
+    browser.drag((left, top), (left + 50, top))
+    browser.drag((left, top), (left, top + 25))
+    camera = browser.run("sceneViewer.camera()")
+    assert (camera["azimuth"], camera["elevation"]) == pytest.approx((-20.0, 70.0))
+    browser.mouse("Wheel", left, top, deltaX=0, deltaY=-100)
+    nearer = browser.run("sceneViewer.camera()")
+    assert nearer["distance"] < 0.95 * camera["distance"]
+    browser.touch((100, 150), (200, 150), kind="Start")
+    browser.touch((50, 150), (250, 150))
+    browser.touch(kind="End")
+    assert browser.run("sceneViewer.camera()")["distance"] == pytest.approx(0.5 * nearer["distance"], rel=0.02)
+    browser.press("r")
+    assert browser.run("sceneViewer.camera()")["elevation"] == pytest.approx(37.0)
+
+    seen = browser.run(_SEEN)
+    pixels, x, y = seen["sums"]["3"]  # the teapot
+    place = (x / pixels, y / pixels)
+    browser.drag(place, place)
+    assert browser.shown()["selected"] == "3"
+    facts = browser.run("document.getElementById('object-facts').textContent")
+    assert "0.1000, -0.3500, 0.0000 m" in facts
+    assert "0.0, 0.0, 40.1°" in facts  # a yaw of 0.7 rad
+    browser.mouse("Moved", *place)
+    browser.wait_for("document.getElementById('tooltip').textContent === 'teapot'")
+    before = np.array(browser.run("sceneViewer.camera().target"))
+    browser.drag((left, top), (left + 30, top), button="right")
+    moved = np.array(browser.run("sceneViewer.camera().target")) - before
+    assert abs(moved[2]) < 1e-9  # sideways only
+    assert np.linalg.norm(moved) > 0.01
+    browser.press("Escape")
+    shown = browser.shown()
+    assert (shown["selected"], shown["errors"]) == ("", "0")
+
+
 def test_without_webgl_the_scene_is_listed(tmp_path):
-    page = write_viewer(scenes(2), tmp_path / "viewer.html")
-    steps = "await note('start'); press('ArrowRight'); await note('next');"
-    dom, result, _ = drive(page, steps, flags=["--disable-3d-apis"], tmp_path=tmp_path)
-    assert result["start"]["state"] == "text"
-    assert result["next"]["scene"] == "1"
-    cells = [re.sub("<.*?>", "", cell) for cell in re.findall(r"<td>.*?</td>", dom)]
-    assert cells[:3] == ["table", "0", "0.0000, 0.0000, 0.0000"]
+    if CHROMIUM is None:
+        pytest.skip("no Chromium is installed")
+    browser = Browser(tmp_path / "profile", "--disable-3d-apis")
+    try:
+        shown = browser.open(write_viewer(scenes(2), tmp_path / "viewer.html"))
+        assert (shown["state"], shown["errors"]) == ("text", "0")
+        browser.press("ArrowRight")
+        assert browser.shown()["scene"] == "1"
+        cells = browser.run("Array.from(document.querySelectorAll('td'), (cell) => cell.textContent)")
+    finally:
+        browser.close()
     assert len(cells) == 4 * 4
+    assert cells[:3] == ["table", "0", "0.0000, 0.0000, 0.0000"]
     assert cells[4:8] == ["teapot", "3", "0.1000, -0.3500, 0.0000", "0.0, 0.0, 40.1"]
     assert cells[8:12] == ["plate", "4", "0.0000, 0.3000, 0.2000", "53.1, 0.0, 0.0"]

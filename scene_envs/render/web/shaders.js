@@ -35,11 +35,11 @@ float sunlight(vec3 point, vec3 normal) {
   if (any(lessThan(at, vec3(0.0))) || any(greaterThan(at, vec3(1.0)))) return 1.0;
   vec2 pixel = 1.0 / vec2(textureSize(sunDepth, 0));
   float light = 0.0;
-  for (int i = 0; i < 20; i++) {
-    float r = sqrt((float(i) + 0.5) / 20.0) * 3.5, a = float(i) * 2.39996;
+  for (int i = 0; i < 12; i++) {
+    float r = sqrt((float(i) + 0.5) / 12.0) * 3.0, a = float(i) * 2.39996;
     light += texture(sunDepth, vec3(at.xy + r * pixel * vec2(cos(a), sin(a)), at.z));
   }
-  return light / 20.0;
+  return light / 12.0;
 }`;
 
 const OBJECT_FRAGMENT = `${HEADER}
@@ -164,8 +164,8 @@ float away(vec2 uv) {
 void main() {  // the noise of the occlusion is averaged out over the pixels of the same surface
   vec2 pixel = 1.0 / vec2(textureSize(depth, 0));
   float here = away(at), sum = 0.0, weights = 0.0;
-  for (int i = -2; i <= 2; i++) for (int j = -2; j <= 2; j++) {
-    vec2 there = at + pixel * vec2(float(i), float(j));
+  for (int i = 0; i < 4; i++) for (int j = 0; j < 4; j++) {
+    vec2 there = at + pixel * (vec2(float(i), float(j)) - 1.5);
     float weight = step(abs(away(there) - here), 0.02 * here) + 1e-4;
     sum += weight * texture(occlusion, there).r;
     weights += weight;
