@@ -59,8 +59,8 @@ def ways_out(
     pair, a, b = pair[near], a[near], b[near]
     offset = objects.translation[second] - objects.translation[first]
     groups = list(grouped_gaps(collider.library, placed.parts, a, b, offset[pair]))
-    down = np.where(objects.fixed[first], -1.0, np.where(objects.fixed[second], 1.0, 0.0))
-    ways = _directions(len(first), pair, groups, offset, down)
+    walk = _walk(objects, first, second, pair, groups, bounds)
+    ways = _directions(len(first), pair, groups, offset, walk)
     lengths = _lengths(len(first), pair, groups, ways)
     costs = lengths * _weights(collider, objects, first, second, ways, lengths, bounds)
     for row, key in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
@@ -73,11 +73,8 @@ def ways_out(
     return ways[line, best] * (lengths[line, best] + CLEARANCE)[:, None]  # type: ignore[no-any-return]
 
 
-def _directions(count: int, pair: Index, groups: list[tuple[Index, Array, Array]], offset: Array, down: Array) -> Array:
-    """(P, D, 3) directions to try: the axes, away from and toward the other's centre, the parts' own, a walk's.
-
-    ``down`` (P,) is the sign of the z of a way that takes the free object of a pair with a fixed one down.
-    """
+def _directions(count: int, pair: Index, groups: list[tuple[Index, Array, Array]], offset: Array, walk: Array) -> Array:
+    """(P, D, 3) directions to try: the axes, away from and toward the other's centre, the parts' own, the walk's."""
     ways = np.zeros((count, 9 + 2 * _OWN, 3))
     ways[:, :6] = _AXES
     level = offset * np.array([1.0, 1.0, 0.0])
@@ -101,21 +98,42 @@ def _directions(count: int, pair: Index, groups: list[tuple[Index, Array, Array]
         rank = np.arange(len(order)) - np.repeat(leading, members)
         top = order[rank < _OWN]
         ways[owner[top], base + rank[rank < _OWN]] = direction[top]
-    walk = _walk(count, pair, groups, down)
     length = np.linalg.norm(walk, axis=1)
     ways[length > 0, -1] = walk[length > 0] / length[length > 0, None]
     return ways
 
 
-def _walk(count: int, pair: Index, groups: list[tuple[Index, Array, Array]], down: Array) -> Array:
-    """(P, 3) m: out of the deepest parts, then out of those that are deepest then, and so on; out of corners."""
-    walk = np.zeros((count, 3))
+def _walk(
+    objects: Objects,
+    first: Index,
+    second: Index,
+    pair: Index,
+    groups: list[tuple[Index, Array, Array]],
+    bounds: tuple[Array, Array],
+) -> Array:
+    """(P, 3) m: out of the deepest parts, then out of those that are deepest then, and so on; out of corners.
+
+    From fixed objects, steps down and steps out of the workspace are avoided.
+    """
+    free = np.where(objects.fixed[first], second, first)
+    sign = np.where(objects.fixed[first], 1.0, -1.0)
+    held = objects.fixed[first] | objects.fixed[second]
+    walk = np.zeros((len(first), 3))
     for _ in range(_STEPS):
         depth, direction = np.zeros(len(pair)), np.zeros((len(pair), 3))
         for rows, gaps, normals in groups:
-            now = gaps + np.einsum("qki,qi->qk", normals, walk[pair[rows]])
-            downward = normals[..., 2] * down[pair[rows], None] > 0.7
-            best = np.where(downward & (now < 0), _DOWN * now, now).argmax(axis=1)
+            owner = pair[rows]
+            now = gaps + np.einsum("qki,qi->qk", normals, walk[owner])
+            cost = now.copy()
+            q = np.flatnonzero(held[owner] & (now < 0).all(axis=1))
+            if len(q):
+                step = normals[q] * sign[owner[q], None, None]
+                here = objects.translation[free[owner[q]]] + sign[owner[q], None] * walk[owner[q]]
+                there = here[:, None] - step * now[q][..., None]
+                low, high = (bound[free[owner[q]]][:, None] for bound in bounds)
+                leaves = ((there < low) | (there > high)).any(axis=2)
+                cost[q] *= np.where(leaves, _BLOCKED, np.where(step[..., 2] < -0.7, _DOWN, 1.0))
+            best = cost.argmax(axis=1)
             line = np.arange(len(rows))
             depth[rows], direction[rows] = -now[line, best], normals[line, best]
         order = np.lexsort((-depth, pair))
