@@ -32,6 +32,8 @@ _MOST_CONVEX = 2e-3
 _THIN = 3e-3
 """Parts thinner than this (m) lose much of themselves to the margins of physics engines."""
 _MANY_PARTS, _MANY_TRIANGLES = 64, 200_000
+_UNLIKE = 0.01
+"""Difference (m) between the boxes of what is seen and what collides that is worth a note."""
 _SMALL, _LARGE = 2e-3, 20.0
 """Diagonals (m) outside of which the unit is probably another."""
 
@@ -64,9 +66,10 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
     if not static:
         notes += weight.notes
         warnings += weight.warnings
-    shift = _shift(parts, entry)
-    fine = tuple(ConvexPart(_clean(part.vertices + shift), part.faces) for part in parts)
     visual = join(*(mesh for shape in model.visuals or shapes for mesh in visual_of(shape, entry.color)))
+    shift = _shift(parts, entry, visual if static else None)
+    notes += _unlike(visual, parts, size)
+    fine = tuple(ConvexPart(_clean(part.vertices + shift), part.faces) for part in parts)
     if len(visual.faces) > _MANY_TRIANGLES:
         notes.append(f"{len(visual.faces)} triangles to draw; pictures will be slow")
     asset = Asset(
@@ -82,7 +85,7 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
         color=entry.color or (128, 128, 128),
         static=static,
     )
-    x, y, z = shift.tolist()
+    x, y, z = (shift + 0.0).tolist()
     density = 0.0 if static else properties.mass / volume
     report = AssetReport(
         entry.name, path, properties.mass, density, len(fine), (x, y, z), tuple(notes), tuple(warnings)
@@ -152,18 +155,12 @@ def _collide(
     """Fine parts of all shapes and the volume (m^3) they fill; what is to be said is added to the lists."""
     tolerance = min(_CONVEX * size, _MOST_CONVEX)
     parts: list[ConvexPart] = []
-    volume, repeated, flat = 0.0, 0, []
+    volume, repeated = 0.0, 0
     seen: set[bytes] = set()
     for shape in shapes:
-        try:
-            found = collision_of(shape, entry.decomposition, tolerance, entry.concavity)
-        except InvalidInputError as error:
-            if "spans no volume" not in str(error):
-                raise
-            flat.append(shape.where)
-            continue
-        key = np.round(np.concatenate([part.vertices for part in found.parts]), 7).tobytes()
-        if key in seen:
+        found = collision_of(shape, entry.decomposition, tolerance, entry.concavity)
+        key = b"".join(np.round(part.vertices, 7).tobytes() for part in found.parts)
+        if key and key in seen:
             repeated += 1
             continue
         seen.add(key)
@@ -173,8 +170,6 @@ def _collide(
         warnings += [warning for warning in found.warnings if warning not in warnings]
     if not parts:
         raise InvalidInputError(f"{path} spans no volume: all corners of its collision geometry lie in one plane")
-    if flat:
-        notes.append(f"flat, so left out of the collision parts: {', '.join(flat)}")
     if repeated:
         notes.append(f"{repeated} repeated collision shape{'s' if repeated > 1 else ''} left out")
     widths = [thickness(part) for part in parts]
@@ -186,13 +181,28 @@ def _collide(
     return parts, volume
 
 
-def _shift(parts: Sequence[ConvexPart], entry: AssetEntry) -> Array:
-    """(3,) m from the file's origin to the asset frame's."""
+def _bounds(parts: Sequence[ConvexPart]) -> Array:
+    """(2, 3): lowest and highest corner of the parts, m."""
+    corners = np.stack([part.bounds for part in parts])
+    return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
+
+
+def _unlike(visual: trimesh.Trimesh, parts: Sequence[ConvexPart], size: float) -> list[str]:
+    """A note when what is seen and what collides have different bounding boxes."""
+    apart = float(np.abs(np.asarray(visual.bounds) - _bounds(parts)).max())
+    if apart <= max(_UNLIKE, 0.05 * size):
+        return []
+    return [f"what is seen reaches up to {apart:.2g} m beyond what collides, or the other way round"]
+
+
+def _shift(parts: Sequence[ConvexPart], entry: AssetEntry, visual: trimesh.Trimesh | None) -> Array:
+    """(3,) m from the file's origin to the asset frame's; the visual counts too when there is one."""
     if entry.base == "origin":
         return np.zeros(3)
-    low = np.min([part.bounds[0] for part in parts], axis=0)
-    high = np.max([part.bounds[1] for part in parts], axis=0)
-    return -np.array([0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]), low[2]])
+    low, high = _bounds(parts)
+    if visual is not None:
+        low, high = np.minimum(low, visual.bounds[0]), np.maximum(high, visual.bounds[1])
+    return 0.0 - np.array([0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]), low[2]])
 
 
 def _clean(vertices: Array) -> Array:

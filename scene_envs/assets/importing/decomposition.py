@@ -29,8 +29,11 @@ if TYPE_CHECKING:
 Method = Literal["auto", "coacd", "convex"]
 METHODS: tuple[Method, ...] = ("auto", "coacd", "convex")
 _LOGGER = logging.getLogger(__name__)
-_VERSION = 1
+_VERSION = 2
 """Of what is kept on disk."""
+_DRAWN = 0.015
+"""CoACD rebuilds surfaces that are not closed on a grid; corners this near the true one, relative to the size
+of the body, are drawn back onto it, so that flat faces stay flat."""
 _MOST_BODIES = 128
 """Closed bodies of one mesh that are taken one by one."""
 
@@ -61,15 +64,14 @@ def convex_parts(
         what: name of the mesh, for messages.
 
     Returns:
-        parts, notes and warnings.
+        parts, notes and warnings; no parts when the mesh spans no volume.
 
     Raises:
-        InvalidInputError: the mesh spans no volume.
         MissingDependencyError: ``"coacd"`` without the package.
     """
     surface = bare(mesh)
     if not len(surface.faces) or not has_volume(np.asarray(surface.vertices)):
-        raise InvalidInputError(f"{what} spans no volume (all its corners lie in one plane), so it cannot collide")
+        return [], [f"{what} is flat and left out of the collision parts"], []
     if method == "convex":
         return [_hull(surface.vertices, tolerance)], [], []
     bodies, dropped = _bodies(surface, tolerance)
@@ -144,11 +146,30 @@ def _decompose(body: trimesh.Trimesh, method: Method, threshold: float, what: st
     coacd.set_log_level("error")
     size = float(body.scale)  # CoACD's numerics want a size near 1
     found = coacd.run_coacd(coacd.Mesh(np.asarray(body.vertices) / size, np.asarray(body.faces)), **settings)
-    pieces = [np.asarray(vertices) * size for vertices, _ in found if has_volume(np.asarray(vertices))]
+    pieces = [drawn_to(body, np.asarray(vertices) * size, _DRAWN * size) for vertices, _ in found]
+    pieces = [piece for piece in pieces if has_volume(piece)]
     if not pieces:
         raise InvalidInputError(f"CoACD found no convex parts in {what}; set `decomposition: convex` for it")
     _write(path, pieces)
     return pieces
+
+
+def drawn_to(body: trimesh.Trimesh, points: Array, reach: float) -> Array:
+    """The points (P, 3), those within ``reach`` (m) of the surface moved to the nearest point on it."""
+    from trimesh.triangles import closest_point
+
+    triangles = np.asarray(body.triangles)
+    low, high = triangles.min(axis=1) - reach, triangles.max(axis=1) + reach
+    drawn = points.copy()
+    for index, point in enumerate(points):
+        near = triangles[((point >= low) & (point <= high)).all(axis=1)]
+        if not len(near):
+            continue
+        on_surface = closest_point(near, np.tile(point, (len(near), 1)))
+        distance = np.linalg.norm(on_surface - point, axis=1)
+        if distance.min() <= reach:
+            drawn[index] = on_surface[distance.argmin()]
+    return drawn
 
 
 # -- the cache ------------------------------------------------------------------------------------

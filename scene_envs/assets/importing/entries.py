@@ -55,7 +55,7 @@ class AssetEntry:
     color: Color | None = None
     base: Base = "bottom"
     decomposition: Method = "auto"
-    concavity: float = 0.1
+    concavity: float = 0.05
 
 
 _TEXTS = ("file", "name", "display_name", "plural")

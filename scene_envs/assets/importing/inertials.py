@@ -13,8 +13,8 @@ from scene_envs.assets.shapes import MassProperties, mass_properties
 
 DEFAULT_DENSITY = 500.0
 """kg/m^3, where neither the file nor the user says: wood, or a vessel of ceramic with its air."""
-_POSSIBLE = (2.0, 23_000.0)
-"""kg/m^3 between the lightest foams and osmium."""
+_POSSIBLE = (1.0, 23_000.0)
+"""kg/m^3 between air and osmium."""
 _FACTOR = 10.0
 """By how much a moment of inertia may differ from that of the same shape filled evenly."""
 

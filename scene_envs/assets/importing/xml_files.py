@@ -52,7 +52,7 @@ def numbers(text: str | None, count: int, path: Path, where: str, default: tuple
     try:
         values = np.array([float(word) for word in text.replace(",", " ").split()])
     except ValueError:
-        hint = "; expand it with xacro first" if "${" in text else ""
+        hint = "; expand it with xacro first" if "$" in text else ""
         raise CorruptFileError(f"{path}: {where} is {text.strip()!r}, which is not numbers{hint}") from None
     if len(values) != count or not np.isfinite(values).all():
         raise CorruptFileError(f"{path}: {where} must be {count} finite number(s), got {text.strip()!r}")

@@ -1,0 +1,181 @@
+"""Concave meshes as convex parts, and what is kept on disk."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import ConvexHull
+
+from scene_envs.assets import Asset, ConvexPart, import_report, load_library
+from scene_envs.assets.importing.decomposition import cache_folder
+from scene_envs.assets.importing.hulls import MOST_CORNERS, enclosing_hull, few_cornered_hull, thickness
+from scene_envs.assets.shapes import box, convex_hull
+from scene_envs.errors import MissingDependencyError
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path_factory.mktemp("cache")
+    monkeypatch.setenv("SCENE_ENVS_CACHE", str(folder))
+    return folder
+
+
+def angle_iron() -> trimesh.Trimesh:
+    """A closed L of two legs 0.1 long and 0.02 thick, 0.06 wide: one body of 20 triangles."""
+    outline = np.array([[0, 0], [0.1, 0], [0.1, 0.02], [0.02, 0.02], [0.02, 0.1], [0, 0.1]])
+    vertices = np.concatenate([np.column_stack([outline, np.full(6, z)]) for z in (0.0, 0.06)])
+    cap = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
+    sides = [[i, (i + 1) % 6, (i + 1) % 6 + 6] for i in range(6)] + [[i, (i + 1) % 6 + 6, i + 6] for i in range(6)]
+    return trimesh.Trimesh(vertices, np.concatenate([cap[:, ::-1], cap + 6, sides]))
+
+
+def load(folder: Path, mesh: trimesh.Trimesh, keys: str = "") -> Asset:
+    mesh.export(folder / "thing.stl")
+    (folder / "library.yaml").write_text(f"- {{file: thing.stl, base: origin{keys}}}")
+    return load_library(folder)[0]
+
+
+def depth(parts: tuple[ConvexPart, ...], point: tuple[float, float, float]) -> float:
+    """How deep (m) a point lies in the parts; negative outside all of them."""
+    planes = [ConvexHull(part.vertices).equations for part in parts]
+    return max(float(-(p[:, :3] @ np.array(point) + p[:, 3]).max()) for p in planes)
+
+
+def test_the_angle_iron_is_one_closed_body() -> None:
+    assert angle_iron().is_watertight
+    assert angle_iron().volume == pytest.approx(0.06 * (0.1 * 0.02 + 0.08 * 0.02))
+
+
+def test_a_concave_mesh_keeps_its_hollow(tmp_path: Path) -> None:
+    pytest.importorskip("coacd")
+    asset = load(tmp_path, angle_iron(), ", density: 1000")
+    assert 2 <= len(asset.fine) <= 4
+    assert depth(asset.fine, (0.06, 0.06, 0.03)) < -0.025
+    for point in ((0.09, 0.01, 0.03), (0.01, 0.09, 0.03), (0.01, 0.01, 0.03)):
+        assert depth(asset.fine, point) > 0.005
+    assert len(asset.coarse) == 1
+    assert depth(asset.coarse, (0.05, 0.05, 0.03)) > 0
+    exact = angle_iron()
+    exact.density = 1000
+    assert asset.mass == pytest.approx(exact.mass, rel=0.02)
+    assert asset.center_of_mass == pytest.approx(exact.center_mass, abs=1e-3)
+    assert asset.inertia == pytest.approx(exact.moment_inertia, abs=0.05 * exact.moment_inertia.max())
+
+
+def test_a_decomposition_is_computed_once_and_kept(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    coacd = pytest.importorskip("coacd")
+    calls = []
+    real = coacd.run_coacd
+    monkeypatch.setattr(coacd, "run_coacd", lambda *args, **options: calls.append(1) or real(*args, **options))
+    first = load(tmp_path, angle_iron())
+    again = load(tmp_path, angle_iron(), ", name: again")
+    assert len(calls) == 1
+    assert again is not first
+    for one, other in zip(first.fine, again.fine, strict=True):
+        assert np.array_equal(one.vertices, other.vertices)
+    (file,) = (cache / "decompositions").iterdir()
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with caplog.at_level(logging.WARNING):
+        load(tmp_path, angle_iron(), ", name: third")
+    assert len(calls) == 2
+    assert "damaged" in caplog.text
+    load(tmp_path, angle_iron(), ", name: fourth")
+    assert len(calls) == 2  # the damaged entry was made good
+    load(tmp_path, angle_iron(), ", name: fifth, concavity: 0.2")
+    assert len(calls) == 3
+
+
+def test_a_cache_that_cannot_be_written_costs_nothing_but_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    pytest.importorskip("coacd")
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("SCENE_ENVS_CACHE", str(tmp_path / "file"))
+    assert len(load(tmp_path, angle_iron()).fine) > 1
+    assert "could not be kept" in caplog.text
+
+
+def test_without_coacd_there_is_one_hull_and_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "coacd", None)
+    asset = load(tmp_path, angle_iron())
+    assert len(asset.fine) == 1
+    assert depth(asset.fine, (0.05, 0.05, 0.03)) > 0
+    (warning,) = import_report(tmp_path)["thing"].warnings
+    assert "thing.stl" in warning
+    assert "scene-envs[decomposition]" in warning
+    assert asset.mass == pytest.approx(500 * angle_iron().volume)  # of the mesh, not of its hull
+    with pytest.raises(MissingDependencyError, match=r"scene-envs\[decomposition\]"):
+        load(tmp_path, angle_iron(), ", decomposition: coacd")
+
+
+def test_convex_is_one_hull_when_asked_for(tmp_path: Path) -> None:
+    assert len(load(tmp_path, angle_iron(), ", decomposition: convex").fine) == 1
+
+
+def test_convex_bodies_in_one_file_are_kept_as_they_are(tmp_path: Path) -> None:
+    def piece(size: tuple[float, ...], place: tuple[float, ...]) -> trimesh.Trimesh:
+        return trimesh.creation.box(size, trimesh.transformations.translation_matrix(place))
+
+    table = trimesh.util.concatenate(
+        [
+            piece((1.0, 0.6, 0.04), (0, 0, 0.72)),
+            *(piece((0.05, 0.05, 0.7), (x, y, 0.35)) for x in (-0.4, 0.4) for y in (-0.2, 0.2)),
+        ]
+    )
+    asset = load(tmp_path, table, ", density: 700")
+    assert [len(part.vertices) for part in asset.fine] == [8] * 5
+    assert depth(asset.fine, (0, 0, 0.35)) < -0.2
+    assert asset.mass == pytest.approx(700 * (1.0 * 0.6 * 0.04 + 4 * 0.05 * 0.05 * 0.7))
+
+
+def test_an_almost_convex_mesh_is_its_hull(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(3, 0.05)
+    dented = ball.copy()
+    dented.vertices[0] *= 0.985  # 0.75 mm
+    asset = load(tmp_path, dented)
+    assert len(asset.fine) == 1
+    assert len(asset.fine[0].vertices) <= MOST_CORNERS
+
+
+def test_a_hull_of_few_corners_is_close_and_inside() -> None:
+    cloud = trimesh.creation.cylinder(0.05, 0.1, sections=400).vertices
+    part, outside = few_cornered_hull(np.asarray(cloud), 5e-4)
+    assert len(part.vertices) <= MOST_CORNERS
+    assert outside <= 5e-4
+    planes = ConvexHull(part.vertices).equations
+    assert (cloud @ planes[:, :3].T + planes[:, 3]).max() == pytest.approx(outside, abs=1e-12)
+    assert ConvexHull(part.vertices).volume == pytest.approx(np.pi * 0.05**2 * 0.1, rel=0.02)
+    assert (part.vertices[:, 2] == -0.05).sum() >= 16  # the base stays flat
+
+
+def test_the_coarse_hull_encloses_all_parts_with_few_corners() -> None:
+    rng = np.random.default_rng(0)
+    parts = [convex_hull(rng.normal(size=(60, 3)) + shift) for shift in rng.normal(size=(8, 3))]
+    coarse = enclosing_hull(parts)
+    planes = ConvexHull(coarse.vertices).equations
+    points = np.concatenate([part.vertices for part in parts])
+    assert (points @ planes[:, :3].T + planes[:, 3]).max() < 1e-7
+    assert len(coarse.vertices) <= 2 * MOST_CORNERS
+    assert coarse.bounds == pytest.approx(np.stack([points.min(axis=0), points.max(axis=0)]))
+    assert ConvexHull(coarse.vertices).volume < 1.6 * ConvexHull(points).volume
+
+
+def test_thickness_of_a_plate() -> None:
+    turn = trimesh.transformations.random_rotation_matrix(np.array([0.1, 0.7, 0.3]))[:3, :3]
+    plate = box((0.2, 0.1, 0.002))
+    assert thickness(ConvexPart(plate.vertices @ turn.T, plate.faces)) == pytest.approx(0.002)
+
+
+def test_the_cache_lies_where_the_user_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SCENE_ENVS_CACHE", "/a/b")
+    assert cache_folder() == Path("/a/b")
+    monkeypatch.delenv("SCENE_ENVS_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", "/c")
+    assert cache_folder() == Path("/c/scene_envs")
