@@ -9,21 +9,28 @@ import math
 from collections.abc import Callable, Sequence
 
 from scene_envs.grammars.containers import Heap, Standing
-from scene_envs.grammars.dsl import NOTHING, Geometric, Group, Object, OneOf, Repeat, Stack
+from scene_envs.grammars.dsl import NOTHING, Cluster, Geometric, Group, Object, OneOf, Repeat, Stack
 from scene_envs.grammars.surface import Region
 from scene_envs.grammars.towers import Node, Surface, Tower
 from scene_envs.grammars.wishes import Gaussian, Uniform, Wish, Yaw
 
-TABLE = Region(0.2575, 0.60, overhang=0.10)
-"""Frames stay 10 cm from the edge of the table, so that nothing hangs over it."""
+HALF_DEPTH, HALF_LENGTH = 0.2575, 0.65
+"""How far (m) the frames of what stands on the table are from its middle, at most."""
+TABLE = Region(HALF_DEPTH, HALF_LENGTH, overhang=0.09)
+"""Nothing hangs over the edge of the table, which is 0.375 and 0.75 m from its middle."""
 
 CROCK_RADIUS = 0.055
 """Inner radius of the utensil crock, m."""
 
 ALONG = Yaw(std=0.06)
-"""Cutlery points to the middle of the table."""
+"""Cutlery beside the plate points to the middle of the table."""
 ACROSS = Yaw(std=0.06, choices=(math.pi / 2, -math.pi / 2))
 """Cutlery above the plate lies across."""
+
+
+def maybe(chance: float, node: Node) -> Node:
+    """A node with some chance, else nothing."""
+    return OneOf((chance, node), (1.0 - chance, NOTHING))
 
 
 def middle(child: Node) -> list[Surface]:
@@ -31,9 +38,9 @@ def middle(child: Node) -> list[Surface]:
     return [Surface([child], Region(0.01, 0.01), height=None)]
 
 
-def near(x: float, y: float) -> Gaussian:
-    """A place of the setting: x toward the middle of the table, y to the left of who sits there, m."""
-    return Gaussian(x, y, along=0.01)
+def near(x: float, y: float) -> Uniform:
+    """A place of the setting, within 1.5 cm: x toward the middle of the table, y to the left of who sits there, m."""
+    return Uniform(0.015, 0.015, x, y)
 
 
 def toast(another: float) -> Node:
@@ -41,58 +48,66 @@ def toast(another: float) -> Node:
     return Stack("bread_slice", {"bread_slice": another, None: 1.0 - another})
 
 
-def fruit(name: str) -> Node:
-    return Object(name)
+def bowl_of_food(where: Wish, yaw: Yaw, bread: float, apple: float, pear: float, beside: Node = NOTHING) -> Node:
+    """A bowl with bread leaning in it, fruit, or nothing, with these chances."""
+    fruit = OneOf((apple, Object("apple_gala")), (pear, Object("pear_bosc")), (1.0 - bread - apple - pear, NOTHING))
+    leaning = Heap(Object("bread_slice"), radius=0.01, upright=True)
+    return OneOf(
+        (bread, Object("bowl", where, yaw, inside=leaning, beside=beside)),
+        (1.0 - bread, Object("bowl", where, yaw, on=middle(fruit), beside=beside)),
+    )
 
 
 def place_setting(plate: float, bowl: float, nothing: float, another_toast: float) -> Node:
-    """One person's place, in a frame whose x axis points to the middle of the table."""
+    """One person's place, in a frame whose x axis points to the middle of the table: a plate, a bowl, or nothing."""
+    top = near(0.135, 0.0)
     cutlery = Group(
-        OneOf((0.7, Object("fork", near(0.0, 0.135), ALONG)), (0.3, NOTHING)),
-        OneOf((0.8, Object("knife", near(0.0, -0.125), ALONG)), (0.2, NOTHING)),
-        OneOf(
-            (0.2, Object("dinner_spoon", near(0.135, 0.0), ACROSS)),
-            (0.2, Object("teaspoon", near(0.135, 0.0), ACROSS)),
-            (0.6, NOTHING),
-        ),
-        OneOf((0.8, Object("mug", near(0.10, -0.20))), (0.2, NOTHING)),
+        maybe(0.7, Object("fork", near(0.0, 0.135), ALONG)),
+        maybe(0.8, Object("knife", near(0.0, -0.130), ALONG)),
+        OneOf((0.2, Object("dinner_spoon", top, ACROSS)), (0.2, Object("teaspoon", top, ACROSS)), (0.6, NOTHING)),
+        maybe(0.8, Object("mug", near(0.125, -0.175))),
     )
     on_plate = OneOf(
         (0.2, toast(another_toast)),
-        (0.1, fruit("apple_gala")),
-        (0.1, fruit("pear_bosc")),
+        (0.1, Object("apple_gala")),
+        (0.1, Object("pear_bosc")),
         (0.2, Object("bowl")),
         (0.4, NOTHING),
     )
+    right, above = near(0.0, -0.115), near(0.115, 0.0)
     spoons = Group(
-        *(
-            OneOf((1.0, Object("dinner_spoon", where, yaw)), (1.0, Object("teaspoon", where, yaw)), (4.0, NOTHING))
-            for where, yaw in ((near(0.0, -0.115), ALONG), (near(0.115, 0.0), ACROSS))
-        )
+        OneOf((1.0, Object("dinner_spoon", right, ALONG)), (1.0, Object("teaspoon", right, ALONG)), (4.0, NOTHING)),
+        OneOf((1.0, Object("dinner_spoon", above, ACROSS)), (1.0, Object("teaspoon", above, ACROSS)), (4.0, NOTHING)),
     )
-    in_bowl = OneOf((0.1, Object("apple_gala")), (0.1, Object("pear_bosc")), (0.8, NOTHING))
-    here, straight = Gaussian(along=0.02), Yaw(std=0.0)
+    here, straight = Uniform(0.03, 0.03), Yaw(std=0.0)
     return OneOf(
         (plate, Object("plate", here, straight, on=middle(on_plate), beside=cutlery)),
-        (bowl, Object("bowl", here, straight, on=middle(in_bowl), beside=spoons)),
+        (bowl, bowl_of_food(here, straight, 0.1, 0.1, 0.1, beside=spoons)),
         (nothing, NOTHING),
     )
 
 
+def facing_pair(setting: Node) -> Node:
+    """Two settings on the long sides of the table, opposite each other."""
+    return Group(
+        Cluster(setting, Gaussian(-0.2, 0.0, along=0.0)),
+        Cluster(setting, Gaussian(0.2, 0.0, along=0.0), Yaw(0.0, (math.pi,))),
+    )
+
+
 def anywhere() -> Wish:
-    return Uniform(0.30, 0.60)
+    return Uniform(HALF_DEPTH, HALF_LENGTH)
 
 
 def shared_plates(p: float, most: int, another_toast: float) -> Node:
     """Plates for all, each with toast or fruit."""
-    food = OneOf((0.5, toast(another_toast)), (0.25, fruit("apple_gala")), (0.25, fruit("pear_bosc")))
+    food = OneOf((0.5, toast(another_toast)), (0.25, Object("apple_gala")), (0.25, Object("pear_bosc")))
     return Repeat(Object("shared_plate", anywhere(), on=middle(food)), Geometric(p, 0, most))
 
 
 def shared_bowls(p: float, most: int) -> Node:
-    """Bowls for all, each with toast or fruit, which comes to rest in it."""
-    food = OneOf((0.2, Object("bread_slice")), (0.4, Object("apple_gala")), (0.4, Object("pear_bosc")))
-    return Repeat(Object("bowl", anywhere(), inside=Heap(food, radius=0.01, upright=True)), Geometric(p, 0, most))
+    """Bowls for all, each with bread or fruit."""
+    return Repeat(bowl_of_food(anywhere(), Yaw(), 0.2, 0.4, 0.4), Geometric(p, 0, most))
 
 
 def cereal(p: float) -> Node:
@@ -107,7 +122,7 @@ def crock(present: float) -> Node:
     """A crock in which up to ten forks, knives and spoons stand."""
     utensil = OneOf(*((1.0, Object(name)) for name in ("fork", "knife", "dinner_spoon", "teaspoon")))
     cutlery = Standing(Repeat(utensil, Geometric(0.1, 0, 10)), CROCK_RADIUS)
-    return OneOf((present, Object("utensil_crock", anywhere(), inside=cutlery)), (1.0 - present, NOTHING))
+    return maybe(present, Object("utensil_crock", anywhere(), inside=cutlery))
 
 
 def at_least(objects: int) -> dict[str, Callable[[Sequence[Tower]], bool]]:

@@ -5,12 +5,11 @@ Probabilities follow the scene grammar of the paper's dataset (Pfaff et al., CoR
 
 from __future__ import annotations
 
-import math
-
 from scene_envs.grammars.breakfast import (
     TABLE,
     at_least,
     cereal,
+    facing_pair,
     jugs,
     place_setting,
     shared_bowls,
@@ -19,25 +18,22 @@ from scene_envs.grammars.breakfast import (
 from scene_envs.grammars.dsl import Cluster, Group, OneOf
 from scene_envs.grammars.grammar import Grammar, register_grammar
 from scene_envs.grammars.towers import Node, Surface
-from scene_envs.grammars.wishes import Gaussian, Uniform, Yaw
+from scene_envs.grammars.wishes import Uniform
 from scene_envs.scene_types import get_scene_type
 
 
 def six_places(plate: float, bowl: float, nothing: float) -> Node:
-    """Three pairs of places that face each other: at both ends and in the middle of the long sides."""
-    setting = place_setting(plate, bowl, nothing, another_toast=0.25)
-    pair = Group(
-        Cluster(setting, Gaussian(-0.2, 0.0, along=0.0)),
-        Cluster(setting, Gaussian(0.2, 0.0, along=0.0), Yaw(0.0, (math.pi,))),
-    )
-    return Group(*(Cluster(pair, Uniform(0.0, half, 0.0, y)) for y, half in ((-0.41, 0.11), (0.0, 0.08), (0.41, 0.11))))
+    """Three pairs of places that face each other: near both ends and in the middle of the long sides."""
+    pair = facing_pair(place_setting(plate, bowl, nothing, another_toast=0.25))
+    ends_and_middle = (Uniform(0.0, 0.065, y=-0.40), Uniform(0.0, 0.04), Uniform(0.0, 0.065, y=0.40))
+    return Group(*(Cluster(pair, where) for where in ends_and_middle))
 
 
 def shared(fullness: float) -> Node:
     return Group(shared_plates(1 - fullness, 4, 0.25), shared_bowls(1 - fullness, 6), cereal(0.4), jugs(0.6))
 
 
-USUAL = Group(six_places(0.56, 0.19, 0.25), shared(0.3))
+USUAL = Group(six_places(0.54, 0.19, 0.27), shared(0.3))
 QUIET = Group(six_places(0.10, 0.05, 0.85), shared(0.3))
 FEAST = Group(six_places(0.95, 0.05, 0.00), shared(0.6))
 

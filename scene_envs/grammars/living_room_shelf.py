@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from scene_envs.grammars.breakfast import at_least, middle, toast
+from scene_envs.grammars.breakfast import at_least, maybe, middle, toast
 from scene_envs.grammars.containers import Heap
 from scene_envs.grammars.dsl import NOTHING, Geometric, Group, Object, OneOf, Pile, Repeat, Stack, Tiers
 from scene_envs.grammars.grammar import Grammar, register_grammar
@@ -20,18 +20,16 @@ from scene_envs.scene_types import get_scene_type
 
 ALONG_SHELF = Yaw(std=0.015, choices=(math.pi / 2, -math.pi / 2))
 """Large games fit lengthwise only."""
-FACING_FRONT = Yaw(std=0.1, choices=(math.pi / 2, -math.pi / 2))
-"""A speaker plays to the room."""
+FACING_FRONT = Yaw(std=0.1, choices=(math.pi / 2,))
+"""A speaker's badge faces the room."""
 SQUARE = Yaw(std=0.05, choices=(0.0, math.pi))
 """Small games lie straight."""
+NEARLY_SQUARE = Yaw(std=0.15, choices=(0.0, math.pi))
+"""Game cases are put down with less care."""
 
 
 def anywhere() -> Wish:
     return Uniform(HALF_DEPTH, HALF_WIDTH, x=MIDDLE)
-
-
-def maybe(chance: float, node: Node) -> Node:
-    return OneOf((chance, node), (1.0 - chance, NOTHING))
 
 
 def large_games() -> Node:
@@ -56,24 +54,38 @@ def plate_of_food() -> Node:
     return Object("shared_plate", anywhere(), on=middle(food))
 
 
-def drinks(asset: str) -> Node:
-    return Repeat(Object(asset, anywhere()), Geometric(0.7, 0, 6))
+def game_cases(p: float) -> Node:
+    """Up to three stacks of game cases."""
+    stack = Stack("game_case", {"game_case": 0.3, None: 0.7}, where=anywhere(), yaw=NEARLY_SQUARE)
+    return Repeat(stack, Geometric(p, 0, 3))
 
 
-def inner_tier(mixed: float = 0.20, games: float = 0.07, nothing: float = 0.73) -> Node:
-    """A tier with a mixed setting, large games, or nothing, by weight."""
-    setting = Group(
-        maybe(0.2, bookend()),
-        maybe(0.3, small_games()),
+def drinks(asset: str, p: float) -> Node:
+    return Repeat(Object(asset, anywhere()), Geometric(p, 0, 6))
+
+
+def things(toy: float, game: float, p: float) -> Node:
+    """What a tier may hold: each toy, book or speaker, and each game or plate, with a chance; drinks and cases by
+    ``p``, which says how quickly their numbers fall off."""
+    return Group(
+        maybe(toy, bookend()),
+        maybe(game, small_games()),
         maybe(0.1, Object("speaker", anywhere(), FACING_FRONT)),
-        maybe(0.2, plate_of_food()),
-        Repeat(Stack("game_case", {"game_case": 0.3, None: 0.7}, where=anywhere(), yaw=Yaw()), Geometric(0.7, 0, 3)),
-        drinks("soda_can"),
-        drinks("tea_bottle"),
-        maybe(0.2, Object("stacking_ring", anywhere())),
-        maybe(0.2, Object("toy_train", anywhere())),
+        maybe(game, plate_of_food()),
+        game_cases(p),
+        drinks("soda_can", p),
+        drinks("tea_bottle", p),
+        maybe(toy, Object("stacking_ring", anywhere())),
+        maybe(toy, Object("toy_train", anywhere())),
     )
-    return OneOf((mixed, setting), (games, large_games()), (nothing, NOTHING))
+
+
+def inner_tier() -> Node:
+    return OneOf((0.57, things(toy=0.12, game=0.08, p=0.85)), (0.08, large_games()), (0.35, NOTHING))
+
+
+def full_tier() -> Node:
+    return OneOf((0.9, things(toy=0.3, game=0.4, p=0.55)), (0.1, large_games()))
 
 
 def top_tier() -> Node:
@@ -90,11 +102,11 @@ def top_tier() -> Node:
 
 
 USUAL = Tiers(tiers(inner_tier(), top_tier()))
-FULL = Tiers(tiers(inner_tier(0.9, 0.1, 0.0), top_tier()))
+FULL = Tiers(tiers(full_tier(), top_tier()))
 
 
 @register_grammar("living_room_shelf")
 def living_room_shelf() -> Grammar:
     """The whole shelf."""
-    room = Surface([OneOf((0.97, USUAL), (0.03, FULL))], Region(1.0, 1.0))
+    room = Surface([OneOf((0.98, USUAL), (0.02, FULL))], Region(1.0, 1.0))
     return Grammar("living_room_shelf", get_scene_type("living_room_shelf"), [room], at_least(3))

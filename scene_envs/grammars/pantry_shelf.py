@@ -6,9 +6,9 @@ solver and objects fell off the shelf; here everything is placed where there is 
 
 from __future__ import annotations
 
-from scene_envs.grammars.breakfast import at_least
+from scene_envs.grammars.breakfast import at_least, maybe
 from scene_envs.grammars.containers import Heap
-from scene_envs.grammars.dsl import NOTHING, Geometric, Group, Object, OneOf, Repeat, Tiers
+from scene_envs.grammars.dsl import Geometric, Group, Object, OneOf, Repeat, Tiers
 from scene_envs.grammars.grammar import Grammar, register_grammar
 from scene_envs.grammars.shelf import HALF_DEPTH, HALF_WIDTH, MIDDLE, tiers
 from scene_envs.grammars.surface import Region
@@ -35,13 +35,13 @@ def fruit_bowl() -> Node:
 
 def pantry(p: float) -> Node:
     """The whole shelf; ``p`` says how quickly the numbers of a kind fall off."""
-    top = Group(OneOf((0.2, fruit_bowl()), (0.8, NOTHING)), goods(p))
+    top = Group(maybe(0.2, fruit_bowl()), goods(p))
     return Tiers(tiers(goods(p), top))
 
 
 @register_grammar("pantry_shelf")
 def pantry_shelf() -> Grammar:
     """Shelves from nearly empty to packed."""
-    shelves = OneOf((0.02, pantry(0.93)), (0.90, pantry(0.65)), (0.08, pantry(0.5)))
+    shelves = OneOf((0.02, pantry(0.93)), (0.90, pantry(0.647)), (0.08, pantry(0.5)))
     room = Surface([shelves], Region(1.0, 1.0))
     return Grammar("pantry_shelf", get_scene_type("pantry_shelf"), [room], at_least(2))
