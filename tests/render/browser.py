@@ -109,7 +109,7 @@ class Browser:
 
     def drag(self, start: tuple[float, float], end: tuple[float, float], button: str = "left") -> None:
         """Press, move, release; a click where both places are the same."""
-        held = {"button": button, "buttons": {"left": 1, "right": 2}[button]}
+        held: dict[str, Any] = {"button": button, "buttons": {"left": 1, "right": 2}[button]}
         self.mouse("Pressed", *start, clickCount=1, **held)
         if end != start:
             self.mouse("Moved", *end, **held)
