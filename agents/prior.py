@@ -46,6 +46,9 @@ class ScenePrior(nn.Module):
     """
 
     conditional = False
+    process_name = "continuous"
+    denoiser: Any
+    """The network inside its process, a module with ``.network``."""
 
     def __init__(
         self,
@@ -56,24 +59,52 @@ class ScenePrior(nn.Module):
         residual: ResidualVariance | None = None,
     ) -> None:
         super().__init__()
+        scene_type = get_scene_type(config.scene_type)
+        if config.network.features != scene_type.features:
+            raise InvalidInputError(
+                f"the network reads {config.network.features} features, {config.scene_type!r} has {scene_type.features}"
+            )
+        self._keep(config, normalizer, preconditioning, card, residual)
+        schedule = make_schedule(config.schedule, config.num_timesteps)
+        self.process = GaussianProcess(schedule, config.prediction, preconditioning)
+        self.denoiser = Denoiser(FluxDenoiser(config.network), self.process)
+        self._timestep_weights = lognormal_timesteps(schedule, config.noise_mean, config.noise_std)
+
+    def _keep(
+        self,
+        config: Any,
+        normalizer: Normalizer,
+        preconditioning: Preconditioning,
+        card: dict[str, Any] | None,
+        residual: ResidualVariance | None,
+    ) -> None:
+        """What priors of every process have in common."""
         self.config = config
         self.scene_type: SceneType = get_scene_type(config.scene_type)
-        if config.network.features != self.scene_type.features:
-            raise InvalidInputError(
-                f"the network reads {config.network.features} features, "
-                f"{config.scene_type!r} has {self.scene_type.features}"
-            )
         self.normalizer = normalizer
         self.preconditioning = preconditioning
         self.card = card or {}
         self.residual = residual
-        schedule = make_schedule(config.schedule, config.num_timesteps)
-        self.process = GaussianProcess(schedule, config.prediction, preconditioning)
-        self.denoiser = Denoiser(FluxDenoiser(config.network), self.process)
         self._fixed: Tensor
-        self._timestep_weights = lognormal_timesteps(schedule, config.noise_mean, config.noise_std)
         fixed = SceneBatch.empty(self.scene_type, 1, len(self.scene_type.fixed) or 1)
-        self.register_buffer("_fixed", normalizer.normalize(fixed.tensor[0]), persistent=False)
+        self.register_buffer("_fixed", self.normalised(fixed)[0], persistent=False)
+
+    @classmethod
+    def from_state(
+        cls,
+        fields: dict[str, Any],
+        normalizer: Normalizer,
+        preconditioning: Preconditioning,
+        card: dict[str, Any] | None,
+        residual: ResidualVariance | None,
+    ) -> ScenePrior:
+        """From the ``prior`` entry of a configuration file."""
+        fields = {**fields, "network": FluxConfig(**fields["network"])}
+        return cls(PriorConfig(**fields), normalizer, preconditioning, card, residual)
+
+    def config_state(self) -> dict[str, Any]:
+        """The ``prior`` entry of the configuration file."""
+        return asdict(self.config)
 
     # -- files ----------------------------------------------------------------------------------
 
@@ -84,12 +115,11 @@ class ScenePrior(nn.Module):
             return name
         state, tensors = read_prior(name)
         try:
-            fields = dict(state["prior"])
-            fields["network"] = FluxConfig(**fields["network"])
             moments = (torch.tensor(state["preconditioning"][key]) for key in ("mean", "std"))
             normalizer = Normalizer.from_state(state["normalizer_state"])
             residual = ResidualVariance(tensors.pop(_LEVELS), tensors.pop(_RESIDUAL)) if _LEVELS in tensors else None
-            prior = cls(PriorConfig(**fields), normalizer, Preconditioning(*moments), state.get("card"), residual)
+            kind = _prior_class(state.get("process", "continuous"))
+            prior = kind.from_state(state["prior"], normalizer, Preconditioning(*moments), state.get("card"), residual)
             prior.denoiser.network.load_state_dict(tensors)
         except (KeyError, TypeError) as error:
             raise CorruptFileError(
@@ -103,7 +133,8 @@ class ScenePrior(nn.Module):
         """Write ``config.json`` and ``model.safetensors`` into ``directory``."""
         moments = {"mean": self.preconditioning.mean.tolist(), "std": self.preconditioning.std.tolist()}
         state = {
-            "prior": asdict(self.config),
+            "process": self.process_name,
+            "prior": self.config_state(),
             "preconditioning": moments,
             "normalizer_state": self.normalizer.state(),
             "card": self.card,
@@ -206,7 +237,11 @@ class ScenePrior(nn.Module):
             raise InvalidInputError(
                 f"scene {scene} does not begin with the fixed objects {names}; reorder its slots so that it does"
             )
-        return self.clamp(batch.to_tensor(normalised=self.normalizer))
+        return self.clamp(self.normalised(batch))
+
+    def normalised(self, batch: SceneBatch) -> Tensor:
+        """(B, N, D) scenes as this process sees them, before known entries are clamped."""
+        return batch.to_tensor(normalised=self.normalizer)
 
     def inpaint(
         self,
@@ -269,6 +304,14 @@ class ScenePrior(nn.Module):
         weight = (~self.known(slots)).float()
         weight[:, TRANSLATION] *= self.config.translation_weight
         return weight
+
+
+def _prior_class(process: str) -> type[ScenePrior]:
+    if process == "mixed":
+        from agents.mixed_prior import MixedPrior
+
+        return MixedPrior
+    return ScenePrior
 
 
 def _chunk_sizes(total: int, size: int) -> Iterator[int]:

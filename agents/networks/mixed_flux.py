@@ -37,6 +37,7 @@ class MixedFluxConfig:
         text_width: width of the text tokens; 0 for none.
         frequencies: octaves of Fourier features of each translation, damped by the noise (0: none, as the paper).
         time_scale: what timesteps are multiplied by before they are embedded.
+        flags: 1 to tell the network which poses and categories are given (inpainting), 0 as the paper.
     """
 
     categories: int
@@ -50,6 +51,7 @@ class MixedFluxConfig:
     text_width: int = 0
     frequencies: int = 8
     time_scale: float = 1.0
+    flags: int = 1
 
     def __post_init__(self) -> None:
         if self.hidden % self.heads:
@@ -58,7 +60,7 @@ class MixedFluxConfig:
     @classmethod
     def paper(cls, categories: int, text_width: int = 768) -> MixedFluxConfig:
         """The size and the details of the paper: 88.3 M parameters with text."""
-        return cls(categories, 512, 5, 10, 16, 4.0, 256, POSE, text_width, 0, 1000.0)
+        return cls(categories, 512, 5, 10, 16, 4.0, 256, POSE, text_width, 0, 1000.0, 0)
 
 
 class DoubleStreamBlock(nn.Module):
@@ -138,6 +140,9 @@ class MixedFlux(nn.Module):
             nn.Linear(POSE + 6 * config.frequencies, width), nn.SiLU(), nn.Linear(width, width)
         )
         self.category_in = nn.Embedding(config.categories + 1, width)
+        self.given_in = nn.Embedding(4, width) if config.flags else None
+        if self.given_in is not None:
+            nn.init.zeros_(self.given_in.weight)
         self.scene_in = nn.Linear(width, hidden)
         self.time_in = nn.Sequential(nn.Linear(_TIME_WIDTH, hidden), nn.SiLU(), nn.Linear(hidden, hidden))
         self.text_in = nn.Linear(config.text_width, hidden) if config.text_width else None
@@ -169,6 +174,7 @@ class MixedFlux(nn.Module):
         text_mask: Tensor | None = None,
         position: Tensor | None = None,
         noise_level: Tensor | None = None,
+        given: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Predict.
 
@@ -179,13 +185,17 @@ class MixedFlux(nn.Module):
             text: (B, L, W) text tokens; None for no text, which needs no double-stream blocks.
             text_mask: (B, L) bool, True for real tokens.
             position: (B, N, 3) translations in signal units, for the Fourier features.
-            noise_level: (B,) noise-to-signal ratio of ``position``.
+            noise_level: (B, N) noise-to-signal ratio of ``position``.
+            given: (B, N) int64, 1 where the pose is given, plus 2 where the category is; None for nowhere.
 
         Returns:
             pose output (B, N, 12) and logits (B, N, K) of the clean category.
         """
         condition = self.time_in(_embed(time * self.config.time_scale, pose.dtype))
-        scene = self.scene_in(self.pose_in(self._pose_features(pose, position, noise_level)) + self.category_in(states))
+        features = self.pose_in(self._pose_features(pose, position, noise_level)) + self.category_in(states)
+        if self.given_in is not None and given is not None:
+            features = features + self.given_in(given)
+        scene = self.scene_in(features)
         count, mask = 0, None
         if self.text_in is not None:
             if text is None:
@@ -211,7 +221,7 @@ class MixedFlux(nn.Module):
         if position is None or noise_level is None:
             raise InvalidInputError("a network with Fourier features needs position= and noise_level=")
         angle = position[..., None] * self.octaves  # (B, N, 3, F)
-        damping = torch.exp(-0.5 * (self.octaves * noise_level[:, None]) ** 2)[:, None, None]  # (B, 1, 1, F)
+        damping = torch.exp(-0.5 * (self.octaves * noise_level[..., None]) ** 2).unsqueeze(-2)  # (B, N, 1, F)
         return torch.cat([pose, (angle.sin() * damping).flatten(-2), (angle.cos() * damping).flatten(-2)], dim=-1)
 
 

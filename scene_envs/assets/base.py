@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -16,6 +17,15 @@ if TYPE_CHECKING:
     import trimesh
 
 Array = NDArray[np.float64]
+
+
+def indefinite_article(name: str) -> str:
+    """The indefinite article of a noun, by sound.
+
+    >>> indefinite_article("apple"), indefinite_article("utensil crock"), indefinite_article("plate")
+    ('an', 'a', 'a')
+    """
+    return "an" if re.match(r"(?!u[nst]|eu|one)[aeiou]|hour|hono|heir", name, re.IGNORECASE) else "a"
 
 
 @dataclass(frozen=True)
@@ -68,8 +78,8 @@ class Asset:
 
     @property
     def article(self) -> str:
-        """The indefinite article of the display name."""
-        return "an" if self.display_name[0] in "aeiou" else "a"
+        """The indefinite article of the display name, by sound."""
+        return indefinite_article(self.display_name)
 
     @cached_property
     def bounds(self) -> Array:

@@ -135,15 +135,7 @@ def test_sizes_masses_and_names_are_the_specified_ones(library, name):
     assert f"{asset.display_name}, {asset.plural}" == called
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.xfail(reason="Asset.article goes by the letter: 'an utensil crock'"))
-        if name == "utensil_crock"
-        else name
-        for name in NAMES
-    ],
-)
+@pytest.mark.parametrize("name", NAMES)
 def test_articles_go_by_sound(library, name):
     assert library[name].article == CALLED[name].split(" ")[0]
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Sequence
 
+from scene_envs.assets.base import indefinite_article
 from scene_envs.datasets.prompts.claims import (
     Claim,
     NameCount,
@@ -46,7 +46,7 @@ class Nouns:
 
     def __init__(self, scene_type: SceneType) -> None:
         self.plural = {asset.display_name: asset.plural for asset in scene_type.library}
-        self.article = {name: article(name) for name in self.plural}
+        self.article = {name: indefinite_article(name) for name in self.plural}
 
     def counted(self, number: int, name: str) -> str:
         """A number of things: "a cup", "two cups"."""
@@ -80,15 +80,6 @@ class Nouns:
 
     def _are(self, number: int, name: str) -> str:
         return f"{self.counted(number, name)} {'is' if number == 1 else 'are'}"
-
-
-def article(name: str) -> str:
-    """The indefinite article, by sound.
-
-    >>> article("apple"), article("utensil crock"), article("plate")
-    ('an', 'a', 'a')
-    """
-    return "an" if re.match(r"(?!u[nst]|eu|one)[aeiou]|hour|hono|heir", name, re.IGNORECASE) else "a"
 
 
 def say_reference(reference: Reference, *, near: Place | None = None) -> str:

@@ -1,0 +1,132 @@
+"""What a mixed prior is made of, and its network inside its two processes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from agents.diffusion import CategoricalProcess, GaussianProcess
+from agents.diffusion.reverse_steps import state_of
+from agents.networks.mixed_flux import POSE, MixedFlux, MixedFluxConfig
+
+
+@dataclass(frozen=True)
+class MixedPriorConfig:
+    """What a mixed discrete-continuous prior is made of.
+
+    Attributes:
+        scene_type: name of its scene type.
+        slots: slots per scene that it was trained on.
+        network: size of its denoiser.
+        schedule: noise schedule of the poses, ``"karras"``, ``"linear"`` or ``"cosine"``.
+        prediction: ``"karras"``, ``"epsilon"``, ``"x0"`` or ``"v"``, of the poses.
+        kernel: of the categories, ``"mask_and_replace"``, ``"absorbing"`` or ``"uniform"``.
+        num_timesteps: T of both.
+        noise_mean: mean of ln(noise-to-signal) over training timesteps.
+        noise_std: its standard deviation.
+        translation_weight: weight of x, y, z in the pretraining loss, rotation entries having 1.
+        category_loss: ``"cross_entropy"`` of the clean category, or ``"bound"``, the paper's variational bound.
+        category_weight: weight of the category loss beside the pose loss.
+        auxiliary: weight of the cross-entropy in the bound.
+        given_share: share of training scenes in which some poses or categories are given, for inpainting.
+    """
+
+    scene_type: str
+    slots: int
+    network: MixedFluxConfig
+    schedule: str = "karras"
+    prediction: str = "karras"
+    kernel: str = "mask_and_replace"
+    num_timesteps: int = 1000
+    noise_mean: float = -1.8
+    noise_std: float = 2.1
+    translation_weight: float = 3.0
+    category_loss: str = "cross_entropy"
+    category_weight: float = 0.3
+    auxiliary: float = 5e-4
+    given_share: float = 0.3
+
+
+@dataclass(frozen=True)
+class Given:
+    """Entries of scenes that are given exactly: the network sees them without noise, chains keep them.
+
+    Attributes:
+        x: (B, N, D) scenes; only given entries are read.
+        pose: (B, N) bool.
+        category: (B, N) bool.
+    """
+
+    x: Tensor
+    pose: Tensor
+    category: Tensor
+
+    def flags(self) -> Tensor:
+        """(B, N) int64 as the network reads them."""
+        return self.pose.long() + 2 * self.category.long()
+
+    def entries(self) -> Tensor:
+        """(B, N, D) bool."""
+        categories = self.x.shape[-1] - POSE
+        return torch.cat(
+            [self.pose[..., None].expand(-1, -1, POSE), self.category[..., None].expand(-1, -1, categories)], dim=-1
+        )
+
+    def write(self, x: Tensor) -> Tensor:
+        """``x`` (B, N, D) with the given entries in place."""
+        return torch.where(self.entries(), self.x, x)
+
+
+class MixedDenoiser(nn.Module):
+    """x_t (B, N, 12 + K) and t (B,) to the clean pose (B, N, 12) and logits of the clean category (B, N, K)."""
+
+    def __init__(self, network: MixedFlux, poses: GaussianProcess, categories: CategoricalProcess) -> None:
+        super().__init__()
+        self.network = network
+        self.poses = poses
+        self.categories = categories
+
+    def output(
+        self, x_t: Tensor, t: Tensor, given: Given | None = None, text: tuple[Tensor, Tensor] | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """The raw pose output, in the units of ``poses.target``, and logits.
+
+        Args:
+            x_t: (B, N, 12 + K), given entries in place.
+            t: (B,) timesteps.
+            given: which entries carry no noise.
+            text: (B, L, W) tokens and (B, L) their mask.
+        """
+        pose, states = x_t[..., :POSE], state_of(x_t[..., POSE:])
+        alpha, _ = self.poses.rates(t, pose)
+        ratio = (self.poses.sigma[t.cpu()] / self.poses.alpha[t.cpu()]).to(x_t.device)
+        level = ratio[:, None].expand(pose.shape[:2])
+        scaled, position = self.poses.network_input(pose, t), pose[..., :3] / alpha
+        if given is not None:
+            exact = given.pose[..., None]
+            scaled = torch.where(exact, self.poses.network_input(pose, torch.zeros_like(t)), scaled)
+            position = torch.where(exact, pose[..., :3], position)
+            level = torch.where(given.pose, torch.zeros_like(level), level)
+        tokens, mask = (None, None) if text is None else text
+        network: MixedFlux = self.network
+        time = (t - 1).to(pose.dtype) if not network.config.frequencies else 250.0 * ratio.log()
+        output: tuple[Tensor, Tensor] = network(
+            scaled,
+            states,
+            time,
+            text=tokens,
+            text_mask=mask,
+            position=position,
+            noise_level=level,
+            given=None if given is None else given.flags(),
+        )
+        return output
+
+    def forward(
+        self, x_t: Tensor, t: Tensor, given: Given | None = None, text: tuple[Tensor, Tensor] | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """The clean pose (B, N, 12), normalised, and the logits of the clean category (B, N, K)."""
+        output, logits = self.output(x_t, t, given, text)
+        return self.poses.x0_from_output(x_t[..., :POSE], t, output), logits

@@ -1,0 +1,290 @@
+"""A mixed discrete-continuous prior: D3PM on categories and DDPM on poses, each conditioned on the other.
+
+A scene x is (B, N, 12 + K): the normalised pose and the one-hot category of each slot, K = C + 1 with *empty* last.
+While a category is masked its K entries are zeros. (Pfaff et al., CoRL 2025; Hu et al. 2024)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import torch
+from torch import Generator, Tensor, nn
+from torch.nn import functional as F
+
+from agents.diffusion import (
+    CategoricalProcess,
+    GaussianProcess,
+    MixedStep,
+    Preconditioning,
+    ResidualVariance,
+    StepTable,
+    lognormal_timesteps,
+    make_categorical_schedule,
+    make_schedule,
+)
+from agents.diffusion.reverse_steps import state_of
+from agents.mixed_denoiser import Given, MixedDenoiser, MixedPriorConfig
+from agents.networks.mixed_flux import POSE, MixedFlux, MixedFluxConfig
+from agents.prior import ScenePrior
+from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.normalizer import Normalizer
+from scene_envs.protocols import StepTableLike
+from scene_envs.scene import SceneBatch
+from scene_envs.scene_types import get_scene_type
+
+CATEGORY_LOSSES = ("cross_entropy", "bound")
+_EMPTY_WEIGHT = 0.1
+"""Weight of the pose of an empty slot in the loss: it means nothing, but chains should not drift on it."""
+
+
+class MixedPrior(ScenePrior):
+    """A :class:`~agents.prior.ScenePrior` whose categories are discrete.
+
+    Args:
+        config: what it is made of.
+        normalizer: of raw scenes; only its pose features are used.
+        preconditioning: moments (12,) of normalised poses.
+        card: facts about its training.
+        residual: (G, 12) measured error of the denoised pose.
+    """
+
+    process_name = "mixed"
+
+    def __init__(
+        self,
+        config: MixedPriorConfig,
+        normalizer: Normalizer,
+        preconditioning: Preconditioning,
+        card: dict[str, Any] | None = None,
+        residual: ResidualVariance | None = None,
+    ) -> None:
+        nn.Module.__init__(self)
+        scene_type = get_scene_type(config.scene_type)
+        if config.network.categories != scene_type.num_assets + 1:
+            raise InvalidInputError(
+                f"the network knows {config.network.categories} categories, {config.scene_type!r} has "
+                f"{scene_type.num_assets + 1} with empty"
+            )
+        if config.category_loss not in CATEGORY_LOSSES:
+            raise unknown_name("category loss", config.category_loss, CATEGORY_LOSSES)
+        self.mixed = config
+        self._keep(config, normalizer, preconditioning, card, residual)
+        schedule = make_schedule(config.schedule, config.num_timesteps)
+        self.process = GaussianProcess(schedule, config.prediction, preconditioning)
+        self.categories = CategoricalProcess(
+            make_categorical_schedule(config.kernel, config.num_timesteps), config.network.categories
+        )
+        self.denoiser = MixedDenoiser(MixedFlux(config.network), self.process, self.categories)
+        self._timestep_weights = lognormal_timesteps(schedule, config.noise_mean, config.noise_std)
+
+    @classmethod
+    def from_state(
+        cls,
+        fields: dict[str, Any],
+        normalizer: Normalizer,
+        preconditioning: Preconditioning,
+        card: dict[str, Any] | None,
+        residual: ResidualVariance | None,
+    ) -> MixedPrior:
+        """From the ``prior`` entry of a configuration file."""
+        fields = {**fields, "network": MixedFluxConfig(**fields["network"])}
+        return cls(MixedPriorConfig(**fields), normalizer, preconditioning, card, residual)
+
+    def config_state(self) -> dict[str, Any]:
+        """The ``prior`` entry of the configuration file."""
+        return asdict(self.mixed)
+
+    # -- scenes and states ----------------------------------------------------------------------
+
+    @property
+    def num_categories(self) -> int:
+        """K = C + 1."""
+        return self.mixed.network.categories
+
+    def known(self, slots: int) -> Tensor:
+        """(slots, D) bool: entries that are clamped (fixed welded slots, constant pose features)."""
+        constant = self.normalizer.is_constant.to(self._fixed.device).clone()
+        constant[POSE:] = False
+        known = constant.expand(slots, -1).clone()
+        known[: len(self.scene_type.fixed)] = True
+        return known
+
+    def clamp(self, x: Tensor) -> Tensor:
+        """``x`` (B, N, D) with its known entries set to their values."""
+        count = len(self.scene_type.fixed)
+        constant = self.normalizer.is_constant[:POSE].to(x.device)
+        x = torch.cat([torch.where(constant, torch.zeros_like(x[..., :POSE]), x[..., :POSE]), x[..., POSE:]], dim=-1)
+        if count:
+            x = torch.cat([self._fixed[:count].to(x).expand(x.shape[0], -1, -1), x[:, count:]], dim=1)
+        return x
+
+    def normalised(self, batch: SceneBatch) -> Tensor:
+        """(B, N, D): normalised pose, one-hot category as it is."""
+        pose = batch.to_tensor(normalised=self.normalizer)[..., :POSE]
+        return torch.cat([pose, batch.tensor[..., POSE:]], dim=-1)
+
+    def initial(self, count: int, slots: int, generator: Generator | None = None) -> Tensor:
+        """x_T (count, slots, D): normal poses, categories from the end of their chain, known entries clamped."""
+        noise = torch.randn(count, slots, self.scene_type.features, generator=generator, device=self._fixed.device)
+        probs = self.categories.prior().to(noise).expand(count, slots, -1)
+        return self.clamp(self._with_states(noise[..., :POSE], probs, noise))
+
+    def add_noise(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
+        """A sample of q(x_t | x_0) from standard normal noise (B, N, D)."""
+        pose = self.process.add_noise(x0[..., :POSE], t, noise[..., :POSE])
+        category = x0[..., POSE:].argmax(dim=-1)
+        return self.clamp(self._with_states(pose, self.categories.marginal(category, t.expand(len(x0))), noise))
+
+    @staticmethod
+    def _with_states(pose: Tensor, probs: Tensor, noise: Tensor) -> Tensor:
+        """``pose`` (B, N, 12) beside states drawn from ``probs`` (B, N, K + 1) by ``noise`` (B, N, D)."""
+        random = torch.ones(pose.shape[1], dtype=torch.bool, device=pose.device)
+        return MixedStep(pose, torch.zeros_like(pose[0]), probs, random).from_noise(noise)
+
+    # -- the reverse chain ----------------------------------------------------------------------
+
+    def transition(
+        self,
+        x_t: Tensor,
+        step: int,
+        table: StepTableLike,
+        *,
+        given: Given | None = None,
+        text: tuple[Tensor, Tensor] | None = None,
+        guidance: float = 0.0,
+    ) -> MixedStep:
+        """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters.
+
+        Args:
+            x_t: scenes at ``table.timesteps[step]``.
+            step: index in the table.
+            table: the chain.
+            given: entries that carry no noise.
+            text: tokens (B, L, W) and their mask (B, L).
+            guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional, on poses and logits.
+        """
+        t, previous = int(table.timesteps[step]), int(table.previous[step])
+        levels = torch.full((x_t.shape[0],), t, device=x_t.device)
+        pose, logits = self.denoiser(x_t, levels, given, text)
+        if text is not None and guidance:
+            free_pose, free_logits = self.denoiser(x_t, levels, given, None)
+            pose = (1 + guidance) * pose - guidance * free_pose
+            logits = (1 + guidance) * logits.log_softmax(-1) - guidance * free_logits.log_softmax(-1)
+        residual = None if self.residual is None else self.residual.at(t)
+        mean, std = self.process.posterior(x_t[..., :POSE], pose, t, previous, residual)
+        states = x_t[..., POSE:]
+        probs = self.categories.posterior(state_of(states), logits.softmax(dim=-1), t, previous)
+        slots, fixed = x_t.shape[1], len(self.scene_type.fixed)
+        random = torch.full((slots,), previous > 0, device=x_t.device)
+        random[:fixed] = False
+        known = self.known(slots)[:, :POSE]
+        zeros = torch.zeros(*mean.shape[:2], self.num_categories, device=mean.device)
+        clamped = self.clamp(torch.cat([mean, zeros], dim=-1))
+        if fixed:
+            certain = F.one_hot(self._fixed[:fixed, POSE:].argmax(dim=-1), self.num_categories + 1).to(probs)
+            probs = torch.cat([certain.expand(len(probs), -1, -1), probs[:, fixed:]], dim=1)
+        return MixedStep(clamped[..., :POSE], std * (~known).to(mean.dtype), probs, random)
+
+    @torch.no_grad()
+    def run_chain(
+        self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None, given: Given | None = None,
+        text: tuple[Tensor, Tensor] | None = None, guidance: float = 0.0,
+    ) -> Tensor:  # fmt: skip
+        """x_0 (B, N, D) from x_T, with given entries kept.
+
+        Args:
+            x: x_T (B, N, D).
+            table: the chain.
+            noises: one generator for all scenes, or one per scene; None for torch's own.
+            given: entries that carry no noise.
+            text, guidance: as in :meth:`transition`.
+        """
+        x = x if given is None else given.write(x)
+        for step in range(len(table)):
+            reverse = self.transition(x, step, table, given=given, text=text, guidance=guidance)
+            x = reverse.from_noise(draw_noise(x, noises))
+            x = x if given is None else given.write(x)
+        return x
+
+    # -- the training loss ----------------------------------------------------------------------
+
+    def pretraining_loss(
+        self, x0: Tensor, generator: Generator | None = None, reduction: str = "mean", t: Tensor | None = None,
+        text: tuple[Tensor, Tensor] | None = None,
+    ) -> Tensor:  # fmt: skip
+        """Mean square of the pose output plus ``category_weight`` times the category loss, on entries not given.
+
+        Args:
+            x0: (B, N, D) scenes as :meth:`encode` gives them.
+            generator: source of timesteps, noise and given entries (CPU).
+            reduction: ``"mean"`` over scenes, or ``"none"`` for (B,); always the mean over entries.
+            t: (B,) timesteps, drawn when None.
+            text: tokens and their mask.
+        """
+        config, device = self.mixed, x0.device
+        if t is None:
+            t = self.draw_timesteps(x0.shape[0], generator).to(device)
+        noise = torch.randn(x0.shape, generator=generator).to(device)
+        given = self._draw_given(x0, generator) if config.given_share > 0 else None
+        x_t = self.add_noise(x0, t, noise)
+        x_t = x_t if given is None else given.write(x_t)
+        output, logits = self.denoiser.output(x_t, t, given, text)
+        pose0, category0 = x0[..., :POSE], x0[..., POSE:].argmax(dim=-1)
+        error = output - self.process.target(pose0, x_t[..., :POSE], t, noise[..., :POSE])
+        weight = self.loss_weight(x0.shape[1])[None, :, :POSE].to(device).expand(len(x0), -1, -1)
+        empty = (category0 == self.num_categories - 1)[..., None]
+        weight = torch.where(empty, _EMPTY_WEIGHT * weight, weight)
+        drawn = torch.ones(x0.shape[:2], device=device)
+        drawn[:, : len(self.scene_type.fixed)] = 0.0
+        if given is not None:
+            weight = weight * (~given.pose)[..., None]
+            drawn = drawn * (~given.category)
+        pose_loss = (error.square() * weight).sum(dim=(1, 2)) / weight.sum(dim=(1, 2)).clamp(min=1.0)
+        if config.category_loss == "bound":
+            states = x_t[..., POSE:]
+            losses = self.categories.loss(category0, state_of(states), t, logits, config.auxiliary)
+        else:
+            losses = F.cross_entropy(logits.flatten(0, 1), category0.flatten(), reduction="none").view_as(drawn)
+        category_loss = (losses * drawn).sum(dim=1) / drawn.sum(dim=1).clamp(min=1.0)
+        per_scene = pose_loss + config.category_weight * category_loss
+        return per_scene.mean() if reduction == "mean" else per_scene
+
+    def _draw_given(self, x0: Tensor, generator: Generator | None) -> Given:
+        """Random given entries: slots (completion), all categories (rearrangement), or any attribute of any slot."""
+        batch, slots = x0.shape[:2]
+        kind, share = torch.rand(2, batch, 1, generator=generator)
+        kind = kind / max(self.mixed.given_share, 1e-9)  # above 1: nothing is given
+        picks = torch.rand(2, batch, slots, generator=generator) < share
+        whole, rearrange, free = kind < 0.5, (kind >= 0.5) & (kind < 0.75), (kind >= 0.75) & (kind < 1.0)
+        pose = (whole & picks[0]) | (rearrange & picks[0] & (share < 0.5)) | (free & picks[0])
+        category = (whole & picks[0]) | rearrange.expand(-1, slots) | (free & picks[1])
+        fixed = torch.zeros(slots, dtype=torch.bool)
+        fixed[: len(self.scene_type.fixed)] = True
+        return Given(x0, (pose | fixed).to(x0.device), (category | fixed).to(x0.device))
+
+    @torch.no_grad()
+    def fit_residual(self, x0: Tensor, levels: int = 40, seed: int = 0) -> ResidualVariance:
+        """Measure the error of the denoised pose on scenes ``x0`` (B, N, D) at ``levels`` timesteps, and keep it."""
+        generator = Generator().manual_seed(seed)
+        timesteps = StepTable.spaced(self.mixed.num_timesteps, levels).timesteps.flip(0)
+        present = (x0[..., POSE:].argmax(dim=-1) != self.num_categories - 1).float()
+        present[:, : len(self.scene_type.fixed)] = 0.0
+        rows = []
+        for t in timesteps:
+            noise = torch.randn(x0.shape, generator=generator).to(x0.device)
+            level = t.to(x0.device).expand(len(x0))
+            pose, _ = self.denoiser(self.add_noise(x0, level, noise), level)
+            error = (pose - x0[..., :POSE]).square() * present[..., None]
+            rows.append((error.sum(dim=(0, 1)) / present.sum()).cpu())
+        self.residual = ResidualVariance(timesteps, torch.stack(rows))
+        return self.residual
+
+
+def draw_noise(like: Tensor, noises: Sequence[Generator] | Generator | None) -> Tensor:
+    """Standard normal noise shaped as ``like`` (B, N, D), from one generator or one per scene."""
+    if noises is None or isinstance(noises, Generator):
+        return torch.randn(like.shape, generator=noises, device=like.device)
+    return torch.stack([torch.randn(like.shape[1:], generator=g) for g in noises]).to(like.device)
