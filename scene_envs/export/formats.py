@@ -115,7 +115,7 @@ def get_format(name: str) -> ExportFormat:
 
 
 def resolve_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
-    """Names of formats, each once, from one name, several, or ``"all"`` (all built in that can be written here).
+    """Names of formats, each once, from one name, several, or ``"all"`` (those registered that can be written here).
 
     Raises:
         UnknownNameError: no such format.

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from export_scenes import laid_scene
 
-from scene_envs.export import export
+from scene_envs.export import export, formats
 
 PAGE = Path(__file__).parents[2] / "docs" / "export.md"
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
@@ -26,7 +26,8 @@ def test_code_blocks_run(block, tmp_path, monkeypatch):
         if f"import {name}" in block or f"from {name}" in block or (name == "pxr" and '"usd"' in block):
             pytest.importorskip(name)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(formats, "_FORMATS", dict(formats._FORMATS))
     if "SceneBatch" not in block:
-        formats = [("scene.xml", "mjcf"), ("dmd", "drake"), ("objects.json", "urdf"), ("usda", "usd"), ("npz", "npz")]
-        export(laid_scene(), "scenes", [name for sign, name in formats if sign in block] or ["npz"])
+        signs = [("scene.xml", "mjcf"), ("dmd", "drake"), ("objects.json", "urdf"), ("usda", "usd"), ("npz", "npz")]
+        export(laid_scene(), "scenes", [name for sign, name in signs if sign in block] or ["npz"])
     exec(block, {"__name__": "docs"})
