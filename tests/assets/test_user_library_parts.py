@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import doctest
 import logging
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from scene_envs.assets import Asset, ConvexPart, import_report, load_library
-from scene_envs.assets.importing.decomposition import cache_folder
+from scene_envs.assets.importing.decomposition import cache_folder, drawn_to
 from scene_envs.assets.importing.hulls import MOST_CORNERS, enclosing_hull, few_cornered_hull, thickness
 from scene_envs.assets.shapes import box, convex_hull
 from scene_envs.errors import MissingDependencyError
@@ -179,3 +181,18 @@ def test_the_cache_lies_where_the_user_says(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.delenv("SCENE_ENVS_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", "/c")
     assert cache_folder() == Path("/c/scene_envs")
+
+
+def test_corners_near_the_surface_are_drawn_onto_it() -> None:
+    """A cube of 0.2: corners of pieces a millimetre off its faces come back, one deep inside stays."""
+    cube = trimesh.creation.box((0.2, 0.2, 0.2))
+    points = np.array([[0.03, 0.02, -0.101], [0.099, 0.05, 0.0], [0.101, 0.101, 0.101], [0.0, 0.0, 0.0]])
+    drawn = drawn_to(cube, points, 0.003)
+    assert drawn == pytest.approx(np.array([[0.03, 0.02, -0.1], [0.1, 0.05, 0.0], [0.1, 0.1, 0.1], [0.0, 0.0, 0.0]]))
+
+
+@pytest.mark.parametrize("name", ["hulls", "inertials", "class_colors"])
+def test_docstring_examples(name: str) -> None:
+    result = doctest.testmod(import_module(f"scene_envs.assets.importing.{name}"))
+    assert result.attempted > 0
+    assert result.failed == 0

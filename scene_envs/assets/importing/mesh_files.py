@@ -26,6 +26,8 @@ _SMOOTH = float(np.cos(np.radians(40.0)))
 """Faces that meet at less than 40 degrees are shaded as one curved surface."""
 _MOST_SMOOTHED = 100_000
 """Triangles up to which corners are smoothed."""
+_FINE_TEXTURE, _TEXTURE_COLORS = 500, 32
+"""Textured meshes are cut into at least this many triangles, with at most so many colours."""
 _SAMPLES = np.array(
     [[a, b, 4 - a - b] for a in range(5) for b in range(5 - a)], dtype=np.float64
 ) / 4.0  # fmt: skip
@@ -139,6 +141,7 @@ def painted(mesh: trimesh.Trimesh, color: Color | None) -> trimesh.Trimesh:
     """The mesh with a colour and a normal per vertex: its own, else ``color``, else grey."""
     import trimesh
 
+    mesh = _cut(mesh)
     faces = np.asarray(mesh.faces)
     colors = _corner_colors(mesh) if color is None or has_color(mesh) else None
     if colors is None:
@@ -176,7 +179,34 @@ def _corner_colors(mesh: trimesh.Trimesh) -> NDArray[np.uint8] | None:
         return np.tile(flat, (len(faces), 3, 1))
     points = np.einsum("sk,fkc->fsc", _SAMPLES, uv[faces])  # (F, S, 2)
     read = np.asarray(visual.material.to_color(points.reshape(-1, 2)))[:, :3].reshape(len(faces), len(_SAMPLES), 3)
-    return np.repeat(np.rint(read.mean(axis=1, keepdims=True)), 3, axis=1).astype(np.uint8)
+    return np.repeat(_few_colors(np.rint(read.mean(axis=1)).astype(np.uint8))[:, None], 3, axis=1)
+
+
+def _few_colors(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The colours (F, 3) reduced to a palette."""
+    from PIL import Image
+
+    if len(np.unique(colors, axis=0)) <= _TEXTURE_COLORS:
+        return colors
+    reduced = Image.fromarray(colors[None]).quantize(_TEXTURE_COLORS).convert("RGB")
+    return np.asarray(reduced, dtype=np.uint8)[0]
+
+
+def _cut(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A textured mesh of few triangles cut into more, so that the texture is seen; others as they are."""
+    import trimesh
+
+    visual: Any = mesh.visual
+    if visual.kind != "texture" or visual.uv is None or _image(visual.material) is None:
+        return mesh
+    vertices, faces, uv = np.asarray(mesh.vertices), np.asarray(mesh.faces), np.asarray(visual.uv)
+    if len(uv) != len(vertices) or len(faces) >= _FINE_TEXTURE:
+        return mesh
+    while len(faces) < _FINE_TEXTURE:
+        vertices, faces, attributes = trimesh.remesh.subdivide(vertices, faces, vertex_attributes={"uv": uv})
+        uv = attributes["uv"]
+    look = trimesh.visual.TextureVisuals(uv=uv, material=visual.material)
+    return trimesh.Trimesh(vertices, faces, visual=look, process=False)
 
 
 def _corner_normals(mesh: trimesh.Trimesh) -> Array:
