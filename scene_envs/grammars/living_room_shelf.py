@@ -39,7 +39,7 @@ def large_games() -> Node:
 
 
 def small_games() -> Node:
-    """Up to four small games on each other."""
+    """Up to four small games on each other: a fifth would not fit under the next board."""
     return Stack("board_game_s", {"board_game_s": 0.3, None: 0.7}, where=anywhere(), at_most=4, yaw=SQUARE)
 
 
@@ -65,8 +65,13 @@ def drinks(asset: str, p: float) -> Node:
 
 
 def things(toy: float, game: float, p: float) -> Node:
-    """What a tier may hold: each toy, book or speaker, and each game or plate, with a chance; drinks and cases by
-    ``p``, which says how quickly their numbers fall off."""
+    """What stands on one tier.
+
+    Args:
+        toy: chance of the book and of each toy.
+        game: chance of small games and of a plate.
+        p: how quickly the numbers of game cases, cans and bottles fall off.
+    """
     return Group(
         maybe(toy, bookend()),
         maybe(game, small_games()),
@@ -81,7 +86,7 @@ def things(toy: float, game: float, p: float) -> Node:
 
 
 def inner_tier() -> Node:
-    return OneOf((0.57, things(toy=0.12, game=0.08, p=0.85)), (0.08, large_games()), (0.35, NOTHING))
+    return OneOf((0.53, things(toy=0.12, game=0.08, p=0.85)), (0.08, large_games()), (0.39, NOTHING))
 
 
 def full_tier() -> Node:
@@ -91,7 +96,7 @@ def full_tier() -> Node:
 def top_tier() -> Node:
     """The top of the shelf: lamps, a fruit bowl, small games, a speaker."""
     fruit = OneOf((1.0, Object("apple_gala")), (1.0, Object("pear_bosc")))
-    bowl = Object("fruit_bowl", anywhere(), inside=Heap(Repeat(fruit, Geometric(0.6, 0, 3)), 0.03))
+    bowl = Object("fruit_bowl", anywhere(), inside=Heap(Repeat(fruit, Geometric(0.5, 0, 3)), 0.03))
     setting = Group(
         maybe(0.2, bowl),
         maybe(0.3, small_games()),
