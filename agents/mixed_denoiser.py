@@ -31,6 +31,7 @@ class MixedPriorConfig:
         category_weight: weight of the category loss beside the pose loss.
         auxiliary: weight of the cross-entropy in the bound.
         given_share: share of training scenes in which some poses or categories are given, for inpainting.
+        clip: bound on denoised poses while sampling, normalised units; 0 for none (1 is the paper's).
     """
 
     scene_type: str
@@ -47,6 +48,7 @@ class MixedPriorConfig:
     category_weight: float = 0.3
     auxiliary: float = 5e-4
     given_share: float = 0.3
+    clip: float = 0.0
 
 
 @dataclass(frozen=True)

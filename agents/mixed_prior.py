@@ -173,6 +173,8 @@ class MixedPrior(ScenePrior):
             free_pose, free_logits = self.denoiser(x_t, levels, given, None)
             pose = (1 + guidance) * pose - guidance * free_pose
             logits = (1 + guidance) * logits.log_softmax(-1) - guidance * free_logits.log_softmax(-1)
+        if self.mixed.clip:
+            pose = pose.clamp(-self.mixed.clip, self.mixed.clip)
         residual = None if self.residual is None else self.residual.at(t)
         mean, std = self.process.posterior(x_t[..., :POSE], pose, t, previous, residual)
         states = x_t[..., POSE:]

@@ -25,11 +25,11 @@ from agents.diffusion import (
 from agents.inpainting import inpaint
 from agents.networks import FluxConfig, FluxDenoiser
 from agents.prior_files import read_prior, write_prior
-from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
 from scene_envs.scene import TRANSLATION, SceneBatch
-from scene_envs.scene_types import SceneType, get_scene_type
+from scene_envs.scene_types import SceneType, get_scene_type, register_scene_type
 
 _LEVELS, _RESIDUAL = "residual.timesteps", "residual.variance"
 
@@ -118,6 +118,7 @@ class ScenePrior(nn.Module):
             moments = (torch.tensor(state["preconditioning"][key]) for key in ("mean", "std"))
             normalizer = Normalizer.from_state(state["normalizer_state"])
             residual = ResidualVariance(tensors.pop(_LEVELS), tensors.pop(_RESIDUAL)) if _LEVELS in tensors else None
+            _know_scene_type(state)
             kind = _prior_class(state.get("process", "continuous"))
             prior = kind.from_state(state["prior"], normalizer, Preconditioning(*moments), state.get("card"), residual)
             prior.denoiser.network.load_state_dict(tensors)
@@ -135,6 +136,7 @@ class ScenePrior(nn.Module):
         state = {
             "process": self.process_name,
             "prior": self.config_state(),
+            "scene_type": asdict(self.scene_type),
             "preconditioning": moments,
             "normalizer_state": self.normalizer.state(),
             "card": self.card,
@@ -304,6 +306,16 @@ class ScenePrior(nn.Module):
         weight = (~self.known(slots)).float()
         weight[:, TRANSLATION] *= self.config.translation_weight
         return weight
+
+
+def _know_scene_type(state: dict[str, Any]) -> None:
+    """Register the scene type that a prior was saved with, unless one of that name is known."""
+    try:
+        get_scene_type(state["prior"]["scene_type"])
+    except UnknownNameError:
+        if "scene_type" not in state:
+            raise
+        register_scene_type(SceneType.from_dict(state["scene_type"]))
 
 
 def _prior_class(process: str) -> type[ScenePrior]:

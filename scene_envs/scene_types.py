@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.plugins import load_plugins
@@ -87,6 +88,14 @@ class SceneType:
         if self.slots <= len(self.fixed):
             raise InvalidInputError(f"scene type {self.name!r}: slots={self.slots} leaves no room for free objects")
 
+    @classmethod
+    def from_dict(cls, fields: Mapping[str, Any]) -> SceneType:
+        """Inverse of :func:`dataclasses.asdict`, also after a trip through JSON."""
+        values = {name: _tuples(value) for name, value in fields.items() if name not in ("camera", "fixed")}
+        camera = Camera(**{name: _tuples(value) for name, value in fields["camera"].items()})
+        fixed = tuple(FixedObject(**{name: _tuples(v) for name, v in item.items()}) for item in fields["fixed"])
+        return cls(**values, camera=camera, fixed=fixed)
+
     @property
     def num_assets(self) -> int:
         """C, the number of assets; the category of an empty slot is C."""
@@ -108,6 +117,11 @@ class SceneType:
         from scene_envs.assets import get_library
 
         return get_library(self.assets, self.asset_folders)
+
+
+def _tuples(value: Any) -> Any:
+    """Lists as tuples, all the way down."""
+    return tuple(_tuples(item) for item in value) if isinstance(value, list | tuple) else value
 
 
 _REGISTRY: dict[str, SceneType] = {}

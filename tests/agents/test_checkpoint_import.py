@@ -1,0 +1,142 @@
+"""Checkpoints of the paper's authors: exactly their function, safely read, and what does not fit is named."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from pathlib import Path
+
+import pytest
+import torch
+
+from agents.checkpoint_import import import_checkpoint, read_lightning
+from agents.prior import ScenePrior
+from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
+from scene_envs.scene_types import get_scene_type
+from tests.agents.authors_flux import forward, random_state
+
+DIMSUM = get_scene_type("dimsum_table")
+
+
+def _normalizer(features: int) -> dict[str, object]:
+    return {
+        "params": {
+            "scale": [2.0] * features,
+            "min": [0.0] * features,
+            "input_stats": {"min": [-0.5] * features, "max": [0.5] * features},
+        },
+        "is_fitted": True,
+    }
+
+
+def _write(
+    folder: Path, state: dict[str, torch.Tensor], *, order: list[str] | None = None, **extra: object
+) -> tuple[Path, Path]:
+    names = order or list(DIMSUM.assets)
+    metadata = {
+        "model_paths": [f"package://some/models/{name}.sdf" for name in names],
+        "normalizer_state": _normalizer(13 + len(names)),
+        "welded_object_model_paths": ["package://some/models/cafe_table.sdf"],
+        "max_num_objects_per_scene": 34,
+    }
+    (folder / "metadata.json").write_text(json.dumps(metadata))
+    content = {
+        "state_dict": {f"model.{name}": 0.0 * tensor for name, tensor in state.items()}
+        | {f"ema.averaged_model.{name}": tensor for name, tensor in state.items()}
+        | {"ema.optimization_step": torch.tensor(7), "txt_encoder.weight": torch.zeros(2)},
+        "normalizer_state": _normalizer(12),
+        "global_step": 1234,
+        "optimizer_states": [{"state": {}}],
+        **extra,
+    }
+    torch.save(content, folder / "mixed.ckpt")
+    return folder / "mixed.ckpt", folder / "metadata.json"
+
+
+@pytest.mark.parametrize("text", [0, 10])
+def test_the_network_computes_exactly_the_described_function(tmp_path: Path, text: int) -> None:
+    state = random_state(text=text)
+    prior = import_checkpoint(*_write(tmp_path, state), scene=DIMSUM)
+    network = prior.denoiser.network.double()
+    generator = torch.Generator().manual_seed(1)
+    pose = torch.randn(3, 6, 12, generator=generator, dtype=torch.float64)
+    category = torch.randint(9, (3, 6), generator=generator)
+    t = torch.tensor([0, 17, 999])
+    words = torch.randn(3, 4, text, generator=generator, dtype=torch.float64) if text else None
+    noise, logits = network(pose, category, t.double(), text=words)
+    expected_noise, expected_logits = forward(state, pose, category, t, words)
+    torch.testing.assert_close(noise, expected_noise, atol=1e-9, rtol=1e-9)
+    torch.testing.assert_close(logits, expected_logits, atol=1e-9, rtol=1e-9)
+
+
+def test_the_result_samples_and_survives_a_round_trip(tmp_path: Path) -> None:
+    prior = import_checkpoint(*_write(tmp_path, random_state()), scene="dimsum_table")
+    batch = prior.sample(2, num_steps=5, seed=0)
+    assert batch.tensor.shape == (2, 34, 20)
+    assert prior.card["trained_steps"] == 1234
+    again = ScenePrior.load(prior.save(tmp_path / "prior"))
+    assert (again.sample(2, num_steps=5, seed=0).tensor == batch.tensor).all()
+
+
+def test_the_first_timestep_is_0_as_theirs(tmp_path: Path) -> None:
+    state = random_state(text=0)
+    prior = import_checkpoint(*_write(tmp_path, state), scene=DIMSUM)
+    x = prior.initial(2, 34, torch.Generator().manual_seed(0))
+    pose, logits = prior.denoiser.output(x, torch.tensor([1, 3]))
+    category = torch.where(x[..., 12:].amax(-1) > 0.5, x[..., 12:].argmax(-1), 8)
+    expected, expected_logits = forward(state, x[..., :12], category, torch.tensor([0, 2]), None)
+    torch.testing.assert_close(pose, expected.float(), atol=2e-3, rtol=2e-3)
+    torch.testing.assert_close(logits, expected_logits.float(), atol=2e-3, rtol=2e-3)
+
+
+def test_categories_follow_the_model_paths_not_their_order(tmp_path: Path) -> None:
+    state = random_state(text=0)
+    order = list(reversed(DIMSUM.assets))
+    (tmp_path / "a").mkdir(), (tmp_path / "b").mkdir()
+    straight = import_checkpoint(*_write(tmp_path / "a", state), scene=DIMSUM)
+    turned = import_checkpoint(*_write(tmp_path / "b", state, order=order), scene=DIMSUM)
+    pose, category = torch.randn(1, 7, 12), torch.arange(7)[None]
+    _, logits = straight.denoiser.network(pose, category, torch.tensor([5.0]))
+    _, other = turned.denoiser.network(pose, 6 - category, torch.tensor([5.0]))
+    torch.testing.assert_close(other[..., :7], logits[..., :7].flip(-1), atol=1e-4, rtol=1e-4)
+
+
+def test_unknown_assets_need_aliases_and_without_a_scene_type_one_is_made(tmp_path: Path) -> None:
+    order = [*DIMSUM.assets[:-1], "tetsubin"]
+    files = _write(tmp_path, random_state(), order=order)
+    with pytest.raises(UnknownNameError, match="aliases"):
+        import_checkpoint(*files, scene=DIMSUM)
+    import_checkpoint(*files, scene=DIMSUM, aliases={"tetsubin": "teapot"})
+    prior = import_checkpoint(*files)
+    assert prior.scene_type.assets == tuple(order)
+    assert prior.scene_type.welded == ("cafe_table",)
+    assert len(prior.sample(1, num_steps=2, seed=0)) == 1
+
+
+class _Trap:
+    def __reduce__(self) -> tuple[object, ...]:
+        return (Path.touch, (Path(pickle.__name__ + ".trap"),))
+
+
+def test_objects_in_the_file_are_never_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    file, metadata = _write(tmp_path, random_state(), hyper_parameters={"config": _Trap()})
+    prior = import_checkpoint(file, metadata, scene=DIMSUM)
+    assert len(prior.sample(1, num_steps=2, seed=0)) == 1
+    assert not list(tmp_path.glob("*.trap"))
+
+
+def test_what_does_not_fit_is_named(tmp_path: Path) -> None:
+    state = random_state()
+    del state["scene_in.bias"], state["double_blocks.0.x_qkv_linear.weight"]
+    with pytest.raises(CorruptFileError, match=r"double_blocks\.0\.scene\.qkv\.weight"):
+        import_checkpoint(*_write(tmp_path, state), scene=DIMSUM)
+    with pytest.raises(CorruptFileError, match="unet_block"):
+        import_checkpoint(*_write(tmp_path, random_state() | {"unet_block.weight": torch.zeros(1)}), scene=DIMSUM)
+    with pytest.raises(InvalidInputError, match="knows 5 assets"):
+        import_checkpoint(*_write(tmp_path, random_state(assets=5)), scene=DIMSUM)
+    (tmp_path / "mixed.ckpt").write_bytes(b"nothing")
+    with pytest.raises(CorruptFileError, match="not a checkpoint"):
+        read_lightning(tmp_path / "mixed.ckpt")
+    with pytest.raises(InvalidInputError, match="no checkpoint"):
+        read_lightning(tmp_path / "missing.ckpt")
