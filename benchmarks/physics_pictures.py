@@ -86,9 +86,9 @@ def main() -> None:
     )
 
     scene = noisy("breakfast_table_low_clutter", 3, (0.0, 0.0, 0.0))
-    lifted = scene.translations.clone()
-    lifted[..., 2] += 0.05 * scene.is_free
-    lifted = scene.with_poses(lifted, scene.rotations)
+    higher = scene.translations.clone()
+    higher[..., 2] += 0.05 * scene.is_free
+    lifted = scene.with_poses(higher, scene.rotations)
     save(folder / "physics_settle.png", [("5 cm above", lifted, None), ("settled", settle(lifted).batch, None)])
 
     scene = noisy("dimsum_table", 5, (0.01, 0.01, 0.01))

@@ -102,7 +102,7 @@ class SmallProgram:
             )  # fmt: skip
             if (distance > 0 and distance > gap[row] + 1e-6) or gap[row] + 1e-6 < distance < 0:
                 way = on_b - on_a if distance > 0 else on_a - on_b
-                gap[row], normal[row] = distance, way / max(np.linalg.norm(way), 1e-12)
+                gap[row], normal[row] = distance, way / max(float(np.linalg.norm(way)), 1e-12)
         line = np.arange(len(gap))
         jacobian[line, self.column[self.second[self.pair]]] += normal
         jacobian[line, self.column[self.first[self.pair]]] -= normal
@@ -227,18 +227,8 @@ def main() -> None:
             measure_type(name, options.count, options.seed, table)
         console.print(table)
     if options.small:
-        columns = (
-            "scene type",
-            "scenes",
-            "mean",
-            "10 %",
-            "median",
-            "90 %",
-            "largest",
-            "solved by projection",
-            "by SLSQP alone",
-        )
-        table = Table(*columns, title="way of projection / way of SLSQP, 2 to 8 objects, jitter 2 cm")
+        headers = ("scene type", "scenes", "mean", "10 %", "median", "90 %", "largest", "we solve", "SLSQP alone")
+        table = Table(*headers, title="way of projection / way of SLSQP, 2 to 8 objects, jitter 2 cm")
         for name in options.types:
             measure_small(name, options.small, options.starts, options.seed, table)
         console.print(table)
