@@ -26,8 +26,12 @@ WALL = Line((-4.75, -3.0), (-4.75, 3.0))
 
 
 def chairs() -> Node:
-    """Four chairs around a table, each facing it, in the frame of the table."""
-    chair = Object("chair", Gaussian(1.1, 0.0, along=0.07, across=0.17), Yaw(0.14, (math.pi,)))
+    """Four chairs around a table, one on each side and facing it, in the frame of the table.
+
+    Their places have the spread of the paper's, 7 cm to the table and 17 cm along it, but no tails: a table that finds
+    no room for its chairs stands somewhere else.
+    """
+    chair = Object("chair", Uniform(0.12, 0.29, x=1.12), Yaw(0.14, (math.pi,)))
     center = Gaussian(along=0.0)
     return Group(*(Cluster(chair, center, Yaw(0.0, (quarter * math.pi / 2,))) for quarter in range(4)))
 
