@@ -190,10 +190,20 @@ class MixedPrior(ScenePrior):
             probs = torch.cat([certain.expand(len(probs), -1, -1), probs[:, fixed:]], dim=1)
         return MixedStep(clamped[..., :POSE], std * (~known).to(mean.dtype), probs, random)
 
+    def regenerate(
+        self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int
+    ) -> Tensor:
+        """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; the rest is seen as it is."""
+        given = Given(self.encode(batch), ~mask[..., 0], ~mask[..., 1])
+        noise = draw_noise(given.x, generators)
+        probs = self.categories.prior().to(noise).expand(*noise.shape[:2], -1)
+        start = self.clamp(self._with_states(noise[..., :POSE], probs, noise))
+        return self.run_chain(start, table, generators, given, resample=resample)
+
     @torch.no_grad()
     def run_chain(
         self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None, given: Given | None = None,
-        text: tuple[Tensor, Tensor] | None = None, guidance: float = 0.0,
+        text: tuple[Tensor, Tensor] | None = None, guidance: float = 0.0, resample: int = 1,
     ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D) from x_T, with given entries kept.
 
@@ -203,13 +213,25 @@ class MixedPrior(ScenePrior):
             noises: one generator for all scenes, or one per scene; None for torch's own.
             given: entries that carry no noise.
             text, guidance: as in :meth:`transition`.
+            resample: how often each step is taken, going back in between.
         """
         x = x if given is None else given.write(x)
         for step in range(len(table)):
-            reverse = self.transition(x, step, table, given=given, text=text, guidance=guidance)
-            x = reverse.from_noise(draw_noise(x, noises))
-            x = x if given is None else given.write(x)
+            level, after = int(table.timesteps[step]), int(table.previous[step])
+            for again in range(resample if after > 0 else 1):
+                if again:
+                    x = self._renoise(x, after, level, draw_noise(x, noises))
+                    x = x if given is None else given.write(x)
+                reverse = self.transition(x, step, table, given=given, text=text, guidance=guidance)
+                x = reverse.from_noise(draw_noise(x, noises))
+                x = x if given is None else given.write(x)
         return x
+
+    def _renoise(self, x_s: Tensor, s: int, t: int, noise: Tensor) -> Tensor:
+        """A sample of q(x_t | x_s), s < t."""
+        pose = self.process.renoise(x_s[..., :POSE], s, t, noise[..., :POSE])
+        rows = self.categories.transition(s, t).to(x_s)[state_of(x_s[..., POSE:])]
+        return self.clamp(self._with_states(pose, rows, noise))
 
     # -- the training loss ----------------------------------------------------------------------
 

@@ -22,13 +22,13 @@ from agents.diffusion import (
     lognormal_timesteps,
     make_schedule,
 )
-from agents.inpainting import inpaint
+from agents.inpainting import chain_with_noised, inpaint
 from agents.networks import FluxConfig, FluxDenoiser
 from agents.prior_files import read_prior, write_prior
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
-from scene_envs.scene import TRANSLATION, SceneBatch
+from scene_envs.scene import POSE, TRANSLATION, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type, register_scene_type
 
 _LEVELS, _RESIDUAL = "residual.timesteps", "residual.variance"
@@ -253,13 +253,38 @@ class ScenePrior(nn.Module):
         num_steps: int = 50,
         generators: Sequence[Generator] | None = None,
         seed: int = 0,
+        resample: int = 1,
     ) -> SceneBatch:
-        """Regenerate the slots where ``mask`` (B, N) is True; see :func:`agents.inpainting.inpaint`."""
-        return inpaint(self, batch, mask, num_steps=num_steps, generators=generators, seed=seed)
+        """Regenerate what ``mask`` (B, N) or (B, N, 2) says; see :func:`agents.inpainting.inpaint`."""
+        return inpaint(self, batch, mask, num_steps=num_steps, generators=generators, seed=seed, resample=resample)
 
-    def complete(self, batch: SceneBatch, *, num_steps: int = 50, seed: int = 0) -> SceneBatch:
-        """Fill the empty slots of ``batch``, keeping its objects."""
-        return self.inpaint(batch, batch.is_empty, num_steps=num_steps, seed=seed)
+    def regenerate(
+        self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int
+    ) -> Tensor:
+        """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; used by :meth:`inpaint`."""
+        x0 = self.encode(batch)
+        widths = torch.tensor([POSE.stop, x0.shape[-1] - POSE.stop], device=mask.device)
+        keep = ~mask.repeat_interleave(widths, dim=-1)
+        return chain_with_noised(self, x0, keep, table, generators, resample)
+
+    def complete(
+        self, batch: SceneBatch, *, slots: int | None = None, num_steps: int = 50, seed: int = 0
+    ) -> SceneBatch:
+        """Fill the empty slots of ``batch``, keeping its objects.
+
+        Args:
+            batch: scenes.
+            slots: slots of the result, at least those of ``batch``; None keeps them.
+            num_steps: denoiser evaluations per scene.
+            seed: of the noise; scene i uses ``seed + i``.
+        """
+        wide = batch if slots is None else batch.with_slots(slots)
+        return self.inpaint(wide, wide.is_empty, num_steps=num_steps, seed=seed)
+
+    def rearrange(self, batch: SceneBatch, *, num_steps: int = 50, seed: int = 0) -> SceneBatch:
+        """New poses for the free objects of ``batch``; what is there, and what is welded, stays."""
+        free = batch.is_free
+        return self.inpaint(batch, torch.stack([free, torch.zeros_like(free)], dim=-1), num_steps=num_steps, seed=seed)
 
     # -- the training loss ----------------------------------------------------------------------
 

@@ -67,6 +67,11 @@ class GaussianProcess:
         alpha, sigma = self.rates(t, x0)
         return alpha * x0 + sigma * noise
 
+    def renoise(self, x_s: Tensor, s: int, t: int, noise: Tensor) -> Tensor:
+        """A sample of q(x_t | x_s), s < t: back up the chain."""
+        ratio = self.schedule.alpha_bar[t] / self.schedule.alpha_bar[s]
+        return float(ratio.sqrt()) * x_s + float((1.0 - ratio).sqrt()) * noise
+
     # -- what the network sees and says ---------------------------------------------------------
 
     def network_input(self, x_t: Tensor, t: Tensor) -> Tensor:

@@ -71,7 +71,7 @@ def render(
     categories = batch.categories.detach().cpu().numpy()
     rotations = torch.where(batch.is_empty[..., None, None], torch.eye(3).to(batch.rotations), batch.rotations)
     quaternions = matrix_to_quaternion(rotations.detach().cpu().double()).numpy()
-    stage = get_stage(scene_type.assets)
+    stage = get_stage(scene_type.assets, scene_type.asset_folders)
     images = np.empty((len(batch), height, width, 3), dtype=np.uint8)
     for index in range(len(batch)):
         stage.place(translations[index], quaternions[index], categories[index])

@@ -62,10 +62,10 @@ class Stage:
         names: asset names in category order.
     """
 
-    def __init__(self, names: tuple[str, ...]) -> None:
+    def __init__(self, names: tuple[str, ...], folders: tuple[str, ...] = ()) -> None:
         self._bullet = load_pybullet()
         self._client: int = self._bullet.connect(self._bullet.DIRECT)
-        self._library = get_library(names)
+        self._library = get_library(names, folders)
         self._palette, self._texture = self._load_palette()
         self._shapes: dict[int, int] = {}
         self._bodies: list[list[int]] = [[] for _ in names]
@@ -179,9 +179,9 @@ class Stage:
 
 
 @cache
-def get_stage(names: tuple[str, ...]) -> Stage:
-    """The stage of this process for the library ``names``."""
-    return Stage(names)
+def get_stage(names: tuple[str, ...], folders: tuple[str, ...] = ()) -> Stage:
+    """The stage of this process for the library ``names``, taken from ``folders`` first."""
+    return Stage(names, folders)
 
 
 def make_palette(codes: NDArray[np.int64], limit: int) -> tuple[NDArray[np.int64], int]:
