@@ -33,9 +33,9 @@ def shared(fullness: float) -> Node:
     return Group(shared_plates(1 - fullness, 4, 0.25), shared_bowls(1 - fullness, 6), cereal(0.4), jugs(0.6))
 
 
-USUAL = Group(six_places(0.54, 0.19, 0.27), shared(0.3))
+USUAL = Group(six_places(0.535, 0.19, 0.275), shared(0.3))
 QUIET = Group(six_places(0.10, 0.05, 0.85), shared(0.3))
-FEAST = Group(six_places(0.95, 0.05, 0.00), shared(0.6))
+FEAST = Group(six_places(0.95, 0.05, 0.00), shared(0.7))
 
 
 @register_grammar("breakfast_table_high_clutter")

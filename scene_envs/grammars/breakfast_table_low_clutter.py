@@ -34,7 +34,7 @@ def shared(crock_present: float) -> Node:
     return Group(crock(crock_present), shared_plates(0.7, 2, 0.2), shared_bowls(0.7, 2), cereal(0.58), jugs(0.6))
 
 
-USUAL = Group(two_places(0.37, 0.12, 0.51), shared(0.12))
+USUAL = Group(two_places(0.36, 0.12, 0.52), shared(0.12))
 FEAST = Group(two_places(0.90, 0.10, 0.00), shared(0.90))
 
 

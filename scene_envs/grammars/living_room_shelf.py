@@ -86,7 +86,7 @@ def things(toy: float, game: float, p: float) -> Node:
 
 
 def inner_tier() -> Node:
-    return OneOf((0.53, things(toy=0.12, game=0.08, p=0.85)), (0.08, large_games()), (0.39, NOTHING))
+    return OneOf((0.48, things(toy=0.12, game=0.08, p=0.85)), (0.08, large_games()), (0.44, NOTHING))
 
 
 def full_tier() -> Node:

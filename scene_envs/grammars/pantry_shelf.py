@@ -42,6 +42,6 @@ def pantry(p: float) -> Node:
 @register_grammar("pantry_shelf")
 def pantry_shelf() -> Grammar:
     """Shelves from nearly empty to packed."""
-    shelves = OneOf((0.02, pantry(0.93)), (0.90, pantry(0.647)), (0.08, pantry(0.5)))
+    shelves = OneOf((0.02, pantry(0.93)), (0.90, pantry(0.649)), (0.08, pantry(0.5)))
     room = Surface([shelves], Region(1.0, 1.0))
     return Grammar("pantry_shelf", get_scene_type("pantry_shelf"), [room], at_least(2))
