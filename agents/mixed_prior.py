@@ -33,7 +33,7 @@ from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import get_scene_type
+from scene_envs.scene_types import SceneType, get_scene_type
 
 CATEGORY_LOSSES = ("cross_entropy", "bound")
 _EMPTY_WEIGHT = 0.1
@@ -96,6 +96,15 @@ class MixedPrior(ScenePrior):
     def config_state(self) -> dict[str, Any]:
         """The ``prior`` entry of the configuration file."""
         return asdict(self.mixed)
+
+    @classmethod
+    def tiny(cls, scene_type: SceneType, slots: int, normalizer: Normalizer) -> MixedPrior:
+        """A very small prior with fresh weights."""
+        network = MixedFluxConfig(
+            scene_type.num_assets + 1, hidden=32, double_blocks=1, single_blocks=2, heads=2, embedding=32, pose_head=16
+        )
+        moments = Preconditioning(torch.zeros(POSE), torch.full((POSE,), 0.5))
+        return cls(MixedPriorConfig(scene_type.name, slots, network), normalizer, moments)
 
     # -- scenes and states ----------------------------------------------------------------------
 

@@ -25,11 +25,14 @@ from agents.diffusion import (
 from agents.inpainting import chain_with_noised, inpaint
 from agents.networks import FluxConfig, FluxDenoiser
 from agents.prior_files import read_prior, write_prior
-from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
+from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
 from scene_envs.scene import POSE, TRANSLATION, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type, register_scene_type
+
+PROCESSES = ("continuous", "mixed")
+"""Diffusion processes: categories as numbers, or as discrete states."""
 
 _LEVELS, _RESIDUAL = "residual.timesteps", "residual.variance"
 
@@ -105,6 +108,13 @@ class ScenePrior(nn.Module):
     def config_state(self) -> dict[str, Any]:
         """The ``prior`` entry of the configuration file."""
         return asdict(self.config)
+
+    @classmethod
+    def tiny(cls, scene_type: SceneType, slots: int, normalizer: Normalizer) -> ScenePrior:
+        """A very small prior with fresh weights."""
+        features = scene_type.features
+        config = PriorConfig(scene_type.name, slots, FluxConfig(features=features, hidden=32, depth=2, heads=2))
+        return cls(config, normalizer, Preconditioning(torch.zeros(features), torch.full((features,), 0.5)))
 
     # -- files ----------------------------------------------------------------------------------
 
@@ -344,6 +354,8 @@ def _know_scene_type(state: dict[str, Any]) -> None:
 
 
 def _prior_class(process: str) -> type[ScenePrior]:
+    if process not in PROCESSES:
+        raise unknown_name("process", process, PROCESSES)
     if process == "mixed":
         from agents.mixed_prior import MixedPrior
 
@@ -366,19 +378,22 @@ def _workspace_normalizer(scene_type: SceneType) -> Normalizer:
     return Normalizer.from_range(torch.cat([low, yaw_low, 0 * flags]), torch.cat([high, yaw_high, flags]))
 
 
-def tiny_prior(scene_type: str | SceneType = "dimsum_table", seed: int = 0, slots: int | None = None) -> ScenePrior:
-    """An untrained prior with a very small network and random weights, for tests and examples."""
+def tiny_prior(
+    scene_type: str | SceneType = "dimsum_table", seed: int = 0, slots: int | None = None, process: str = "continuous"
+) -> ScenePrior:
+    """An untrained prior with a very small network and random weights, for tests and examples.
+
+    Args:
+        scene_type: scene type or its name.
+        seed: of the weights.
+        slots: slots per scene; the scene type's when None.
+        process: ``"continuous"`` or ``"mixed"``.
+    """
     scene_type = get_scene_type(scene_type)
-    features = scene_type.features
-    config = PriorConfig(
-        scene_type.name,
-        scene_type.slots if slots is None else slots,
-        FluxConfig(features=features, hidden=32, depth=2, heads=2),
-    )
-    moments = Preconditioning(torch.zeros(features), torch.full((features,), 0.5))
+    normalizer = _workspace_normalizer(scene_type)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        prior = ScenePrior(config, _workspace_normalizer(scene_type), moments)
+        prior = _prior_class(process).tiny(scene_type, scene_type.slots if slots is None else slots, normalizer)
         for parameter in prior.parameters():
             if not bool(parameter.any()):
                 nn.init.normal_(parameter, std=0.02)
