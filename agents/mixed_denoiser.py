@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from agents.diffusion import CategoricalProcess, GaussianProcess
 from agents.diffusion.reverse_steps import state_of
 from agents.networks.mixed_flux import POSE, MixedFlux, MixedFluxConfig
+from agents.networks.text import TextConfig, TextEncoder
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class MixedPriorConfig:
         category_weight: weight of the category loss beside the pose loss.
         auxiliary: weight of the cross-entropy in the bound.
         given_share: share of training scenes in which some poses or categories are given, for inpainting.
+        text: size and vocabulary of the text encoder; None for a prior that reads no prompts.
         clip: bound on denoised poses while sampling, normalised units; 0 for none (1 is the paper's).
     """
 
@@ -48,6 +50,7 @@ class MixedPriorConfig:
     category_weight: float = 0.3
     auxiliary: float = 5e-4
     given_share: float = 0.3
+    text: TextConfig | None = None
     clip: float = 0.0
 
 
@@ -84,9 +87,16 @@ class Given:
 class MixedDenoiser(nn.Module):
     """x_t (B, N, 12 + K) and t (B,) to the clean pose (B, N, 12) and logits of the clean category (B, N, K)."""
 
-    def __init__(self, network: MixedFlux, poses: GaussianProcess, categories: CategoricalProcess) -> None:
+    def __init__(
+        self,
+        network: MixedFlux,
+        poses: GaussianProcess,
+        categories: CategoricalProcess,
+        text_encoder: TextEncoder | None = None,
+    ) -> None:
         super().__init__()
         self.network = network
+        self.text_encoder = text_encoder
         self.poses = poses
         self.categories = categories
 

@@ -28,6 +28,7 @@ from agents.diffusion import (
 from agents.diffusion.reverse_steps import state_of
 from agents.mixed_denoiser import Given, MixedDenoiser, MixedPriorConfig
 from agents.networks.mixed_flux import POSE, MixedFlux, MixedFluxConfig
+from agents.networks.text import TextConfig, TextEncoder
 from agents.prior import ScenePrior
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
@@ -35,7 +36,11 @@ from scene_envs.protocols import StepTableLike
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
+Text = tuple[Tensor, Tensor]
+"""Tokens (B, L, W) and their mask (B, L)."""
+
 CATEGORY_LOSSES = ("cross_entropy", "bound")
+_TEXT = "text_encoder."
 _EMPTY_WEIGHT = 0.1
 """Weight of the pose of an empty slot in the loss: it means nothing, but chains should not drift on it."""
 
@@ -77,7 +82,8 @@ class MixedPrior(ScenePrior):
         self.categories = CategoricalProcess(
             make_categorical_schedule(config.kernel, config.num_timesteps), config.network.categories
         )
-        self.denoiser = MixedDenoiser(MixedFlux(config.network), self.process, self.categories)
+        encoder = None if config.text is None else TextEncoder(config.text)
+        self.denoiser = MixedDenoiser(MixedFlux(config.network), self.process, self.categories, encoder)
         self._timestep_weights = lognormal_timesteps(schedule, config.noise_mean, config.noise_std)
 
     @classmethod
@@ -90,7 +96,10 @@ class MixedPrior(ScenePrior):
         residual: ResidualVariance | None,
     ) -> MixedPrior:
         """From the ``prior`` entry of a configuration file."""
-        fields = {**fields, "network": MixedFluxConfig(**fields["network"])}
+        text = fields.get("text")
+        if text is not None:
+            text = TextConfig(**{**text, "words": tuple(text["words"])})
+        fields = {**fields, "network": MixedFluxConfig(**fields["network"]), "text": text}
         return cls(MixedPriorConfig(**fields), normalizer, preconditioning, card, residual)
 
     def config_state(self) -> dict[str, Any]:
@@ -105,6 +114,47 @@ class MixedPrior(ScenePrior):
         )
         moments = Preconditioning(torch.zeros(POSE), torch.full((POSE,), 0.5))
         return cls(MixedPriorConfig(scene_type.name, slots, network), normalizer, moments)
+
+    def weights(self) -> dict[str, Tensor]:
+        """Tensors of the network, and those of the text encoder under ``text_encoder.``."""
+        tensors = dict(self.denoiser.network.state_dict())
+        if self.denoiser.text_encoder is not None:
+            tensors |= {f"{_TEXT}{name}": value for name, value in self.denoiser.text_encoder.state_dict().items()}
+        return tensors
+
+    def load_weights(self, tensors: dict[str, Tensor]) -> None:
+        """Inverse of :meth:`weights`; raises RuntimeError when names or shapes differ."""
+        text = {name.removeprefix(_TEXT): value for name, value in tensors.items() if name.startswith(_TEXT)}
+        self.denoiser.network.load_state_dict(
+            {name: value for name, value in tensors.items() if not name.startswith(_TEXT)}
+        )
+        if self.denoiser.text_encoder is not None:
+            self.denoiser.text_encoder.load_state_dict(text)
+
+    # -- prompts --------------------------------------------------------------------------------
+
+    @property
+    def conditional(self) -> bool:  # type: ignore[override]
+        """Whether the prior reads prompts."""
+        return self.mixed.text is not None
+
+    def encode_prompts(self, prompts: Sequence[str]) -> Text:
+        """Tokens (B, L, W) and mask (B, L) of prompts; ``""`` stands for none.
+
+        Raises:
+            InvalidInputError: the prior reads no prompts, or one is too long.
+        """
+        if self.denoiser.text_encoder is None:
+            raise InvalidInputError(
+                f"this prior of {self.scene_type.name!r} was trained without text and cannot follow the prompt "
+                f"{prompts[0]!r}; leave prompt= out, or load a prior that reads prompts"
+            )
+        text: Text = self.denoiser.text_encoder(prompts)
+        return text
+
+    def _unconditional(self, count: int) -> Text | None:
+        """What stands for no prompt; None when the prior reads none."""
+        return self.encode_prompts([""] * count) if self.conditional else None
 
     # -- scenes and states ----------------------------------------------------------------------
 
@@ -162,7 +212,7 @@ class MixedPrior(ScenePrior):
         table: StepTableLike,
         *,
         given: Given | None = None,
-        text: tuple[Tensor, Tensor] | None = None,
+        text: Text | None = None,
         guidance: float = 0.0,
     ) -> MixedStep:
         """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters.
@@ -177,9 +227,10 @@ class MixedPrior(ScenePrior):
         """
         t, previous = int(table.timesteps[step]), int(table.previous[step])
         levels = torch.full((x_t.shape[0],), t, device=x_t.device)
-        pose, logits = self.denoiser(x_t, levels, given, text)
+        unconditional = None if text is not None and not guidance else self._unconditional(x_t.shape[0])
+        pose, logits = self.denoiser(x_t, levels, given, unconditional if text is None else text)
         if text is not None and guidance:
-            free_pose, free_logits = self.denoiser(x_t, levels, given, None)
+            free_pose, free_logits = self.denoiser(x_t, levels, given, unconditional)
             pose = (1 + guidance) * pose - guidance * free_pose
             logits = (1 + guidance) * logits.log_softmax(-1) - guidance * free_logits.log_softmax(-1)
         if self.mixed.clip:
@@ -212,7 +263,7 @@ class MixedPrior(ScenePrior):
     @torch.no_grad()
     def run_chain(
         self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None, given: Given | None = None,
-        text: tuple[Tensor, Tensor] | None = None, guidance: float = 0.0, resample: int = 1,
+        text: Text | None = None, guidance: float = 0.0, resample: int = 1,
     ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D) from x_T, with given entries kept.
 
@@ -242,11 +293,25 @@ class MixedPrior(ScenePrior):
         rows = self.categories.transition(s, t).to(x_s)[state_of(x_s[..., POSE:])]
         return self.clamp(self._with_states(pose, rows, noise))
 
+    @torch.no_grad()
+    def _sample_chunk(
+        self,
+        count: int,
+        prompts: list[str] | None,
+        guidance: float,
+        num_steps: int,
+        slots: int | None,
+        generator: Generator,
+    ) -> Tensor:
+        text = None if prompts is None else self.encode_prompts(prompts)
+        start = self.initial(count, self.mixed.slots if slots is None else slots, generator)
+        return self.run_chain(start, self.step_table(num_steps), generator, text=text, guidance=guidance)
+
     # -- the training loss ----------------------------------------------------------------------
 
     def pretraining_loss(
         self, x0: Tensor, generator: Generator | None = None, reduction: str = "mean", t: Tensor | None = None,
-        text: tuple[Tensor, Tensor] | None = None,
+        text: Text | None = None,
     ) -> Tensor:  # fmt: skip
         """Mean square of the pose output plus ``category_weight`` times the category loss, on entries not given.
 
@@ -264,7 +329,7 @@ class MixedPrior(ScenePrior):
         given = self._draw_given(x0, generator) if config.given_share > 0 else None
         x_t = self.add_noise(x0, t, noise)
         x_t = x_t if given is None else given.write(x_t)
-        output, logits = self.denoiser.output(x_t, t, given, text)
+        output, logits = self.denoiser.output(x_t, t, given, self._unconditional(len(x0)) if text is None else text)
         pose0, category0 = x0[..., :POSE], x0[..., POSE:].argmax(dim=-1)
         error = output - self.process.target(pose0, x_t[..., :POSE], t, noise[..., :POSE])
         weight = self.loss_weight(x0.shape[1])[None, :, :POSE].to(device).expand(len(x0), -1, -1)

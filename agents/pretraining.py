@@ -8,110 +8,24 @@ import logging
 import math
 import os
 import time
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Generator, Tensor, nn
 
+from agents.averaging import Averaged, WeightAverage
 from agents.checkpoints import load_checkpoint, save_checkpoint
-from agents.denoiser import PriorConfig
-from agents.diffusion import Preconditioning
-from agents.networks import FluxConfig
+from agents.mixed_prior import MixedPrior
+from agents.new_prior import build_prior
+from agents.pretrain_config import PretrainConfig
 from agents.prior import ScenePrior
 from scene_envs.errors import TrainingError
-from scene_envs.normalizer import Normalizer
-from scene_envs.scene_types import get_scene_type
+from scene_envs.scene import SceneBatch
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass
-class PretrainConfig:
-    """One pretraining run.
-
-    Attributes:
-        scene: scene type.
-        data: dataset directory of training scenes.
-        heldout: dataset directory of held-out scenes; empty takes the last 2 % of ``data``.
-        output: run directory; an interrupted run in it goes on where it stopped.
-        iterations: optimiser steps.
-        batch_size: scenes per step.
-        learning_rate: peak learning rate.
-        final_learning_rate: where the cosine ends, as a fraction of the peak.
-        warmup: steps of linear warm-up.
-        weight_decay: decoupled weight decay.
-        clip: largest gradient norm.
-        ema: decay of the weight average that is evaluated and saved.
-        hidden: width of the network.
-        depth: blocks of the network.
-        heads: attention heads.
-        prediction: what the network predicts (``karras``, ``epsilon``, ``x0``, ``v``).
-        schedule: noise schedule (``karras``, ``linear``, ``cosine``).
-        compile: compile the network with ``torch.compile`` (needs a C++ compiler on CPU).
-        seed: of weights, batches and noise.
-        log_every: steps between log rows.
-        evaluate_every: steps between held-out evaluations.
-        checkpoint_every: steps between checkpoints.
-        device: torch device.
-    """
-
-    scene: str = "dimsum_table"
-    data: str = "data/dimsum_table"
-    heldout: str = ""
-    output: str = "runs/pretrain"
-    iterations: int = 5000
-    batch_size: int = 128
-    learning_rate: float = 1e-3
-    final_learning_rate: float = 0.01
-    warmup: int = 100
-    weight_decay: float = 0.01
-    clip: float = 1.0
-    ema: float = 0.999
-    hidden: int = 192
-    depth: int = 6
-    heads: int = 6
-    prediction: str = "karras"
-    schedule: str = "karras"
-    compile: bool = False
-    seed: int = 0
-    log_every: int = 20
-    evaluate_every: int = 250
-    checkpoint_every: int = 250
-    device: str = "cpu"
-
-
-class WeightAverage:
-    """Exponential moving average of a module's parameters, with a warm-up of the decay.
-
-    >>> layer = nn.Linear(1, 1)
-    >>> average = WeightAverage(layer, decay=0.5)
-    >>> _ = average.update(layer)
-    >>> bool((average.tensors["weight"] == layer.weight).all())
-    True
-    """
-
-    def __init__(self, module: nn.Module, decay: float) -> None:
-        self.decay = decay
-        self.updates = 0
-        self.tensors = {name: p.detach().clone() for name, p in module.named_parameters()}
-
-    @torch.no_grad()
-    def update(self, module: nn.Module) -> float:
-        """Move towards ``module``; returns the decay that was used."""
-        self.updates += 1
-        decay = min(self.decay, self.updates / (self.updates + 10.0))
-        for name, parameter in module.named_parameters():
-            self.tensors[name].lerp_(parameter, 1.0 - decay)
-        return decay
-
-    @torch.no_grad()
-    def copy_to(self, module: nn.Module) -> None:
-        """Write the averages into ``module``."""
-        for name, parameter in module.named_parameters():
-            parameter.copy_(self.tensors[name])
 
 
 def learning_rate_at(step: int, config: PretrainConfig) -> float:
@@ -121,16 +35,6 @@ def learning_rate_at(step: int, config: PretrainConfig) -> float:
     progress = (step - config.warmup) / max(1, config.iterations - config.warmup)
     cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
     return config.learning_rate * (config.final_learning_rate + (1 - config.final_learning_rate) * cosine)
-
-
-def build_prior(config: PretrainConfig, raw: Tensor, normalizer: Normalizer) -> ScenePrior:
-    """A fresh prior whose preconditioning is fitted to the raw scenes (M, N, D)."""
-    scene_type = get_scene_type(config.scene)
-    network = FluxConfig(scene_type.features, config.hidden, config.depth, config.heads)
-    prior_config = PriorConfig(config.scene, raw.shape[1], network, config.schedule, config.prediction)
-    torch.manual_seed(config.seed)
-    sample = normalizer.normalize(raw[:20_000])
-    return ScenePrior(prior_config, normalizer, Preconditioning.fit(sample[:, len(scene_type.fixed) :]))
 
 
 @torch.no_grad()
@@ -149,13 +53,22 @@ class Pretrainer:
         train: (M, N, D) normalised training scenes.
         heldout: (K, N, D) normalised held-out scenes.
         prior: the prior to train, in place.
+        prompts: prompts of every training scene, for a prior that reads them.
     """
 
-    def __init__(self, config: PretrainConfig, train: Tensor, heldout: Tensor, prior: ScenePrior) -> None:
+    def __init__(
+        self,
+        config: PretrainConfig,
+        train: Tensor,
+        heldout: Tensor,
+        prior: ScenePrior,
+        prompts: Sequence[Sequence[str]] = (),
+    ) -> None:
         self.config = config
         self.train_data, self.heldout_data = train, heldout
         self.prior = prior.to(config.device).train()
-        self.network = prior.denoiser.network
+        self.network: nn.Module = prior.denoiser
+        self.prompts = prompts
         self.average = WeightAverage(self.network, config.ema)
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), betas=(0.9, 0.99), weight_decay=config.weight_decay
@@ -176,12 +89,10 @@ class Pretrainer:
         self.directory.mkdir(parents=True, exist_ok=True)
         if self.checkpoint_path.exists():
             self._load()
-        network = self.network
         if self.config.compile:
-            self.prior.denoiser.network = torch.compile(network)  # type: ignore[assignment]
+            self.prior.denoiser.network.compile()
         for row in self._steps():
             self._log(row)
-        self.prior.denoiser.network = network
         with self._averaged():
             self.prior.fit_residual(self.heldout_data[:512].to(self.config.device))
         return self.save_prior()
@@ -209,7 +120,8 @@ class Pretrainer:
     def _update(self) -> tuple[float, float]:
         config = self.config
         index = torch.randint(len(self.train_data), (config.batch_size,), generator=self.generator)
-        loss = self.prior.pretraining_loss(self.train_data[index].to(config.device), self.generator)
+        x0 = self.train_data[index].to(config.device)
+        loss = self.prior.pretraining_loss(x0, self.generator, **self._condition(index))
         if not bool(torch.isfinite(loss)):
             raise TrainingError(
                 f"the pretraining loss became {float(loss.detach())} at step {self.step}; the last good state is "
@@ -224,14 +136,25 @@ class Pretrainer:
         self.average.update(self.network)
         return float(loss.detach()), float(norm)
 
+    def _condition(self, index: Tensor) -> dict[str, Any]:
+        """The prompts of the scenes ``index``, one of each scene's, some withheld; nothing for other priors."""
+        if not isinstance(self.prior, MixedPrior) or not self.prior.conditional:
+            return {}
+        choice = torch.rand(2, len(index), generator=self.generator).tolist()
+        texts = [
+            "" if dropped < self.config.prompt_dropout else group[int(pick * len(group))]
+            for group, pick, dropped in zip((self.prompts[i] for i in index.tolist()), *choice, strict=True)
+        ]
+        return {"text": self.prior.encode_prompts(texts)}
+
     def _evaluate(self) -> float:
         with self._averaged():
             value = heldout_loss(self.prior, self.heldout_data.to(self.config.device))
         self.evaluations.append({"step": self.step, "heldout": value})
         return value
 
-    def _averaged(self) -> _Swapped:
-        return _Swapped(self.network, self.average)
+    def _averaged(self) -> Averaged:
+        return Averaged(self.network, self.average)
 
     # -- files ----------------------------------------------------------------------------------
 
@@ -273,14 +196,8 @@ class Pretrainer:
                 "seconds": round(self.seconds),
                 "heldout_loss": self.evaluations[-1]["heldout"] if self.evaluations else None,
             }
-            self._unwrapped_save()
+            self.prior.save(self.directory / "prior")
             return ScenePrior.load(self.directory)
-
-    def _unwrapped_save(self) -> None:
-        wrapped = self.prior.denoiser.network
-        self.prior.denoiser.network = self.network
-        self.prior.save(self.directory / "prior")
-        self.prior.denoiser.network = wrapped
 
     def _log(self, row: dict[str, float]) -> None:
         per_step = self.seconds / max(1, self.step)
@@ -297,22 +214,6 @@ class Pretrainer:
             writer.writerow(row)
 
 
-class _Swapped:
-    """Context in which a network holds its averaged weights."""
-
-    def __init__(self, network: nn.Module, average: WeightAverage) -> None:
-        self.network, self.average = network, average
-
-    def __enter__(self) -> None:
-        self.saved = {name: p.detach().clone() for name, p in self.network.named_parameters()}
-        self.average.copy_to(self.network)
-
-    def __exit__(self, *_: object) -> None:
-        with torch.no_grad():
-            for name, parameter in self.network.named_parameters():
-                parameter.copy_(self.saved[name])
-
-
 def pretrain(config: PretrainConfig) -> dict[str, Any]:
     """Train a prior as ``config`` says; resumes a run found in ``config.output``.
 
@@ -322,15 +223,18 @@ def pretrain(config: PretrainConfig) -> dict[str, Any]:
     from scene_envs.datasets import SceneDataset
 
     dataset = SceneDataset.load(config.data)
-    raw = dataset.tensor
+    raw, prompts = dataset.tensor, dataset.prompt_sets
     if config.heldout:
         heldout_raw = SceneDataset.load(config.heldout).tensor
     else:
         split = max(1, len(raw) // 50)
-        raw, heldout_raw = raw[:-split], raw[-split:]
-    prior = build_prior(config, raw, dataset.normalizer)
-    heldout_raw = heldout_raw[:2048]
-    trainer = Pretrainer(config, prior.normalizer.normalize(raw), prior.normalizer.normalize(heldout_raw), prior)
+        raw, heldout_raw, prompts = raw[:-split], raw[-split:], prompts[:-split]
+    prior = build_prior(config, raw, dataset.normalizer, prompts)
+
+    def encode(scenes: Tensor) -> Tensor:
+        return torch.cat([prior.encode(SceneBatch(part, prior.scene_type)) for part in scenes.split(10_000)])
+
+    trainer = Pretrainer(config, encode(raw), encode(heldout_raw[:2048]), prior, prompts)
     trained = trainer.run()
     metrics = {**trained.card, "evaluations": trainer.evaluations, "config": asdict(config)}
     partial = trainer.directory / "metrics.json.partial"

@@ -131,7 +131,7 @@ class ScenePrior(nn.Module):
             _know_scene_type(state)
             kind = _prior_class(state.get("process", "continuous"))
             prior = kind.from_state(state["prior"], normalizer, Preconditioning(*moments), state.get("card"), residual)
-            prior.denoiser.network.load_state_dict(tensors)
+            prior.load_weights(tensors)
         except (KeyError, TypeError) as error:
             raise CorruptFileError(
                 f"the configuration of the prior {str(name)!r} is not one of ours: {error}"
@@ -151,10 +151,18 @@ class ScenePrior(nn.Module):
             "normalizer_state": self.normalizer.state(),
             "card": self.card,
         }
-        tensors = dict(self.denoiser.network.state_dict())
+        tensors = self.weights()
         if self.residual is not None:
             tensors |= {_LEVELS: self.residual.timesteps, _RESIDUAL: self.residual.variance}
         return write_prior(directory, state, tensors)
+
+    def weights(self) -> dict[str, Tensor]:
+        """Trained tensors by name, as a prior's file holds them."""
+        return dict(self.denoiser.network.state_dict())
+
+    def load_weights(self, tensors: dict[str, Tensor]) -> None:
+        """Inverse of :meth:`weights`; raises RuntimeError when names or shapes differ."""
+        self.denoiser.network.load_state_dict(tensors)
 
     # -- the reverse chain ----------------------------------------------------------------------
 
@@ -210,12 +218,22 @@ class ScenePrior(nn.Module):
         return x
 
     def sample(
-        self, count: int, *, num_steps: int = 50, slots: int | None = None, seed: int = 0, batch_size: int = 64
+        self,
+        count: int,
+        *,
+        prompt: str | Sequence[str] | None = None,
+        guidance: float = 0.0,
+        num_steps: int = 50,
+        slots: int | None = None,
+        seed: int = 0,
+        batch_size: int = 64,
     ) -> SceneBatch:
         """``count`` scenes by ancestral sampling (Ho et al. 2020, Algorithm 2) over ``num_steps`` strides.
 
         Args:
             count: number of scenes.
+            prompt: what the scenes should hold, one text for all or one per scene; None for anything.
+            guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional (Ho and Salimans 2022).
             num_steps: denoiser evaluations per scene, 1..T.
             slots: slots per scene; more than trained is allowed.
             seed: of the torch generator; the same seed and batch size give the same scenes.
@@ -223,12 +241,39 @@ class ScenePrior(nn.Module):
         """
         if count < 1:
             raise InvalidInputError(f"count={count}: ask for at least one scene")
+        prompts = self._prompts(prompt, count)
         generator = Generator(str(self._fixed.device)).manual_seed(seed)
-        chunks = [
-            self.sample_tensor(size, num_steps=num_steps, slots=slots, generator=generator)
-            for size in _chunk_sizes(count, batch_size)
-        ]
+        chunks, done = [], 0
+        for size in _chunk_sizes(count, batch_size):
+            asked = None if prompts is None else prompts[done : done + size]
+            chunks.append(self._sample_chunk(size, asked, guidance, num_steps, slots, generator))
+            done += size
         return self.decode(torch.cat(chunks))
+
+    @staticmethod
+    def _prompts(prompt: str | Sequence[str] | None, count: int) -> list[str] | None:
+        if prompt is None:
+            return None
+        prompts = [prompt] * count if isinstance(prompt, str) else list(prompt)
+        if len(prompts) != count:
+            raise InvalidInputError(f"{len(prompts)} prompts for {count} scenes; give one text, or one per scene")
+        return prompts
+
+    def _sample_chunk(
+        self,
+        count: int,
+        prompts: list[str] | None,
+        guidance: float,
+        num_steps: int,
+        slots: int | None,
+        generator: Generator,
+    ) -> Tensor:
+        if prompts is not None:
+            raise InvalidInputError(
+                f"this prior of {self.scene_type.name!r} was trained without text and cannot follow the prompt "
+                f"{prompts[0]!r}; leave prompt= out, or load a prior that reads prompts"
+            )
+        return self.sample_tensor(count, num_steps=num_steps, slots=slots, generator=generator)
 
     def decode(self, x: Tensor) -> SceneBatch:
         """Scenes from normalised x_0 (B, N, D); known entries take their exact values."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from agents.pretraining import PretrainConfig, pretrain
+from agents.pretrain_config import PretrainConfig
 
 if TYPE_CHECKING:
     from agents.cli_run import Run
@@ -17,6 +17,8 @@ def config() -> type[PretrainConfig]:
 
 def run(settings: PretrainConfig, run: Run) -> None:
     """Train the prior; the trainer writes its own metrics."""
+    from agents.pretraining import pretrain
+
     metrics = pretrain(settings)
     run.say(f"held-out loss {metrics['heldout_loss']:.4g} after {metrics['trained_steps']} steps")
     run.say(f"sample it: scene-envs sample prior={run.directory}")

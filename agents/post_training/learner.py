@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Generator, Tensor, nn
 
+from agents.averaging import WeightAverage
 from agents.post_training.advantages import compute_advantages
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.gradients import (
@@ -20,7 +21,6 @@ from agents.post_training.losses import DDPOSFLoss
 from agents.post_training.policy import DenoisingPolicy, gradient_weights
 from agents.post_training.real_scenes import RealScenes
 from agents.post_training.rollouts import Rollout, collect, stream_seed
-from agents.pretraining import WeightAverage
 from agents.prior import ScenePrior
 from scene_envs.denoising_torchrl import DenoisingTorchRLEnv
 

@@ -8,7 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from agents.pretraining import PretrainConfig, Pretrainer, WeightAverage, build_prior, learning_rate_at
+from agents.averaging import WeightAverage
+from agents.new_prior import build_prior
+from agents.pretrain_config import PretrainConfig
+from agents.pretraining import Pretrainer, learning_rate_at
 from scene_envs.errors import CorruptFileError, TrainingError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch

@@ -15,7 +15,8 @@ import pytest
 import torch
 
 from agents.cli import main
-from agents.pretraining import PretrainConfig, build_prior
+from agents.new_prior import build_prior
+from agents.pretrain_config import PretrainConfig
 from agents.prior import ScenePrior, tiny_prior
 from rewards import RewardContext, check_reward, resolve_reward
 from scene_envs import SceneBatch, get_scene_type, list_scene_types, plugins, scene_types

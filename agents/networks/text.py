@@ -1,0 +1,114 @@
+"""A small text encoder with a closed vocabulary, trained together with the prior that reads it."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from scene_envs.errors import InvalidInputError
+
+_LOGGER = logging.getLogger(__name__)
+
+_TOKEN = re.compile(r"[a-z]+|\d+|[^\sa-z\d]")
+PADDING, UNKNOWN, START = 0, 1, 2
+"""The first tokens: padding, a word outside the vocabulary, and the start of every prompt."""
+_SPECIAL = 3
+
+
+def split_words(prompt: str) -> list[str]:
+    """Lower-case words, numbers and punctuation marks.
+
+    >>> split_words("A scene with 12 cups, and a lid.")
+    ['a', 'scene', 'with', '12', 'cups', ',', 'and', 'a', 'lid', '.']
+    """
+    return _TOKEN.findall(prompt.lower())
+
+
+@dataclass(frozen=True)
+class TextConfig:
+    """Size and vocabulary of a :class:`TextEncoder`.
+
+    Attributes:
+        words: the vocabulary, sorted; tokens are its indices after three special ones.
+        width: of the tokens.
+        depth: transformer layers.
+        heads: attention heads.
+        max_tokens: longest prompt, its start token included.
+    """
+
+    words: tuple[str, ...]
+    width: int = 128
+    depth: int = 2
+    heads: int = 4
+    max_tokens: int = 128
+
+
+def vocabulary(prompts: Iterable[str]) -> tuple[str, ...]:
+    """All words of ``prompts``, sorted, and the numbers up to 130 (counts are made of these)."""
+    words = {word for prompt in prompts for word in split_words(prompt)}
+    return tuple(sorted(words | {str(number) for number in range(131)}))
+
+
+class TextEncoder(nn.Module):
+    """Prompts to tokens (B, L, W): learned embeddings and positions, then a small transformer.
+
+    >>> encoder = TextEncoder(TextConfig(words=("cup", "two", "cups"), width=16, heads=2))
+    >>> tokens, mask = encoder(["two cups", ""])
+    >>> tokens.shape, mask.tolist()
+    (torch.Size([2, 3, 16]), [[True, True, True], [True, False, False]])
+    """
+
+    def __init__(self, config: TextConfig) -> None:
+        super().__init__()
+        self.config = config
+        self._index = {word: index + _SPECIAL for index, word in enumerate(config.words)}
+        self.embedding = nn.Embedding(len(config.words) + _SPECIAL, config.width)
+        self.position = nn.Parameter(0.02 * torch.randn(config.max_tokens, config.width))
+        layer = nn.TransformerEncoderLayer(
+            config.width,
+            config.heads,
+            4 * config.width,
+            dropout=0.0,
+            activation="gelu",
+            batch_first=True,
+            norm_first=True,
+        )
+        self.layers = nn.TransformerEncoder(layer, config.depth, enable_nested_tensor=False)
+        self.norm = nn.LayerNorm(config.width)
+
+    def tokenize(self, prompts: Sequence[str]) -> tuple[Tensor, list[str]]:
+        """Token indices (B, L) int64, padded at the end, and the words that the vocabulary lacks.
+
+        Raises:
+            InvalidInputError: a prompt is longer than ``max_tokens``.
+        """
+        rows: list[list[int]] = []
+        unknown: list[str] = []
+        for prompt in prompts:
+            words = split_words(prompt)
+            unknown += [word for word in words if word not in self._index and word not in unknown]
+            rows.append([START, *(self._index.get(word, UNKNOWN) for word in words)])
+            if len(rows[-1]) > self.config.max_tokens:
+                raise InvalidInputError(
+                    f"the prompt {prompt[:60]!r}… has {len(words)} words; at most {self.config.max_tokens - 1} are read"
+                )
+        longest = max(len(row) for row in rows)
+        return torch.tensor([row + [PADDING] * (longest - len(row)) for row in rows]), unknown
+
+    def forward(self, prompts: Sequence[str]) -> tuple[Tensor, Tensor]:
+        """Tokens (B, L, W) and their mask (B, L), True for real ones; ``""`` stands for no prompt.
+
+        Words outside the vocabulary are listed in a warning and read as unknown.
+        """
+        indices, unknown = self.tokenize(prompts)
+        if unknown:
+            _LOGGER.warning("the prior does not know the word(s) %s; they are read as unknown", ", ".join(unknown))
+        indices = indices.to(self.position.device)
+        mask = indices != PADDING
+        x = self.embedding(indices) + self.position[: indices.shape[1]]
+        return self.norm(self.layers(x, src_key_padding_mask=~mask)), mask

@@ -1,0 +1,68 @@
+"""The keys of a pretraining run; imports nothing, so that they can be listed quickly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass
+class PretrainConfig:
+    """One pretraining run.
+
+    Attributes:
+        scene: scene type.
+        data: dataset directory of training scenes.
+        heldout: dataset directory of held-out scenes; empty takes the last 2 % of ``data``.
+        output: run directory; an interrupted run in it goes on where it stopped.
+        iterations: optimiser steps.
+        batch_size: scenes per step.
+        learning_rate: peak learning rate.
+        final_learning_rate: where the cosine ends, as a fraction of the peak.
+        warmup: steps of linear warm-up.
+        weight_decay: decoupled weight decay.
+        clip: largest gradient norm.
+        ema: decay of the weight average that is evaluated and saved.
+        hidden: width of the network.
+        depth: blocks of the network.
+        heads: attention heads.
+        prediction: what the network predicts (``karras``, ``epsilon``, ``x0``, ``v``).
+        schedule: noise schedule (``karras``, ``linear``, ``cosine``).
+        compile: compile the network with ``torch.compile`` (needs a C++ compiler on CPU).
+        process: ``continuous`` (categories as numbers) or ``mixed`` (categories as discrete states).
+        kernel: of the categories of a mixed prior (``mask_and_replace``, ``absorbing``, ``uniform``).
+        text: whether a mixed prior reads prompts.
+        prompt_dropout: share of training scenes whose prompt is withheld, for classifier-free guidance.
+        seed: of weights, batches and noise.
+        log_every: steps between log rows.
+        evaluate_every: steps between held-out evaluations.
+        checkpoint_every: steps between checkpoints.
+        device: torch device.
+    """
+
+    scene: str = "dimsum_table"
+    data: str = "data/dimsum_table"
+    heldout: str = ""
+    output: str = "runs/pretrain"
+    iterations: int = 5000
+    batch_size: int = 128
+    learning_rate: float = 1e-3
+    final_learning_rate: float = 0.01
+    warmup: int = 100
+    weight_decay: float = 0.01
+    clip: float = 1.0
+    ema: float = 0.999
+    hidden: int = 192
+    depth: int = 6
+    heads: int = 6
+    prediction: str = "karras"
+    schedule: str = "karras"
+    process: str = "continuous"
+    kernel: str = "mask_and_replace"
+    text: bool = False
+    prompt_dropout: float = 0.1
+    compile: bool = False
+    seed: int = 0
+    log_every: int = 20
+    evaluate_every: int = 250
+    checkpoint_every: int = 250
+    device: str = "cpu"
