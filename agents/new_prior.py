@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from agents.continuous_prior import ContinuousPrior
 from agents.denoiser import PriorConfig
 from agents.diffusion import Preconditioning
 from agents.mixed_denoiser import MixedPriorConfig
@@ -40,7 +41,7 @@ def build_prior(
         prior_config = PriorConfig(config.scene, raw.shape[1], network, config.schedule, config.prediction)
         torch.manual_seed(config.seed)
         sample = normalizer.normalize(raw[:20_000])
-        return ScenePrior(prior_config, normalizer, Preconditioning.fit(sample[:, fixed:]))
+        return ContinuousPrior(prior_config, normalizer, Preconditioning.fit(sample[:, fixed:]))
     if config.process != "mixed":
         raise unknown_name("process", config.process, PROCESSES)
     text = TextConfig(vocabulary(prompt for group in prompts for prompt in group)) if config.text else None

@@ -5,30 +5,26 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Generator, Tensor, nn
 
-from agents.denoiser import Denoiser, PriorConfig
 from agents.diffusion import (
     GaussianProcess,
-    GaussianStep,
     Preconditioning,
     ResidualVariance,
     ReverseStep,
     StepTable,
-    lognormal_timesteps,
-    make_schedule,
 )
-from agents.inpainting import chain_with_noised, inpaint
-from agents.networks import FluxConfig, FluxDenoiser
+from agents.inpainting import inpaint
 from agents.prior_files import read_prior, write_prior
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
-from scene_envs.scene import POSE, TRANSLATION, SceneBatch
+from scene_envs.scene import TRANSLATION, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type, register_scene_type
 
 PROCESSES = ("continuous", "mixed")
@@ -41,7 +37,8 @@ class ScenePrior(nn.Module):
     """A trained denoiser with its schedule, layout and normalizer. Tensors x are normalised scenes (B, N, D).
 
     Fixed welded objects and constant features are *known*: clamped to their values while sampling and left
-    out of the loss and of every log-probability.
+    out of the loss and of every log-probability. The two kinds are
+    :class:`~agents.continuous_prior.ContinuousPrior` and :class:`~agents.mixed_prior.MixedPrior`.
 
     >>> prior = tiny_prior("dimsum_table")
     >>> prior.sample(2, num_steps=3, seed=0)
@@ -49,29 +46,12 @@ class ScenePrior(nn.Module):
     """
 
     conditional = False
-    process_name = "continuous"
+    process_name = ""
     denoiser: Any
     """The network inside its process, a module with ``.network``."""
-
-    def __init__(
-        self,
-        config: PriorConfig,
-        normalizer: Normalizer,
-        preconditioning: Preconditioning,
-        card: dict[str, Any] | None = None,
-        residual: ResidualVariance | None = None,
-    ) -> None:
-        super().__init__()
-        scene_type = get_scene_type(config.scene_type)
-        if config.network.features != scene_type.features:
-            raise InvalidInputError(
-                f"the network reads {config.network.features} features, {config.scene_type!r} has {scene_type.features}"
-            )
-        self._keep(config, normalizer, preconditioning, card, residual)
-        schedule = make_schedule(config.schedule, config.num_timesteps)
-        self.process = GaussianProcess(schedule, config.prediction, preconditioning)
-        self.denoiser = Denoiser(FluxDenoiser(config.network), self.process)
-        self._timestep_weights = lognormal_timesteps(schedule, config.noise_mean, config.noise_std)
+    process: GaussianProcess
+    """The process of what is continuous."""
+    _timestep_weights: Tensor
 
     def _keep(
         self,
@@ -92,6 +72,12 @@ class ScenePrior(nn.Module):
         fixed = SceneBatch.empty(self.scene_type, 1, len(self.scene_type.fixed) or 1)
         self.register_buffer("_fixed", self.normalised(fixed)[0], persistent=False)
 
+    def config_state(self) -> dict[str, Any]:
+        """The ``prior`` entry of the configuration file."""
+        return asdict(self.config)
+
+    # -- files ----------------------------------------------------------------------------------
+
     @classmethod
     def from_state(
         cls,
@@ -102,21 +88,12 @@ class ScenePrior(nn.Module):
         residual: ResidualVariance | None,
     ) -> ScenePrior:
         """From the ``prior`` entry of a configuration file."""
-        fields = {**fields, "network": FluxConfig(**fields["network"])}
-        return cls(PriorConfig(**fields), normalizer, preconditioning, card, residual)
-
-    def config_state(self) -> dict[str, Any]:
-        """The ``prior`` entry of the configuration file."""
-        return asdict(self.config)
+        raise NotImplementedError
 
     @classmethod
     def tiny(cls, scene_type: SceneType, slots: int, normalizer: Normalizer) -> ScenePrior:
         """A very small prior with fresh weights."""
-        features = scene_type.features
-        config = PriorConfig(scene_type.name, slots, FluxConfig(features=features, hidden=32, depth=2, heads=2))
-        return cls(config, normalizer, Preconditioning(torch.zeros(features), torch.full((features,), 0.5)))
-
-    # -- files ----------------------------------------------------------------------------------
+        raise NotImplementedError
 
     @classmethod
     def load(cls, name: str | os.PathLike[str] | ScenePrior) -> ScenePrior:
@@ -190,20 +167,17 @@ class ScenePrior(nn.Module):
         return self.clamp(noise)
 
     def transition(self, x_t: Tensor, step: int, table: StepTableLike) -> ReverseStep:
-        """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters."""
-        return GaussianStep(*self.posterior(x_t, step, table))
+        """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters.
 
-    def posterior(self, x_t: Tensor, step: int, table: StepTableLike) -> tuple[Tensor, Tensor]:
-        """Mean (B, N, D) and std (N, D) of x_{t-1} given x_t; differentiable in the network's parameters.
-
-        The std is 0 on known entries, and everywhere at the last step, which is deterministic.
+        Known entries are certain; at the last step all are.
         """
-        t, previous = int(table.timesteps[step]), int(table.previous[step])
-        x0 = self.denoiser(x_t, torch.full((x_t.shape[0],), t, device=x_t.device))
-        residual = None if self.residual is None else self.residual.at(t)
-        mean, std = self.process.posterior(x_t, x0, t, previous, residual)
-        std_map = std * (~self.known(x_t.shape[1])).to(x_t.dtype)
-        return self.clamp(mean), std_map
+        raise NotImplementedError
+
+    def regenerate(
+        self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int
+    ) -> Tensor:
+        """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; used by :meth:`inpaint`."""
+        raise NotImplementedError
 
     @torch.no_grad()
     def sample_tensor(
@@ -313,15 +287,6 @@ class ScenePrior(nn.Module):
         """Regenerate what ``mask`` (B, N) or (B, N, 2) says; see :func:`agents.inpainting.inpaint`."""
         return inpaint(self, batch, mask, num_steps=num_steps, generators=generators, seed=seed, resample=resample)
 
-    def regenerate(
-        self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int
-    ) -> Tensor:
-        """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; used by :meth:`inpaint`."""
-        x0 = self.encode(batch)
-        widths = torch.tensor([POSE.stop, x0.shape[-1] - POSE.stop], device=mask.device)
-        keep = ~mask.repeat_interleave(widths, dim=-1)
-        return chain_with_noised(self, x0, keep, table, generators, resample)
-
     def complete(
         self, batch: SceneBatch, *, slots: int | None = None, num_steps: int = 50, seed: int = 0
     ) -> SceneBatch:
@@ -350,36 +315,19 @@ class ScenePrior(nn.Module):
     def pretraining_loss(
         self, x0: Tensor, generator: Generator | None = None, reduction: str = "mean", t: Tensor | None = None
     ) -> Tensor:
-        """Weighted mean square of the network's error, over entries that are not known.
+        """The training loss of scenes ``x0`` (B, N, D) as :meth:`encode` gives them, on entries that are not known.
 
         Args:
-            x0: (B, N, D) normalised scenes.
+            x0: normalised scenes.
             generator: source of timesteps and noise (CPU).
             reduction: ``"mean"`` over scenes, or ``"none"`` for (B,); always the mean over entries.
             t: (B,) timesteps, drawn when None.
         """
-        if t is None:
-            t = self.draw_timesteps(x0.shape[0], generator).to(x0.device)
-        noise = torch.randn(x0.shape, generator=generator).to(x0.device)
-        x_t = self.clamp(self.process.add_noise(x0, t, noise))
-        error = self.denoiser.output(x_t, t) - self.process.target(x0, x_t, t, noise)
-        weight = self.loss_weight(x0.shape[1])
-        per_scene = (error.square() * weight).sum(dim=(1, 2)) / weight.sum()
-        return per_scene.mean() if reduction == "mean" else per_scene
+        raise NotImplementedError
 
-    @torch.no_grad()
     def fit_residual(self, x0: Tensor, levels: int = 40, seed: int = 0) -> ResidualVariance:
         """Measure the denoiser's error on normalised scenes ``x0`` (B, N, D) at ``levels`` timesteps, and keep it."""
-        generator = Generator().manual_seed(seed)
-        timesteps = StepTable.spaced(self.config.num_timesteps, levels).timesteps.flip(0)
-        rows = []
-        for t in timesteps:
-            noise = torch.randn(x0.shape, generator=generator).to(x0.device)
-            x_t = self.clamp(self.process.add_noise(x0, t, noise))
-            error = self.denoiser(x_t, t.to(x0.device).expand(len(x0))) - x0
-            rows.append(error[:, len(self.scene_type.fixed) :].square().mean(dim=(0, 1)).cpu())
-        self.residual = ResidualVariance(timesteps, torch.stack(rows))
-        return self.residual
+        raise NotImplementedError
 
     def loss_weight(self, slots: int) -> Tensor:
         """(slots, D) weights of the pretraining loss; 0 on known entries."""
@@ -401,11 +349,8 @@ def _know_scene_type(state: dict[str, Any]) -> None:
 def _prior_class(process: str) -> type[ScenePrior]:
     if process not in PROCESSES:
         raise unknown_name("process", process, PROCESSES)
-    if process == "mixed":
-        from agents.mixed_prior import MixedPrior
-
-        return MixedPrior
-    return ScenePrior
+    kind: type[ScenePrior] = getattr(import_module(f"agents.{process}_prior"), f"{process.capitalize()}Prior")
+    return kind
 
 
 def _chunk_sizes(total: int, size: int) -> Iterator[int]:
