@@ -21,6 +21,7 @@ BLOCKS = [block for block in re.findall(r"```python\n(.*?)```", PAGE, flags=re.D
 def page() -> Any:
     """The names that the page defines, its blocks run in order."""
     names: dict[str, Any] = {}
+    grammars.list_grammars()  # the built-in ones are registered for good, before the registry is swapped
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scene_types, "_REGISTRY", dict(scene_types._REGISTRY))
         patch.setattr(grammar, "_REGISTRY", dict(grammar._REGISTRY))

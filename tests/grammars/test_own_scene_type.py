@@ -40,6 +40,7 @@ def tea_house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     options = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--disable-pip-version-check"]
     command = [sys.executable, "-m", "pip", "install", *options, "--target", str(site), str(copy)]
     subprocess.run(command, check=True, capture_output=True, text=True)
+    list_grammars()  # the built-in ones are registered for good, before the registry is swapped
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(site))
         patch.setattr(scene_types, "_REGISTRY", dict(scene_types._REGISTRY))

@@ -84,6 +84,14 @@ def test_the_floor_comes_first_and_everything_is_in_the_room(batch: SceneBatch, 
         assert room.positions[0].tolist() == pytest.approx([0.0, 0.0, FLOOR])
 
 
+def test_everything_stands_upright(batch: SceneBatch) -> None:
+    """Turned about the vertical alone; what comes to rest in fruit bowls is left out by the fixture."""
+    rotations = batch.rotations[~batch.is_empty]
+    assert bool((rotations[:, 2, :2] == 0).all())
+    assert bool((rotations[:, :2, 2] == 0).all())
+    assert bool((rotations[:, 2, 2] == 1).all())
+
+
 def test_each_table_has_four_chairs_that_face_it_at_arms_length(kind: str, rooms: list[Room]) -> None:
     low, high = NUMBERS[kind]
     for room in rooms:
