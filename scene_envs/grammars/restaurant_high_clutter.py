@@ -15,7 +15,7 @@ from scene_envs.scene_types import get_scene_type
 
 USUAL = tables(
     {3: 0.89, 4: 0.11},
-    laid(Geometric(0.2, 2, 4), another=0.3, lid=0.4, nothing=0.3, setting=0.38, empty=0.52),
+    laid(Geometric(0.2, 2, 4), another=0.3, lid=0.4, nothing=0.3, setting=0.40, empty=0.50),
 )
 QUIET = tables(
     {3: 1.0},

@@ -14,7 +14,7 @@ from scene_envs.scene_types import get_scene_type
 
 USUAL = tables(
     {1: 0.44, 2: 0.39, 3: 0.13, 4: 0.04},
-    laid(Geometric(0.4, 1, 4), another=0.3, lid=0.4, nothing=0.3, setting=0.50, empty=0.40),
+    laid(Geometric(0.4, 1, 4), another=0.3, lid=0.4, nothing=0.3, setting=0.52, empty=0.38),
 )
 QUIET = tables(
     {1: 1.0},
