@@ -85,7 +85,7 @@ def _help(command: str, module: ModuleType) -> str:
 def _run(command: str, module: ModuleType, words: list[str]) -> int:
     from agents.cli_run import Run, fresh_directory
 
-    settings = compose(command, module.config(), words)
+    settings = compose(command, module.config(), _named(words, getattr(module, "POSITIONAL", ())))
     if not getattr(module, "WRITES", True):
         module.run(settings)
         return DONE
@@ -94,6 +94,12 @@ def _run(command: str, module: ModuleType, words: list[str]) -> int:
     with Run(command, settings) as run:
         module.run(settings, run)
     return DONE
+
+
+def _named(words: Sequence[str], keys: Sequence[str]) -> list[str]:
+    """Words without ``=`` under the keys they stand for; those beyond the keys stay as they are."""
+    left = iter(keys)
+    return [word if "=" in word else f"{key}={word}" if (key := next(left, "")) else word for word in words]
 
 
 def _verdict(error: Exception) -> tuple[str, int]:

@@ -10,6 +10,8 @@ COMMANDS = {
     "post-train": "steer a prior with a reward (DDPO-SF with regularisation on real scenes)",
     "doctor": "examine a post-training run before it starts",
     "sample": "draw scenes and pictures from a prior",
+    "complete": "fill the empty slots of scenes, keeping their objects",
+    "rearrange": "give the objects of scenes new poses",
     "search": "search for one scene that scores high, at inference time",
     "project": "make scenes simulation-ready: project out of penetration, then settle",
     "export": "write scenes for simulators and viewers: URDF, SDF, Drake, MJCF, USD, GLB, arrays",
@@ -17,6 +19,7 @@ COMMANDS = {
     "evaluate": "measure the samples of a prior against real scenes",
     "priors": "list the priors that ship with the package",
     "rewards": "list the rewards, those of installed packages included",
+    "import-checkpoint": "make a prior of a checkpoint of the paper's authors",
     "check-reward": "check that a reward keeps its contract",
     "demo": "post-train the shipped prior, compare before and after, write a report",
 }

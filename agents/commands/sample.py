@@ -20,6 +20,8 @@ class SampleConfig:
     Attributes:
         prior: a shipped name, or the folder of a prior or a run.
         count: scenes to draw.
+        prompt: what the scenes should hold, for priors that read prompts; null for anything.
+        guidance: weight of classifier-free guidance, 0 for none.
         num_steps: denoising steps per scene.
         slots: slots per scene, more than trained is allowed; null means as trained.
         seed: of the noise.
@@ -37,6 +39,8 @@ class SampleConfig:
 
     prior: str = "dimsum_table"
     count: int = 16
+    prompt: str | None = None
+    guidance: float = 0.0
     num_steps: int = 50
     slots: int | None = None
     seed: int = 0
@@ -69,6 +73,8 @@ def run(settings: SampleConfig, run: Run) -> None:
     started = time.perf_counter()
     batch = prior.sample(
         settings.count,
+        prompt=settings.prompt,
+        guidance=settings.guidance,
         num_steps=settings.num_steps,
         slots=settings.slots,
         seed=settings.seed,

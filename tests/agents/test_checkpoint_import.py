@@ -29,7 +29,7 @@ def _normalizer(features: int) -> dict[str, object]:
     }
 
 
-def _write(
+def write_checkpoint(
     folder: Path, state: dict[str, torch.Tensor], *, order: list[str] | None = None, **extra: object
 ) -> tuple[Path, Path]:
     names = order or list(DIMSUM.assets)
@@ -56,7 +56,7 @@ def _write(
 @pytest.mark.parametrize("text", [0, 10])
 def test_the_network_computes_exactly_the_described_function(tmp_path: Path, text: int) -> None:
     state = random_state(text=text)
-    prior = import_checkpoint(*_write(tmp_path, state), scene=DIMSUM)
+    prior = import_checkpoint(*write_checkpoint(tmp_path, state), scene=DIMSUM)
     network = prior.denoiser.network.double()
     generator = torch.Generator().manual_seed(1)
     pose = torch.randn(3, 6, 12, generator=generator, dtype=torch.float64)
@@ -70,7 +70,7 @@ def test_the_network_computes_exactly_the_described_function(tmp_path: Path, tex
 
 
 def test_the_result_samples_and_survives_a_round_trip(tmp_path: Path) -> None:
-    prior = import_checkpoint(*_write(tmp_path, random_state()), scene="dimsum_table")
+    prior = import_checkpoint(*write_checkpoint(tmp_path, random_state()), scene="dimsum_table")
     batch = prior.sample(2, num_steps=5, seed=0)
     assert batch.tensor.shape == (2, 34, 20)
     assert prior.card["trained_steps"] == 1234
@@ -80,7 +80,7 @@ def test_the_result_samples_and_survives_a_round_trip(tmp_path: Path) -> None:
 
 def test_the_first_timestep_is_0_as_theirs(tmp_path: Path) -> None:
     state = random_state(text=0)
-    prior = import_checkpoint(*_write(tmp_path, state), scene=DIMSUM)
+    prior = import_checkpoint(*write_checkpoint(tmp_path, state), scene=DIMSUM)
     x = prior.initial(2, 34, torch.Generator().manual_seed(0))
     pose, logits = prior.denoiser.output(x, torch.tensor([1, 3]))
     category = torch.where(x[..., 12:].amax(-1) > 0.5, x[..., 12:].argmax(-1), 8)
@@ -93,8 +93,8 @@ def test_categories_follow_the_model_paths_not_their_order(tmp_path: Path) -> No
     state = random_state(text=0)
     order = list(reversed(DIMSUM.assets))
     (tmp_path / "a").mkdir(), (tmp_path / "b").mkdir()
-    straight = import_checkpoint(*_write(tmp_path / "a", state), scene=DIMSUM)
-    turned = import_checkpoint(*_write(tmp_path / "b", state, order=order), scene=DIMSUM)
+    straight = import_checkpoint(*write_checkpoint(tmp_path / "a", state), scene=DIMSUM)
+    turned = import_checkpoint(*write_checkpoint(tmp_path / "b", state, order=order), scene=DIMSUM)
     pose, category = torch.randn(1, 7, 12), torch.arange(7)[None]
     _, logits = straight.denoiser.network(pose, category, torch.tensor([5.0]))
     _, other = turned.denoiser.network(pose, 6 - category, torch.tensor([5.0]))
@@ -103,7 +103,7 @@ def test_categories_follow_the_model_paths_not_their_order(tmp_path: Path) -> No
 
 def test_unknown_assets_need_aliases_and_without_a_scene_type_one_is_made(tmp_path: Path) -> None:
     order = [*DIMSUM.assets[:-1], "tetsubin"]
-    files = _write(tmp_path, random_state(), order=order)
+    files = write_checkpoint(tmp_path, random_state(), order=order)
     with pytest.raises(UnknownNameError, match="aliases"):
         import_checkpoint(*files, scene=DIMSUM)
     import_checkpoint(*files, scene=DIMSUM, aliases={"tetsubin": "teapot"})
@@ -120,7 +120,7 @@ class _Trap:
 
 def test_objects_in_the_file_are_never_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    file, metadata = _write(tmp_path, random_state(), hyper_parameters={"config": _Trap()})
+    file, metadata = write_checkpoint(tmp_path, random_state(), hyper_parameters={"config": _Trap()})
     prior = import_checkpoint(file, metadata, scene=DIMSUM)
     assert len(prior.sample(1, num_steps=2, seed=0)) == 1
     assert not list(tmp_path.glob("*.trap"))
@@ -130,11 +130,13 @@ def test_what_does_not_fit_is_named(tmp_path: Path) -> None:
     state = random_state()
     del state["scene_in.bias"], state["double_blocks.0.x_qkv_linear.weight"]
     with pytest.raises(CorruptFileError, match=r"double_blocks\.0\.scene\.qkv\.weight"):
-        import_checkpoint(*_write(tmp_path, state), scene=DIMSUM)
+        import_checkpoint(*write_checkpoint(tmp_path, state), scene=DIMSUM)
     with pytest.raises(CorruptFileError, match="unet_block"):
-        import_checkpoint(*_write(tmp_path, random_state() | {"unet_block.weight": torch.zeros(1)}), scene=DIMSUM)
+        import_checkpoint(
+            *write_checkpoint(tmp_path, random_state() | {"unet_block.weight": torch.zeros(1)}), scene=DIMSUM
+        )
     with pytest.raises(InvalidInputError, match="knows 5 assets"):
-        import_checkpoint(*_write(tmp_path, random_state(assets=5)), scene=DIMSUM)
+        import_checkpoint(*write_checkpoint(tmp_path, random_state(assets=5)), scene=DIMSUM)
     (tmp_path / "mixed.ckpt").write_bytes(b"nothing")
     with pytest.raises(CorruptFileError, match="not a checkpoint"):
         read_lightning(tmp_path / "mixed.ckpt")

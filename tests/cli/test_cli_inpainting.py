@@ -1,0 +1,65 @@
+"""Commands that change scenes with a prior, and the import of checkpoints."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from agents.cli import main
+from agents.prior import ScenePrior, tiny_prior
+from scene_envs.grammars import get_grammar
+from scene_envs.scene import SceneBatch
+from tests.agents.authors_flux import random_state
+from tests.agents.test_checkpoint_import import write_checkpoint
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    folder = tmp_path_factory.mktemp("inpainting")
+    tiny_prior(process="mixed").save(folder / "prior")
+    scenes = get_grammar("dimsum_table").sample(np.random.default_rng(0), 3)
+    return scenes.save(folder / "scenes.safetensors"), folder / "prior"
+
+
+def test_complete_adds_and_keeps(files: tuple[Path, Path], tmp_path: Path) -> None:
+    scenes, prior = files
+    words = ["complete", f"scenes={scenes}", f"prior={prior}", "slots=40", "num_steps=3", "pictures=0", "count=2"]
+    assert main([*words, f"output={tmp_path}"]) == 0
+    before, after = SceneBatch.load(scenes)[:2], SceneBatch.load(tmp_path / "scenes.safetensors")
+    assert after.tensor.shape == (2, 40, 20)
+    present = ~before.is_empty
+    assert (after.tensor[:, :34][present] == before.tensor[present]).all()
+    assert json.loads((tmp_path / "metrics.json").read_text())["added"] >= 0
+
+
+def test_rearrange_moves_and_keeps_what_there_is(files: tuple[Path, Path], tmp_path: Path) -> None:
+    scenes, prior = files
+    words = ["rearrange", f"scenes={scenes}", f"prior={prior}", "num_steps=3", "pictures=2", f"output={tmp_path}"]
+    assert main(words) == 0
+    before, after = SceneBatch.load(scenes), SceneBatch.load(tmp_path / "scenes.safetensors")
+    assert (after.categories == before.categories).all()
+    assert json.loads((tmp_path / "metrics.json").read_text())["mean_distance_m"] > 0.01
+    assert (tmp_path / "gallery.png").stat().st_size > 1000
+
+
+def test_wrong_input_is_said(files: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["complete", f"output={tmp_path}"]) == 2
+    assert "scenes=" in capsys.readouterr().err
+    _, prior = files
+    assert main(["sample", f"prior={prior}", "prompt=A scene with 3 objects.", f"output={tmp_path}"]) == 2
+    assert "trained without text" in capsys.readouterr().err
+    assert main(["import-checkpoint", "only.ckpt", f"output={tmp_path}"]) == 2
+    assert "metadata.json" in capsys.readouterr().err
+
+
+def test_a_checkpoint_of_the_authors_becomes_a_prior(tmp_path: Path) -> None:
+    checkpoint, metadata = write_checkpoint(tmp_path, random_state())
+    words = ["import-checkpoint", str(checkpoint), str(metadata), "scene=dimsum_table", "num_steps=3", "count=2"]
+    assert main([*words, f"output={tmp_path / 'run'}"]) == 0
+    prior = ScenePrior.load(tmp_path / "run")
+    saved = SceneBatch.load(tmp_path / "run" / "scenes.safetensors")
+    assert torch.equal(prior.sample(2, num_steps=3, seed=0).tensor, saved.tensor)
