@@ -1,0 +1,121 @@
+"""Prompts as conditions: words, padding, guidance, and what happens to words that are not known."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+import torch
+
+from agents.mixed_denoiser import MixedPriorConfig
+from agents.mixed_prior import MixedPrior
+from agents.networks import MixedFluxConfig, TextConfig, TextEncoder, vocabulary
+from agents.new_prior import build_prior
+from agents.pretrain_config import PretrainConfig
+from agents.prior import ScenePrior, tiny_prior
+from scene_envs.datasets.prompts import describe_all
+from scene_envs.errors import InvalidInputError
+from scene_envs.grammars import get_grammar
+from scene_envs.normalizer import Normalizer
+
+PROMPTS = ["A scene with 12 objects.", "A scene with two cups and a table."]
+
+
+@pytest.fixture(scope="module")
+def prior() -> MixedPrior:
+    scenes = get_grammar("dimsum_table").sample(np.random.default_rng(0), 8)
+    prompts = describe_all(scenes, np.random.default_rng(0))
+    config = PretrainConfig(process="mixed", text=True, hidden=32, depth=2, heads=2)
+    made = build_prior(config, scenes.tensor, Normalizer.fit(scenes.tensor), prompts)
+    assert isinstance(made, MixedPrior)
+    generator = torch.Generator().manual_seed(0)
+    for parameter in made.parameters():
+        if not bool(parameter.any()):
+            torch.nn.init.normal_(parameter, std=0.1, generator=generator)
+    return made.eval()
+
+
+def test_padding_changes_nothing(prior: MixedPrior) -> None:
+    x = prior.initial(1, 34, torch.Generator().manual_seed(0))
+    t = torch.tensor([500])
+    alone = prior.denoiser(x, t, None, prior.encode_prompts(PROMPTS[:1]))
+    tokens, mask = prior.encode_prompts([PROMPTS[0], PROMPTS[1] + " " + PROMPTS[1]])
+    padded = prior.denoiser(x, t, None, (tokens[:1], mask[:1]))
+    assert bool((~mask[0]).any())
+    for first, second in zip(alone, padded, strict=True):
+        torch.testing.assert_close(first, second, atol=1e-5, rtol=1e-4)
+
+
+def test_the_prompt_and_the_order_of_its_words_matter(prior: MixedPrior) -> None:
+    encoder = prior.denoiser.text_encoder
+    assert encoder is not None
+    tokens, _ = encoder(["two cups and a table", "a table and two cups"])
+    assert not torch.allclose(tokens[0].mean(dim=0), tokens[1].mean(dim=0), atol=1e-4)
+    first, second = (prior.sample(2, prompt=prompt, num_steps=4, seed=0) for prompt in PROMPTS)
+    assert not torch.equal(first.tensor, second.tensor)
+
+
+def test_guidance_follows_its_formula(prior: MixedPrior) -> None:
+    x, table, w = prior.initial(2, 34, torch.Generator().manual_seed(0)), prior.step_table(4), 1.5
+    text, t = prior.encode_prompts(PROMPTS), torch.tensor([1000, 1000])
+    pose, logits = prior.denoiser(x, t, None, text)
+    free_pose, free_logits = prior.denoiser(x, t, None, prior.encode_prompts(["", ""]))
+    guided = prior.transition(x, 0, table, text=text, guidance=w)
+    mean, _ = prior.process.posterior(x[..., :12], (1 + w) * pose - w * free_pose, 1000, int(table.previous[0]))
+    known = prior.known(34)[:, :12]
+    torch.testing.assert_close(guided.mean[:, ~known], mean[:, ~known], atol=1e-5, rtol=1e-4)
+    mixed = ((1 + w) * logits.log_softmax(-1) - w * free_logits.log_softmax(-1)).softmax(-1)
+    probs = prior.categories.posterior(torch.full((2, 33), 8), mixed[:, 1:], 1000, int(table.previous[0]))
+    torch.testing.assert_close(guided.probs[:, 1:], probs, atol=1e-5, rtol=1e-4)
+
+
+def test_the_unconditional_branch_runs_only_when_guidance_needs_it(
+    prior: MixedPrior, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+    forward = type(prior.denoiser.network).forward
+    monkeypatch.setattr(
+        type(prior.denoiser.network), "forward", lambda self, *a, **k: calls.append(1) or forward(self, *a, **k)
+    )
+    for guidance, expected in ((0.0, 3), (1.0, 6)):
+        calls.clear()
+        prior.sample(1, prompt=PROMPTS[0], guidance=guidance, num_steps=3)
+        assert len(calls) == expected
+
+
+def test_unknown_words_are_listed_and_long_prompts_refused(prior: MixedPrior, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        prior.sample(1, prompt="A scene with a zeppelin and a table.", num_steps=1)
+    assert "zeppelin" in caplog.text
+    assert "table" not in caplog.text
+    with pytest.raises(InvalidInputError, match="at most 127"):
+        prior.sample(1, prompt="a " * 200, num_steps=1)
+    with pytest.raises(InvalidInputError, match="2 prompts for 3 scenes"):
+        prior.sample(3, prompt=PROMPTS, num_steps=1)
+    with pytest.raises(InvalidInputError, match="trained without text"):
+        tiny_prior(process="mixed").sample(1, prompt=PROMPTS[0], num_steps=1)
+    with pytest.raises(InvalidInputError, match="trained without text"):
+        tiny_prior().sample(1, prompt=PROMPTS[0], num_steps=1)
+
+
+def test_vocabulary_and_encoder_survive_a_file(prior: MixedPrior, tmp_path: object) -> None:
+    again = ScenePrior.load(prior.save(str(tmp_path)))
+    assert again.conditional
+    first, second = (p.sample(2, prompt=PROMPTS, guidance=0.5, num_steps=3, seed=1) for p in (prior, again))
+    assert torch.equal(first.tensor, second.tensor)
+
+
+def test_a_vocabulary_holds_the_words_of_prompts_and_all_counts() -> None:
+    words = vocabulary(PROMPTS)
+    assert {"a", "scene", "cups", "12", "125", "."} <= set(words)
+    encoder = TextEncoder(TextConfig(words, width=16, heads=2))
+    indices, unknown = encoder.tokenize(PROMPTS)
+    assert indices.shape[0] == 2
+    assert unknown == []
+
+
+def test_a_network_with_text_has_double_blocks_and_one_without_has_none() -> None:
+    with_text = MixedPriorConfig("dimsum_table", 34, MixedFluxConfig(8, text_width=16))
+    assert with_text.network.double_blocks > 0
+    assert len(tiny_prior(process="mixed").denoiser.network.double_blocks) == 0
