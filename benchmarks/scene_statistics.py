@@ -4,7 +4,7 @@
         [--pictures docs/scene_types] [--gallery 6]
 
 Prints the counts per scene, and per asset, as Markdown. With ``--pictures`` it draws ``<scene>_counts.png`` there, and
-with ``--gallery`` also ``<scene>.png``, a picture of so many scenes, complete and at rest.
+with ``--gallery`` also ``<scene>.png``, a picture of so many scenes, from empty to full.
 
 Scene ``i`` comes from the generator ``[seed, i]``, so the result does not depend on the number of workers. For the
 counts, the contents of crocks and bowls are drawn but not settled (their poses are not looked at); draws that would
@@ -111,7 +111,7 @@ def draw_histogram(total: Counts, support: str, path: Path) -> None:
     axes.text(total.mean() + 0.015 * (high - low), 0.94 * axes.get_ylim()[1], f"mean {total.mean():.2f}", fontsize=9)
     axes.set_xlabel(f"objects per scene, {support} included")
     axes.set_ylabel(f"% of {len(total):,} scenes")
-    axes.set_xticks(np.unique(np.linspace(low, high, 10).round().astype(int)))
+    axes.set_xticks(range(low, high + 1, max(1, round((high - low) / 9))))
     axes.spines[["top", "right"]].set_visible(False)
     figure.tight_layout()
     figure.savefig(path)
@@ -119,11 +119,13 @@ def draw_histogram(total: Counts, support: str, path: Path) -> None:
 
 
 def draw_gallery(scene: str, count: int, seed: int, path: Path) -> None:
-    """Write a picture of ``count`` scenes to ``path``."""
+    """Write a picture of ``count`` scenes to ``path``: of five times as many, evenly from empty to full."""
     from scene_envs.render import gallery, render
 
-    batch = get_grammar(scene).sample(np.random.default_rng(seed), count)
-    gallery(render(batch, width=480, height=360), columns=3).save(path, optimize=True)
+    batch = get_grammar(scene).sample(np.random.default_rng(seed), 5 * count)
+    batch = batch[batch.counts.argsort()[2::5]]
+    captions = [f"{number} objects" for number in batch.counts.tolist()]
+    gallery(render(batch, width=480, height=360), columns=3, captions=captions).save(path, optimize=True)
 
 
 def main() -> None:
