@@ -59,7 +59,7 @@ def frame_scene_type(scene_type: SceneType) -> Framing:
     if vertices[:, 2].max(initial=-np.inf) > low[2] + 0.25 * extent[2]:
         side = _open_side(boxes)
         top = vertices[:, 2].max()
-        above = _footprint(low, high, 1.0, top + 0.6 * max(0.0, high[2] - top))
+        above = _footprint(low, high, 1.0, max(top, high[2]))
         points = np.concatenate([vertices, above])
         if side is None:
             return Framing(points, _direction(_across(extent), 52.0), _direction(_across(extent) - 85.0, 62.0), ground)
