@@ -43,18 +43,19 @@ def inpaint(
         resample: how often each step is taken, going back in between (Lugmayr et al. 2022, Algorithm 1); 1 is once.
 
     Returns:
-        Scenes whose unmasked entries are bit-identical to those of ``batch``. A slot whose category alone is
-        regenerated stays an object, as its pose is kept.
+        Scenes on the device of ``batch``, whose unmasked entries are bit-identical to its own. Where the category alone
+        is regenerated, an object stays an object and an empty slot stays empty, as the pose is kept.
 
     Raises:
         InvalidInputError: a mask of the wrong shape or type, not one generator per scene, or ``resample`` below 1.
     """
-    both = check_mask(batch, mask, generators, resample)
+    both = check_mask(batch, mask, generators, resample).to(batch.tensor.device)
     both[:, : len(prior.scene_type.fixed)] = False
     if generators is None:
         generators = [Generator().manual_seed(seed + i) for i in range(len(batch))]
-    x = prior.regenerate(batch, both, prior.step_table(num_steps), generators, resample)
-    return merge(batch, prior.decode(x), both)
+    device = prior.known(1).device
+    x = prior.regenerate(batch.to(device), both.to(device), prior.step_table(num_steps), generators, resample)
+    return merge(batch, prior.decode(x).to(batch.tensor.device), both)
 
 
 def check_mask(
@@ -77,9 +78,8 @@ def check_mask(
 def merge(batch: SceneBatch, new: SceneBatch, mask: Tensor) -> SceneBatch:
     """``batch`` with the poses and categories of ``new`` where ``mask`` (B, N, 2) says so."""
     empty = batch.scene_type.num_assets
-    stays = ~mask[..., 0] & ~batch.is_empty  # an object whose pose is kept
-    category = torch.where((mask[..., 1] & ~(stays & (new.categories == empty)))[..., None],
-                           new.tensor[..., CATEGORY], batch.tensor[..., CATEGORY])  # fmt: skip
+    taken = mask[..., 1] & (mask[..., 0] | (new.is_empty == batch.is_empty))  # a kept pose, or none, stays one
+    category = torch.where(taken[..., None], new.tensor[..., CATEGORY], batch.tensor[..., CATEGORY])
     pose = torch.where(mask[..., :1], new.tensor[..., POSE], batch.tensor[..., POSE])
     gone = category.argmax(dim=-1, keepdim=True) == empty
     return SceneBatch(torch.cat([torch.where(gone, torch.zeros_like(pose), pose), category], dim=-1), batch.scene_type)
@@ -98,7 +98,7 @@ def chain_with_noised(
             noised = prior.process.add_noise(x0, level, scene_noise(generators, x0))
             x = prior.clamp(torch.where(keep, noised, x))
             x = prior.transition(x, step, table).from_noise(scene_noise(generators, x0))
-    return x
+    return torch.where(keep, x0, x)
 
 
 def scene_noise(generators: Sequence[Generator], like: Tensor) -> Tensor:

@@ -154,7 +154,21 @@ class MixedPrior(ScenePrior):
 
     def _unconditional(self, count: int) -> Text | None:
         """What stands for no prompt; None when the prior reads none."""
-        return self.encode_prompts([""] * count) if self.conditional else None
+        if not self.conditional:
+            return None
+        tokens, mask = self.encode_prompts([""])
+        return tokens.expand(count, -1, -1), mask.expand(count, -1)
+
+    def seen(self, x: Tensor, given: Given | None = None) -> Given | None:
+        """What the network is told to be exact in scenes ``x`` (B, N, D): ``given``, or else the fixed objects.
+
+        A prior trained with given entries has always been told of its fixed objects; one trained without is not.
+        """
+        if given is not None or self.mixed.given_share <= 0:
+            return given
+        fixed = torch.zeros(x.shape[:2], dtype=torch.bool, device=x.device)
+        fixed[:, : len(self.scene_type.fixed)] = True
+        return Given(x, fixed, fixed)
 
     # -- scenes and states ----------------------------------------------------------------------
 
@@ -221,12 +235,13 @@ class MixedPrior(ScenePrior):
             x_t: scenes at ``table.timesteps[step]``.
             step: index in the table.
             table: the chain.
-            given: entries that carry no noise.
+            given: entries that carry no noise; None for the fixed objects alone.
             text: tokens (B, L, W) and their mask (B, L).
             guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional, on poses and logits.
         """
         t, previous = int(table.timesteps[step]), int(table.previous[step])
         levels = torch.full((x_t.shape[0],), t, device=x_t.device)
+        given = self.seen(x_t, given)
         unconditional = None if text is not None and not guidance else self._unconditional(x_t.shape[0])
         pose, logits = self.denoiser(x_t, levels, given, unconditional if text is None else text)
         if text is not None and guidance:
@@ -374,7 +389,8 @@ class MixedPrior(ScenePrior):
         for t in timesteps:
             noise = torch.randn(x0.shape, generator=generator).to(x0.device)
             level = t.to(x0.device).expand(len(x0))
-            pose, _ = self.denoiser(self.add_noise(x0, level, noise), level)
+            x_t = self.add_noise(x0, level, noise)
+            pose, _ = self.denoiser(x_t, level, self.seen(x_t), self._unconditional(len(x0)))
             error = (pose - x0[..., :POSE]).square() * present[..., None]
             rows.append((error.sum(dim=(0, 1)) / present.sum()).cpu())
         self.residual = ResidualVariance(timesteps, torch.stack(rows))

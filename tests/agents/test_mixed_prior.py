@@ -109,6 +109,42 @@ def test_given_entries_carry_no_noise_into_the_network(prior: MixedPrior, scenes
     assert (seen[0] == x0[given.entries()]).all()
 
 
+def test_fixed_objects_look_alike_in_training_and_in_chains(
+    prior: MixedPrior, scenes: SceneBatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[dict[str, torch.Tensor]] = []
+    kind = type(prior.denoiser.network)
+    forward = kind.forward
+
+    def watched(self: torch.nn.Module, pose: torch.Tensor, *args: torch.Tensor, **more: torch.Tensor) -> object:
+        seen.append({"pose": pose[0, 0], "position": more["position"][0, 0], "level": more["noise_level"][0, 0],
+                     "given": more["given"][0, 0]})  # fmt: skip
+        return forward(self, pose, *args, **more)
+
+    monkeypatch.setattr(kind, "forward", watched)
+    prior.pretraining_loss(prior.encode(scenes))
+    prior.sample(2, num_steps=2)
+    prior.rearrange(scenes, num_steps=1)
+    assert len(seen) == 4
+    for other in seen[1:]:
+        for name, value in seen[0].items():
+            torch.testing.assert_close(other[name], value, atol=1e-6, rtol=0)
+    assert int(seen[0]["given"]) == 3
+    assert float(seen[0]["level"]) == 0.0
+
+
+@pytest.mark.parametrize("process", ["continuous", "mixed"])
+def test_whatever_is_regenerated_objects_keep_valid_poses(process: str, scenes: SceneBatch) -> None:
+    any_prior = tiny_prior(process=process)
+    for column in (0, 1):
+        mask = torch.zeros(6, 34, 2, dtype=torch.bool)
+        mask[..., column] = True
+        changed = any_prior.inpaint(scenes, mask, num_steps=3)
+        assert (changed.is_empty == scenes.is_empty).all()
+        turn = changed.rotations[~changed.is_empty]
+        torch.testing.assert_close(turn @ turn.mT, torch.eye(3).expand_as(turn), atol=1e-5, rtol=0)
+
+
 def test_bad_masks_and_names_are_refused(prior: MixedPrior, scenes: SceneBatch) -> None:
     with pytest.raises(InvalidInputError, match=r"\(6, 34, 2\)"):
         prior.inpaint(scenes, torch.zeros(6, 34, 3, dtype=torch.bool))
@@ -169,7 +205,7 @@ def test_the_probability_of_a_chain_of_states_is_that_of_bayes(prior: MixedPrior
     x = prior.initial(1, 34, torch.Generator().manual_seed(0))
     table = prior.step_table(2)  # T -> 1 -> 0
     step = prior.transition(x, 0, table)
-    _, logits = prior.denoiser(x, torch.tensor([1000]))
+    _, logits = prior.denoiser(x, torch.tensor([1000]), prior.seen(x))
     data, keep = logits.softmax(dim=-1)[0, 1:], float(prior.categories.schedule.keep[1])
     mask, rest = float(prior.categories.schedule.mask[1]), 0.0
     rest = max(0.0, 1 - keep - mask) / 8

@@ -39,9 +39,9 @@ def prior() -> MixedPrior:
 def test_padding_changes_nothing(prior: MixedPrior) -> None:
     x = prior.initial(1, 34, torch.Generator().manual_seed(0))
     t = torch.tensor([500])
-    alone = prior.denoiser(x, t, None, prior.encode_prompts(PROMPTS[:1]))
+    alone = prior.denoiser(x, t, prior.seen(x), prior.encode_prompts(PROMPTS[:1]))
     tokens, mask = prior.encode_prompts([PROMPTS[0], PROMPTS[1] + " " + PROMPTS[1]])
-    padded = prior.denoiser(x, t, None, (tokens[:1], mask[:1]))
+    padded = prior.denoiser(x, t, prior.seen(x), (tokens[:1], mask[:1]))
     assert bool((~mask[0]).any())
     for first, second in zip(alone, padded, strict=True):
         torch.testing.assert_close(first, second, atol=1e-5, rtol=1e-4)
@@ -59,8 +59,8 @@ def test_the_prompt_and_the_order_of_its_words_matter(prior: MixedPrior) -> None
 def test_guidance_follows_its_formula(prior: MixedPrior) -> None:
     x, table, w = prior.initial(2, 34, torch.Generator().manual_seed(0)), prior.step_table(4), 1.5
     text, t = prior.encode_prompts(PROMPTS), torch.tensor([1000, 1000])
-    pose, logits = prior.denoiser(x, t, None, text)
-    free_pose, free_logits = prior.denoiser(x, t, None, prior.encode_prompts(["", ""]))
+    pose, logits = prior.denoiser(x, t, prior.seen(x), text)
+    free_pose, free_logits = prior.denoiser(x, t, prior.seen(x), prior.encode_prompts(["", ""]))
     guided = prior.transition(x, 0, table, text=text, guidance=w)
     mean, _ = prior.process.posterior(x[..., :12], (1 + w) * pose - w * free_pose, 1000, int(table.previous[0]))
     known = prior.known(34)[:, :12]
