@@ -55,7 +55,7 @@ _RULES: tuple[tuple[str, str], ...] = (
     (r"to_continous_out\.out_layer\.", "pose_out.2."),
     (r"to_logits\.", "logits_out."),
 )
-"""Their names to ours; the meaning of each is in the docs page of the network."""
+"""Names of their tensors, as patterns, and what ours are called."""
 
 
 def import_checkpoint(

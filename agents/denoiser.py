@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor, nn
 
 from agents.diffusion import GaussianProcess
@@ -37,21 +38,32 @@ class PriorConfig:
     translation_weight: float = 3.0
 
 
+def autocast(like: Tensor, precision: torch.dtype) -> torch.autocast:
+    """The context in which a network runs in ``precision`` on the device of ``like``; does nothing for float32."""
+    return torch.autocast(like.device.type, precision, enabled=precision != torch.float32)
+
+
 class Denoiser(nn.Module):
-    """A network inside its process: x_t (B, N, D) and t (B,) to the denoised scene x_0 (B, N, D)."""
+    """A network inside its process: x_t (B, N, D) and t (B,) to the denoised scene x_0 (B, N, D).
+
+    Attributes:
+        precision: number format of the network alone (``torch.bfloat16`` for autocast); the chain is always float32.
+    """
 
     def __init__(self, network: nn.Module, process: GaussianProcess) -> None:
         super().__init__()
         self.network = network
         self.process = process
+        self.precision = torch.float32
 
     def output(self, x_t: Tensor, t: Tensor) -> Tensor:
         """The raw network output (B, N, D), in the units of ``process.target``."""
         process = self.process
         alpha, _ = process.rates(t, x_t)
         level = (process.sigma[t.cpu()] / process.alpha[t.cpu()]).to(x_t.device)
-        result: Tensor = self.network(process.network_input(x_t, t), x_t / alpha, level)
-        return result
+        with autocast(x_t, self.precision):
+            result: Tensor = self.network(process.network_input(x_t, t), x_t / alpha, level)
+        return result.to(x_t.dtype)
 
     def forward(self, x_t: Tensor, t: Tensor) -> Tensor:
         """The denoised scene x_0 (B, N, D), normalised."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from agents.denoiser import autocast
 from agents.diffusion import CategoricalProcess, GaussianProcess
 from agents.diffusion.reverse_steps import state_of
 from agents.networks.mixed_flux import POSE, MixedFlux, MixedFluxConfig
@@ -85,7 +86,11 @@ class Given:
 
 
 class MixedDenoiser(nn.Module):
-    """x_t (B, N, 12 + K) and t (B,) to the clean pose (B, N, 12) and logits of the clean category (B, N, K)."""
+    """x_t (B, N, 12 + K) and t (B,) to the clean pose (B, N, 12) and logits of the clean category (B, N, K).
+
+    Attributes:
+        precision: number format of the network alone (``torch.bfloat16`` for autocast); chains are always float32.
+    """
 
     def __init__(
         self,
@@ -96,6 +101,7 @@ class MixedDenoiser(nn.Module):
     ) -> None:
         super().__init__()
         self.network = network
+        self.precision = torch.float32
         self.text_encoder = text_encoder
         self.poses = poses
         self.categories = categories
@@ -124,17 +130,18 @@ class MixedDenoiser(nn.Module):
         tokens, mask = (None, None) if text is None else text
         network: MixedFlux = self.network
         time = (t - 1).to(pose.dtype) if not network.config.frequencies else 250.0 * ratio.log()
-        output: tuple[Tensor, Tensor] = network(
-            scaled,
-            states,
-            time,
-            text=tokens,
-            text_mask=mask,
-            position=position,
-            noise_level=level,
-            given=None if given is None else given.flags(),
-        )
-        return output
+        with autocast(x_t, self.precision):
+            output, logits = network(
+                scaled,
+                states,
+                time,
+                text=tokens,
+                text_mask=mask,
+                position=position,
+                noise_level=level,
+                given=None if given is None else given.flags(),
+            )
+        return output.to(x_t.dtype), logits.to(x_t.dtype)
 
     def forward(
         self, x_t: Tensor, t: Tensor, given: Given | None = None, text: tuple[Tensor, Tensor] | None = None

@@ -11,11 +11,13 @@ class PretrainConfig:
 
     Attributes:
         scene: scene type.
-        data: dataset directory of training scenes.
-        heldout: dataset directory of held-out scenes; empty takes the last 2 % of ``data``.
+        data: dataset directory of training scenes, or ``grammar`` for fresh scenes of the grammar without end.
+        heldout: dataset directory of held-out scenes; empty takes the last 2 % of ``data``, or 512 of the grammar.
         output: run directory; an interrupted run in it goes on where it stopped.
         iterations: optimiser steps.
-        batch_size: scenes per step.
+        batch_size: scenes per step, over all processes and parts.
+        accumulate: parts in which a process takes its scenes, one after the other, to save memory.
+        precision: number format of the network in training, ``float32`` or ``bfloat16`` (autocast).
         learning_rate: peak learning rate.
         final_learning_rate: where the cosine ends, as a fraction of the peak.
         warmup: steps of linear warm-up.
@@ -36,6 +38,8 @@ class PretrainConfig:
         log_every: steps between log rows.
         evaluate_every: steps between held-out evaluations.
         checkpoint_every: steps between checkpoints.
+        pictures_every: steps between pictures of samples; 0 draws none.
+        tensorboard: also log for TensorBoard.
         device: torch device.
     """
 
@@ -45,6 +49,8 @@ class PretrainConfig:
     output: str = "runs/pretrain"
     iterations: int = 5000
     batch_size: int = 128
+    accumulate: int = 1
+    precision: str = "float32"
     learning_rate: float = 1e-3
     final_learning_rate: float = 0.01
     warmup: int = 100
@@ -65,4 +71,6 @@ class PretrainConfig:
     log_every: int = 20
     evaluate_every: int = 250
     checkpoint_every: int = 250
+    pictures_every: int = 0
+    tensorboard: bool = False
     device: str = "cpu"

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import logging
 import math
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Generator, Tensor, nn
 
@@ -20,12 +20,23 @@ from agents.averaging import Averaged, WeightAverage
 from agents.checkpoints import load_checkpoint, save_checkpoint
 from agents.mixed_prior import MixedPrior
 from agents.new_prior import build_prior
+from agents.parallel import World
 from agents.pretrain_config import PretrainConfig
 from agents.prior import ScenePrior
-from scene_envs.errors import TrainingError
+from agents.training_data import PROMPTS_PER_SCENE, GrammarStream, SceneTable, TrainingData
+from agents.training_log import TrainingLog
+from scene_envs.datasets.prompts import describe_all
+from scene_envs.errors import InvalidInputError, MissingDependencyError, TrainingError, unknown_name
+from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch
 
 logger = logging.getLogger(__name__)
+
+_PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+_SAMPLE = 1024
+"""Scenes of a grammar to which the moments and the vocabulary are fitted."""
+_HELD_OUT = 512
+"""Held-out scenes of a grammar."""
 
 
 def learning_rate_at(step: int, config: PretrainConfig) -> float:
@@ -46,37 +57,41 @@ def heldout_loss(prior: ScenePrior, x0: Tensor, seed: int = 1234, batch_size: in
 
 
 class Pretrainer:
-    """The state of one run: prior, average, optimisers, random generators, step.
+    """The state of one run: prior, average, optimiser, step.
+
+    What a step draws is a function of (seed, step, part) alone, where the parts of a step are those of all processes:
+    two processes take the same steps as one with twice the parts, and a killed run goes on bit for bit.
 
     Args:
         config: the run.
-        train: (M, N, D) normalised training scenes.
-        heldout: (K, N, D) normalised held-out scenes.
+        data: training scenes.
+        heldout: (K, N, D) held-out scenes as the prior encodes them.
         prior: the prior to train, in place.
-        prompts: prompts of every training scene, for a prior that reads them.
     """
 
-    def __init__(
-        self,
-        config: PretrainConfig,
-        train: Tensor,
-        heldout: Tensor,
-        prior: ScenePrior,
-        prompts: Sequence[Sequence[str]] = (),
-    ) -> None:
+    def __init__(self, config: PretrainConfig, data: TrainingData, heldout: Tensor, prior: ScenePrior) -> None:
         self.config = config
-        self.train_data, self.heldout_data = train, heldout
+        self.data, self.heldout_data = data, heldout
+        self.world = World.join(config.device)
+        self.parts = self.world.size * config.accumulate
+        if config.batch_size % self.parts:
+            raise InvalidInputError(
+                f"batch_size={config.batch_size} is not a multiple of {self.parts}, "
+                f"the {self.world.size} process(es) times accumulate={config.accumulate}"
+            )
         self.prior = prior.to(config.device).train()
         self.network: nn.Module = prior.denoiser
-        self.prompts = prompts
+        if config.precision not in _PRECISIONS:
+            raise unknown_name("precision", config.precision, _PRECISIONS)
+        prior.denoiser.precision = _PRECISIONS[config.precision]
         self.average = WeightAverage(self.network, config.ema)
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), betas=(0.9, 0.99), weight_decay=config.weight_decay
         )
-        self.generator = Generator().manual_seed(config.seed)
         self.step = 0
         self.seconds = 0.0
         self.directory = Path(config.output)
+        self.log = TrainingLog(self.directory, config.tensorboard and self.world.leads)
         self.evaluations: list[dict[str, float]] = []
 
     @property
@@ -92,9 +107,11 @@ class Pretrainer:
         if self.config.compile:
             self.prior.denoiser.network.compile()
         for row in self._steps():
-            self._log(row)
+            if self.world.leads:
+                self.log.write(row, self.config.iterations)
         with self._averaged():
             self.prior.fit_residual(self.heldout_data[:512].to(self.config.device))
+        self.prior.denoiser.precision = torch.float32
         return self.save_prior()
 
     def _steps(self) -> Iterator[dict[str, float]]:
@@ -114,38 +131,47 @@ class Pretrainer:
                 row |= {"learning_rate": learning_rate_at(self.step - 1, config), "seconds": round(self.seconds, 1)}
                 running.clear()
                 yield row
+            if config.pictures_every and self.step % config.pictures_every == 0:
+                self._draw_samples()
             if self.step % config.checkpoint_every == 0 or last:
                 self._save()
 
     def _update(self) -> tuple[float, float]:
         config = self.config
-        index = torch.randint(len(self.train_data), (config.batch_size,), generator=self.generator)
-        x0 = self.train_data[index].to(config.device)
-        loss = self.prior.pretraining_loss(x0, self.generator, **self._condition(index))
-        if not bool(torch.isfinite(loss)):
+        total = torch.zeros((), device=config.device)
+        for part in range(config.accumulate):
+            generator = part_generator(config.seed, self.step, self.world.rank * config.accumulate + part)
+            loss = self._part_loss(config.batch_size // self.parts, generator) / self.parts
+            loss.backward()  # type: ignore[no-untyped-call]
+            total += loss.detach()
+        value = float(self.world.sum(total))
+        if not math.isfinite(value):
             raise TrainingError(
-                f"the pretraining loss became {float(loss.detach())} at step {self.step}; the last good state is "
+                f"the pretraining loss became {value} at step {self.step}; the last good state is "
                 f"{str(self.checkpoint_path)!r}: lower learning_rate (now {config.learning_rate}) and run again"
             )
-        loss.backward()
+        self.world.sum_gradients(self.network.parameters())
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), config.clip)
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate_at(self.step, config)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.average.update(self.network)
-        return float(loss.detach()), float(norm)
+        return value, float(norm)
 
-    def _condition(self, index: Tensor) -> dict[str, Any]:
-        """The prompts of the scenes ``index``, one of each scene's, some withheld; nothing for other priors."""
-        if not isinstance(self.prior, MixedPrior) or not self.prior.conditional:
-            return {}
-        choice = torch.rand(2, len(index), generator=self.generator).tolist()
+    def _part_loss(self, count: int, generator: Generator) -> Tensor:
+        """The loss of ``count`` scenes; of each scene's prompts one is read, or none where it is withheld."""
+        reads = self.prior.conditional
+        scenes, prompts = self.data.draw(count, generator, prompts=reads)
+        x0 = scenes.to(self.config.device)
+        if not reads or not isinstance(self.prior, MixedPrior):
+            return self.prior.pretraining_loss(x0, generator)
+        choice = torch.rand(2, count, generator=generator).tolist()
         texts = [
             "" if dropped < self.config.prompt_dropout else group[int(pick * len(group))]
-            for group, pick, dropped in zip((self.prompts[i] for i in index.tolist()), *choice, strict=True)
+            for group, pick, dropped in zip(prompts, *choice, strict=True)
         ]
-        return {"text": self.prior.encode_prompts(texts)}
+        return self.prior.pretraining_loss(x0, generator, text=self.prior.encode_prompts(texts))
 
     def _evaluate(self) -> float:
         with self._averaged():
@@ -156,9 +182,31 @@ class Pretrainer:
     def _averaged(self) -> Averaged:
         return Averaged(self.network, self.average)
 
+    def _draw_samples(self) -> None:
+        """A gallery of samples of the averaged prior, ``samples-STEP.png``; left out without PyBullet."""
+        if not self.world.leads:
+            return
+        from scene_envs.render import gallery, render
+
+        with self._averaged():
+            batch = self.prior.eval().sample(8, num_steps=50, seed=self.config.seed).to("cpu")
+        self.prior.train()
+        captions = [f"{int(count)} objects" for count in batch.counts]
+        try:
+            images = render(batch, width=400, height=300)
+        except MissingDependencyError as error:
+            logger.warning("no pictures of samples: %s", error)
+            return
+        gallery(list(images), columns=4, captions=captions).save(self.directory / f"samples-{self.step:07d}.png")
+
     # -- files ----------------------------------------------------------------------------------
 
     def _save(self) -> None:
+        if self.world.leads:
+            self._save_checkpoint()
+        self.save_prior()
+
+    def _save_checkpoint(self) -> None:
         save_checkpoint(
             self.checkpoint_path,
             {
@@ -167,13 +215,11 @@ class Pretrainer:
                 "average": self.average.tensors,
                 "average_updates": self.average.updates,
                 "optimizer": self.optimizer.state_dict(),
-                "generator": self.generator.get_state(),
                 "step": self.step,
                 "seconds": self.seconds,
                 "evaluations": self.evaluations,
             },
         )
-        self.save_prior()
 
     def _load(self) -> None:
         state = load_checkpoint(self.checkpoint_path)
@@ -181,7 +227,6 @@ class Pretrainer:
         self.average.tensors = state["average"]
         self.average.updates = state["average_updates"]
         self.optimizer.load_state_dict(state["optimizer"])
-        self.generator.set_state(state["generator"])
         self.step, self.seconds = state["step"], state["seconds"]
         self.evaluations = state["evaluations"]
         logger.info("resumed at step %d", self.step)
@@ -192,26 +237,20 @@ class Pretrainer:
             self.prior.card = {
                 "trained_steps": self.step,
                 "batch_size": self.config.batch_size,
-                "training_scenes": len(self.train_data),
+                "training_scenes": self.data.size or self.step * self.config.batch_size,
                 "seconds": round(self.seconds),
                 "heldout_loss": self.evaluations[-1]["heldout"] if self.evaluations else None,
             }
-            self.prior.save(self.directory / "prior")
-            return ScenePrior.load(self.directory)
+            if self.world.leads:
+                self.prior.save(self.directory / "prior")
+        self.world.wait()
+        return ScenePrior.load(self.directory)
 
-    def _log(self, row: dict[str, float]) -> None:
-        per_step = self.seconds / max(1, self.step)
-        left = (self.config.iterations - self.step) * per_step
-        text = "  ".join(f"{key} {value:.6g}" for key, value in row.items())
-        logger.info("%s  left %.0f s", text, left)
-        fields = ["step", "loss", "heldout", "gradient_norm", "learning_rate", "seconds"]
-        path = self.directory / "log.csv"
-        fresh = not path.exists()
-        with path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, fields)
-            if fresh:
-                writer.writeheader()
-            writer.writerow(row)
+
+def part_generator(seed: int, step: int, part: int) -> Generator:
+    """The generator of one part of one step of a run."""
+    words = np.random.SeedSequence([seed, step, part]).generate_state(2, np.uint64)
+    return Generator().manual_seed(int(words[0]) >> 1)
 
 
 def pretrain(config: PretrainConfig) -> dict[str, Any]:
@@ -220,24 +259,41 @@ def pretrain(config: PretrainConfig) -> dict[str, Any]:
     Returns:
         The numbers of ``metrics.json``, which is written beside the prior.
     """
-    from scene_envs.datasets import SceneDataset
-
-    dataset = SceneDataset.load(config.data)
-    raw, prompts = dataset.tensor, dataset.prompt_sets
-    if config.heldout:
-        heldout_raw = SceneDataset.load(config.heldout).tensor
-    else:
-        split = max(1, len(raw) // 50)
-        raw, heldout_raw, prompts = raw[:-split], raw[-split:], prompts[:-split]
-    prior = build_prior(config, raw, dataset.normalizer, prompts)
-
-    def encode(scenes: Tensor) -> Tensor:
-        return torch.cat([prior.encode(SceneBatch(part, prior.scene_type)) for part in scenes.split(10_000)])
-
-    trainer = Pretrainer(config, encode(raw), encode(heldout_raw[:2048]), prior, prompts)
+    prior, data, heldout = prepare(config)
+    trainer = Pretrainer(config, data, heldout, prior)
     trained = trainer.run()
     metrics = {**trained.card, "evaluations": trainer.evaluations, "config": asdict(config)}
+    if not trainer.world.leads:
+        return metrics
     partial = trainer.directory / "metrics.json.partial"
     partial.write_text(json.dumps(metrics, indent=1))
     os.replace(partial, trainer.directory / "metrics.json")
     return metrics
+
+
+def prepare(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
+    """A fresh prior, its training scenes, and held-out scenes (K, N, D)."""
+    from scene_envs.datasets import SceneDataset, fixed_normalizer
+
+    if config.data == "grammar":
+        grammar = get_grammar(config.scene)
+        sample = grammar.sample(np.random.default_rng([config.seed, _SAMPLE]), _SAMPLE)
+        prompts = (
+            describe_all(sample, np.random.default_rng(config.seed), count=PROMPTS_PER_SCENE) if config.text else []
+        )
+        prior = build_prior(config, sample.tensor, fixed_normalizer(grammar), prompts)
+        held_out = grammar.sample(np.random.default_rng([config.seed, _SAMPLE, 1]), _HELD_OUT)
+        return prior, GrammarStream(grammar, prior), prior.encode(held_out)
+    dataset = SceneDataset.load(config.data)
+    raw, prompt_sets = dataset.tensor, dataset.prompt_sets
+    if config.heldout:
+        heldout_raw = SceneDataset.load(config.heldout).tensor
+    else:
+        split = max(1, len(raw) // 50)
+        raw, heldout_raw, prompt_sets = raw[:-split], raw[-split:], prompt_sets[:-split]
+    prior = build_prior(config, raw, dataset.normalizer, prompt_sets)
+
+    def encode(scenes: Tensor) -> Tensor:
+        return torch.cat([prior.encode(SceneBatch(part, prior.scene_type)) for part in scenes.split(10_000)])
+
+    return prior, SceneTable(encode(raw), prompt_sets), encode(heldout_raw[:2048])

@@ -76,6 +76,11 @@ class ScenePrior(nn.Module):
         """The ``prior`` entry of the configuration file."""
         return asdict(self.config)
 
+    @property
+    def device(self) -> torch.device:
+        """Where the prior computes."""
+        return self._fixed.device
+
     # -- files ----------------------------------------------------------------------------------
 
     @classmethod

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from agents.commands.scenes import draw_scenes
+from agents.commands.scenes import draw_scenes, load_scenes
 
 if TYPE_CHECKING:
     from agents.cli_run import Run
@@ -18,7 +19,8 @@ class CompleteConfig:
     """Scenes filled up: what is there stays, bit for bit.
 
     Attributes:
-        scenes: a scene file, such as the scenes.safetensors that sample writes.
+        scenes: a scene file, the folder of a sample or project run (its simulation-ready scenes if it has any), or
+            a dataset.
         prior: a shipped name, or the folder of a prior or a run; empty means the shipped prior of the scene type.
         count: how many of the scenes, from the first; null for all.
         slots: slots of the result; null keeps those of the scenes.
@@ -47,28 +49,29 @@ def config() -> type[CompleteConfig]:
 
 def run(settings: CompleteConfig, run: Run) -> None:
     """Fill the empty slots."""
-    prior, batch = load_scenes("complete", settings.scenes, settings.prior, settings.count, settings.device)
+    prior, batch = load_prior_and_scenes("complete", settings.scenes, settings.prior, settings.count, settings.device)
     filled = prior.complete(batch, slots=settings.slots, num_steps=settings.num_steps, seed=settings.seed)
     added = float((filled.counts - batch.counts).double().mean())
     run.say(f"{len(batch)} scenes, {added:.1f} objects added on average")
     save_scenes(batch, filled.to("cpu"), settings.pictures, run, {"added": added})
 
 
-def load_scenes(command: str, scenes: str, prior: str, count: int | None, device: str) -> tuple[ScenePrior, SceneBatch]:
+def load_prior_and_scenes(
+    command: str, scenes: str, prior: str, count: int | None, device: str
+) -> tuple[ScenePrior, SceneBatch]:
     """The prior and the scenes that a command works on."""
     from agents.prior import ScenePrior
     from scene_envs.errors import InvalidInputError
-    from scene_envs.scene import SceneBatch
 
     if not scenes:
-        raise InvalidInputError(f"{command}: name a scene file, as in scenes=runs/mine/scenes.safetensors")
-    batch = SceneBatch.load(scenes)
+        raise InvalidInputError(f"{command}: name a scene file, run or dataset, as in scenes=runs/mine")
+    batch = load_scenes(Path(scenes), count)
     loaded = ScenePrior.load(prior or batch.scene_type.name).to(device)
     if loaded.scene_type.name != batch.scene_type.name:
         raise InvalidInputError(
             f"{command}: the prior makes scenes of {loaded.scene_type.name!r}, the file holds {batch.scene_type.name!r}"
         )
-    return loaded, batch if count is None else batch[:count]
+    return loaded, batch
 
 
 def save_scenes(before: SceneBatch, after: SceneBatch, pictures: int, run: Run, figures: dict[str, float]) -> None:

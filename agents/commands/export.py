@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.commands.scenes import make_ready
+from agents.commands.scenes import load_scenes, make_ready
 
 if TYPE_CHECKING:
     from agents.cli_run import Run
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
 _OVERLAP = 1e-3
 """Overlap (m) that a simulator pushes apart visibly."""
-_SCENE_FILES = ("ready.safetensors", "scenes.safetensors")
-"""What is taken from the folder of a run, the first that is there."""
 
 
 @dataclass
@@ -122,21 +120,3 @@ def _scenes(settings: ExportConfig, run: Run) -> SceneBatch:
         batch.save(run.directory / "scenes.safetensors")
         return batch
     return load_scenes(Path(settings.scenes), settings.count)
-
-
-def load_scenes(path: Path, count: int | None = None) -> SceneBatch:
-    """Scenes from a scene file, the folder of a run that has one, a dataset folder or a parquet file.
-
-    Args:
-        path: file or folder.
-        count: at most so many, the first ones; None for all.
-    """
-    from scene_envs.datasets import SceneDataset
-    from scene_envs.scene import SceneBatch
-
-    if path.is_dir():
-        path = next((path / name for name in _SCENE_FILES if (path / name).is_file()), path)
-    if path.is_dir() or path.suffix == ".parquet":
-        return SceneDataset.load(path, limit=count).batch()
-    batch = SceneBatch.load(path)
-    return batch if count is None else batch[:count]

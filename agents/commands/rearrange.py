@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from agents.commands.complete import load_scenes, save_scenes
+from agents.commands.complete import load_prior_and_scenes, save_scenes
 
 if TYPE_CHECKING:
     from agents.cli_run import Run
@@ -16,7 +16,8 @@ class RearrangeConfig:
     """The same objects at new poses; what is welded stays.
 
     Attributes:
-        scenes: a scene file, such as the scenes.safetensors that sample writes.
+        scenes: a scene file, the folder of a sample or project run (its simulation-ready scenes if it has any), or
+            a dataset.
         prior: a shipped name, or the folder of a prior or a run; empty means the shipped prior of the scene type.
         count: how many of the scenes, from the first; null for all.
         num_steps: denoising steps per scene.
@@ -43,7 +44,7 @@ def config() -> type[RearrangeConfig]:
 
 def run(settings: RearrangeConfig, run: Run) -> None:
     """New poses for the free objects."""
-    prior, batch = load_scenes("rearrange", settings.scenes, settings.prior, settings.count, settings.device)
+    prior, batch = load_prior_and_scenes("rearrange", settings.scenes, settings.prior, settings.count, settings.device)
     moved = prior.rearrange(batch, num_steps=settings.num_steps, seed=settings.seed).to("cpu")
     distance = (moved.translations - batch.translations).norm(dim=-1)[batch.is_free]
     figures = {"mean_distance_m": float(distance.double().mean()) if len(distance) else 0.0}

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from agents.commands.scenes import SCENE_FILES
+
 if TYPE_CHECKING:
     from agents.cli_run import Run
     from scene_envs.scene import SceneBatch
-
-_SAMPLES = ("ready.safetensors", "scenes.safetensors")
-"""What a run's folder may hold, the better first."""
 
 
 @dataclass
@@ -112,7 +111,7 @@ def _read(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str]:
 
     path = Path(settings.scenes)
     chosen = slice(settings.first, settings.first + settings.count)
-    held = next((path / name for name in _SAMPLES if (path / name).is_file()), None)
+    held = next((path / name for name in SCENE_FILES if (path / name).is_file()), None)
     if held is not None or path.suffix == ".safetensors":
         path = held or path
         batch = SceneBatch.load(path)

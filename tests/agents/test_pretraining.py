@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import csv
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +15,9 @@ import torch
 from agents.averaging import WeightAverage
 from agents.new_prior import build_prior
 from agents.pretrain_config import PretrainConfig
-from agents.pretraining import Pretrainer, learning_rate_at
-from scene_envs.errors import CorruptFileError, TrainingError
+from agents.pretraining import Pretrainer, learning_rate_at, part_generator, prepare
+from agents.training_data import SceneTable
+from scene_envs.errors import CorruptFileError, InvalidInputError, TrainingError, UnknownNameError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch
 
@@ -39,9 +44,9 @@ def config(tmp_path: Path) -> PretrainConfig:
 
 
 def make_run(config: PretrainConfig, raw: torch.Tensor) -> Pretrainer:
-    normalizer = Normalizer.fit(raw)
-    scenes = normalizer.normalize(raw)
-    return Pretrainer(config, scenes[:56], scenes[56:], build_prior(config, raw, normalizer))
+    prior = build_prior(config, raw, Normalizer.fit(raw))
+    scenes = prior.encode(SceneBatch(raw, prior.scene_type))
+    return Pretrainer(config, SceneTable(scenes[:56]), scenes[56:], prior)
 
 
 class Killed(Exception):
@@ -77,7 +82,7 @@ def test_nan_stops_the_run_and_keeps_the_last_checkpoint(config: PretrainConfig,
 
     def poisoned() -> tuple[float, float]:
         if run.step == 4:
-            run.train_data = torch.full_like(run.train_data, float("nan"))
+            run.data = SceneTable(torch.full((8, 34, 20), float("nan")))
         return update()
 
     run._update = poisoned  # type: ignore[method-assign]
@@ -111,3 +116,81 @@ def test_the_weight_average_follows_its_closed_form() -> None:
     used = [average.update(layer) for _ in range(3)]
     kept = torch.tensor(used).prod()
     torch.testing.assert_close(average.tensors["weight"], kept * start + (1 - kept) * layer.weight.detach())
+
+
+@pytest.mark.parametrize("process", ["continuous", "mixed"])
+def test_parts_one_after_the_other_add_up_to_their_batch(
+    config: PretrainConfig, raw: torch.Tensor, process: str
+) -> None:
+    """The gradient of a step is the mean over its parts, each with noise of its own."""
+    run = make_run(replace(config, process=process, accumulate=2, clip=1e9), raw)
+    losses = [run._part_loss(4, part_generator(0, 0, part)) for part in range(2)]
+    expected = torch.autograd.grad(sum(losses) / 2, list(run.network.parameters()), allow_unused=True)  # type: ignore[arg-type]
+    norm = torch.stack([g.norm() for g in expected if g is not None]).norm()
+    value, found = run._update()
+    assert value == pytest.approx(sum(float(loss.detach()) for loss in losses) / 2, rel=1e-5)
+    assert found == pytest.approx(float(norm), rel=1e-4)
+
+
+def test_a_batch_that_cannot_be_parted_is_refused(config: PretrainConfig, raw: torch.Tensor) -> None:
+    with pytest.raises(InvalidInputError, match="not a multiple of 3"):
+        make_run(replace(config, accumulate=3), raw)
+    with pytest.raises(UnknownNameError, match="did you mean 'bfloat16'"):
+        make_run(replace(config, precision="bfloat"), raw)
+
+
+def test_autocast_is_of_the_network_only(config: PretrainConfig, raw: torch.Tensor) -> None:
+    run = make_run(replace(config, precision="bfloat16"), raw)
+    x = run.prior.initial(2, 34)
+    assert run.prior.denoiser(x, torch.tensor([5, 900])).dtype == torch.float32
+    assert run.run().denoiser.precision == torch.float32
+
+
+def test_a_grammar_without_end_trains_a_prior_that_reads_prompts(tmp_path: Path) -> None:
+    config = PretrainConfig(
+        output=str(tmp_path), data="grammar", process="mixed", text=True, iterations=2, batch_size=4, hidden=16,
+        depth=1, heads=2, log_every=1, evaluate_every=2, checkpoint_every=2, pictures_every=2,
+    )  # fmt: skip
+    prior, data, heldout = prepare(config)
+    assert data.size == 0
+    first, again = (data.draw(3, torch.Generator().manual_seed(1), prompts=True) for _ in range(2))
+    assert torch.equal(first[0], again[0])
+    assert first[1] == again[1]
+    assert all(len(group) == 3 for group in first[1])
+    trained = Pretrainer(config, data, heldout[:64], prior).run()
+    assert trained.conditional
+    assert trained.card["training_scenes"] == 8
+    assert (tmp_path / "samples-0000002.png").stat().st_size > 1000
+
+
+_TWO = """
+import sys
+from dataclasses import replace
+import torch
+from agents.pretraining import Pretrainer, prepare
+from agents.pretrain_config import PretrainConfig
+torch.set_num_threads(1)
+config = PretrainConfig(output=sys.argv[1], data="grammar", iterations=4, batch_size=8, hidden=16, depth=1, heads=2,
+                        warmup=2, log_every=1, evaluate_every=4, checkpoint_every=4, accumulate=int(sys.argv[2]))
+prior, data, heldout = prepare(config)
+Pretrainer(config, data, heldout[:32], prior).run()
+"""
+
+
+def test_two_processes_take_the_steps_of_one_with_twice_the_parts(tmp_path: Path) -> None:
+    script = tmp_path / "two.py"
+    script.write_text(_TWO)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
+    runs = [
+        ([*launcher, str(script), str(tmp_path / "two"), "1"]),
+        [sys.executable, str(script), str(tmp_path / "one"), "2"],
+    ]
+    for command in runs:
+        subprocess.run(command, env=environment, check=True, capture_output=True, timeout=240)
+    two, one = (list(csv.DictReader((tmp_path / name / "log.csv").open())) for name in ("two", "one"))
+    assert len(two) == len(one) == 4
+    for first, second in zip(two, one, strict=True):
+        assert float(first["loss"]) == pytest.approx(float(second["loss"]), rel=1e-4)
+        assert float(first["gradient_norm"]) == pytest.approx(float(second["gradient_norm"]), rel=1e-3)
+    assert float(two[-1]["heldout"]) == pytest.approx(float(one[-1]["heldout"]), rel=1e-4)
