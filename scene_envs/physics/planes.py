@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
+from scipy.optimize import lsq_linear, nnls
 
 from scene_envs.physics.collision import Collider, scene_pairs
 from scene_envs.physics.placement import Objects, object_boxes, part_pairs, place
@@ -170,7 +170,10 @@ def least_distance(matrix: Array, needed: Array) -> Array:
         system = np.vstack([matrix[rows].T, np.eye(len(rows)) / _SLACK, needed[rows]])
         target = np.zeros(len(system))
         target[-1] = 1.0
-        multipliers, _ = nnls(system, target, maxiter=30 * len(rows))
+        try:
+            multipliers, _ = nnls(system, target, maxiter=30 * len(rows))
+        except RuntimeError:  # out of iterations: a slower method that always ends
+            multipliers = lsq_linear(system, target, bounds=(0.0, np.inf), tol=1e-12).x
         residual = system @ multipliers - target
         x = -residual[: matrix.shape[1]] / residual[-1]
         broken = ~used & (matrix @ x < needed - _MET)

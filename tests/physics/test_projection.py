@@ -11,7 +11,7 @@ from simple_scenes import scene as boxes
 
 from scene_envs.assets import get_library
 from scene_envs.grammars import get_grammar
-from scene_envs.physics import penetration, project
+from scene_envs.physics import penetration, planes, project
 from scene_envs.rotations import yaw_matrix
 from scene_envs.scene import SceneBatch
 
@@ -46,6 +46,19 @@ def jittered(batch: SceneBatch, scale: float) -> SceneBatch:
 def tiers(batch: SceneBatch) -> torch.Tensor:
     """(B, N): which board of the shelf each object is above."""
     return (batch.translations[..., 2, None] + 5e-3 >= TIERS).sum(dim=-1)
+
+
+def test_the_least_distance_is_found_when_the_first_method_gives_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """x + y >= 1, x >= 0.8, y >= -1: the nearest point to the origin is (0.8, 0.2)."""
+    matrix, needed = np.array([[1.0, 1.0], [1.0, 0.0], [0.0, 1.0]]), np.array([1.0, 0.8, -1.0])
+    expected = pytest.approx([0.8, 0.2], abs=1e-4)
+    assert planes.least_distance(matrix, needed).tolist() == expected
+
+    def gives_up(*_: object, **__: object) -> None:
+        raise RuntimeError("Maximum number of iterations reached.")
+
+    monkeypatch.setattr(planes, "nnls", gives_up)
+    assert planes.least_distance(matrix, needed).tolist() == expected
 
 
 def test_two_steamers_share_the_way_apart() -> None:
