@@ -209,16 +209,17 @@ def _stack(
 
 
 def _moved(rows: list[dict[str, Any] | None], batch: SceneBatch) -> tuple[SceneBatch, Tensor, Tensor]:
-    """The batch at its new poses, with displacement (B, N) m and rotation (B, N) rad of each object."""
-    translations, rotations = batch.translations.cpu().clone(), batch.rotations.cpu().clone()
+    """The batch at its new poses, with displacement (B, N) m and rotation (B, N) rad of each object; all on the CPU."""
+    batch = batch.to("cpu")
+    translations, rotations = batch.translations.clone(), batch.rotations.clone()
     for index, row in enumerate(rows):
         if row is not None and row["valid"]:
             translations[index] = torch.from_numpy(row["translations"]).float()
             if "rotations" in row:
                 rotations[index] = torch.from_numpy(row["rotations"]).float()
-    present = ~batch.is_empty.cpu()
-    displacement = (translations - batch.translations.cpu()).norm(dim=-1) * present
+    present = ~batch.is_empty
+    displacement = (translations - batch.translations).norm(dim=-1) * present
     identity = torch.eye(3).expand_as(rotations)
-    before = torch.where(present[..., None, None], batch.rotations.cpu(), identity)
+    before = torch.where(present[..., None, None], batch.rotations, identity)
     after = torch.where(present[..., None, None], project_to_so3(rotations), identity)
     return batch.with_poses(translations, after), displacement, geodesic_angle(before, after) * present
