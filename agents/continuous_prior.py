@@ -37,6 +37,12 @@ class ContinuousPrior(ScenePrior):
         preconditioning: moments (D,) of normalised scenes.
         card: facts about its training.
         residual: (G, D) measured error of the denoised scene.
+
+    >>> from agents.prior import tiny_prior
+    >>> prior = tiny_prior("dimsum_table", process="continuous")
+    >>> mean, std = prior.posterior(prior.initial(2, 34), 0, prior.step_table(4))
+    >>> mean.shape, bool((std[0] == 0).all())  # the table is known
+    (torch.Size([2, 34, 20]), True)
     """
 
     process_name = "continuous"

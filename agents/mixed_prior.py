@@ -54,6 +54,13 @@ class MixedPrior(ScenePrior):
         preconditioning: moments (12,) of normalised poses.
         card: facts about its training.
         residual: (G, 12) measured error of the denoised pose.
+
+    >>> from agents.prior import tiny_prior
+    >>> prior = tiny_prior("dimsum_table", process="mixed")
+    >>> x, table = prior.initial(2, 34), prior.step_table(4)
+    >>> step = prior.transition(x, 0, table)
+    >>> step.from_noise(torch.randn_like(x)).shape, step.log_prob(x).shape
+    (torch.Size([2, 34, 20]), torch.Size([2, 34]))
     """
 
     process_name = "mixed"

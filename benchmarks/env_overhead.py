@@ -40,8 +40,7 @@ def bare_loop(prior: PriorLike, batch: int, steps: int) -> Callable[[], None]:
     def run() -> None:
         x = prior.initial(batch, scene_type.slots)
         for step in range(steps):
-            mean, std = prior.posterior(x, step, table)
-            x = mean + std * torch.randn_like(x)
+            x = prior.transition(x, step, table).from_noise(torch.randn_like(x))
         scenes = SceneBatch.from_tensor(prior.clamp(x), scene_type, normalised=prior.normalizer)
         evaluate_reward(reward, scenes, RewardContext())
 
@@ -53,8 +52,8 @@ def ancestral(prior: PriorLike, steps: int) -> Callable[[Tensor, int], Tensor]:
     table = prior.step_table(steps)
 
     def policy(x: Tensor, step: int) -> Tensor:
-        mean, std = prior.posterior(x, step, table)
-        return mean + std * torch.randn_like(x)
+        result: Tensor = prior.transition(x, step, table).from_noise(torch.randn_like(x))
+        return result
 
     return policy
 

@@ -40,6 +40,7 @@ import torch
 from torch import Tensor
 
 import scene_envs  # noqa: F401  (registers the environments)
+from agents.continuous_prior import ContinuousPrior
 from agents.prior import ScenePrior
 from scene_envs.grammars import get_grammar
 
@@ -47,7 +48,7 @@ from scene_envs.grammars import get_grammar
 @dataclass
 class Args:
     prior: str = "dimsum_table"
-    """shipped name or directory of the prior to start from"""
+    """shipped name or directory of the continuous prior to start from"""
     reward: str = "object_count"
     """registered name of the reward"""
     output: str = "runs/ddpo_sf"
@@ -96,7 +97,7 @@ def log_prob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def sample(envs: gym.vector.VectorEnv, prior: ScenePrior, args: Args, iteration: int) -> Batch:
+def sample(envs: gym.vector.VectorEnv, prior: ContinuousPrior, args: Args, iteration: int) -> Batch:
     """One episode in every environment under the current prior."""
     table = prior.step_table(args.num_steps)
     generator = torch.Generator().manual_seed(args.seed * 1_000_003 + iteration)
@@ -131,7 +132,7 @@ def advantages(reward: Tensor, valid: Tensor, clip: float) -> Tensor:
     return result
 
 
-def add_policy_gradient(prior: ScenePrior, batch: Batch, args: Args, generator: torch.Generator) -> float:
+def add_policy_gradient(prior: ContinuousPrior, batch: Batch, args: Args, generator: torch.Generator) -> float:
     """Accumulate the score-function gradient step by step; returns the largest |log-ratio|."""
     table = prior.step_table(args.num_steps)
     advantage = advantages(batch.reward, batch.valid, args.advantage_clip)
@@ -149,19 +150,21 @@ def add_policy_gradient(prior: ScenePrior, batch: Batch, args: Args, generator: 
 
 
 @torch.no_grad()
-def smallest_std(prior: ScenePrior, x: Tensor, step: int, args: Args) -> float:
+def smallest_std(prior: ContinuousPrior, x: Tensor, step: int, args: Args) -> float:
     """The std of a step over its random entries; 0 when it is deterministic."""
     _, std = prior.posterior(x[:1], step, prior.step_table(args.num_steps))
     return float(std[std > 0].min()) if std.any() else 0.0
 
 
-def gradient_norm(prior: ScenePrior) -> float:
+def gradient_norm(prior: ContinuousPrior) -> float:
     """Norm of all accumulated gradients."""
     norms = [p.grad.norm() for p in prior.parameters() if p.grad is not None]
     return float(torch.stack(norms).norm()) if norms else 0.0
 
 
-def add_regularization(prior: ScenePrior, real: Tensor, args: Args, generator: torch.Generator) -> tuple[float, float]:
+def add_regularization(
+    prior: ContinuousPrior, real: Tensor, args: Args, generator: torch.Generator
+) -> tuple[float, float]:
     """Accumulate the pretraining gradient; returns its loss and its norm."""
     x0 = real[torch.randint(len(real), (args.batch_size,), generator=generator)]
     loss = prior.pretraining_loss(x0, generator)
@@ -173,16 +176,18 @@ def add_regularization(prior: ScenePrior, real: Tensor, args: Args, generator: t
 
 
 @torch.no_grad()
-def heldout_loss(prior: ScenePrior, x0: Tensor) -> float:
+def heldout_loss(prior: ContinuousPrior, x0: Tensor) -> float:
     """The guard: pretraining loss on held-out scenes, with the same timesteps and noise at every call."""
     return float(prior.pretraining_loss(x0, torch.Generator().manual_seed(1234)))
 
 
 def main(args: Args) -> None:
     """Train, log, and save the prior."""
+    prior = ScenePrior.load(args.prior)
+    if not isinstance(prior, ContinuousPrior):
+        raise SystemExit(f"{args.prior!r} is a {prior.process_name} prior; this file is written for continuous ones")
     output = Path(args.output)
     output.mkdir(parents=True, exist_ok=True)
-    prior = ScenePrior.load(args.prior)
     scene = prior.scene_type.name
     envs = gym.make_vec(
         "SceneEnvs/Denoising-v0",
