@@ -40,11 +40,22 @@ class Camera:
 
 @dataclass(frozen=True)
 class FixedObject:
-    """A welded asset with one constant pose (translation in m, rotation matrix row-major)."""
+    """A welded asset with one constant pose (translation in m, rotation matrix row-major).
+
+    Raises:
+        InvalidInputError: not three and nine numbers.
+    """
 
     asset: str
     translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rotation: tuple[float, ...] = _IDENTITY
+
+    def __post_init__(self) -> None:
+        for name, length in (("translation", 3), ("rotation", 9)):
+            value = _tuples(getattr(self, name))
+            if len(value) != length:
+                raise InvalidInputError(f"fixed object {self.asset!r}: {name} needs {length} numbers, got {value}")
+            object.__setattr__(self, name, value)
 
 
 @dataclass(frozen=True)
@@ -61,6 +72,10 @@ class SceneType:
         camera: the paper's semantic-render camera.
         description: one sentence for listings.
         asset_folders: folders of users' own assets, searched before the built-in ones.
+
+    Raises:
+        InvalidInputError: an asset named twice, a welded asset that is not among the assets, a workspace whose corners
+            are exchanged, or no slot for a free object.
 
     >>> scene_type = get_scene_type("dimsum_table")
     >>> scene_type.num_assets, scene_type.slots, scene_type.features
@@ -82,6 +97,15 @@ class SceneType:
             raise InvalidInputError(f"scene type {self.name!r}: asset_folders is a tuple of paths, got one string")
         folders = tuple(os.path.abspath(os.path.expanduser(folder)) for folder in self.asset_folders)
         object.__setattr__(self, "asset_folders", folders)  # absolute: workers may run elsewhere
+        for name in ("assets", "workspace", "welded", "fixed"):
+            object.__setattr__(self, name, _tuples(getattr(self, name)))  # lists have no hash
+        for asset in self.assets:
+            if self.assets.count(asset) > 1:
+                raise InvalidInputError(f"scene type {self.name!r}: asset {asset!r} is named twice among its assets")
+        if not all(low <= high for low, high in zip(*self.workspace, strict=True)):
+            raise InvalidInputError(
+                f"scene type {self.name!r}: workspace is (lowest corner, highest corner), got {self.workspace}"
+            )
         for asset in (*self.welded, *(f.asset for f in self.fixed)):
             if asset not in self.assets:
                 raise InvalidInputError(f"scene type {self.name!r}: welded asset {asset!r} is not among its assets")

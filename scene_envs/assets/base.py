@@ -24,8 +24,11 @@ def indefinite_article(name: str) -> str:
 
     >>> indefinite_article("apple"), indefinite_article("utensil crock"), indefinite_article("plate")
     ('an', 'a', 'a')
+    >>> indefinite_article("USB stick"), indefinite_article("umbrella"), indefinite_article("uncut loaf")
+    ('a', 'an', 'an')
     """
-    return "an" if re.match(r"(?!u[nst]|eu|one)[aeiou]|hour|hono|heir", name, re.IGNORECASE) else "a"
+    yoo = r"uni(?![nm])|us[abeiu]|ut[aeiou]|eu|one\b|once\b"
+    return "an" if re.match(rf"(?!{yoo})[aeiou]|hour|hono|heir", name, re.IGNORECASE) else "a"
 
 
 @dataclass(frozen=True)

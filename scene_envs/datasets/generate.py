@@ -63,7 +63,7 @@ def generate(
 
     Each shard depends on (grammar, seed, shard index) alone, so the result does not depend on the number
     of workers or on where they run, and a run killed at any point gives the same files when it is started again:
-    finished shards are kept, and in those under way what was judged is not judged again.
+    finished shards are kept, and in those under way what was judged is not judged again (with Ray they begin anew).
 
     Args:
         scene_type: name of a grammar (built-in ones are called like their scene type).
@@ -78,7 +78,8 @@ def generate(
         address: of a running Ray cluster; None starts one on this machine.
 
     Raises:
-        InvalidInputError: a bad argument, or ``output`` holds a dataset made with other settings.
+        InvalidInputError: a bad argument, ``output`` holds a dataset made with other settings, or workers cannot import
+            the grammar.
         UnknownNameError: no grammar, or no backend, of that name.
         CorruptFileError: a shard found in ``output`` cannot be read.
         PhysicsError: worker processes keep dying, or nothing passes verification.

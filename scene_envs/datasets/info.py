@@ -67,7 +67,8 @@ class DatasetInfo:
         aliases = aliases or {}
         found = []
         for path, stem in zip(self.model_paths, self.stems, strict=True):
-            name = aliases.get(path, aliases.get(stem, stem))
+            whole = Path(path).name  # our paths have no suffix, but a name may hold a dot
+            name = aliases.get(path, aliases.get(stem, whole if whole in scene_type.assets else stem))
             if name not in scene_type.assets:
                 kind = f"asset of {scene_type.name!r} (model path {path!r}; pass aliases=)"
                 raise unknown_name(kind, name, scene_type.assets)

@@ -9,9 +9,10 @@ from scene_envs.datasets.store import storage_error
 
 
 class Journal:
-    """An append-only text file with one verdict per line, in the order of the candidates.
+    """An append-only text file with the number of a candidate and its verdict per line.
 
-    A process may be killed while it writes: a last line without its end is dropped.
+    A process may be killed while it writes: a last line without its end is dropped. Two processes that make the same
+    shard may write here by turns (a worker outlives its killed parent by a second): what is told twice counts once.
 
     Args:
         path: the file; made by the first :meth:`append`.
@@ -21,21 +22,37 @@ class Journal:
         self.path = path
 
     def read(self) -> list[str]:
-        """The verdicts so far; what follows the last whole line is cut off the file."""
+        """The verdicts on candidates 0, 1, … so far; what follows the last whole line is cut off the file.
+
+        Raises:
+            StorageError: the file cannot be read or written.
+        """
         try:
             content = self.path.read_bytes()
+            whole = content[: content.rfind(b"\n") + 1]
+            if len(whole) < len(content):
+                self.path.write_bytes(whole)
         except FileNotFoundError:
             return []
-        whole = content[: content.rfind(b"\n") + 1]
-        if len(whole) < len(content):
-            self.path.write_bytes(whole)
-        return whole.decode(errors="replace").split("\n")[:-1]
+        except OSError as error:
+            raise storage_error(self.path, error) from error
+        verdicts: list[str] = []
+        for line in whole.decode(errors="replace").split("\n")[:-1]:
+            candidate, _, verdict = line.partition(" ")
+            if candidate == str(len(verdicts)):
+                verdicts.append(verdict)
+        return verdicts
 
-    def append(self, verdicts: Sequence[str]) -> None:
-        """Add verdicts; raises :class:`~scene_envs.datasets.store.StorageError`."""
+    def append(self, first: int, verdicts: Sequence[str]) -> None:
+        """Add the verdicts on candidates ``first``, ``first + 1``, …
+
+        Raises:
+            StorageError: the file cannot be written.
+        """
+        lines = "".join(f"{candidate} {verdict}\n" for candidate, verdict in enumerate(verdicts, start=first))
         try:
             with self.path.open("ab") as file:
-                file.write("".join(f"{verdict}\n" for verdict in verdicts).encode())
+                file.write(lines.encode())
         except OSError as error:
             raise storage_error(self.path, error) from error
 

@@ -80,7 +80,7 @@ def make_shard(
         scenes, drawn = _draw(grammar, job, tried, count)
         verdicts = known[tried : tried + count] if ahead > 0 else _judge(scenes, grammar, normalizer, job.verify)
         if journal is not None and ahead <= 0:
-            journal.append(verdicts)
+            journal.append(tried, verdicts)
         before, fresh, first = reasons.copy(), len(kept), tried
         for scene, why, verdict in zip(scenes, drawn, verdicts, strict=True):
             if len(kept) == job.size:

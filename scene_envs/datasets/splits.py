@@ -25,7 +25,10 @@ class Part:
     Attributes:
         fractions: of all parts, in order; they may sum to less than one.
         index: which part.
-        seed: another seed makes other parts.
+        seed: not negative; another seed makes other parts.
+
+    Raises:
+        InvalidInputError: fractions, index or seed are not as said.
 
     >>> keys = mix_bits(np.arange(10_000, dtype=np.uint64))
     >>> train, test = (Part((0.9, 0.1), index).contains(keys) for index in (0, 1))
@@ -40,7 +43,12 @@ class Part:
     def __post_init__(self) -> None:
         object.__setattr__(self, "fractions", check_fractions(self.fractions))
         if not 0 <= self.index < len(self.fractions):
-            raise InvalidInputError(f"part {self.index} of {len(self.fractions)} parts; give 0 to the last")
+            raise InvalidInputError(
+                f"there is no part {self.index} of {len(self.fractions)} parts; index goes from 0 to "
+                f"{len(self.fractions) - 1}"
+            )
+        if self.seed < 0:
+            raise InvalidInputError(f"a part needs seed >= 0, got {self.seed}")
 
     def contains(self, keys: Keys) -> NDArray[np.bool_]:
         """(M,) bool: which of the scenes with these keys are in this part."""
@@ -60,6 +68,8 @@ def check_fractions(fractions: Sequence[float]) -> tuple[float, ...]:
 def split_rows(keys: Keys, fractions: Sequence[float], seed: int) -> list[NDArray[np.int64]]:
     """Rows of disjoint random parts; sizes are exact where no scene repeats, rows of one scene stay together."""
     check_fractions(fractions)
+    if seed < 0:
+        raise InvalidInputError(f"a split needs seed >= 0, got {seed}")
     _, first, group, sizes = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
     shuffled = np.argsort(first)[np.random.default_rng(seed).permutation(len(sizes))]  # groups, in random order
     ends = np.cumsum(sizes[shuffled])

@@ -17,8 +17,8 @@ def union_scene_type(types: Sequence[str | SceneType], name: str | None = None) 
     """The scene type that holds the scenes of all ``types``.
 
     Its assets are all of theirs by name, its slots the most of any, its workspace the box around theirs. Assets that
-    are welded in one type are welded in the union. Only objects that are fixed in the same pose in *every* type stay
-    fixed; the others are objects like any other, in any slot.
+    are welded in one type are welded in the union; its folders of users' assets are those of all. Only objects that
+    are fixed in the same pose in *every* type stay fixed; the others are objects like any other, in any slot.
 
     Args:
         types: at least one scene type or name.
@@ -50,6 +50,7 @@ def union_scene_type(types: Sequence[str | SceneType], name: str | None = None) 
         fixed=tuple(fixed for fixed in members[0].fixed if all(fixed in member.fixed for member in members)),
         camera=largest.camera,
         description="Scenes of " + ", ".join(dict.fromkeys(member.name for member in members)) + ".",
+        asset_folders=tuple(dict.fromkeys(folder for member in members for folder in member.asset_folders)),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -67,7 +68,7 @@ def run_processes(jobs: Sequence[Job], work: Work, workers: int, report: Report)
     """Make the shards of ``jobs`` in ``workers`` spawned processes.
 
     Raises:
-        InvalidInputError: the grammar's function cannot be sent to a process.
+        InvalidInputError: the grammar's function cannot be sent to a process, or not be imported there.
         PhysicsError: worker processes keep dying.
         StorageError: a file cannot be written.
     """
@@ -78,6 +79,12 @@ def run_processes(jobs: Sequence[Job], work: Work, workers: int, report: Report)
             f"the grammar's function cannot be sent to worker processes ({error}); "
             "define it at the top level of a module, or use workers=0"
         ) from error
+    main = sys.modules["__main__"]
+    if work.factory.__module__ == "__main__" and not Path(getattr(main, "__file__", None) or "").is_file():
+        raise InvalidInputError(
+            "the grammar's function stands in a notebook or at a prompt, where worker processes cannot import it; "
+            "define it in a module, or use workers=0"
+        )
     context = get_context("spawn")
     for _ in range(_RESTARTS):
         queue, stop = context.Queue(), context.Event()
@@ -94,8 +101,8 @@ def run_processes(jobs: Sequence[Job], work: Work, workers: int, report: Report)
             executor.shutdown(cancel_futures=True)
             queue.close()
     raise PhysicsError(
-        f"worker processes died {_RESTARTS} times while generating (out of memory?); finished shards are kept, "
-        "run again to resume, with fewer workers"
+        f"worker processes died {_RESTARTS} times while generating; finished shards are kept. When memory ran out, run "
+        "again to resume, with fewer workers; a script must call generate under `if __name__ == '__main__':`"
     )
 
 
@@ -122,8 +129,11 @@ class _Stopped(Exception):
 def _start_worker(payload: bytes, queue: Any, stop: Any) -> None:
     queue.cancel_join_thread()  # reports that nobody reads must not hold the process
     Thread(target=_exit_with_parent, args=(os.getppid(),), daemon=True).start()
-    grammar, normalizer = pickle.loads(payload).start()
-    _worker.update(grammar=grammar, normalizer=normalizer, queue=queue, stop=stop)
+    _worker.update(queue=queue, stop=stop)
+    try:
+        _worker["grammar"], _worker["normalizer"] = pickle.loads(payload).start()
+    except (ImportError, AttributeError) as error:
+        _worker["error"] = f"worker processes cannot import what the grammar needs ({error}); use workers=0"
 
 
 def _exit_with_parent(parent: int) -> None:
@@ -134,6 +144,9 @@ def _exit_with_parent(parent: int) -> None:
 
 
 def _work(job: Job) -> int:
+    if "error" in _worker:
+        raise InvalidInputError(_worker["error"])
+
     def report(*message: Any) -> None:
         if _worker["stop"].is_set():
             raise _Stopped

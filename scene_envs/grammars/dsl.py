@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import accumulate
@@ -93,6 +93,13 @@ class Stack:
         where: the distribution of the stack's axis; the middle of the support by default.
         at_most: objects in the stack, at most; drawn again when it grows higher.
         yaw: how each object is turned; any angle by default.
+
+    Raises:
+        InvalidInputError: negative weights, or a stack that never ends.
+
+    >>> Stack("box", {"box": 1.0})
+    Traceback (most recent call last):
+    scene_envs.errors.InvalidInputError: a Stack of 'box' needs at_most >= 1 and, in `then`, another asset or None ...
     """
 
     base: str
@@ -101,6 +108,14 @@ class Stack:
     where: Wish = _CENTER
     at_most: int = 10
     yaw: Yaw = Yaw()  # noqa: RUF009  (frozen)
+
+    def __post_init__(self) -> None:
+        _check_weights("Stack", self.then.values())
+        if self.at_most < 1 or not any(weight for asset, weight in self.then.items() if asset != self.base):
+            raise InvalidInputError(
+                f"a Stack of {self.base!r} needs at_most >= 1 and, in `then`, another asset or None with a positive "
+                f"weight, or it never ends; got at_most={self.at_most}, then={dict(self.then)}"
+            )
 
     @cached_property
     def _next(self) -> tuple[list[str | None], list[float]]:
@@ -135,6 +150,9 @@ class Pile:
     height: Geometric
     where: Wish = _CENTER
     yaw: Yaw = Yaw()  # noqa: RUF009  (frozen)
+
+    def __post_init__(self) -> None:
+        _check_weights("Pile", [weight for weight, _ in self.members])
 
     @cached_property
     def _cumulative(self) -> list[float]:
@@ -171,8 +189,7 @@ class OneOf:
     options: tuple[tuple[float, Node], ...]
 
     def __init__(self, *options: tuple[float, Node]) -> None:
-        if not options or any(weight < 0 for weight, _ in options) or sum(weight for weight, _ in options) <= 0:
-            raise InvalidInputError(f"OneOf needs weights >= 0 with a positive sum, got {[w for w, _ in options]}")
+        _check_weights("OneOf", [weight for weight, _ in options])
         object.__setattr__(self, "options", options)
 
     @cached_property
@@ -191,12 +208,25 @@ class Geometric:
     >>> counts = [Geometric(0.5, 1, 2, present=0.9).draw(np.random.default_rng(seed)) for seed in range(200)]
     >>> sorted(set(counts))
     [0, 1, 2]
+    >>> Geometric(0.5, 3, 1)
+    Traceback (most recent call last):
+    scene_envs.errors.InvalidInputError: Geometric needs p and present in [0, 1] and 0 <= low <= high, got p=0.5, ...
+
+    Raises:
+        InvalidInputError: p or ``present`` is outside [0, 1], or not 0 <= low <= high.
     """
 
     p: float
     low: int
     high: int
     present: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (0.0 <= self.p <= 1.0 and 0.0 <= self.present <= 1.0 and 0 <= self.low <= self.high):
+            raise InvalidInputError(
+                f"Geometric needs p and present in [0, 1] and 0 <= low <= high, "
+                f"got p={self.p}, low={self.low}, high={self.high}, present={self.present}"
+            )
 
     @cached_property
     def _cumulative(self) -> list[float]:
@@ -229,3 +259,8 @@ class Repeat:
                 return towers
             reasons[failed] += 1
         raise InvalidInputError(f"a grammar's condition {failed!r} did not hold in 100,000 draws; it cannot be met")
+
+
+def _check_weights(word: str, weights: Collection[float]) -> None:
+    if not all(weight >= 0 for weight in weights) or not sum(weights) > 0:
+        raise InvalidInputError(f"{word} needs weights >= 0 with a positive sum, got {list(weights)}")

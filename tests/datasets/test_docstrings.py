@@ -8,6 +8,7 @@ from importlib import import_module
 import pytest
 
 MODULES = ["dataset", "mixing", "splits", "stream", "union"]
+MODULES += [f"prompts.{name}" for name in ("claims", "facts", "language", "parser")]
 
 
 @pytest.mark.parametrize("name", MODULES)

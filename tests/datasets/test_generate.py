@@ -132,7 +132,8 @@ def test_what_was_judged_before_a_kill_is_not_judged_again(
     (journal,) = tmp_path.glob(".*.journal")
     known = journal.read_text().count("\n")
     assert 10 <= known <= 20
-    journal.write_text(journal.read_text() + "penetr")  # killed while it wrote this line
+    lines = journal.read_text().splitlines(keepends=True)
+    journal.write_text("".join([*lines[:5], *lines[3:], f"{known} penetr"]))  # told twice; killed while it wrote a line
     counted = 0
 
     def count(batch: SceneBatch) -> list[str]:
@@ -230,7 +231,7 @@ def test_a_broken_shard_is_named_before_work_starts(reference: Path, tmp_path: P
 def test_ray_writes_the_same_files(reference: Path, tmp_path: Path) -> None:
     ray = pytest.importorskip("ray")
     assert not ray.is_initialized()
-    report = _generate(tmp_path, workers=2, backend="ray")
+    report = _generate(tmp_path, workers=1, backend="ray")  # one CPU is enough: each worker takes seconds to start
     assert report.scenes == 70
     assert _hashes(tmp_path) == _hashes(reference)
     assert not ray.is_initialized()
@@ -242,6 +243,16 @@ def test_an_unknown_backend_is_refused(tmp_path: Path) -> None:
 
 
 # -- refusals ---------------------------------------------------------------------------------------
+
+
+def test_a_grammar_of_a_notebook_is_refused_with_the_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import __main__
+
+    monkeypatch.setattr(toy_cups, "__module__", "__main__")
+    monkeypatch.setattr(__main__, "toy_cups", toy_cups, raising=False)
+    monkeypatch.delattr(__main__, "__file__")
+    with pytest.raises(InvalidInputError, match=r"notebook.*workers=0"):
+        _generate(tmp_path, count=1, workers=1)
 
 
 def test_another_seed_gives_other_scenes(reference: Path, tmp_path: Path) -> None:

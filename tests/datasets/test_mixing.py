@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections import Counter
 from itertools import islice
@@ -246,6 +247,11 @@ def test_a_union_holds_the_assets_slots_and_room_of_all() -> None:
     same = union_scene_type(["restaurant_high_clutter", "restaurant_low_clutter"], name="restaurants")
     assert [fixed.asset for fixed in same.fixed] == ["floor"]
     assert same.name == "restaurants"
+
+
+def test_a_union_finds_the_users_assets_of_its_types(tmp_path: Path) -> None:
+    own = dataclasses.replace(TYPE, name="own_cups", asset_folders=(str(tmp_path),))
+    assert union_scene_type([own, "dimsum_table", own]).asset_folders == (str(tmp_path),)
 
 
 def test_scenes_go_to_a_union_and_back() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 import torch
 from toy_grammars import TYPE, cup_row, toy_scenes
 
-from scene_envs.datasets import SceneDataset
+from scene_envs.datasets import DatasetInfo, SceneDataset
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch
@@ -310,3 +311,10 @@ def test_scenes_read_are_usable(tmp_path: Path) -> None:
     assert batch.names() == [["cafe_table", "teacup"]]
     assert batch.translations[0, 3].tolist() == pytest.approx([0.1, -0.2, 0.0], abs=1e-6)
     assert math.atan2(batch.rotations[0, 3, 1, 0], batch.rotations[0, 3, 0, 0]) == pytest.approx(0.5, abs=1e-6)
+
+
+def test_names_may_hold_dots_and_model_paths_suffixes() -> None:
+    kind = dataclasses.replace(TYPE, name="dots", assets=("cafe_table", "mug.v2", "teacup"))
+    paths = ("scene_envs/assets/mug.v2", "package://things/teacup.sdf", "scene_envs/assets/cafe_table")
+    info = DatasetInfo(Path("metadata.json"), paths, Normalizer.fit(torch.zeros(1, 1, 16)))
+    assert info.categories_in(kind).tolist() == [1, 2, 0, 3]

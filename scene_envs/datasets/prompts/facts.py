@@ -154,11 +154,21 @@ def viewer_axes(scene_type: str | SceneType) -> Array:
 
     >>> viewer_axes("dimsum_table").round(6).tolist()
     [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+
+    Raises:
+        InvalidInputError: the camera has no horizontal right: it looks along its up direction, or lies on its side.
     """
-    camera = get_scene_type(scene_type).camera
+    kind = get_scene_type(scene_type)
+    camera = kind.camera
     right = np.cross(np.subtract(camera.target, camera.position, dtype=float), camera.up)
     right[2] = 0.0
-    right /= np.linalg.norm(right)
+    length = float(np.linalg.norm(right))
+    if not length > 1e-9:
+        raise InvalidInputError(
+            f"the camera of scene type {kind.name!r} at {camera.position}, target {camera.target}, up {camera.up} has "
+            "no left and right; a camera that looks down needs a horizontal up, such as (-1, 0, 0)"
+        )
+    right /= length
     up = np.array([0.0, 0.0, 1.0])
     return np.stack([right, np.cross(right, up), up]) + 0.0
 
