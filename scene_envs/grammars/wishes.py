@@ -51,9 +51,11 @@ class Gaussian:
         u, v = along * rng.standard_normal(), across * rng.standard_normal()
         return self.x + cos * u - sin * v, self.y + sin * u + cos * v
 
-    def log_density(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(P,) log density up to a constant, at ``points`` (P, 2)."""
+    def log_density(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """(P,) log density up to a constant, at ``points`` (P, 2); None for a point or a line."""
         cos, sin, along, across = self._axes
+        if along == 0.0 or across == 0.0:
+            return None
         dx, dy = points[:, 0] - self.x, points[:, 1] - self.y
         result: NDArray[np.float64] = -0.5 * (
             ((cos * dx + sin * dy) / along) ** 2 + ((cos * dy - sin * dx) / across) ** 2
