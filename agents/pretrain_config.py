@@ -10,8 +10,9 @@ class PretrainConfig:
     """One pretraining run.
 
     Attributes:
-        scene: scene type.
-        data: dataset directory of training scenes, or ``grammar`` for fresh scenes of the grammar without end.
+        scene: scene type; with several datasets it is their union, and this key is not read.
+        data: dataset directory of training scenes; several, joined by commas, train one prior on all their scene
+            types with equal chances; ``grammar`` stands for fresh scenes of the grammar without end.
         heldout: dataset directory of held-out scenes; empty takes the last 2 % of ``data``, or 512 of the grammar.
         output: run directory; an interrupted run in it goes on where it stopped.
         iterations: optimiser steps.

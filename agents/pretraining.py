@@ -8,7 +8,7 @@ import math
 import os
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +23,13 @@ from agents.new_prior import build_prior
 from agents.parallel import World
 from agents.pretrain_config import PretrainConfig
 from agents.prior import ScenePrior
-from agents.training_data import PROMPTS_PER_SCENE, GrammarStream, SceneTable, TrainingData
+from agents.training_data import PROMPTS_PER_SCENE, GrammarStream, SceneTable, TrainingData, UnionTable
 from agents.training_log import TrainingLog
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.errors import InvalidInputError, MissingDependencyError, TrainingError, unknown_name
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch
+from scene_envs.scene_types import register_scene_type
 
 logger = logging.getLogger(__name__)
 
@@ -284,6 +285,8 @@ def prepare(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
         prior = build_prior(config, sample.tensor, fixed_normalizer(grammar), prompts)
         held_out = grammar.sample(np.random.default_rng([config.seed, _SAMPLE, 1]), _HELD_OUT)
         return prior, GrammarStream(grammar, prior), prior.encode(held_out)
+    if "," in config.data:
+        return _prepare_union(config)
     dataset = SceneDataset.load(config.data)
     raw, prompt_sets = dataset.tensor, dataset.prompt_sets
     if config.heldout:
@@ -297,3 +300,18 @@ def prepare(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
         return torch.cat([prior.encode(SceneBatch(part, prior.scene_type)) for part in scenes.split(10_000)])
 
     return prior, SceneTable(encode(raw), prompt_sets), encode(heldout_raw[:2048])
+
+
+def _prepare_union(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
+    from scene_envs.datasets import SceneDataset, to_union, union_normalizer, union_scene_type
+
+    whole = [SceneDataset.load(folder.strip()) for folder in config.data.split(",")]
+    union = register_scene_type(union_scene_type([dataset.scene_type for dataset in whole]))
+    parts = [dataset.stable_split((0.98, 0.02), seed=0) for dataset in whole]
+    some = torch.cat([to_union(dataset.batch(slice(5000)), union).tensor for dataset, _ in parts])
+    normalizer = union_normalizer([dataset.normalizer for dataset in whole], union)
+    prompts = [prompt for dataset in whole for prompt in dataset.prompt_sets]
+    prior = build_prior(replace(config, scene=union.name), some, normalizer, prompts)
+    data = UnionTable([train for train, _ in parts], prior)
+    heldout = torch.cat([data.encode(held.batch(slice(2048 // len(whole)))) for _, held in parts])
+    return prior, data, heldout

@@ -1,4 +1,4 @@
-"""Where training scenes come from: a dataset in memory, or a grammar without end."""
+"""Where training scenes come from: datasets in memory, of one scene type or several, or a grammar without end."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import torch
 from torch import Generator, Tensor
 
 from agents.prior import ScenePrior
+from scene_envs.datasets import SceneDataset, to_union
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.grammars import Grammar
 from scene_envs.scene import SceneBatch
@@ -51,6 +52,44 @@ class SceneTable:
         """See :class:`TrainingData`."""
         index = torch.randint(len(self.scenes), (count,), generator=generator)
         return self.scenes[index], [self.prompts[i] for i in index.tolist()] if prompts else []
+
+
+class UnionTable:
+    """Scenes of several types in memory, as scenes of their union; each type is as likely as the others.
+
+    Args:
+        datasets: one per scene type.
+        prior: of the union; encodes what is drawn.
+    """
+
+    def __init__(self, datasets: Sequence[SceneDataset], prior: ScenePrior) -> None:
+        self.datasets = datasets
+        self.prior = prior
+
+    @property
+    def size(self) -> int:
+        """Scenes of all types."""
+        return sum(len(dataset) for dataset in self.datasets)
+
+    def draw(self, count: int, generator: Generator, *, prompts: bool) -> tuple[Tensor, list[Sequence[str]]]:
+        """See :class:`TrainingData`."""
+        chosen = torch.randint(len(self.datasets), (count,), generator=generator)
+        places = torch.rand(count, generator=generator)
+        scenes = torch.empty(count, self.prior.scene_type.slots, self.prior.scene_type.features)
+        texts: list[Sequence[str]] = [()] * count
+        for number, dataset in enumerate(self.datasets):
+            rows = torch.nonzero(chosen == number).flatten()
+            index = (places[rows] * len(dataset)).long()
+            if len(rows):
+                scenes[rows] = self.encode(dataset.batch(index))
+            for row, i in zip(rows.tolist(), index.tolist(), strict=True):
+                texts[row] = dataset.prompt_sets[i]
+        return scenes, texts if prompts else []
+
+    def encode(self, batch: SceneBatch) -> Tensor:
+        """Scenes of one type as the prior of the union encodes them."""
+        union = to_union(batch, self.prior.scene_type)
+        return self.prior.encode(union.to(self.prior.device)).cpu()
 
 
 class GrammarStream:

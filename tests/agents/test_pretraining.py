@@ -17,6 +17,7 @@ from agents.new_prior import build_prior
 from agents.pretrain_config import PretrainConfig
 from agents.pretraining import Pretrainer, learning_rate_at, part_generator, prepare
 from agents.training_data import SceneTable
+from scene_envs.datasets import generate
 from scene_envs.errors import CorruptFileError, InvalidInputError, TrainingError, UnknownNameError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch
@@ -199,3 +200,20 @@ def test_two_processes_take_the_steps_of_one_with_twice_the_parts(tmp_path: Path
         assert float(first["loss"]) == pytest.approx(float(second["loss"]), rel=1e-4)
         assert float(first["gradient_norm"]) == pytest.approx(float(second["gradient_norm"]), rel=1e-3)
     assert float(two[-1]["heldout"]) == pytest.approx(float(one[-1]["heldout"]), rel=1e-4)
+
+
+def test_one_prior_is_trained_on_several_scene_types(tmp_path: Path) -> None:
+    for scene in ("dimsum_table", "pantry_shelf"):
+        generate(scene, 12, tmp_path / scene, workers=0, verify=False, progress=False)
+    config = PretrainConfig(
+        output=str(tmp_path / "run"), data=f"{tmp_path / 'dimsum_table'},{tmp_path / 'pantry_shelf'}", process="mixed",
+        text=True, iterations=2, batch_size=8, hidden=16, depth=1, heads=2, log_every=1, evaluate_every=2,
+    )  # fmt: skip
+    prior, data, heldout = prepare(config)
+    assert prior.scene_type.name == "dimsum_table+pantry_shelf"
+    scenes, prompts = data.draw(400, torch.Generator().manual_seed(0), prompts=True)
+    tables = prior.decode(scenes).categories == prior.scene_type.assets.index("cafe_table")
+    assert float(tables.any(dim=1).float().mean()) == pytest.approx(0.5, abs=0.08)
+    assert len(prompts) == 400
+    trained = Pretrainer(config, data, heldout if len(heldout) else scenes[:4], prior).run()
+    assert trained.sample(2, prompt="A scene with 9 objects.", num_steps=2).tensor.shape[1] == 61
