@@ -31,6 +31,17 @@ def indefinite_article(name: str) -> str:
     return "an" if re.match(rf"(?!{yoo})[aeiou]|hour|hono|heir", name, re.IGNORECASE) else "a"
 
 
+def regular_plural(name: str) -> str:
+    """The regular plural of a noun.
+
+    >>> regular_plural("mug"), regular_plural("toy box"), regular_plural("cherry"), regular_plural("tray")
+    ('mugs', 'toy boxes', 'cherries', 'trays')
+    """
+    if re.search(r"[^aeiou]y$", name, re.IGNORECASE):
+        return f"{name[:-1]}ies"
+    return f"{name}es" if re.search(r"(s|x|z|ch|sh)$", name, re.IGNORECASE) else f"{name}s"
+
+
 @dataclass(frozen=True)
 class ConvexPart:
     """One convex piece of collision geometry in the asset frame (m).

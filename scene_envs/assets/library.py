@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scene_envs.assets.base import Asset, AssetLibrary, ConvexPart
+from scene_envs.assets.base import Asset, AssetLibrary, ConvexPart, regular_plural
 from scene_envs.assets.shapes import mass_properties
 from scene_envs.errors import InvalidInputError, unknown_name
 
@@ -59,7 +59,7 @@ def asset_recipe(
         display_name: what prompts call it.
         mass: kg; 0 makes the asset static.
         color: (r, g, b) class colour of semantic renders.
-        plural: plural of the display name; ``display_name + "s"`` by default.
+        plural: plural of the display name; the regular one by default.
 
     Raises:
         InvalidInputError: the name is taken, or the mass is negative.
@@ -70,7 +70,7 @@ def asset_recipe(
             raise InvalidInputError(f"an asset called {name!r} is registered already; choose another name")
         if not mass >= 0:
             raise InvalidInputError(f"asset {name!r}: mass must be 0 (static) or positive kg, got {mass}")
-        _RECIPES[name] = _Entry(recipe, display_name, plural or f"{display_name}s", mass, color)
+        _RECIPES[name] = _Entry(recipe, display_name, plural or regular_plural(display_name), mass, color)
         return recipe
 
     return register

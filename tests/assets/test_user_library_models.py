@@ -114,6 +114,14 @@ def test_movable_joints_are_frozen_at_zero_and_that_is_said(tmp_path: Path) -> N
     assert "movable joints frozen at zero: wedge" in import_report(tmp_path)["b"].notes
 
 
+def test_materials_without_a_name_keep_their_own_colors(tmp_path: Path) -> None:
+    box = '<geometry><box size="0.1 0.1 0.1"/></geometry><material><color rgba="{}"/></material>'
+    visuals = "".join(f"<visual>{box.format(rgba)}</visual>" for rgba in ("1 0 0 1", "0 0 1 1"))
+    asset = load(tmp_path, "two.urdf", f'<robot name="two"><link name="a">{visuals}</link></robot>')
+    colors = np.unique(asset.visual.visual.vertex_colors[:, :3], axis=0).tolist()
+    assert colors == [[0, 0, 255], [255, 0, 0]]
+
+
 def test_sdf_and_urdf_of_one_thing_agree(tmp_path: Path) -> None:
     """Poses relative to a frame, in degrees, and a model pose that is left out."""
     urdf = load(tmp_path, "a.urdf", HAMMER.format(joint="fixed"))

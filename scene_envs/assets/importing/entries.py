@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
+from scene_envs.assets.base import regular_plural
 from scene_envs.assets.importing.decomposition import METHODS, Method
 from scene_envs.assets.importing.mesh_files import MESH_SUFFIXES
 from scene_envs.assets.importing.model import Color
@@ -31,7 +32,7 @@ class AssetEntry:
         file: path relative to the folder.
         name: identifier; the stem of the file by default.
         display_name: what prompts call it; the name with spaces by default.
-        plural: plural of the display name.
+        plural: plural of the display name; the regular one by default.
         scale: factor on all lengths; a file in millimetres wants 0.001.
         density: kg/m^3; fills the shape evenly.
         mass: kg.
@@ -109,7 +110,7 @@ def _named(values: dict[str, Any]) -> AssetEntry:
     file = Path(values["file"])
     values.setdefault("name", "_".join(file.stem.split()))
     values.setdefault("display_name", " ".join(values["name"].replace("_", " ").split()) or values["name"])
-    values.setdefault("plural", f"{values['display_name']}s")
+    values.setdefault("plural", regular_plural(values["display_name"]))
     values.setdefault("up", "z")
     return AssetEntry(**values)
 

@@ -108,7 +108,7 @@ def _own_color(material: Element, path: Path) -> Color | None:
 def _shape(element: Element, link: Array, materials: dict[str, Color | None], path: Path, where: str) -> Shape:
     pose = link @ _origin(element, path, where)
     material = element.find("material")
-    color = None if material is None else materials.get(material.get("name", ""))
+    color = None if material is None else _own_color(material, path) or materials.get(material.get("name", ""))
     geometry = element.find("geometry")
     kinds = [] if geometry is None else [child for child in geometry if isinstance(child.tag, str)]
     if not kinds:
