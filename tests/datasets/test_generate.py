@@ -250,7 +250,7 @@ def test_a_grammar_of_a_notebook_is_refused_with_the_remedy(tmp_path: Path, monk
 
     monkeypatch.setattr(toy_cups, "__module__", "__main__")
     monkeypatch.setattr(__main__, "toy_cups", toy_cups, raising=False)
-    monkeypatch.delattr(__main__, "__file__")
+    monkeypatch.delattr(__main__, "__file__", raising=False)
     with pytest.raises(InvalidInputError, match=r"notebook.*workers=0"):
         _generate(tmp_path, count=1, workers=1)
 
