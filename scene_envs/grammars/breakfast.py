@@ -6,12 +6,12 @@ Probabilities follow the scene grammar of the paper's dataset (Pfaff et al., CoR
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 
 from scene_envs.grammars.containers import Heap, Standing
-from scene_envs.grammars.dsl import NOTHING, Cluster, Geometric, Group, Object, OneOf, Repeat, Stack
+from scene_envs.grammars.dsl import NOTHING, Cluster, Geometric, Group, Object, OneOf, Repeat
+from scene_envs.grammars.parts import maybe, middle, toast
 from scene_envs.grammars.surface import Region
-from scene_envs.grammars.towers import Node, Surface, Tower
+from scene_envs.grammars.towers import Node
 from scene_envs.grammars.wishes import Gaussian, Uniform, Wish, Yaw
 
 HALF_DEPTH, HALF_LENGTH = 0.2575, 0.65
@@ -28,24 +28,9 @@ ACROSS = Yaw(std=0.06, choices=(math.pi / 2, -math.pi / 2))
 """Cutlery above the plate lies across."""
 
 
-def maybe(chance: float, node: Node) -> Node:
-    """A node with some chance, else nothing."""
-    return OneOf((chance, node), (1.0 - chance, NOTHING))
-
-
-def middle(child: Node) -> list[Surface]:
-    """Something in the middle of a plate or on the floor of a bowl."""
-    return [Surface([child], Region(0.01, 0.01), height=None)]
-
-
 def near(x: float, y: float) -> Uniform:
     """A place of the setting, within 1.5 cm: x toward the middle of the table, y to the left of who sits there, m."""
     return Uniform(0.015, 0.015, x, y)
-
-
-def toast(another: float) -> Node:
-    """A slice of bread, with more on top by chance."""
-    return Stack("bread_slice", {"bread_slice": another, None: 1.0 - another})
 
 
 def bowl_of_food(where: Wish, yaw: Yaw, bread: float, apple: float, pear: float, beside: Node = NOTHING) -> Node:
@@ -123,12 +108,3 @@ def crock(present: float) -> Node:
     utensil = OneOf(*((1.0, Object(name)) for name in ("fork", "knife", "dinner_spoon", "teaspoon")))
     cutlery = Standing(Repeat(utensil, Geometric(0.1, 0, 10)), CROCK_RADIUS)
     return maybe(present, Object("utensil_crock", anywhere(), inside=cutlery))
-
-
-def at_least(objects: int) -> dict[str, Callable[[Sequence[Tower]], bool]]:
-    """The condition that a scene has ``objects`` of them besides the table."""
-
-    def enough(towers: Sequence[Tower]) -> bool:
-        return sum(len(tower.assets) + len(tower.contents) for tower in towers) >= objects
-
-    return {f"fewer than {objects} objects": enough}

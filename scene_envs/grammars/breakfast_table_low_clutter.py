@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from scene_envs.grammars.breakfast import (
     TABLE,
-    at_least,
     cereal,
     crock,
     facing_pair,
@@ -19,6 +18,7 @@ from scene_envs.grammars.breakfast import (
 )
 from scene_envs.grammars.dsl import Cluster, Group, OneOf
 from scene_envs.grammars.grammar import Grammar, register_grammar
+from scene_envs.grammars.parts import at_least
 from scene_envs.grammars.towers import Node, Surface
 from scene_envs.grammars.wishes import Gaussian
 from scene_envs.scene_types import get_scene_type

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 
-from scene_envs.grammars.breakfast import at_least, maybe, middle, toast
 from scene_envs.grammars.containers import Heap
 from scene_envs.grammars.dsl import NOTHING, Geometric, Group, Object, OneOf, Pile, Repeat, Stack, Tiers
 from scene_envs.grammars.grammar import Grammar, register_grammar
+from scene_envs.grammars.parts import at_least, maybe, middle, toast
 from scene_envs.grammars.shelf import HALF_DEPTH, HALF_WIDTH, MIDDLE, tiers
 from scene_envs.grammars.surface import Region
 from scene_envs.grammars.towers import Node, Surface

@@ -6,10 +6,10 @@ solver and objects fell off the shelf; here everything is placed where there is 
 
 from __future__ import annotations
 
-from scene_envs.grammars.breakfast import at_least, maybe
 from scene_envs.grammars.containers import Heap
 from scene_envs.grammars.dsl import Geometric, Group, Object, OneOf, Repeat, Tiers
 from scene_envs.grammars.grammar import Grammar, register_grammar
+from scene_envs.grammars.parts import at_least, maybe
 from scene_envs.grammars.shelf import HALF_DEPTH, HALF_WIDTH, MIDDLE, tiers
 from scene_envs.grammars.surface import Region
 from scene_envs.grammars.towers import Node, Surface

@@ -7,9 +7,9 @@ the published data (33 to 125).
 
 from __future__ import annotations
 
-from scene_envs.grammars.breakfast import at_least
 from scene_envs.grammars.dsl import Geometric, OneOf
 from scene_envs.grammars.grammar import Grammar, register_grammar
+from scene_envs.grammars.parts import at_least
 from scene_envs.grammars.restaurant import floor, laid, shelves, tables
 from scene_envs.scene_types import get_scene_type
 
