@@ -30,6 +30,7 @@ from agents.mixed_denoiser import Given, MixedDenoiser, MixedPriorConfig
 from agents.networks.mixed_flux import POSE, MixedFlux, MixedFluxConfig
 from agents.networks.text import TextConfig, TextEncoder
 from agents.prior import ScenePrior
+from scene_envs.datasets.prompts import parse_prompt
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
@@ -325,6 +326,8 @@ class MixedPrior(ScenePrior):
         slots: int | None,
         generator: Generator,
     ) -> Tensor:
+        if prompts is not None:
+            check_room(prompts, self.scene_type, self.mixed.slots if slots is None else slots)
         text = None if prompts is None else self.encode_prompts(prompts)
         start = self.initial(count, self.mixed.slots if slots is None else slots, generator)
         return self.run_chain(start, self.step_table(num_steps), generator, text=text, guidance=guidance)
@@ -409,3 +412,21 @@ def draw_noise(like: Tensor, noises: Sequence[Generator] | Generator | None) -> 
     if noises is None or isinstance(noises, Generator):
         return torch.randn(like.shape, generator=noises, device=like.device)
     return torch.stack([torch.randn(like.shape[1:], generator=g) for g in noises]).to(like.device)
+
+
+def check_room(prompts: Sequence[str], scene_type: SceneType, slots: int) -> None:
+    """Refuse prompts that ask for more objects than a scene has slots; free text is not looked into.
+
+    Raises:
+        InvalidInputError: names the prompt, the number and the remedy.
+    """
+    for prompt in dict.fromkeys(prompts):
+        try:
+            facts = parse_prompt(prompt, scene_type)
+        except InvalidInputError:
+            continue
+        asked = max(facts.count or 0, sum((facts.objects or {}).values()))
+        if asked > slots:
+            raise InvalidInputError(
+                f"the prompt {prompt!r} asks for {asked} objects, a scene has {slots} slots; give slots={asked} or more"
+            )

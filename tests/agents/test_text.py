@@ -91,6 +91,9 @@ def test_unknown_words_are_listed_and_long_prompts_refused(prior: MixedPrior, ca
     assert "table" not in caplog.text
     with pytest.raises(InvalidInputError, match="at most 127"):
         prior.sample(1, prompt="a " * 200, num_steps=1)
+    with pytest.raises(InvalidInputError, match=r"asks for 200 objects, a scene has 34 slots; give slots=200"):
+        prior.sample(1, prompt="A scene with 200 objects.", num_steps=1)
+    prior.sample(1, prompt="A scene with 40 objects.", num_steps=1, slots=40)
     with pytest.raises(InvalidInputError, match="2 prompts for 3 scenes"):
         prior.sample(3, prompt=PROMPTS, num_steps=1)
     with pytest.raises(InvalidInputError, match="trained without text"):
