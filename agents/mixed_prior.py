@@ -203,8 +203,12 @@ class MixedPrior(ScenePrior):
         return x
 
     def normalised(self, batch: SceneBatch) -> Tensor:
-        """(B, N, D): normalised pose, one-hot category as it is."""
+        """(B, N, D): normalised pose, one-hot category as it is.
+
+        The pose of an empty slot means nothing; it takes the mean of poses, where it asks nothing of the network.
+        """
         pose = batch.to_tensor(normalised=self.normalizer)[..., :POSE]
+        pose = torch.where(batch.is_empty[..., None], self.preconditioning.mean.to(pose), pose)
         return torch.cat([pose, batch.tensor[..., POSE:]], dim=-1)
 
     def initial(self, count: int, slots: int, generator: Generator | None = None) -> Tensor:

@@ -39,6 +39,7 @@ class TextConfig:
         depth: transformer layers.
         heads: attention heads.
         max_tokens: longest prompt, its start token included.
+        latents: tokens that a prompt is condensed to, so that long ones cost no more than short ones; 0 for none.
     """
 
     words: tuple[str, ...]
@@ -46,6 +47,7 @@ class TextConfig:
     depth: int = 2
     heads: int = 4
     max_tokens: int = 128
+    latents: int = 16
 
 
 def vocabulary(prompts: Iterable[str]) -> tuple[str, ...]:
@@ -55,9 +57,11 @@ def vocabulary(prompts: Iterable[str]) -> tuple[str, ...]:
 
 
 class TextEncoder(nn.Module):
-    """Prompts to tokens (B, L, W): learned embeddings and positions, then a small transformer.
+    """Prompts to tokens (B, L, W): learned embeddings and positions, a small transformer, and a few learned questions.
 
-    >>> encoder = TextEncoder(TextConfig(words=("cup", "two", "cups"), width=16, heads=2))
+    The questions (``latents``) attend to the words, as in the Perceiver's first layer (Jaegle et al. 2021).
+
+    >>> encoder = TextEncoder(TextConfig(words=("cup", "two", "cups"), width=16, heads=2, latents=0))
     >>> tokens, mask = encoder(["two cups", ""])
     >>> tokens.shape, mask.tolist()
     (torch.Size([2, 3, 16]), [[True, True, True], [True, False, False]])
@@ -80,6 +84,8 @@ class TextEncoder(nn.Module):
         )
         self.layers = nn.TransformerEncoder(layer, config.depth, enable_nested_tensor=False)
         self.norm = nn.LayerNorm(config.width)
+        self.questions = nn.Parameter(torch.randn(config.latents, config.width)) if config.latents else None
+        self.condense = nn.MultiheadAttention(config.width, config.heads, batch_first=True) if config.latents else None
 
     def tokenize(self, prompts: Sequence[str]) -> tuple[Tensor, list[str]]:
         """Token indices (B, L) int64, padded at the end, and the words that the vocabulary lacks.
@@ -111,4 +117,9 @@ class TextEncoder(nn.Module):
         indices = indices.to(self.position.device)
         mask = indices != PADDING
         x = self.embedding(indices) + self.position[: indices.shape[1]]
-        return self.norm(self.layers(x, src_key_padding_mask=~mask)), mask
+        x = self.norm(self.layers(x, src_key_padding_mask=~mask))
+        if self.condense is None or self.questions is None:
+            return x, mask
+        asked = self.questions.expand(len(prompts), -1, -1)
+        answers, _ = self.condense(asked, x, x, key_padding_mask=~mask, need_weights=False)
+        return answers + asked, mask.new_ones(answers.shape[:2])

@@ -36,14 +36,23 @@ def prior() -> MixedPrior:
     return made.eval()
 
 
-def test_padding_changes_nothing(prior: MixedPrior) -> None:
-    x = prior.initial(1, 34, torch.Generator().manual_seed(0))
-    t = torch.tensor([500])
-    alone = prior.denoiser(x, t, prior.seen(x), prior.encode_prompts(PROMPTS[:1]))
-    tokens, mask = prior.encode_prompts([PROMPTS[0], PROMPTS[1] + " " + PROMPTS[1]])
-    padded = prior.denoiser(x, t, prior.seen(x), (tokens[:1], mask[:1]))
-    assert bool((~mask[0]).any())
-    for first, second in zip(alone, padded, strict=True):
+@pytest.mark.parametrize("latents", [0, 4])
+def test_padding_changes_nothing_in_the_encoder(latents: int) -> None:
+    encoder = TextEncoder(TextConfig(vocabulary(PROMPTS), width=16, heads=2, latents=latents)).eval()
+    alone, _ = encoder(PROMPTS[:1])
+    tokens, mask = encoder([PROMPTS[0], PROMPTS[1] + " " + PROMPTS[1]])
+    assert tokens.shape[1] == (latents or 17)
+    torch.testing.assert_close(tokens[:1, : alone.shape[1]], alone, atol=1e-5, rtol=1e-4)
+    assert bool(mask[0].all()) == bool(latents)
+
+
+def test_padding_changes_nothing_in_the_network(prior: MixedPrior) -> None:
+    x, t = prior.initial(1, 34, torch.Generator().manual_seed(0)), torch.tensor([500])
+    tokens, mask = prior.encode_prompts(PROMPTS[:1])
+    alone = prior.denoiser(x, t, prior.seen(x), (tokens, mask))
+    padding = torch.full((1, 5, tokens.shape[-1]), 7.0)
+    padded = torch.cat([tokens, padding], dim=1), torch.cat([mask, torch.zeros(1, 5, dtype=torch.bool)], dim=1)
+    for first, second in zip(alone, prior.denoiser(x, t, prior.seen(x), padded), strict=True):
         torch.testing.assert_close(first, second, atol=1e-5, rtol=1e-4)
 
 
