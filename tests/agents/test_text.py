@@ -41,7 +41,7 @@ def test_padding_changes_nothing_in_the_encoder(latents: int) -> None:
     encoder = TextEncoder(TextConfig(vocabulary(PROMPTS), width=16, heads=2, latents=latents)).eval()
     alone, _ = encoder(PROMPTS[:1])
     tokens, mask = encoder([PROMPTS[0], PROMPTS[1] + " " + PROMPTS[1]])
-    assert tokens.shape[1] == (latents or 17)
+    assert tokens.shape[1] == (latents or 19)
     torch.testing.assert_close(tokens[:1, : alone.shape[1]], alone, atol=1e-5, rtol=1e-4)
     assert bool(mask[0].all()) == bool(latents)
 
