@@ -13,6 +13,9 @@ from agents.diffusion.reverse_steps import state_of
 from agents.networks.mixed_flux import POSE, MixedFlux, MixedFluxConfig
 from agents.networks.text import TextConfig, TextEncoder
 
+Text = tuple[Tensor, Tensor]
+"""Tokens (B, L, W) and their mask (B, L)."""
+
 
 @dataclass(frozen=True)
 class MixedPriorConfig:

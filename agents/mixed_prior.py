@@ -26,24 +26,20 @@ from agents.diffusion import (
     make_schedule,
 )
 from agents.diffusion.reverse_steps import state_of
-from agents.mixed_denoiser import Given, MixedDenoiser, MixedPriorConfig
+from agents.mixed_denoiser import Given, MixedDenoiser, MixedPriorConfig, Text
+from agents.mixed_training import mixed_loss
 from agents.networks.mixed_flux import POSE, MixedFlux, MixedFluxConfig
 from agents.networks.text import TextConfig, TextEncoder
 from agents.prior import ScenePrior
-from scene_envs.datasets.prompts import parse_prompt
+from agents.prompt_room import check_room
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
-Text = tuple[Tensor, Tensor]
-"""Tokens (B, L, W) and their mask (B, L)."""
-
 CATEGORY_LOSSES = ("cross_entropy", "bound")
 _TEXT = "text_encoder."
-_EMPTY_WEIGHT = 0.1
-"""Weight of the pose of an empty slot in the loss: it means nothing, but chains should not drift on it."""
 
 
 class MixedPrior(ScenePrior):
@@ -160,7 +156,7 @@ class MixedPrior(ScenePrior):
         text: Text = self.denoiser.text_encoder(prompts)
         return text
 
-    def _unconditional(self, count: int) -> Text | None:
+    def unconditional(self, count: int) -> Text | None:
         """What stands for no prompt; None when the prior reads none."""
         if not self.conditional:
             return None
@@ -254,7 +250,7 @@ class MixedPrior(ScenePrior):
         t, previous = int(table.timesteps[step]), int(table.previous[step])
         levels = torch.full((x_t.shape[0],), t, device=x_t.device)
         given = self.seen(x_t, given)
-        unconditional = None if text is not None and not guidance else self._unconditional(x_t.shape[0])
+        unconditional = None if text is not None and not guidance else self.unconditional(x_t.shape[0])
         pose, logits = self.denoiser(x_t, levels, given, unconditional if text is None else text)
         if text is not None and guidance:
             free_pose, free_logits = self.denoiser(x_t, levels, given, unconditional)
@@ -351,46 +347,8 @@ class MixedPrior(ScenePrior):
             t: (B,) timesteps, drawn when None.
             text: tokens and their mask.
         """
-        config, device = self.mixed, x0.device
-        if t is None:
-            t = self.draw_timesteps(x0.shape[0], generator).to(device)
-        noise = torch.randn(x0.shape, generator=generator).to(device)
-        given = self._draw_given(x0, generator) if config.given_share > 0 else None
-        x_t = self.add_noise(x0, t, noise)
-        x_t = x_t if given is None else given.write(x_t)
-        output, logits = self.denoiser.output(x_t, t, given, self._unconditional(len(x0)) if text is None else text)
-        pose0, category0 = x0[..., :POSE], x0[..., POSE:].argmax(dim=-1)
-        error = output - self.process.target(pose0, x_t[..., :POSE], t, noise[..., :POSE])
-        weight = self.loss_weight(x0.shape[1])[None, :, :POSE].to(device).expand(len(x0), -1, -1)
-        empty = (category0 == self.num_categories - 1)[..., None]
-        weight = torch.where(empty, _EMPTY_WEIGHT * weight, weight)
-        drawn = torch.ones(x0.shape[:2], device=device)
-        drawn[:, : len(self.scene_type.fixed)] = 0.0
-        if given is not None:
-            weight = weight * (~given.pose)[..., None]
-            drawn = drawn * (~given.category)
-        pose_loss = (error.square() * weight).sum(dim=(1, 2)) / weight.sum(dim=(1, 2)).clamp(min=1.0)
-        if config.category_loss == "bound":
-            states = x_t[..., POSE:]
-            losses = self.categories.loss(category0, state_of(states), t, logits, config.auxiliary)
-        else:
-            losses = F.cross_entropy(logits.flatten(0, 1), category0.flatten(), reduction="none").view_as(drawn)
-        category_loss = (losses * drawn).sum(dim=1) / drawn.sum(dim=1).clamp(min=1.0)
-        per_scene = pose_loss + config.category_weight * category_loss
+        per_scene = mixed_loss(self, x0, generator, t, text)
         return per_scene.mean() if reduction == "mean" else per_scene
-
-    def _draw_given(self, x0: Tensor, generator: Generator | None) -> Given:
-        """Random given entries: slots (completion), all categories (rearrangement), or any attribute of any slot."""
-        batch, slots = x0.shape[:2]
-        kind, share = torch.rand(2, batch, 1, generator=generator)
-        kind = kind / max(self.mixed.given_share, 1e-9)  # above 1: nothing is given
-        picks = torch.rand(2, batch, slots, generator=generator) < share
-        whole, rearrange, free = kind < 0.5, (kind >= 0.5) & (kind < 0.75), (kind >= 0.75) & (kind < 1.0)
-        pose = (whole & picks[0]) | (rearrange & picks[0] & (share < 0.5)) | (free & picks[0])
-        category = (whole & picks[0]) | rearrange.expand(-1, slots) | (free & picks[1])
-        fixed = torch.zeros(slots, dtype=torch.bool)
-        fixed[: len(self.scene_type.fixed)] = True
-        return Given(x0, (pose | fixed).to(x0.device), (category | fixed).to(x0.device))
 
     @torch.no_grad()
     def fit_residual(self, x0: Tensor, levels: int = 40, seed: int = 0) -> ResidualVariance:
@@ -404,7 +362,7 @@ class MixedPrior(ScenePrior):
             noise = torch.randn(x0.shape, generator=generator).to(x0.device)
             level = t.to(x0.device).expand(len(x0))
             x_t = self.add_noise(x0, level, noise)
-            pose, _ = self.denoiser(x_t, level, self.seen(x_t), self._unconditional(len(x0)))
+            pose, _ = self.denoiser(x_t, level, self.seen(x_t), self.unconditional(len(x0)))
             error = (pose - x0[..., :POSE]).square() * present[..., None]
             rows.append((error.sum(dim=(0, 1)) / present.sum()).cpu())
         self.residual = ResidualVariance(timesteps, torch.stack(rows))
@@ -416,21 +374,3 @@ def draw_noise(like: Tensor, noises: Sequence[Generator] | Generator | None) -> 
     if noises is None or isinstance(noises, Generator):
         return torch.randn(like.shape, generator=noises, device=like.device)
     return torch.stack([torch.randn(like.shape[1:], generator=g) for g in noises]).to(like.device)
-
-
-def check_room(prompts: Sequence[str], scene_type: SceneType, slots: int) -> None:
-    """Refuse prompts that ask for more objects than a scene has slots; free text is not looked into.
-
-    Raises:
-        InvalidInputError: names the prompt, the number and the remedy.
-    """
-    for prompt in dict.fromkeys(prompts):
-        try:
-            facts = parse_prompt(prompt, scene_type)
-        except InvalidInputError:
-            continue
-        asked = max(facts.count or 0, sum((facts.objects or {}).values()))
-        if asked > slots:
-            raise InvalidInputError(
-                f"the prompt {prompt!r} asks for {asked} objects, a scene has {slots} slots; give slots={asked} or more"
-            )

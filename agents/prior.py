@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from importlib import import_module
@@ -33,7 +34,7 @@ PROCESSES = ("continuous", "mixed")
 _LEVELS, _RESIDUAL = "residual.timesteps", "residual.variance"
 
 
-class ScenePrior(nn.Module):
+class ScenePrior(nn.Module, ABC):
     """A trained denoiser with its schedule, layout and normalizer. Tensors x are normalised scenes (B, N, D).
 
     Fixed welded objects and constant features are *known*: clamped to their values while sampling and left
@@ -84,6 +85,7 @@ class ScenePrior(nn.Module):
     # -- files ----------------------------------------------------------------------------------
 
     @classmethod
+    @abstractmethod
     def from_state(
         cls,
         fields: dict[str, Any],
@@ -93,12 +95,11 @@ class ScenePrior(nn.Module):
         residual: ResidualVariance | None,
     ) -> ScenePrior:
         """From the ``prior`` entry of a configuration file."""
-        raise NotImplementedError
 
     @classmethod
+    @abstractmethod
     def tiny(cls, scene_type: SceneType, slots: int, normalizer: Normalizer) -> ScenePrior:
         """A very small prior with fresh weights."""
-        raise NotImplementedError
 
     @classmethod
     def load(cls, name: str | os.PathLike[str] | ScenePrior) -> ScenePrior:
@@ -171,18 +172,18 @@ class ScenePrior(nn.Module):
         noise = torch.randn(count, slots, self.scene_type.features, generator=generator, device=self._fixed.device)
         return self.clamp(noise)
 
+    @abstractmethod
     def transition(self, x_t: Tensor, step: int, table: StepTableLike) -> ReverseStep:
         """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters.
 
         Known entries are certain; at the last step all are.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def regenerate(
         self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int
     ) -> Tensor:
         """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; used by :meth:`inpaint`."""
-        raise NotImplementedError
 
     @torch.no_grad()
     def sample_tensor(
@@ -317,6 +318,7 @@ class ScenePrior(nn.Module):
         """(count,) int64 training timesteps, ln(noise-to-signal) being normal."""
         return torch.multinomial(self._timestep_weights, count, replacement=True, generator=generator)
 
+    @abstractmethod
     def pretraining_loss(
         self, x0: Tensor, generator: Generator | None = None, reduction: str = "mean", t: Tensor | None = None
     ) -> Tensor:
@@ -328,11 +330,10 @@ class ScenePrior(nn.Module):
             reduction: ``"mean"`` over scenes, or ``"none"`` for (B,); always the mean over entries.
             t: (B,) timesteps, drawn when None.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def fit_residual(self, x0: Tensor, levels: int = 40, seed: int = 0) -> ResidualVariance:
         """Measure the denoiser's error on normalised scenes ``x0`` (B, N, D) at ``levels`` timesteps, and keep it."""
-        raise NotImplementedError
 
     def loss_weight(self, slots: int) -> Tensor:
         """(slots, D) weights of the pretraining loss; 0 on known entries."""
