@@ -87,6 +87,11 @@ class TextEncoder(nn.Module):
         self.questions = nn.Parameter(torch.randn(config.latents, config.width)) if config.latents else None
         self.condense = nn.MultiheadAttention(config.width, config.heads, batch_first=True) if config.latents else None
 
+    @property
+    def token_space(self) -> tuple[int, int]:
+        """How many tokens a prompt has at most, and how many different ones there are."""
+        return self.config.max_tokens, len(self.config.words) + _SPECIAL
+
     def tokenize(self, prompts: Sequence[str]) -> tuple[Tensor, list[str]]:
         """Token indices (B, L) int64, padded at the end, and the words that the vocabulary lacks.
 
@@ -112,14 +117,23 @@ class TextEncoder(nn.Module):
         Words outside the vocabulary are listed in a warning and read as unknown.
         """
         indices, unknown = self.tokenize(prompts)
-        if unknown:
-            _LOGGER.warning("the prior does not know the word(s) %s; they are read as unknown", ", ".join(unknown))
+        warn_unknown(unknown)
+        return self.encode(indices)
+
+    def encode(self, indices: Tensor) -> tuple[Tensor, Tensor]:
+        """The same from token indices (B, L) int64 as :meth:`tokenize` gives them."""
         indices = indices.to(self.position.device)
         mask = indices != PADDING
         x = self.embedding(indices) + self.position[: indices.shape[1]]
         x = self.norm(self.layers(x, src_key_padding_mask=~mask))
         if self.condense is None or self.questions is None:
             return x, mask
-        asked = self.questions.expand(len(prompts), -1, -1)
+        asked = self.questions.expand(len(indices), -1, -1)
         answers, _ = self.condense(asked, x, x, key_padding_mask=~mask, need_weights=False)
         return answers + asked, mask.new_ones(answers.shape[:2])
+
+
+def warn_unknown(words: Sequence[str]) -> None:
+    """Say which words of a prompt the vocabulary lacks."""
+    if words:
+        _LOGGER.warning("the prior does not know the word(s) %s; they are read as unknown", ", ".join(words))
