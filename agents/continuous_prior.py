@@ -81,8 +81,10 @@ class ContinuousPrior(ScenePrior):
         return cls(PriorConfig(**fields), normalizer, preconditioning, card, residual)
 
     @classmethod
-    def tiny(cls, scene_type: SceneType, slots: int, normalizer: Normalizer) -> ContinuousPrior:
+    def tiny(cls, scene_type: SceneType, slots: int, normalizer: Normalizer, text: bool = False) -> ContinuousPrior:
         """A very small prior with fresh weights."""
+        if text:
+            raise InvalidInputError("text=True needs process='mixed': the continuous prior reads no prompts")
         features = scene_type.features
         config = PriorConfig(scene_type.name, slots, FluxConfig(features=features, hidden=32, depth=2, heads=2))
         return cls(config, normalizer, Preconditioning(torch.zeros(features), torch.full((features,), 0.5)))
@@ -104,7 +106,14 @@ class ContinuousPrior(ScenePrior):
         return self.clamp(mean), std_map
 
     def regenerate(
-        self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int
+        self,
+        batch: SceneBatch,
+        mask: Tensor,
+        table: StepTable,
+        generators: Sequence[Generator],
+        resample: int,
+        prompts: Sequence[str] | None = None,
+        guidance: float = 0.0,
     ) -> Tensor:
         """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; used by :meth:`inpaint`."""
         x0 = self.encode(batch)

@@ -9,6 +9,7 @@ import torch
 from torch import Generator, Tensor
 
 from agents.diffusion.step_tables import StepTable
+from agents.prompt_room import check_prompts
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import CATEGORY, POSE, SceneBatch
 
@@ -22,6 +23,8 @@ def inpaint(
     batch: SceneBatch,
     mask: Tensor,
     *,
+    prompt: str | Sequence[str] | None = None,
+    guidance: float = 0.0,
     num_steps: int = 50,
     generators: Sequence[Generator] | None = None,
     seed: int = 0,
@@ -37,6 +40,8 @@ def inpaint(
         batch: scenes to change.
         mask: bool, True where something is regenerated: (B, N) for whole slots, or (B, N, 2) for the pose and the
             category of each slot. Fixed welded slots never are.
+        prompt: what the whole scenes should hold in the end, one text for all or one per scene; None for anything.
+        guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional; it needs a prompt.
         num_steps: denoiser evaluations of one pass, 1..T.
         generators: one per scene, so that a scene's result does not depend on its neighbours' noise.
         seed: used to make the generators when none are given.
@@ -47,14 +52,17 @@ def inpaint(
         is regenerated, an object stays an object and an empty slot stays empty, as the pose is kept.
 
     Raises:
-        InvalidInputError: a mask of the wrong shape or type, not one generator per scene, or ``resample`` below 1.
+        InvalidInputError: a mask of the wrong shape or type, not one generator per scene, ``resample`` below 1, a
+            prompt for a prior that reads none, or guidance without a prompt.
     """
     both = check_mask(batch, mask, generators, resample).to(batch.tensor.device)
     both[:, : len(prior.scene_type.fixed)] = False
+    prompts = check_prompts(prior, prompt, guidance, len(batch), batch.tensor.shape[1])
     if generators is None:
         generators = [Generator().manual_seed(seed + i) for i in range(len(batch))]
     device = prior.known(1).device
-    x = prior.regenerate(batch.to(device), both.to(device), prior.step_table(num_steps), generators, resample)
+    table = prior.step_table(num_steps)
+    x = prior.regenerate(batch.to(device), both.to(device), table, generators, resample, prompts, guidance)
     return merge(batch, prior.decode(x).to(batch.tensor.device), both)
 
 

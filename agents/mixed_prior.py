@@ -21,9 +21,9 @@ from agents.diffusion import (
     Preconditioning,
     ResidualVariance,
     StepTable,
-    lognormal_timesteps,
     make_categorical_schedule,
     make_schedule,
+    timestep_weights,
 )
 from agents.diffusion.reverse_steps import state_of
 from agents.mixed_denoiser import Given, MixedDenoiser, MixedPriorConfig, Text
@@ -31,7 +31,7 @@ from agents.mixed_training import mixed_loss
 from agents.networks.mixed_flux import POSE, MixedFlux, MixedFluxConfig
 from agents.networks.text import TextConfig, TextEncoder
 from agents.prior import ScenePrior
-from agents.prompt_room import check_room
+from agents.prompt_reading import PromptReader, prompt_words
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
@@ -42,7 +42,7 @@ CATEGORY_LOSSES = ("cross_entropy", "bound")
 _TEXT = "text_encoder."
 
 
-class MixedPrior(ScenePrior):
+class MixedPrior(PromptReader, ScenePrior):
     """A :class:`~agents.prior.ScenePrior` whose categories are discrete.
 
     Args:
@@ -81,14 +81,14 @@ class MixedPrior(ScenePrior):
             raise unknown_name("category loss", config.category_loss, CATEGORY_LOSSES)
         self.mixed = config
         self._keep(config, normalizer, preconditioning, card, residual)
-        schedule = make_schedule(config.schedule, config.num_timesteps)
+        schedule = make_schedule(config.schedule, config.num_timesteps, config.noise_floor)
         self.process = GaussianProcess(schedule, config.prediction, preconditioning)
         self.categories = CategoricalProcess(
             make_categorical_schedule(config.kernel, config.num_timesteps), config.network.categories
         )
         encoder = None if config.text is None else TextEncoder(config.text)
         self.denoiser = MixedDenoiser(MixedFlux(config.network), self.process, self.categories, encoder)
-        self._timestep_weights = lognormal_timesteps(schedule, config.noise_mean, config.noise_std)
+        self._timestep_weights = timestep_weights(config.timesteps, schedule, config.noise_mean, config.noise_std)
 
     @classmethod
     def from_state(
@@ -103,7 +103,13 @@ class MixedPrior(ScenePrior):
         text = fields.get("text")
         if text is not None:
             text = TextConfig(**{**text, "words": tuple(text["words"])})
-        fields = {**fields, "network": MixedFluxConfig(**fields["network"]), "text": text}
+        fields = {
+            **fields,
+            "network": MixedFluxConfig(
+                **{**fields["network"], "unit": tuple(fields["network"].get("unit", (1.0, 1.0, 1.0)))}
+            ),
+            "text": text,
+        }
         return cls(MixedPriorConfig(**fields), normalizer, preconditioning, card, residual)
 
     def config_state(self) -> dict[str, Any]:
@@ -111,13 +117,21 @@ class MixedPrior(ScenePrior):
         return asdict(self.mixed)
 
     @classmethod
-    def tiny(cls, scene_type: SceneType, slots: int, normalizer: Normalizer) -> MixedPrior:
-        """A very small prior with fresh weights."""
+    def tiny(cls, scene_type: SceneType, slots: int, normalizer: Normalizer, text: bool = False) -> MixedPrior:
+        """A very small prior with fresh weights; with ``text``, one that reads prompts."""
+        reader = TextConfig(prompt_words(scene_type), width=16, depth=1, heads=2, latents=4) if text else None
         network = MixedFluxConfig(
-            scene_type.num_assets + 1, hidden=32, double_blocks=1, single_blocks=2, heads=2, embedding=32, pose_head=16
+            scene_type.num_assets + 1,
+            hidden=32,
+            double_blocks=1,
+            single_blocks=2,
+            heads=2,
+            embedding=32,
+            pose_head=16,
+            text_width=0 if reader is None else reader.width,
         )
         moments = Preconditioning(torch.zeros(POSE), torch.full((POSE,), 0.5))
-        return cls(MixedPriorConfig(scene_type.name, slots, network), normalizer, moments)
+        return cls(MixedPriorConfig(scene_type.name, slots, network, text=reader), normalizer, moments)
 
     def weights(self) -> dict[str, Tensor]:
         """Tensors of the network, and those of the text encoder under ``text_encoder.``."""
@@ -135,33 +149,7 @@ class MixedPrior(ScenePrior):
         if self.denoiser.text_encoder is not None:
             self.denoiser.text_encoder.load_state_dict(text)
 
-    # -- prompts --------------------------------------------------------------------------------
-
-    @property
-    def conditional(self) -> bool:  # type: ignore[override]
-        """Whether the prior reads prompts."""
-        return self.mixed.text is not None
-
-    def encode_prompts(self, prompts: Sequence[str]) -> Text:
-        """Tokens (B, L, W) and mask (B, L) of prompts; ``""`` stands for none.
-
-        Raises:
-            InvalidInputError: the prior reads no prompts, or one is too long.
-        """
-        if self.denoiser.text_encoder is None:
-            raise InvalidInputError(
-                f"this prior of {self.scene_type.name!r} was trained without text and cannot follow the prompt "
-                f"{prompts[0]!r}; leave prompt= out, or load a prior that reads prompts"
-            )
-        text: Text = self.denoiser.text_encoder(prompts)
-        return text
-
-    def unconditional(self, count: int) -> Text | None:
-        """What stands for no prompt; None when the prior reads none."""
-        if not self.conditional:
-            return None
-        tokens, mask = self.encode_prompts([""])
-        return tokens.expand(count, -1, -1), mask.expand(count, -1)
+    # -- what the network is told ---------------------------------------------------------------
 
     def seen(self, x: Tensor, given: Given | None = None) -> Given | None:
         """What the network is told to be exact in scenes ``x`` (B, N, D): ``given``, or else the fixed objects.
@@ -236,6 +224,7 @@ class MixedPrior(ScenePrior):
         given: Given | None = None,
         text: Text | None = None,
         guidance: float = 0.0,
+        free: Text | None = None,
     ) -> MixedStep:
         """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters.
 
@@ -244,16 +233,18 @@ class MixedPrior(ScenePrior):
             step: index in the table.
             table: the chain.
             given: entries that carry no noise; None for the fixed objects alone.
-            text: tokens (B, L, W) and their mask (B, L).
+            text: tokens (B, L, W) and their mask (B, L); None for no prompt.
             guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional, on poses and logits.
+            free: what stands for no prompt, as :meth:`unconditional` gives it; encoded anew when None.
         """
         t, previous = int(table.timesteps[step]), int(table.previous[step])
         levels = torch.full((x_t.shape[0],), t, device=x_t.device)
         given = self.seen(x_t, given)
-        unconditional = None if text is not None and not guidance else self.unconditional(x_t.shape[0])
-        pose, logits = self.denoiser(x_t, levels, given, unconditional if text is None else text)
+        if free is None and (text is None or guidance):
+            free = self.unconditional(x_t.shape[0])
+        pose, logits = self.denoiser(x_t, levels, given, free if text is None else text)
         if text is not None and guidance:
-            free_pose, free_logits = self.denoiser(x_t, levels, given, unconditional)
+            free_pose, free_logits = self.denoiser(x_t, levels, given, free)
             pose = (1 + guidance) * pose - guidance * free_pose
             logits = (1 + guidance) * logits.log_softmax(-1) - guidance * free_logits.log_softmax(-1)
         if self.mixed.clip:
@@ -274,14 +265,16 @@ class MixedPrior(ScenePrior):
         return MixedStep(clamped[..., :POSE], std * (~known).to(mean.dtype), probs, random)
 
     def regenerate(
-        self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int
-    ) -> Tensor:
+        self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int,
+        prompts: Sequence[str] | None = None, guidance: float = 0.0,
+    ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; the rest is seen as it is."""
+        text = None if prompts is None else self.encode_prompts(prompts)
         given = Given(self.encode(batch), ~mask[..., 0], ~mask[..., 1])
         noise = draw_noise(given.x, generators)
         probs = self.categories.prior().to(noise).expand(*noise.shape[:2], -1)
         start = self.clamp(self._with_states(noise[..., :POSE], probs, noise))
-        return self.run_chain(start, table, generators, given, resample=resample)
+        return self.run_chain(start, table, generators, given, text, guidance, resample)
 
     @torch.no_grad()
     def run_chain(
@@ -298,6 +291,7 @@ class MixedPrior(ScenePrior):
             text, guidance: as in :meth:`transition`.
             resample: how often each step is taken, going back in between.
         """
+        free = self.unconditional(len(x)) if text is None or guidance else None
         x = x if given is None else given.write(x)
         for step in range(len(table)):
             level, after = int(table.timesteps[step]), int(table.previous[step])
@@ -305,7 +299,7 @@ class MixedPrior(ScenePrior):
                 if again:
                     x = self._renoise(x, after, level, draw_noise(x, noises))
                     x = x if given is None else given.write(x)
-                reverse = self.transition(x, step, table, given=given, text=text, guidance=guidance)
+                reverse = self.transition(x, step, table, given=given, text=text, guidance=guidance, free=free)
                 x = reverse.from_noise(draw_noise(x, noises))
                 x = x if given is None else given.write(x)
         return x
@@ -326,8 +320,6 @@ class MixedPrior(ScenePrior):
         slots: int | None,
         generator: Generator,
     ) -> Tensor:
-        if prompts is not None:
-            check_room(prompts, self.scene_type, self.mixed.slots if slots is None else slots)
         text = None if prompts is None else self.encode_prompts(prompts)
         start = self.initial(count, self.mixed.slots if slots is None else slots, generator)
         return self.run_chain(start, self.step_table(num_steps), generator, text=text, guidance=guidance)

@@ -22,6 +22,7 @@ from agents.diffusion import (
 )
 from agents.inpainting import inpaint
 from agents.prior_files import read_prior, write_prior
+from agents.prompt_room import check_prompts
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
@@ -98,8 +99,8 @@ class ScenePrior(nn.Module, ABC):
 
     @classmethod
     @abstractmethod
-    def tiny(cls, scene_type: SceneType, slots: int, normalizer: Normalizer) -> ScenePrior:
-        """A very small prior with fresh weights."""
+    def tiny(cls, scene_type: SceneType, slots: int, normalizer: Normalizer, text: bool = False) -> ScenePrior:
+        """A very small prior with fresh weights; with ``text``, one that reads prompts."""
 
     @classmethod
     def load(cls, name: str | os.PathLike[str] | ScenePrior) -> ScenePrior:
@@ -108,12 +109,12 @@ class ScenePrior(nn.Module, ABC):
             return name
         state, tensors = read_prior(name)
         try:
-            moments = (torch.tensor(state["preconditioning"][key]) for key in ("mean", "std"))
+            moments = Preconditioning.from_state(state["preconditioning"])
             normalizer = Normalizer.from_state(state["normalizer_state"])
             residual = ResidualVariance(tensors.pop(_LEVELS), tensors.pop(_RESIDUAL)) if _LEVELS in tensors else None
             _know_scene_type(state)
             kind = _prior_class(state.get("process", "continuous"))
-            prior = kind.from_state(state["prior"], normalizer, Preconditioning(*moments), state.get("card"), residual)
+            prior = kind.from_state(state["prior"], normalizer, moments, state.get("card"), residual)
             prior.load_weights(tensors)
         except (KeyError, TypeError) as error:
             raise CorruptFileError(
@@ -125,12 +126,11 @@ class ScenePrior(nn.Module, ABC):
 
     def save(self, directory: str | os.PathLike[str]) -> Path:
         """Write ``config.json`` and ``model.safetensors`` into ``directory``."""
-        moments = {"mean": self.preconditioning.mean.tolist(), "std": self.preconditioning.std.tolist()}
         state = {
             "process": self.process_name,
             "prior": self.config_state(),
             "scene_type": asdict(self.scene_type),
-            "preconditioning": moments,
+            "preconditioning": self.preconditioning.state(),
             "normalizer_state": self.normalizer.state(),
             "card": self.card,
         }
@@ -181,7 +181,14 @@ class ScenePrior(nn.Module, ABC):
 
     @abstractmethod
     def regenerate(
-        self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int
+        self,
+        batch: SceneBatch,
+        mask: Tensor,
+        table: StepTable,
+        generators: Sequence[Generator],
+        resample: int,
+        prompts: Sequence[str] | None = None,
+        guidance: float = 0.0,
     ) -> Tensor:
         """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; used by :meth:`inpaint`."""
 
@@ -213,7 +220,8 @@ class ScenePrior(nn.Module, ABC):
         Args:
             count: number of scenes.
             prompt: what the scenes should hold, one text for all or one per scene; None for anything.
-            guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional (Ho and Salimans 2022).
+            guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional (Ho and Salimans 2022); it
+                needs a prompt.
             num_steps: denoiser evaluations per scene, 1..T.
             slots: slots per scene; more than trained is allowed.
             seed: of the torch generator; the same seed and batch size give the same scenes.
@@ -221,7 +229,7 @@ class ScenePrior(nn.Module, ABC):
         """
         if count < 1:
             raise InvalidInputError(f"count={count}: ask for at least one scene")
-        prompts = self._prompts(prompt, count)
+        prompts = check_prompts(self, prompt, guidance, count, self.config.slots if slots is None else slots)
         generator = Generator(str(self._fixed.device)).manual_seed(seed)
         chunks, done = [], 0
         for size in _chunk_sizes(count, batch_size):
@@ -229,15 +237,6 @@ class ScenePrior(nn.Module, ABC):
             chunks.append(self._sample_chunk(size, asked, guidance, num_steps, slots, generator))
             done += size
         return self.decode(torch.cat(chunks))
-
-    @staticmethod
-    def _prompts(prompt: str | Sequence[str] | None, count: int) -> list[str] | None:
-        if prompt is None:
-            return None
-        prompts = [prompt] * count if isinstance(prompt, str) else list(prompt)
-        if len(prompts) != count:
-            raise InvalidInputError(f"{len(prompts)} prompts for {count} scenes; give one text, or one per scene")
-        return prompts
 
     def _sample_chunk(
         self,
@@ -248,11 +247,7 @@ class ScenePrior(nn.Module, ABC):
         slots: int | None,
         generator: Generator,
     ) -> Tensor:
-        if prompts is not None:
-            raise InvalidInputError(
-                f"this prior of {self.scene_type.name!r} was trained without text and cannot follow the prompt "
-                f"{prompts[0]!r}; leave prompt= out, or load a prior that reads prompts"
-            )
+        """A chunk of :meth:`sample`; priors that read prompts override it."""
         return self.sample_tensor(count, num_steps=num_steps, slots=slots, generator=generator)
 
     def decode(self, x: Tensor) -> SceneBatch:
@@ -285,32 +280,65 @@ class ScenePrior(nn.Module, ABC):
         batch: SceneBatch,
         mask: Tensor,
         *,
+        prompt: str | Sequence[str] | None = None,
+        guidance: float = 0.0,
         num_steps: int = 50,
         generators: Sequence[Generator] | None = None,
         seed: int = 0,
         resample: int = 1,
     ) -> SceneBatch:
         """Regenerate what ``mask`` (B, N) or (B, N, 2) says; see :func:`agents.inpainting.inpaint`."""
-        return inpaint(self, batch, mask, num_steps=num_steps, generators=generators, seed=seed, resample=resample)
+        return inpaint(
+            self,
+            batch,
+            mask,
+            prompt=prompt,
+            guidance=guidance,
+            num_steps=num_steps,
+            generators=generators,
+            seed=seed,
+            resample=resample,
+        )
 
     def complete(
-        self, batch: SceneBatch, *, slots: int | None = None, num_steps: int = 50, seed: int = 0
+        self,
+        batch: SceneBatch,
+        *,
+        prompt: str | Sequence[str] | None = None,
+        guidance: float = 0.0,
+        slots: int | None = None,
+        num_steps: int = 50,
+        seed: int = 0,
     ) -> SceneBatch:
         """Fill the empty slots of ``batch``, keeping its objects.
 
         Args:
             batch: scenes.
+            prompt: what the completed scenes should hold, one text for all or one per scene; None for anything.
+            guidance: w of classifier-free guidance, as in :meth:`sample`.
             slots: slots of the result, at least those of ``batch``; None keeps them.
             num_steps: denoiser evaluations per scene.
             seed: of the noise; scene i uses ``seed + i``.
         """
         wide = batch if slots is None else batch.with_slots(slots)
-        return self.inpaint(wide, wide.is_empty, num_steps=num_steps, seed=seed)
+        return self.inpaint(wide, wide.is_empty, prompt=prompt, guidance=guidance, num_steps=num_steps, seed=seed)
 
-    def rearrange(self, batch: SceneBatch, *, num_steps: int = 50, seed: int = 0) -> SceneBatch:
-        """New poses for the free objects of ``batch``; what is there, and what is welded, stays."""
+    def rearrange(
+        self,
+        batch: SceneBatch,
+        *,
+        prompt: str | Sequence[str] | None = None,
+        guidance: float = 0.0,
+        num_steps: int = 50,
+        seed: int = 0,
+    ) -> SceneBatch:
+        """New poses for the free objects of ``batch``; what is there, and what is welded, stays.
+
+        Arguments as in :meth:`complete`.
+        """
         free = batch.is_free
-        return self.inpaint(batch, torch.stack([free, torch.zeros_like(free)], dim=-1), num_steps=num_steps, seed=seed)
+        mask = torch.stack([free, torch.zeros_like(free)], dim=-1)
+        return self.inpaint(batch, mask, prompt=prompt, guidance=guidance, num_steps=num_steps, seed=seed)
 
     # -- the training loss ----------------------------------------------------------------------
 
@@ -375,7 +403,11 @@ def _workspace_normalizer(scene_type: SceneType) -> Normalizer:
 
 
 def tiny_prior(
-    scene_type: str | SceneType = "dimsum_table", seed: int = 0, slots: int | None = None, process: str = "continuous"
+    scene_type: str | SceneType = "dimsum_table",
+    seed: int = 0,
+    slots: int | None = None,
+    process: str = "continuous",
+    text: bool = False,
 ) -> ScenePrior:
     """An untrained prior with a very small network and random weights, for tests and examples.
 
@@ -384,12 +416,13 @@ def tiny_prior(
         seed: of the weights.
         slots: slots per scene; the scene type's when None.
         process: ``"continuous"`` or ``"mixed"``.
+        text: whether it reads prompts, with a vocabulary of what can be said of scenes of this type; mixed only.
     """
     scene_type = get_scene_type(scene_type)
     normalizer = _workspace_normalizer(scene_type)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        prior = _prior_class(process).tiny(scene_type, scene_type.slots if slots is None else slots, normalizer)
+        prior = _prior_class(process).tiny(scene_type, scene_type.slots if slots is None else slots, normalizer, text)
         for parameter in prior.parameters():
             if not bool(parameter.any()):
                 nn.init.normal_(parameter, std=0.02)

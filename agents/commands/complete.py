@@ -23,6 +23,8 @@ class CompleteConfig:
             a dataset.
         prior: a shipped name, or the folder of a prior or a run; empty means the shipped prior of the scene type.
         count: how many of the scenes, from the first; null for all.
+        prompt: what the whole scenes should hold, for priors that read prompts; null for anything.
+        guidance: weight of classifier-free guidance, 0 for none; needs a prompt.
         slots: slots of the result; null keeps those of the scenes.
         num_steps: denoising steps per scene.
         seed: of the noise.
@@ -34,6 +36,8 @@ class CompleteConfig:
     scenes: str = ""
     prior: str = ""
     count: int | None = None
+    prompt: str | None = None
+    guidance: float = 0.0
     slots: int | None = None
     num_steps: int = 50
     seed: int = 0
@@ -50,7 +54,14 @@ def config() -> type[CompleteConfig]:
 def run(settings: CompleteConfig, run: Run) -> None:
     """Fill the empty slots."""
     prior, batch = load_prior_and_scenes("complete", settings.scenes, settings.prior, settings.count, settings.device)
-    filled = prior.complete(batch, slots=settings.slots, num_steps=settings.num_steps, seed=settings.seed)
+    filled = prior.complete(
+        batch,
+        prompt=settings.prompt,
+        guidance=settings.guidance,
+        slots=settings.slots,
+        num_steps=settings.num_steps,
+        seed=settings.seed,
+    )
     added = float((filled.counts - batch.counts).double().mean())
     run.say(f"{len(batch)} scenes, {added:.1f} objects added on average")
     save_scenes(batch, filled.to("cpu"), settings.pictures, run, {"added": added})

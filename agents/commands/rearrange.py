@@ -20,6 +20,8 @@ class RearrangeConfig:
             a dataset.
         prior: a shipped name, or the folder of a prior or a run; empty means the shipped prior of the scene type.
         count: how many of the scenes, from the first; null for all.
+        prompt: what the whole scenes should hold, for priors that read prompts; null for anything.
+        guidance: weight of classifier-free guidance, 0 for none; needs a prompt.
         num_steps: denoising steps per scene.
         seed: of the noise.
         pictures: how many scenes the galleries show; 0 draws none.
@@ -30,6 +32,8 @@ class RearrangeConfig:
     scenes: str = ""
     prior: str = ""
     count: int | None = None
+    prompt: str | None = None
+    guidance: float = 0.0
     num_steps: int = 50
     seed: int = 0
     pictures: int = 12
@@ -45,7 +49,9 @@ def config() -> type[RearrangeConfig]:
 def run(settings: RearrangeConfig, run: Run) -> None:
     """New poses for the free objects."""
     prior, batch = load_prior_and_scenes("rearrange", settings.scenes, settings.prior, settings.count, settings.device)
-    moved = prior.rearrange(batch, num_steps=settings.num_steps, seed=settings.seed).to("cpu")
+    moved = prior.rearrange(
+        batch, prompt=settings.prompt, guidance=settings.guidance, num_steps=settings.num_steps, seed=settings.seed
+    ).to("cpu")
     distance = (moved.translations - batch.translations).norm(dim=-1)[batch.is_free]
     figures = {"mean_distance_m": float(distance.double().mean()) if len(distance) else 0.0}
     run.say(f"{len(batch)} scenes, objects moved by {figures['mean_distance_m']:.3f} m on average")

@@ -21,7 +21,7 @@ class SampleConfig:
         prior: a shipped name, or the folder of a prior or a run.
         count: scenes to draw.
         prompt: what the scenes should hold, for priors that read prompts; null for anything.
-        guidance: weight of classifier-free guidance, 0 for none.
+        guidance: weight of classifier-free guidance, 0 for none; needs a prompt.
         num_steps: denoising steps per scene.
         slots: slots per scene, more than trained is allowed; null means as trained.
         seed: of the noise.
