@@ -2,17 +2,18 @@
 
 from agents.evaluation.measure import evaluate_prior, figure_table, grammar_scenes, measure_samples
 from agents.evaluation.metrics import (
-    SUPPORTS,
-    Support,
     category_distribution,
     category_kl,
     count_wasserstein,
     height_errors,
     workspace_fraction,
 )
+from agents.evaluation.supports import CONTAINERS, SUPPORTS, Container, Support
 
 __all__ = [
+    "CONTAINERS",
     "SUPPORTS",
+    "Container",
     "Support",
     "category_distribution",
     "category_kl",

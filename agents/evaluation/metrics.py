@@ -3,45 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from agents.evaluation.supports import CONTAINERS, SUPPORTS, Container, Support
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import get_scene_type
 
 KL_EPS = 1e-6
 """Probability added to every category before renormalising, so that a category never sampled stays finite."""
 
-
-@dataclass(frozen=True)
-class Support:
-    """Where objects of a scene type may rest: a surface fixed in the world, or the top of another object.
-
-    Attributes:
-        kind: the name the height error is reported under, such as ``"table"`` or ``"stack"``.
-        height: z of the surface (m), in the world, or above the frame of the supporting object.
-        on: names of the supporting assets; None when the surface is fixed in the world.
-        riders: names of the assets that can rest there; None means all free ones.
-        reach: largest horizontal distance (m) between the frames of rider and supporting object.
-    """
-
-    kind: str
-    height: float
-    on: tuple[str, ...] | None = None
-    riders: tuple[str, ...] | None = None
-    reach: float = 0.06
-
-
-SUPPORTS: dict[str, tuple[Support, ...]] = {
-    "dimsum_table": (
-        Support("table", height=0.0),
-        Support("stack", height=0.091, on=("steamer_bottom",), riders=("steamer_bottom", "steamer_lid")),
-    ),
-}
-"""Supports of each scene type, by name; scene types without an entry have no height figures."""
+_CHUNK = 128
+"""Scenes whose pairs of objects are in memory together."""
 
 
 def category_distribution(batch: SceneBatch, eps: float = KL_EPS) -> Tensor:
@@ -81,12 +55,12 @@ def count_wasserstein(batch: SceneBatch, reference: SceneBatch) -> float:
 
 
 def height_errors(batch: SceneBatch, supports: Sequence[Support] | None = None) -> dict[str, Tensor]:
-    """Distance in height between every free object and the support nearest to it in height.
+    """Distance in height between objects and the support nearest to each in height.
 
-    A support on another object is a candidate when the rider's frame is above the supporter's and within
-    ``reach`` of it horizontally; a surface fixed in the world is always one. An object is counted under the
-    kind of the candidate that is nearest to its own z, so an error says how far it floats above (or is sunk
-    into) what it seems to rest on.
+    A support on another object is a candidate for what is within ``reach`` of it horizontally (and above it, where
+    its top is above its frame); a surface fixed in the world always is one. An object is counted under the kind of
+    the candidate that is nearest to its own z, so an error says how far it floats above (or is sunk into) what it
+    seems to rest on. What lies in a container, see :data:`~agents.evaluation.supports.CONTAINERS`, is left out.
 
     Args:
         batch: the scenes.
@@ -99,10 +73,11 @@ def height_errors(batch: SceneBatch, supports: Sequence[Support] | None = None) 
         supports = SUPPORTS.get(batch.scene_type.name, ())
     if not supports:
         return {}
-    gaps = torch.stack([_height_gap(batch, support) for support in supports])  # (S, B, N)
-    error, nearest = gaps.min(dim=0)
-    supported = batch.is_free & torch.isfinite(error)
-    return {support.kind: error[supported & (nearest == index)] for index, support in enumerate(supports)}
+    errors: dict[str, list[Tensor]] = {support.kind: [] for support in supports}
+    for start in range(0, len(batch), _CHUNK):
+        for kind, error in _chunk_errors(batch[start : start + _CHUNK], supports):
+            errors[kind].append(error)
+    return {kind: torch.cat(parts) if parts else torch.empty(0) for kind, parts in errors.items()}
 
 
 def workspace_fraction(batch: SceneBatch) -> float:
@@ -113,27 +88,56 @@ def workspace_fraction(batch: SceneBatch) -> float:
     return int(batch.in_workspace.sum()) / present
 
 
+def _chunk_errors(batch: SceneBatch, supports: Sequence[Support]) -> list[tuple[str, Tensor]]:
+    """The errors (K,) of each support's objects."""
+    gaps = torch.stack([_height_gap(batch, support) for support in supports])  # (S, B, N)
+    catch = torch.tensor([support.catch for support in supports]).to(gaps)[:, None, None]
+    nearest = (gaps - 1.0 * ((gaps <= catch) & (catch > 0))).argmin(dim=0)
+    error = gaps.gather(0, nearest[None])[0]
+    supported = torch.isfinite(error) & ~_contained(batch)
+    return [(support.kind, error[supported & (nearest == index)]) for index, support in enumerate(supports)]
+
+
 def _height_gap(batch: SceneBatch, support: Support) -> Tensor:
     """(B, N) m: |z - height of the nearest such support|, infinite where there is none."""
     z = batch.translations[..., 2].double()
     if support.on is None:
         gap = (z - support.height).abs()
     else:
-        xy = batch.translations[..., :2].double()
-        distance = (xy.unsqueeze(2) - xy.unsqueeze(1)).norm(dim=-1)  # (B, rider, supporter)
-        below = z.unsqueeze(1) < z.unsqueeze(2)
-        carries = _is_one_of(batch, support.on).unsqueeze(1) & below & (distance <= support.reach)
-        gaps = (z.unsqueeze(2) - z.unsqueeze(1) - support.height).abs()
-        gap = gaps.masked_fill(~carries, torch.inf).amin(dim=-1)
-    if support.riders is not None:
-        gap = gap.masked_fill(~_is_one_of(batch, support.riders), torch.inf)
-    return gap
+        rise = z.unsqueeze(2) - z.unsqueeze(1)  # (B, rider, supporter)
+        carries = _near(batch, support.on, support.reach)
+        if support.height > 0:
+            carries &= rise > 0
+        gap = (rise - support.height).abs().masked_fill(~carries, torch.inf).amin(dim=-1)
+    riders = batch.is_free if support.riders is None else _is_one_of(batch, support.riders)
+    return gap.masked_fill(~riders, torch.inf)
+
+
+def _near(batch: SceneBatch, names: Sequence[str], reach: float) -> Tensor:
+    """(B, N, N) bool: the second is another object, one of the assets ``names``, within ``reach`` horizontally."""
+    xy = batch.translations[..., :2].double()
+    near = (xy.unsqueeze(2) - xy.unsqueeze(1)).norm(dim=-1) <= reach
+    near.diagonal(dim1=1, dim2=2).fill_(False)
+    return near & _is_one_of(batch, names).unsqueeze(1)
+
+
+def _contained(batch: SceneBatch, containers: Sequence[Container] = CONTAINERS) -> Tensor:
+    """(B, N) bool: the object lies in a container."""
+    z = batch.translations[..., 2].double()
+    rise = z.unsqueeze(2) - z.unsqueeze(1)  # (B, rider, container)
+    inside = torch.zeros_like(batch.is_empty)
+    for container in containers:
+        if not set(container.names) & set(batch.scene_type.assets):
+            continue
+        held = _near(batch, container.names, container.reach) & (rise > 0.01) & (rise <= container.depth)
+        inside |= held.any(dim=-1) & _is_one_of(batch, container.riders)
+    return inside
 
 
 def _is_one_of(batch: SceneBatch, names: Sequence[str]) -> Tensor:
     """(B, N) bool: the slot holds one of the assets ``names``."""
-    assets = get_scene_type(batch.scene_type).assets
-    wanted = [assets.index(name) for name in names]
+    assets = batch.scene_type.assets
+    wanted = [assets.index(name) for name in names if name in assets]
     return torch.isin(batch.categories, torch.tensor(wanted, device=batch.tensor.device))
 
 
