@@ -1,0 +1,116 @@
+"""How well a small CNN tells real scenes from samples, by their semantic renders."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from agents.evaluation.judging import Accuracy, Forward, JudgeConfig, Split, check_classes, judge
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import SceneBatch
+
+WIDTH, HEIGHT = 96, 72
+"""Default size of the renders, pixels."""
+
+_COLOR_FEATURES = 6
+
+
+def render_classifier_accuracy(
+    real: SceneBatch,
+    fake: SceneBatch,
+    *,
+    seeds: int = 10,
+    seed: int = 0,
+    width: int = WIDTH,
+    height: int = HEIGHT,
+    config: JudgeConfig | None = None,
+) -> Accuracy:
+    """Accuracy, on held-out scenes, of a CNN trained to tell renders of real scenes from renders of samples.
+
+    The renders are semantic: one class per asset, seen by the camera of the scene type. The protocol is that of
+    :func:`~agents.evaluation.classifier.classifier_accuracy`. A render cannot show millimetres: at the default size a
+    pixel of a table is about 2 cm wide.
+
+    Args:
+        real: real scenes; the two batches should share none.
+        fake: samples of the same scene type. Of the larger batch as many as the smaller has are drawn.
+        seeds: repetitions with other splits and weights.
+        seed: the first of them.
+        width: of the renders, pixels, at least 16.
+        height: likewise.
+        config: sizes of the parts, and how the classifier is trained.
+
+    Returns:
+        Accuracy as a fraction: 0.5 when nothing tells them apart.
+
+    Raises:
+        MissingDependencyError: PyBullet is not installed.
+        InvalidInputError: other scene types, fewer than 20 scenes in one batch, no seeds, renders below 16 pixels.
+    """
+    if real.scene_type.assets != fake.scene_type.assets:
+        raise InvalidInputError(
+            f"a classifier needs scenes of one type, got {real.scene_type.name!r} and {fake.scene_type.name!r}"
+        )
+    if min(width, height) < 16:
+        raise InvalidInputError(f"renders need at least 16 x 16 pixels, got width={width}, height={height}")
+    check_classes(len(real), len(fake), seeds)
+    images, colors = class_images([real, fake], width, height)
+
+    def prepare(split: Split) -> tuple[nn.Module, Forward]:
+        def forward(network: nn.Module, rows: Tensor) -> Tensor:
+            logits: Tensor = network(images[rows].long())
+            return logits
+
+        return _RenderNetwork(colors), forward
+
+    return judge(len(real), len(fake), prepare, seeds=seeds, seed=seed, config=config or JudgeConfig())
+
+
+def class_images(batches: list[SceneBatch], width: int, height: int) -> tuple[Tensor, int]:
+    """Semantic renders as class indices.
+
+    Args:
+        batches: scenes of one type, rendered one after the other.
+        width: pixels.
+        height: pixels.
+
+    Returns:
+        (B, H, W) uint8 indices of the colours seen in any of the renders, and how many colours there are.
+    """
+    from scene_envs.render import render
+
+    codes = np.concatenate([_codes(render(b, style="semantic", width=width, height=height)) for b in batches])
+    colors, index = np.unique(codes, return_inverse=True)
+    return torch.from_numpy(index.reshape(codes.shape).astype(np.uint8)), len(colors)
+
+
+def _codes(images: NDArray[np.uint8]) -> NDArray[np.int32]:
+    """(B, H, W) colours as 0xRRGGBB."""
+    red, green, blue = np.moveaxis(images.astype(np.int32), -1, 0)
+    codes: NDArray[np.int32] = (red << 16) | (green << 8) | blue
+    return codes
+
+
+class _RenderNetwork(nn.Module):
+    """Class images (B, H, W) to logits (B,): three strided convolutions, average and maximum over the image."""
+
+    def __init__(self, colors: int) -> None:
+        super().__init__()
+        self.color = nn.Embedding(colors, _COLOR_FEATURES)
+        widths = (_COLOR_FEATURES, 16, 24, 32)
+        layers: list[nn.Module] = []
+        for fan_in, fan_out in pairwise(widths):
+            layers += [nn.Conv2d(fan_in, fan_out, 3, stride=2, padding=1), nn.GroupNorm(4, fan_out), nn.GELU()]
+        self.trunk = nn.Sequential(*layers)
+        self.coarse = nn.AdaptiveAvgPool2d((3, 4))
+        self.head = nn.Sequential(nn.Dropout(0.2), nn.Linear(32 * 14, 32), nn.GELU(), nn.Linear(32, 1))
+
+    def forward(self, images: Tensor) -> Tensor:
+        features = self.trunk(self.color(images).permute(0, 3, 1, 2).contiguous())
+        summary = [self.coarse(features).flatten(1), features.mean(dim=(2, 3)), features.amax(dim=(2, 3))]
+        logits: Tensor = self.head(torch.cat(summary, dim=1))
+        return logits[:, 0]

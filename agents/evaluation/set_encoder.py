@@ -1,0 +1,133 @@
+"""A frozen set encoder: scenes of any type to features for the Fréchet scene distance."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import cache
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from agents.evaluation.scene_tokens import WAVE_FEATURES, SceneTokens, scene_tokens
+from agents.evaluation.set_network import SetNetwork, SetNetworkConfig
+from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.scene import SceneBatch
+
+SHIPPED = Path(__file__).parent / "weights" / "set_encoder.safetensors"
+"""The encoder that :func:`~agents.evaluation.frechet.frechet_scene_distance` uses."""
+
+FEATURES = 64
+"""Numbers per scene."""
+
+_OWN = 12 + WAVE_FEATURES + 3
+_CHUNK = 256
+
+
+class SetEncoder(nn.Module):
+    """Scenes of any type to 64 features; invariant to the order of slots and to empty slots.
+
+    Categories are read by asset name, so that scenes of a union of types and of its members are alike. An asset
+    outside the vocabulary becomes the *unknown* one, which the encoder knows by its bounding box: distances between
+    scenes of users' own assets see sizes, poses and gaps, and not names.
+
+    Args:
+        vocabulary: asset names known by name.
+        config: of the network; None takes the size of the shipped one.
+
+    >>> encoder = SetEncoder(("cafe_table", "teacup")).eval()
+    >>> encoder.features(SceneBatch.empty("dimsum_table", 2)).shape
+    torch.Size([2, 64])
+    """
+
+    def __init__(self, vocabulary: Sequence[str], config: SetNetworkConfig | None = None) -> None:
+        super().__init__()
+        self.vocabulary = tuple(vocabulary)
+        self.config = config or SetNetworkConfig(
+            _OWN, len(self.vocabulary) + 2, FEATURES, hidden=64, heads=4, blocks=2, dropout=0.0
+        )
+        self.network = SetNetwork(self.config)
+        self.mean: Tensor
+        self.std: Tensor
+        self.register_buffer("mean", torch.zeros(self.config.outputs))
+        self.register_buffer("std", torch.ones(self.config.outputs))
+
+    @property
+    def unknown(self) -> int:
+        """Token of an asset outside the vocabulary."""
+        return len(self.vocabulary)
+
+    def names(self, batch: SceneBatch) -> Tensor:
+        """(C + 1,) int64: the token of each category of the batch's scene type, empty last."""
+        index = {name: token for token, name in enumerate(self.vocabulary)}
+        tokens = [index.get(name, self.unknown) for name in batch.scene_type.assets]
+        return torch.tensor([*tokens, self.unknown + 1])
+
+    def forward(self, tokens: SceneTokens, names: Tensor) -> Tensor:
+        """Features (B, F) before standardisation; ``names`` (C + 1,) gives the token of each category."""
+        size = (tokens.extents.clamp(min=1e-3) / 0.1).log() * tokens.present[..., None]
+        own = torch.cat([tokens.poses, tokens.waves, size], dim=-1)
+        result: Tensor = self.network(
+            own, names[tokens.categories], tokens.offsets, names[tokens.neighbours], tokens.present
+        )
+        return result
+
+    @torch.no_grad()
+    def features(self, batch: SceneBatch) -> Tensor:
+        """(B, F) float32 standardised features, on the CPU."""
+        was_training = self.training
+        self.eval()
+        names = self.names(batch)
+        parts = [batch[start : start + _CHUNK].to("cpu") for start in range(0, len(batch), _CHUNK)]
+        raw = torch.cat([self(scene_tokens(part), names) for part in parts]) if parts else torch.empty(0, FEATURES)
+        self.train(was_training)
+        return (raw - self.mean) / self.std
+
+    # -- files ----------------------------------------------------------------------------------
+
+    def save(self, path: str | os.PathLike[str], note: str = "") -> Path:
+        """Write weights (float16), vocabulary and size to one ``.safetensors`` file.
+
+        Args:
+            path: of the file.
+            note: how the encoder was made, kept in the file.
+        """
+        from safetensors.torch import save_file
+
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        weights = {name: value.detach().half().contiguous() for name, value in self.state_dict().items()}
+        metadata = {"vocabulary": json.dumps(self.vocabulary), "config": json.dumps(asdict(self.config)), "note": note}
+        partial = path.with_name(path.name + ".partial")
+        save_file(weights, partial, metadata)
+        os.replace(partial, path)
+        return path
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str] | None = None) -> SetEncoder:
+        """The encoder in ``path``; the shipped one when None. It is frozen, and in evaluation mode.
+
+        Raises:
+            InvalidInputError: no such file.
+            CorruptFileError: not a file written by :meth:`save`.
+        """
+        return _load(str(SHIPPED if path is None else Path(path).resolve()))
+
+
+@cache
+def _load(path: str) -> SetEncoder:
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, "pt") as file:
+            metadata = file.metadata() or {}
+            encoder = SetEncoder(json.loads(metadata["vocabulary"]), SetNetworkConfig(**json.loads(metadata["config"])))
+            encoder.load_state_dict({name: file.get_tensor(name).float() for name in file.keys()})  # noqa: SIM118
+    except FileNotFoundError:
+        raise InvalidInputError(f"no set encoder at {path!r}; train_set_encoder makes one") from None
+    except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise CorruptFileError(f"{path!r} is not a set encoder written by SetEncoder.save: {error}") from error
+    return encoder.eval().requires_grad_(False)
