@@ -9,9 +9,13 @@ from torch import Tensor, nn
 
 from agents.denoiser import autocast
 from agents.diffusion import CategoricalProcess, GaussianProcess
+from agents.diffusion.gaussian import Moments
 from agents.diffusion.reverse_steps import state_of
 from agents.networks.mixed_flux import POSE, MixedFlux, MixedFluxConfig
 from agents.networks.text import TextConfig, TextEncoder
+
+_LARGEST_INPUT = 20.0
+"""Bound on scaled network inputs: a pose that its category never has should not drown the others."""
 
 Text = tuple[Tensor, Tensor]
 """Tokens (B, L, W) and their mask (B, L)."""
@@ -27,7 +31,7 @@ class MixedPriorConfig:
         network: size of its denoiser.
         schedule: noise schedule of the poses, ``"karras"``, ``"linear"`` or ``"cosine"``.
         prediction: ``"karras"``, ``"epsilon"``, ``"x0"`` or ``"v"``, of the poses.
-        kernel: of the categories, ``"mask_and_replace"``, ``"absorbing"`` or ``"uniform"``.
+        kernel: of the categories, one of :data:`~agents.diffusion.CATEGORICAL_KERNELS`.
         num_timesteps: T of both.
         noise_mean: mean of ln(noise-to-signal) over training timesteps.
         noise_std: its standard deviation.
@@ -37,6 +41,9 @@ class MixedPriorConfig:
         auxiliary: weight of the cross-entropy in the bound.
         given_share: share of training scenes in which some poses or categories are given, for inpainting.
         text: size and vocabulary of the text encoder; None for a prior that reads no prompts.
+        noise_floor: lowest noise-to-signal ratio of the ``"karras"`` schedule, in normalised units.
+        timesteps: law of training timesteps, ``"lognormal"`` (of the noise-to-signal ratio) or ``"uniform"``.
+        loss_weighting: of the pose loss by timestep, ``"none"`` or ``"min_snr"``.
         clip: bound on denoised poses while sampling, normalised units; 0 for none (1 is the paper's).
     """
 
@@ -55,6 +62,9 @@ class MixedPriorConfig:
     auxiliary: float = 5e-4
     given_share: float = 0.3
     text: TextConfig | None = None
+    noise_floor: float = 0.002
+    timesteps: str = "lognormal"
+    loss_weighting: str = "none"
     clip: float = 0.0
 
 
@@ -103,11 +113,26 @@ class MixedDenoiser(nn.Module):
         text_encoder: TextEncoder | None = None,
     ) -> None:
         super().__init__()
+        by_category = poses.preconditioning.by_category
+        mean, std = (None, None) if by_category is None else by_category.given_state(categories)
+        self._mean: Tensor | None
+        self._std: Tensor | None
+        self.register_buffer("_mean", mean, persistent=False)
+        self.register_buffer("_std", std, persistent=False)
         self.network = network
         self.precision = torch.float32
         self.text_encoder = text_encoder
         self.poses = poses
         self.categories = categories
+
+    def moments(self, states: Tensor, t: Tensor) -> Moments | None:
+        """Mean and std (B, N, 12) of poses whose categories are in ``states`` (B, N) at ``t`` (B,).
+
+        None where the preconditioning does not tell categories apart.
+        """
+        if self._mean is None or self._std is None:
+            return None
+        return self._mean[t[:, None], states], self._std[t[:, None], states]
 
     def output(
         self, x_t: Tensor, t: Tensor, given: Given | None = None, text: tuple[Tensor, Tensor] | None = None
@@ -124,7 +149,8 @@ class MixedDenoiser(nn.Module):
         alpha, _ = self.poses.rates(t, pose)
         ratio = (self.poses.sigma[t.cpu()] / self.poses.alpha[t.cpu()]).to(x_t.device)
         level = ratio[:, None].expand(pose.shape[:2])
-        scaled, position = self.poses.network_input(pose, t), pose[..., :3] / alpha
+        scaled = self.poses.network_input(pose, t, self.moments(states, t)).clamp(-_LARGEST_INPUT, _LARGEST_INPUT)
+        position = pose[..., :3] / alpha
         if given is not None:
             exact = given.pose[..., None]
             scaled = torch.where(exact, self.poses.network_input(pose, torch.zeros_like(t)), scaled)
@@ -151,4 +177,5 @@ class MixedDenoiser(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """The clean pose (B, N, 12), normalised, and the logits of the clean category (B, N, K)."""
         output, logits = self.output(x_t, t, given, text)
-        return self.poses.x0_from_output(x_t[..., :POSE], t, output), logits
+        moments = self.moments(state_of(x_t[..., POSE:]), t)
+        return self.poses.x0_from_output(x_t[..., :POSE], t, output, moments), logits

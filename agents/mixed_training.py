@@ -35,7 +35,8 @@ def mixed_loss(
     x_t = x_t if given is None else given.write(x_t)
     output, logits = prior.denoiser.output(x_t, t, given, prior.unconditional(len(x0)) if text is None else text)
     pose0, category0 = x0[..., :POSE], x0[..., POSE:].argmax(dim=-1)
-    error = output - prior.process.target(pose0, x_t[..., :POSE], t, noise[..., :POSE])
+    moments = prior.denoiser.moments(state_of(x_t[..., POSE:]), t)
+    error = output - prior.process.target(pose0, x_t[..., :POSE], t, noise[..., :POSE], moments)
     weight = prior.loss_weight(x0.shape[1])[None, :, :POSE].to(device).expand(len(x0), -1, -1)
     empty = (category0 == prior.num_categories - 1)[..., None]
     weight = torch.where(empty, _EMPTY_WEIGHT * weight, weight)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from agents.continuous_prior import ContinuousPrior
 from agents.denoiser import PriorConfig
-from agents.diffusion import Preconditioning
+from agents.diffusion import CategoryMoments, Preconditioning
 from agents.mixed_denoiser import MixedPriorConfig
 from agents.mixed_prior import MixedPrior
 from agents.networks import FluxConfig, MixedFluxConfig, TextConfig, vocabulary
@@ -19,6 +20,9 @@ from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import POSE
 from scene_envs.scene_types import get_scene_type
+
+MOMENTS = ("category", "feature", "scene")
+"""Whose mean and standard deviation precondition a network."""
 
 
 def build_prior(
@@ -53,12 +57,47 @@ def build_prior(
         heads=config.heads,
         embedding=config.hidden,
         text_width=0 if text is None else text.width,
+        attention=config.attention,
+        frequencies=config.frequencies,
+        unit=_unit(normalizer),
     )
     mixed_config = MixedPriorConfig(
-        config.scene, raw.shape[1], mixed_network, config.schedule, config.prediction, config.kernel, text=text
+        config.scene,
+        raw.shape[1],
+        mixed_network,
+        config.schedule,
+        config.prediction,
+        config.kernel,
+        translation_weight=config.translation_weight,
+        category_loss=config.category_loss,
+        text=text,
+        noise_floor=config.noise_floor,
+        timesteps=config.timesteps,
+        loss_weighting=config.loss_weighting,
     )
     torch.manual_seed(config.seed)
-    some = raw[:20_000, fixed:]
-    present = some[..., -1] == 0
-    moments = Preconditioning.fit(normalizer.normalize(some[present])[..., : POSE.stop])
-    return MixedPrior(mixed_config, normalizer, moments)
+    return MixedPrior(mixed_config, normalizer, _pose_moments(config.moments, raw[:20_000, fixed:], normalizer))
+
+
+def _pose_moments(kind: str, raw: Tensor, normalizer: Normalizer) -> Preconditioning:
+    """Moments of the normalised poses of all objects of raw scenes (M, N, D)."""
+    if kind not in MOMENTS:
+        raise unknown_name("moments", kind, MOMENTS)
+    objects = raw[raw[..., -1] == 0]
+    poses = normalizer.normalize(objects)[..., : POSE.stop]
+    moments = Preconditioning.fit(poses)
+    if kind == "scene":
+        return moments.pooled()
+    if kind == "feature":
+        return moments
+    categories = raw[..., POSE.stop :].argmax(dim=-1).flatten()
+    every = normalizer.normalize(raw).flatten(0, 1)[:, : POSE.stop]
+    by_category = CategoryMoments.fit(every, categories, raw.shape[-1] - POSE.stop)
+    return replace(moments, by_category=by_category)
+
+
+def _unit(normalizer: Normalizer) -> tuple[float, float, float]:
+    """Metres per normalised unit along x, y, z; 0 along an axis that never varies."""
+    scale = normalizer.scale[:3]
+    x, y, z = torch.where(scale == 0, torch.zeros_like(scale), 1.0 / scale.clamp(min=1e-9)).tolist()
+    return x, y, z

@@ -28,11 +28,24 @@ class PretrainConfig:
         hidden: width of the network.
         depth: blocks of the network.
         heads: attention heads.
+        network: ``flux`` (ours), ``midiffusion`` or ``diffuscene``.
+        attention: of the mixed flux network: ``plain``, or ``distance`` for biases from distances between objects.
+        frequencies: octaves of Fourier features of each translation (flux only); 0 for none.
         prediction: what the network predicts (``karras``, ``epsilon``, ``x0``, ``v``).
         schedule: noise schedule (``karras``, ``linear``, ``cosine``).
+        noise_floor: lowest noise-to-signal ratio of the karras schedule, in normalised units.
+        timesteps: law of training timesteps, ``lognormal`` (of the noise-to-signal ratio) or ``uniform``.
+        loss_weighting: of the loss by timestep, ``none`` or ``min_snr``.
+        moments: whose mean and spread scale what the network reads and says: those of each ``category`` (mixed
+            priors), of each ``feature``, or of the ``scene`` as a whole.
+        translation_weight: weight of x, y, z in the loss, rotations having 1.
+        category_loss: of a mixed prior, ``cross_entropy`` of the clean category, or ``bound``, the paper's.
+        rotation: what a continuous prior diffuses as rotation: ``matrix``, ``quaternion`` or ``axis_angle``.
+        matmul_precision: of float32 products on GPUs, ``highest``, ``high`` (TF32) or ``medium``.
         compile: compile the network with ``torch.compile`` (needs a C++ compiler on CPU).
         process: ``continuous`` (categories as numbers) or ``mixed`` (categories as discrete states).
-        kernel: of the categories of a mixed prior (``mask_and_replace``, ``absorbing``, ``uniform``).
+        kernel: of the categories of a mixed prior (``mask_and_replace``, ``absorbing``, ``early_absorbing``,
+            ``uniform``).
         text: whether a mixed prior reads prompts.
         prompt_dropout: share of training scenes whose prompt is withheld, for classifier-free guidance.
         seed: of weights, batches and noise.
@@ -61,8 +74,19 @@ class PretrainConfig:
     hidden: int = 192
     depth: int = 6
     heads: int = 6
+    network: str = "flux"
+    attention: str = "plain"
+    frequencies: int = 8
     prediction: str = "karras"
     schedule: str = "karras"
+    noise_floor: float = 0.002
+    timesteps: str = "lognormal"
+    loss_weighting: str = "none"
+    moments: str = "feature"
+    translation_weight: float = 3.0
+    category_loss: str = "cross_entropy"
+    rotation: str = "matrix"
+    matmul_precision: str = "highest"
     process: str = "continuous"
     kernel: str = "mask_and_replace"
     text: bool = False

@@ -47,7 +47,6 @@ class ScenePrior(nn.Module, ABC):
     SceneBatch('dimsum_table', (2, 34, 20))
     """
 
-    conditional = False
     process_name = ""
     denoiser: Any
     """The network inside its process, a module with ``.network``."""
@@ -73,6 +72,11 @@ class ScenePrior(nn.Module, ABC):
         self._fixed: Tensor
         fixed = SceneBatch.empty(self.scene_type, 1, len(self.scene_type.fixed) or 1)
         self.register_buffer("_fixed", self.normalised(fixed)[0], persistent=False)
+
+    @property
+    def conditional(self) -> bool:
+        """Whether the prior reads prompts."""
+        return False
 
     def config_state(self) -> dict[str, Any]:
         """The ``prior`` entry of the configuration file."""

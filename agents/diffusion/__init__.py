@@ -7,7 +7,8 @@ from agents.diffusion.categorical import (
     make_categorical_schedule,
     sample_categorical,
 )
-from agents.diffusion.gaussian import PREDICTIONS, GaussianProcess, Preconditioning, lognormal_timesteps
+from agents.diffusion.gaussian import PREDICTIONS, TIMESTEP_LAWS, GaussianProcess, lognormal_timesteps, timestep_weights
+from agents.diffusion.moments import CategoryMoments, Preconditioning
 from agents.diffusion.residual import ResidualVariance
 from agents.diffusion.reverse_steps import (
     GaussianStep,
@@ -22,8 +23,10 @@ from agents.diffusion.step_tables import StepTable
 __all__ = [
     "CATEGORICAL_KERNELS",
     "PREDICTIONS",
+    "TIMESTEP_LAWS",
     "CategoricalProcess",
     "CategoricalSchedule",
+    "CategoryMoments",
     "GaussianProcess",
     "GaussianStep",
     "MixedStep",
@@ -38,4 +41,5 @@ __all__ = [
     "make_categorical_schedule",
     "make_schedule",
     "sample_categorical",
+    "timestep_weights",
 ]

@@ -27,7 +27,7 @@ class CategoricalSchedule:
     """Cumulative rates of a kernel at t = 0..T.
 
     Attributes:
-        name: ``"absorbing"``, ``"uniform"`` or ``"mask_and_replace"``.
+        name: ``"absorbing"``, ``"early_absorbing"``, ``"uniform"`` or ``"mask_and_replace"``.
         keep: (T + 1,) float64, probability that a category has not been touched; 1 at t = 0.
         mask: (T + 1,) float64, probability that it is the mask token; 0 at t = 0.
 
@@ -68,8 +68,16 @@ def _mask_and_replace(num_timesteps: int) -> tuple[Tensor, Tensor]:
     return torch.cat([one, keep]), torch.cat([0.0 * one, mask])
 
 
+def _early_absorbing(num_timesteps: int) -> tuple[Tensor, Tensor]:
+    """Absorbing from T/4 on: a chain has decided what there is before it decides to a centimetre where it is."""
+    u = torch.linspace(0, 1, num_timesteps + 1, dtype=torch.float64)
+    mask = torch.maximum(1e-5 * u, (u - 0.25) / 0.75)
+    return 1.0 - mask, mask
+
+
 CATEGORICAL_KERNELS: dict[str, Callable[[int], tuple[Tensor, Tensor]]] = {
     "absorbing": _absorbing,
+    "early_absorbing": _early_absorbing,
     "uniform": _uniform,
     "mask_and_replace": _mask_and_replace,
 }
@@ -117,7 +125,7 @@ class CategoricalProcess:
         keep, mask = self.rates(start, end)
         k = self.categories
         matrix = torch.zeros(k + 1, k + 1, dtype=torch.float64)
-        matrix[:k, :k] = (1.0 - keep - mask) / k
+        matrix[:k, :k] = _replaced(keep, mask) / k
         matrix[:k, :k] += keep * torch.eye(k, dtype=torch.float64)
         matrix[:k, k] = mask
         matrix[k, k] = 1.0
@@ -125,11 +133,12 @@ class CategoricalProcess:
 
     def marginal(self, x0: Tensor, t: Tensor) -> Tensor:
         """q(x_t | x_0) (..., K + 1) of data ``x0`` (...), int64, at timesteps ``t`` that broadcast against it."""
-        keep, mask = (rate[t.cpu()].to(x0.device, torch.float32) for rate in (self.schedule.keep, self.schedule.mask))
+        keep, mask = (rate[t.cpu()].to(x0.device) for rate in (self.schedule.keep, self.schedule.mask))
         keep, mask = torch.broadcast_tensors(_fit(keep, x0), _fit(mask, x0))
-        spread = ((1.0 - keep - mask).clamp(min=0.0) / self.categories).unsqueeze(-1)
+        spread = (_replaced(keep, mask) / self.categories).unsqueeze(-1)
         kept = keep.unsqueeze(-1) * F.one_hot(x0, self.categories)
-        return torch.cat([(kept + spread).expand(*x0.shape, self.categories), mask.expand(x0.shape)[..., None]], dim=-1)
+        rows = [(kept + spread).expand(*x0.shape, self.categories), mask.expand(x0.shape)[..., None]]
+        return torch.cat(rows, dim=-1).float()
 
     def add_noise(self, x0: Tensor, t: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """A sample of q(x_t | x_0), int64 like ``x0``."""
@@ -166,11 +175,11 @@ class CategoricalProcess:
         )
         k, masked = self.categories, (x_t == self.categories).unsqueeze(-1)
         here = F.one_hot(x_t.clamp(max=k - 1), k).double()
-        likelihood = torch.where(masked, mask_t, keep_t * here + (1.0 - keep_t - mask_t) / k)  # q(x_t | x_0)
+        likelihood = torch.where(masked, mask_t, keep_t * here + _replaced(keep_t, mask_t) / k)  # q(x_t | x_0)
         weight = torch.where(likelihood > _TINY, x0_probs.double() / likelihood.clamp(min=_TINY), 0.0)
         weight = weight / weight.sum(dim=-1, keepdim=True).clamp(min=_TINY)
-        back = torch.where(masked, mask_ts, keep_ts * here + (1.0 - keep_ts - mask_ts) / k)  # q(x_t | x_s)
-        states = back * (keep_s * weight + (1.0 - keep_s - mask_s) / k)
+        back = torch.where(masked, mask_ts, keep_ts * here + _replaced(keep_ts, mask_ts) / k)  # q(x_t | x_s)
+        states = back * (keep_s * weight + _replaced(keep_s, mask_s) / k)
         mask = torch.where(masked, mask_s, torch.zeros_like(mask_s))
         joint = torch.cat([states, mask.expand(*states.shape[:-1], 1)], dim=-1)
         result: Tensor = (joint / joint.sum(dim=-1, keepdim=True).clamp(min=_TINY)).to(x0_probs.dtype)
@@ -213,6 +222,12 @@ def sample_categorical(probs: Tensor, generator: torch.Generator | None = None) 
     cumulative = flat.cumsum(dim=-1)
     index = (cumulative < uniform * cumulative[:, -1:]).sum(dim=-1)
     return index.clamp(max=probs.shape[-1] - 1).reshape(probs.shape[:-1])
+
+
+def _replaced(keep: Tensor, mask: Tensor) -> Tensor:
+    """Probability of a uniformly drawn category; exactly 0 where rounding alone would leave some."""
+    rest = 1.0 - keep - mask
+    return torch.where(rest > 1e-12, rest, torch.zeros_like(rest))
 
 
 def _fit(rate: Tensor, like: Tensor) -> Tensor:

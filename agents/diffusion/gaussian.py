@@ -2,35 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
+from agents.diffusion.moments import Preconditioning
 from agents.diffusion.schedules import NoiseSchedule
 from scene_envs.errors import unknown_name
 
+Moments = tuple[Tensor, Tensor]
+"""Mean and standard deviation."""
+
 PREDICTIONS = ("karras", "epsilon", "x0", "v")
 """What a network may predict; see :meth:`GaussianProcess.x0_from_output`."""
-
-
-@dataclass(frozen=True)
-class Preconditioning:
-    """Per-feature first and second moments of normalised data.
-
-    Attributes:
-        mean: (D,) mean.
-        std: (D,) standard deviation, floored away from zero.
-    """
-
-    mean: Tensor
-    std: Tensor
-
-    @classmethod
-    def fit(cls, data: Tensor, floor: float = 0.05) -> Preconditioning:
-        """Moments of normalised scenes (..., D)."""
-        flat = data.reshape(-1, data.shape[-1]).double()
-        return cls(flat.mean(dim=0).float(), flat.std(dim=0).clamp(min=floor).float())
 
 
 class GaussianProcess:
@@ -74,15 +57,18 @@ class GaussianProcess:
 
     # -- what the network sees and says ---------------------------------------------------------
 
-    def network_input(self, x_t: Tensor, t: Tensor) -> Tensor:
-        """x_t scaled to unit variance per feature (Karras et al. 2022, c_in); raw for other predictions."""
+    def network_input(self, x_t: Tensor, t: Tensor, moments: Moments | None = None) -> Tensor:
+        """x_t scaled to unit variance per feature (Karras et al. 2022, c_in); raw for other predictions.
+
+        ``moments``, here and below, are mean and std that broadcast against ``x_t``; None takes those of all data.
+        """
         if self.prediction != "karras":
             return x_t
         alpha, sigma = self.rates(t, x_t)
-        mean, std = self._moments(x_t)
+        mean, std = self._moments(x_t, moments)
         return (x_t - alpha * mean) / (alpha**2 * std**2 + sigma**2).sqrt()
 
-    def x0_from_output(self, x_t: Tensor, t: Tensor, output: Tensor) -> Tensor:
+    def x0_from_output(self, x_t: Tensor, t: Tensor, output: Tensor, moments: Moments | None = None) -> Tensor:
         """The denoised scene x_0 that a network output stands for.
 
         ``karras``: skip and output scaling of Karras et al. (2022), Table 1, in variance-preserving
@@ -90,7 +76,7 @@ class GaussianProcess:
         """
         alpha, sigma = self.rates(t, x_t)
         if self.prediction == "karras":
-            mean, std = self._moments(x_t)
+            mean, std = self._moments(x_t, moments)
             variance = alpha**2 * std**2 + sigma**2
             skip = alpha * std**2 / variance
             return mean + skip * (x_t - alpha * mean) + sigma * std / variance.sqrt() * output
@@ -100,11 +86,11 @@ class GaussianProcess:
             return alpha * x_t - sigma * output
         return output
 
-    def target(self, x0: Tensor, x_t: Tensor, t: Tensor, noise: Tensor) -> Tensor:
+    def target(self, x0: Tensor, x_t: Tensor, t: Tensor, noise: Tensor, moments: Moments | None = None) -> Tensor:
         """The regression target whose plain mean square is the training loss."""
         alpha, sigma = self.rates(t, x0)
         if self.prediction == "karras":
-            mean, std = self._moments(x0)
+            mean, std = self._moments(x0, moments)
             variance = alpha**2 * std**2 + sigma**2
             skip = alpha * std**2 / variance
             residual = x0 - mean - skip * (x_t - alpha * mean)
@@ -144,8 +130,25 @@ class GaussianProcess:
             variance = variance + x0_weight**2 * residual.double().cpu()
         return x0_weight * x0 + xt_weight * x_t, variance.sqrt().float().to(x_t.device)
 
-    def _moments(self, like: Tensor) -> tuple[Tensor, Tensor]:
+    def _moments(self, like: Tensor, moments: Moments | None) -> Moments:
+        if moments is not None:
+            return moments
         return self.preconditioning.mean.to(like), self.preconditioning.std.to(like)
+
+
+TIMESTEP_LAWS = ("lognormal", "uniform")
+"""How training timesteps are drawn: the logarithm of the noise-to-signal ratio being normal, or all alike."""
+
+
+def timestep_weights(law: str, schedule: NoiseSchedule, mean: float, std: float) -> Tensor:
+    """(T + 1,) probabilities of drawing each timestep in training; ``mean`` and ``std`` as in the lognormal law."""
+    if law not in TIMESTEP_LAWS:
+        raise unknown_name("law of timesteps", law, TIMESTEP_LAWS)
+    if law == "lognormal":
+        return lognormal_timesteps(schedule, mean, std)
+    weight = torch.full((schedule.num_timesteps + 1,), 1.0 / schedule.num_timesteps, dtype=torch.float64)
+    weight[0] = 0.0
+    return weight
 
 
 def lognormal_timesteps(schedule: NoiseSchedule, mean: float, std: float) -> Tensor:

@@ -13,11 +13,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from agents.networks.distance_bias import DistanceBias
 from agents.networks.flux import SingleStreamBlock, timestep_embedding
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import InvalidInputError, unknown_name
 
 POSE = 12
 """Numbers of a pose: translation and rotation matrix."""
+ATTENTIONS = ("plain", "distance")
+"""How slots attend to each other: by content alone, or by their distances as well."""
 _TIME_WIDTH = 256
 
 
@@ -38,6 +41,8 @@ class MixedFluxConfig:
         frequencies: octaves of Fourier features of each translation, damped by the noise (0: none, as the paper).
         time_scale: what timesteps are multiplied by before they are embedded.
         flags: 1 to tell the network which poses and categories are given (inpainting), 0 as the paper.
+        attention: ``"plain"``, or ``"distance"`` for biases from the distances between slots.
+        unit: metres per normalised unit along x, y, z, which the distances need.
     """
 
     categories: int
@@ -52,8 +57,13 @@ class MixedFluxConfig:
     frequencies: int = 8
     time_scale: float = 1.0
     flags: int = 1
+    attention: str = "plain"
+    unit: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "unit", tuple(self.unit))  # a list, when it comes from JSON
+        if self.attention not in ATTENTIONS:
+            raise unknown_name("attention", self.attention, ATTENTIONS)
         if self.hidden % self.heads:
             raise InvalidInputError(f"hidden={self.hidden} is not a multiple of heads={self.heads}")
 
@@ -153,6 +163,8 @@ class MixedFlux(nn.Module):
         self.single_blocks = nn.ModuleList(
             SingleStreamBlock(hidden, config.heads, config.mlp_ratio) for _ in range(config.single_blocks)
         )
+        blocks = doubles + config.single_blocks
+        self.bias = DistanceBias(blocks, config.heads, config.unit) if config.attention == "distance" else None
         self.final_modulation = nn.Linear(hidden, 2 * hidden)
         self.final = nn.Linear(hidden, width)
         self.pose_out = nn.Sequential(nn.Linear(width, config.pose_head), nn.SiLU(), nn.Linear(config.pose_head, POSE))
@@ -196,24 +208,39 @@ class MixedFlux(nn.Module):
         if self.given_in is not None and given is not None:
             features = features + self.given_in(given)
         scene = self.scene_in(features)
-        count, mask = 0, None
-        if self.text_in is not None:
-            if text is None:
-                text = pose.new_zeros(pose.shape[0], 1, self.config.text_width)
-            words = self.text_in(text)
-            count = words.shape[1]
-            if text_mask is not None:
-                everywhere = text_mask.new_ones(pose.shape[:2])
-                mask = torch.cat([text_mask, everywhere], dim=1)[:, None, None]
+        words = self._words(text, pose)
+        count = 0 if words is None else words.shape[1]
+        masks = iter(self._masks(text_mask, count, position, noise_level, pose))
+        if words is not None:
             for block in self.double_blocks:
-                scene, words = block(scene, words, condition, mask)
+                scene, words = block(scene, words, condition, next(masks))
             scene = torch.cat([words, scene], dim=1)
         for block in self.single_blocks:
-            scene = block(scene, condition, mask)
+            scene = block(scene, condition, next(masks))
         scene = scene[:, count:]
         shift, scale = self.final_modulation(F.silu(condition)).unsqueeze(1).chunk(2, dim=-1)
         features = self.final((1 + scale) * F.layer_norm(scene, (self.config.hidden,), eps=1e-6) + shift)
         return self.pose_out(features), self.logits_out(features)
+
+    def _words(self, text: Tensor | None, pose: Tensor) -> Tensor | None:
+        if self.text_in is None:
+            return None
+        result: Tensor = self.text_in(pose.new_zeros(len(pose), 1, self.config.text_width) if text is None else text)
+        return result
+
+    def _masks(
+        self, text_mask: Tensor | None, count: int, position: Tensor | None, noise_level: Tensor | None, pose: Tensor
+    ) -> list[Tensor] | list[None]:
+        """What each block adds to its attention logits, or where it may attend; ``count`` tokens are text."""
+        mask = None
+        if text_mask is not None:
+            mask = torch.cat([text_mask, text_mask.new_ones(pose.shape[:2])], dim=1)[:, None, None]
+        if self.bias is None:
+            return [mask] * (len(self.double_blocks) + len(self.single_blocks))  # type: ignore[return-value]
+        if position is None or noise_level is None:
+            raise InvalidInputError("a network with attention='distance' needs position= and noise_level=")
+        biases = F.pad(self.bias(position, noise_level), (count, 0, count, 0))
+        return list(biases if mask is None else biases.masked_fill(~mask, -torch.inf))
 
     def _pose_features(self, pose: Tensor, position: Tensor | None, noise_level: Tensor | None) -> Tensor:
         if not self.config.frequencies:
