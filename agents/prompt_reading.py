@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,9 +14,6 @@ from agents.prompt_room import check_room, no_text
 from scene_envs.datasets.prompts.facts import SIDES
 from scene_envs.datasets.prompts.language import NUMBERS, ORDINALS, SIDE_PHRASES, Nouns
 from scene_envs.scene_types import SceneType
-
-if TYPE_CHECKING:
-    from agents.prior import ScenePrior
 
 
 class PromptReader:
@@ -36,7 +33,7 @@ class PromptReader:
     """
 
     denoiser: Any
-    scene_type: Any
+    scene_type: SceneType
 
     @property
     def conditional(self) -> bool:
@@ -49,7 +46,7 @@ class PromptReader:
         space: tuple[int, int] = self._encoder("").token_space
         return space
 
-    def read_prompts(self: ScenePrior | Any, prompts: Sequence[str], slots: int) -> Tensor:
+    def read_prompts(self, prompts: Sequence[str], slots: int) -> Tensor:
         """Token indices (B, L) int64 on the CPU, padded to the longest prompt there can be.
 
         Unknown words are listed in a warning.
@@ -96,9 +93,9 @@ class PromptReader:
         if self.conditional:
             self.denoiser.text_encoder.requires_grad_(False)
 
-    def _encoder(self: ScenePrior | Any, prompt: str) -> Any:
+    def _encoder(self, prompt: str) -> Any:
         if self.denoiser.text_encoder is None:
-            raise no_text(self, prompt)
+            raise no_text(self.scene_type, prompt)
         return self.denoiser.text_encoder
 
 

@@ -40,7 +40,7 @@ def check_prompts(prior: ScenePrior, prompt: Prompt, guidance: float, count: int
     if len(prompts) != count:
         raise InvalidInputError(f"{len(prompts)} prompts for {count} scenes; give one text, or one per scene")
     if not prior.conditional:
-        raise no_text(prior, next(iter(prompts), ""))
+        raise no_text(prior.scene_type, next(iter(prompts), ""))
     check_guidance("".join(prompts), guidance)
     check_room(prompts, prior.scene_type, slots)
     return prompts
@@ -55,10 +55,10 @@ def check_guidance(prompt: object, guidance: float) -> None:
         )
 
 
-def no_text(prior: ScenePrior, prompt: str) -> InvalidInputError:
+def no_text(scene_type: SceneType, prompt: str) -> InvalidInputError:
     """The error of a prompt for a prior that reads none."""
     return InvalidInputError(
-        f"this prior of {prior.scene_type.name!r} was trained without text and cannot follow the prompt {prompt!r}; "
+        f"this prior of {scene_type.name!r} was trained without text and cannot follow the prompt {prompt!r}; "
         "leave prompt= out, or load a prior that reads prompts"
     )
 

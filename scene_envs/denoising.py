@@ -1,6 +1,6 @@
 """The denoising MDP (Black et al. 2024, Sec. 4.2): one batched pure-torch core, which every face wraps.
 
-State (x_t, t), action x_{t-1}, transition the identity, reward at t = 0 only. In ``noise`` mode the action is
+State (x_t, t, prompt), action x_{t-1}, transition the identity, reward at t = 0 only. In ``noise`` mode the action is
 the noise of the prior's own reverse step instead, so that actions from N(0, I) reproduce the prior.
 """
 
@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from scene_envs.env_errors import ResetNeededError
+from scene_envs.env_prompts import EnvPrompts
 from scene_envs.env_reward import RewardScorer, Score
 from scene_envs.env_spaces import (
     STATE_BOUND,
@@ -67,6 +68,7 @@ class Trajectories:
         valid: (B,) bool.
         score: value, terms, credit and flags per object, on the prior's device.
         batch: the finished scenes x_0, on the CPU.
+        prompts: one per scene, or None without prompts.
     """
 
     scenes: Tensor
@@ -76,6 +78,7 @@ class Trajectories:
     valid: Tensor
     score: Score
     batch: SceneBatch
+    prompts: tuple[str, ...] | None = None
 
 
 class DenoisingCore:
@@ -95,6 +98,7 @@ class DenoisingCore:
         action_mode: ``"next_sample"`` or ``"noise"``.
         max_action: actions are clipped to ±max_action.
         workers: physics worker processes.
+        prompt, guidance: as for :class:`~scene_envs.env_prompts.EnvPrompts`.
 
     Raises:
         InvalidInputError, UnknownNameError: an argument is outside what is accepted.
@@ -119,6 +123,8 @@ class DenoisingCore:
         action_mode: str = "next_sample",
         max_action: float = 10.0,
         workers: int = 0,
+        prompt: Any = None,
+        guidance: float = 0.0,
     ) -> None:
         if not isinstance(num_envs, int) or num_envs < 1:
             raise InvalidInputError(f"num_envs={num_envs!r}: at least one environment is needed")
@@ -136,12 +142,22 @@ class DenoisingCore:
         self.table = self.prior.step_table(num_steps)
         self.num_steps = len(self.table)
         self.device = prior_device(self.prior)
+        if guidance and action_mode != "noise":
+            raise InvalidInputError(
+                f"guidance={guidance:g} acts on the prior's own steps, and action_mode={action_mode!r} takes none; "
+                "use action_mode='noise', or guide the policy"
+            )
+        self.prompting = EnvPrompts(self.prior, prompt, guidance, self.slots)
         self.scorer = RewardScorer(reward, workers)
-        self.term_names = self.scorer.probe(SceneBatch.empty(self.scene_type, 1, self.slots))
+        self.term_names = self.scorer.probe(
+            SceneBatch.empty(self.scene_type, 1, self.slots), [""] if self.prompting.given else None
+        )
         # timestep of step i, with the clean scene's 0 at the end
         self._schedule = np.append(self.table.timesteps.cpu().numpy(), 0).astype(np.int64)
         self._steps: IntArray = np.full(num_envs, -1, dtype=np.int64)  # -1: never reset
         self._x = torch.zeros(num_envs, self.slots, self.features, device=self.device)
+        self._prompts = [""] * num_envs
+        self._read_prompts()
 
     @property
     def features(self) -> int:
@@ -181,16 +197,24 @@ class DenoisingCore:
         """(B, N) int8: slots whose arg-max category is not empty."""
         return occupied(self._x)
 
+    @property
+    def prompts(self) -> tuple[str, ...] | None:
+        """The prompt of each episode, or None without prompts."""
+        return tuple(self._prompts) if self.prompting.given else None
+
     def observation(self) -> dict[str, Tensor]:
         """``scene`` (B, N, D) float32, ``timestep`` (B, 1) int64, ``object_mask`` (B, N) int8; all fresh tensors.
 
-        Prompt tokens join here when a prior reads prompts.
+        With a prior that reads prompts also ``prompt`` (B, L) int64 token indices, 0 being padding.
         """
-        return {
+        observed = {
             "scene": self._x.clone(),
             "timestep": torch.from_numpy(self.timesteps).unsqueeze(-1).to(self.device),
             "object_mask": occupied(self._x),
         }
+        if self._tokens is not None:
+            observed["prompt"] = self._tokens.clone()
+        return observed
 
     def info(self, result: StepResult | None = None) -> dict[str, np.ndarray]:
         """(B,) numbers: step, timestep, objects, reward_valid and ``term_<name>`` for each term of the reward.
@@ -213,12 +237,19 @@ class DenoisingCore:
     # -- transitions ----------------------------------------------------------------------------
 
     @torch.no_grad()
-    def reset(self, rngs: Sequence[np.random.Generator], mask: BoolArray | None = None) -> None:
+    def reset(
+        self,
+        rngs: Sequence[np.random.Generator],
+        mask: BoolArray | None = None,
+        prompts: Sequence[str] | None = None,
+    ) -> None:
         """Start new episodes.
 
         Args:
-            rngs: one NumPy generator per environment; each reset environment draws one seed from its own.
+            rngs: one NumPy generator per environment; each reset environment draws one seed from its own, and then
+                its prompt, if there are several.
             mask: (B,) bool, which environments; None means all.
+            prompts: B prompts, in place of drawn ones; those of environments that are not reset are ignored.
         """
         rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
         if len(rows) == 0:
@@ -226,6 +257,25 @@ class DenoisingCore:
         start = torch.cat([self._draw_start(rngs[row]) for row in rows.tolist()])
         self._x = _replace_rows(self._x, rows, start)
         self._steps[rows] = 0
+        if self.prompting.given:
+            for row in rows.tolist():
+                self._prompts[row] = self.prompting.draw(rngs[row]) if prompts is None else prompts[row]
+        self._read_prompts()
+
+    def _read_prompts(self) -> None:
+        """Token indices of the prompts; what the network makes of them is found when it is needed."""
+        reader = self.prompting.reader
+        self._tokens = None if reader is None else self.prompting.read(self._prompts).to(self.device)
+        self._text: tuple[Tensor, ...] | None = None
+
+    def _text_of(self, rows: IntArray) -> tuple[Tensor, ...] | None:
+        """What the prior's network attends to in ``rows``; encoded once per reset."""
+        reader = self.prompting.reader
+        if reader is None or self._tokens is None:
+            return None
+        if self._text is None:
+            self._text = tuple(reader.encode_tokens(self._tokens))
+        return tuple(_take_rows(part, rows) for part in self._text)
 
     def _draw_start(self, rng: np.random.Generator) -> Tensor:
         generator = torch.Generator(self.device).manual_seed(int(rng.integers(2**63)))
@@ -250,14 +300,19 @@ class DenoisingCore:
         given = given.clamp(-self.max_action, self.max_action)
         for step in np.unique(self._steps[rows]):
             group = rows[self._steps[rows] == step]
-            moved = self._transition(_take_rows(self._x, group), _take_rows(given, group), int(step))
+            moved = self._transition(_take_rows(self._x, group), _take_rows(given, group), int(step), group)
             self._x = _replace_rows(self._x, group, moved)
         self._steps[rows] += 1
         return self._judge(rows[self.finished[rows]])
 
-    def _transition(self, x_t: Tensor, action: Tensor, step: int) -> Tensor:
+    def _transition(self, x_t: Tensor, action: Tensor, step: int, rows: IntArray) -> Tensor:
         if self.action_mode == "noise":
-            action = self.prior.transition(x_t, step, self.table).from_noise(action)
+            text, reader = self._text_of(rows), self.prompting.reader
+            if text is None or reader is None:
+                reverse = self.prior.transition(x_t, step, self.table)
+            else:
+                reverse = reader.transition(x_t, step, self.table, text=text, guidance=self.prompting.guidance)
+            action = reverse.from_noise(action)
         return self.prior.clamp(action).clamp(-STATE_BOUND, STATE_BOUND)
 
     def _check_running(self, rows: IntArray) -> None:
@@ -278,7 +333,8 @@ class DenoisingCore:
         terminated[ended] = True
         together = len(ended) == count
         batch = self.scenes() if together else self.scenes()[torch.from_numpy(ended)]
-        score = self.scorer(batch).to(device)
+        prompts = None if self.prompts is None else [self._prompts[row] for row in ended.tolist()]
+        score = self.scorer(batch, prompts).to(device)
         reward = _replace_rows(reward, ended, score.value)
         valid = _replace_rows(valid, ended, score.valid)
         for name in terms.keys() & score.terms.keys():
@@ -290,14 +346,20 @@ class DenoisingCore:
     # -- whole trajectories ---------------------------------------------------------------------
 
     @torch.no_grad()
-    def collect(self, policy: Callable[[Tensor, int], Tensor], rngs: Sequence[np.random.Generator]) -> Trajectories:
+    def collect(
+        self,
+        policy: Callable[[Tensor, int], Tensor],
+        rngs: Sequence[np.random.Generator],
+        prompts: Sequence[str] | None = None,
+    ) -> Trajectories:
         """Reset every environment and run ``policy`` to the end; the same episodes as single steps give.
 
         Args:
             policy: ``(x_t (B, N, D), step) -> action (B, N, D)``; ``step`` indexes ``self.table``.
-            rngs: one NumPy generator per environment, for x_T.
+            rngs: one NumPy generator per environment, for x_T and prompts.
+            prompts: one per environment, in place of drawn ones.
         """
-        self.reset(rngs)
+        self.reset(rngs, prompts=prompts)
         scenes = torch.empty(self.num_steps + 1, *self._x.shape, device=self.device)
         actions = torch.empty(self.num_steps, *self._x.shape, device=self.device)
         scenes[0] = self._x
@@ -315,6 +377,7 @@ class DenoisingCore:
             valid=result.valid,
             score=result.score,
             batch=result.batch,
+            prompts=self.prompts,
         )
 
     def close(self) -> None:

@@ -20,14 +20,16 @@ Observation = dict[str, np.ndarray]
 
 
 def denoising_observation_space(core: DenoisingCore) -> spaces.Dict:
-    """The observation of one environment: ``scene``, ``timestep`` and ``object_mask``."""
-    return spaces.Dict(
-        {
-            "scene": scene_box(STATE_BOUND, core.slots, core.features),
-            "timestep": spaces.Box(0, core.first_timestep, (1,), np.int64),
-            "object_mask": spaces.MultiBinary(core.slots),
-        }
-    )
+    """What one environment shows: ``scene``, ``timestep``, ``object_mask``, and ``prompt`` if there can be one."""
+    observed: dict[str, spaces.Space[Any]] = {
+        "scene": scene_box(STATE_BOUND, core.slots, core.features),
+        "timestep": spaces.Box(0, core.first_timestep, (1,), np.int64),
+        "object_mask": spaces.MultiBinary(core.slots),
+    }
+    if core.prompting.space is not None:
+        length, words = core.prompting.space
+        observed["prompt"] = spaces.Box(0, words - 1, (length,), np.int64)
+    return spaces.Dict(observed)
 
 
 class DenoisingEnv(gym.Env[Any, np.ndarray]):
@@ -67,6 +69,7 @@ class DenoisingEnv(gym.Env[Any, np.ndarray]):
     | `scene` | `Box(-10, 10, (N, D), float32)` | x_t, normalised |
     | `timestep` | `Box(0, T, (1,), int64)` | diffusion timestep t, 0 when the scene is finished |
     | `object_mask` | `MultiBinary(N)` | slots whose arg-max category is not *empty* |
+    | `prompt` | `Box(0, V-1, (L,), int64)` | tokens of the prompt, 0 being padding; only if the prior reads prompts |
 
     `info` holds the same numbers at every reset and step: `step` (steps taken), `timestep`, `objects` (slots that
     are not empty, welded ones included), `reward_valid` (0 or 1), and `term_<name>` for each term of the reward
@@ -79,7 +82,9 @@ class DenoisingEnv(gym.Env[Any, np.ndarray]):
 
     ## Starting State
 
-    x_T: standard normal noise from `self.np_random`, known entries set. The same seed gives the same x_T.
+    x_T: standard normal noise from `self.np_random`, known entries set; and a prompt, drawn from it too if `prompt`
+    leaves a choice. The same seed gives the same x_T and the same prompt. In `noise` mode the prior follows the
+    prompt; in `next_sample` mode the agent does what it likes with it. Rewards see it in their context.
 
     ## Episode End
 
@@ -104,6 +109,8 @@ class DenoisingEnv(gym.Env[Any, np.ndarray]):
     | `max_action` | `10.0` | bound of the action space |
     | `workers` | `0` | processes for physics in the reward; 0 computes in this one |
     | `render_mode` | `None` | `"rgb_array"` renders the decoded current scene |
+    | `prompt` | `None` | one prompt, a list to draw from, or `"grammar"` for descriptions of the grammar's scenes |
+    | `guidance` | `0.0` | weight of classifier-free guidance in `noise` mode; needs a prompt |
 
     ## Vectorized environment
 
@@ -131,6 +138,8 @@ class DenoisingEnv(gym.Env[Any, np.ndarray]):
         max_action: float = 10.0,
         workers: int = 0,
         render_mode: str | None = None,
+        prompt: Any = None,
+        guidance: float = 0.0,
     ) -> None:
         self.render_mode = check_render_mode(render_mode)
         self.core = DenoisingCore(
@@ -143,6 +152,8 @@ class DenoisingEnv(gym.Env[Any, np.ndarray]):
             action_mode=action_mode,
             max_action=max_action,
             workers=workers,
+            prompt=prompt,
+            guidance=guidance,
         )
         self.observation_space = denoising_observation_space(self.core)
         self.action_space = scene_box(self.core.max_action, self.core.slots, self.core.features)
@@ -185,7 +196,7 @@ class DenoisingVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
 
     Args:
         num_envs: B.
-        scene, reward, num_steps, prior, slots, action_mode, max_action, workers, render_mode: as for
+        scene, reward, num_steps, prior, slots, action_mode, max_action, workers, render_mode, prompt, guidance: as for
             :class:`DenoisingEnv`.
         autoreset_mode: ``"SameStep"``, ``"NextStep"`` or ``"Disabled"``, or the Gymnasium enum.
 
@@ -216,6 +227,8 @@ class DenoisingVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         workers: int = 0,
         render_mode: str | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
+        prompt: Any = None,
+        guidance: float = 0.0,
     ) -> None:
         self.render_mode = check_render_mode(render_mode)
         self.autoreset_mode = _check_autoreset_mode(autoreset_mode)
@@ -229,6 +242,8 @@ class DenoisingVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
             action_mode=action_mode,
             max_action=max_action,
             workers=workers,
+            prompt=prompt,
+            guidance=guidance,
         )
         self.num_envs = num_envs
         self.metadata = {**type(self).metadata, "autoreset_mode": self.autoreset_mode}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -21,15 +21,17 @@ class DenoisingTorchRLEnv(EnvBase):
     """B denoising episodes as a batch-locked torchrl environment; its page is ``DenoisingEnv``'s.
 
     Keys: ``scene`` (B, N, D) float32, ``timestep`` (B, 1) int64, ``object_mask`` (B, N) int8, ``valid`` (B, 1) bool
-    (False where the reward could not score the finished scene, whose reward is then 0), ``action`` (B, N, D),
-    ``reward``, ``terminated``, ``truncated`` and ``done`` (B, 1). Everything lives on the prior's device.
+    (False where the reward could not score the finished scene, whose reward is then 0), ``prompt`` (B, L) int64 if the
+    prior reads prompts, ``action`` (B, N, D), ``reward``, ``terminated``, ``truncated`` and ``done`` (B, 1). Everything
+    lives on the prior's device.
 
     With the same seed, ``reset`` and ``step`` give bit for bit what ``DenoisingVectorEnv`` gives; :meth:`collect`
     gives the same episodes without a tensordict per step.
 
     Args:
         num_envs: B.
-        scene, reward, num_steps, prior, slots, action_mode, max_action, workers: as for ``DenoisingEnv``.
+        scene, reward, num_steps, prior, slots, action_mode, max_action, workers, prompt, guidance: as for
+            ``DenoisingEnv``.
 
     >>> from agents.prior import tiny_prior
     >>> env = DenoisingTorchRLEnv(2, prior=tiny_prior(), reward="object_count", num_steps=3)
@@ -48,6 +50,8 @@ class DenoisingTorchRLEnv(EnvBase):
         action_mode: str = "next_sample",
         max_action: float = 10.0,
         workers: int = 0,
+        prompt: Any = None,
+        guidance: float = 0.0,
     ) -> None:
         core = DenoisingCore(
             num_envs,
@@ -59,6 +63,8 @@ class DenoisingTorchRLEnv(EnvBase):
             action_mode=action_mode,
             max_action=max_action,
             workers=workers,
+            prompt=prompt,
+            guidance=guidance,
         )
         super().__init__(device=core.device, batch_size=torch.Size([num_envs]))
         self.core = core
@@ -78,6 +84,9 @@ class DenoisingTorchRLEnv(EnvBase):
             shape=batch,
             device=device,
         )
+        if core.prompting.space is not None:
+            length, words = core.prompting.space
+            self.observation_spec["prompt"] = Bounded(0, words - 1, (*batch, length), device, torch.int64)
         self.action_spec = Bounded(-core.max_action, core.max_action, scene_shape, device, torch.float32)
         self.reward_spec = Unbounded((*batch, 1), device, torch.float32)
         flag = Binary(1, (*batch, 1), device, torch.bool)
@@ -116,11 +125,12 @@ class DenoisingTorchRLEnv(EnvBase):
         }
         return TensorDict(fields, batch_size=self.batch_size, device=self.device)
 
-    def collect(self, policy: Callable[[Tensor, int], Tensor]) -> Trajectories:
+    def collect(self, policy: Callable[[Tensor, int], Tensor], prompts: Sequence[str] | None = None) -> Trajectories:
         """Reset, then run ``policy`` to the end of all episodes: what training calls.
 
         Args:
             policy: ``(x_t (B, N, D), step) -> action (B, N, D)``. Called without gradients.
+            prompts: one per episode, in place of drawn ones; an environment made without ``prompt`` ignores them.
 
         >>> from agents.prior import tiny_prior
         >>> prior = tiny_prior()
@@ -129,7 +139,7 @@ class DenoisingTorchRLEnv(EnvBase):
         >>> tuple(trajectories.scenes.shape), tuple(trajectories.reward.shape)
         ((4, 2, 34, 20), (2,))
         """
-        return self.core.collect(policy, self._rngs)
+        return self.core.collect(policy, self._rngs, prompts)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Stop physics workers, if any."""

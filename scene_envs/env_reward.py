@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
@@ -74,18 +74,18 @@ class RewardScorer:
         self.workers = workers
         self._pool: Any = None
 
-    def __call__(self, batch: SceneBatch) -> Score:
-        """Score ``batch``; rows that the reward could not score come back invalid with value 0."""
-        context = reward_context(pool=self._physics_pool())
+    def __call__(self, batch: SceneBatch, prompts: Sequence[str] | None = None) -> Score:
+        """Score ``batch``, made for ``prompts`` if any; rows that cannot be scored come back invalid with value 0."""
+        context = reward_context(pool=self._physics_pool(), prompts=None if prompts is None else tuple(prompts))
         output = import_module("rewards").evaluate_reward(self.reward, batch, context)
         valid = output.is_valid
         value = torch.where(valid, output.value, torch.zeros_like(output.value)).float()
         terms = {name: torch.nan_to_num(term.float(), 0.0, 0.0, 0.0) for name, term in output.terms.items()}
         return Score(value, valid, terms, output.per_object, output.object_flags)
 
-    def probe(self, empty: SceneBatch) -> tuple[str, ...]:
+    def probe(self, empty: SceneBatch, prompts: Sequence[str] | None = None) -> tuple[str, ...]:
         """Names of the terms this reward reports, found by scoring one empty scene in this process."""
-        context = reward_context(pool=None)
+        context = reward_context(pool=None, prompts=None if prompts is None else tuple(prompts))
         output = import_module("rewards").evaluate_reward(self.reward, empty, context)
         return tuple(sorted(output.terms))
 

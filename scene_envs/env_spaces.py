@@ -31,10 +31,6 @@ def resolve_scene_and_prior(scene: str | SceneType, prior: Any) -> tuple[SceneTy
             f"the prior makes scenes of {resolved.scene_type.name!r}, the environment asks for {scene_type.name!r}; "
             f"pass scene={resolved.scene_type.name!r} or another prior"
         )
-    if resolved.conditional:
-        raise InvalidInputError(
-            "this prior reads prompts and the v0 environments have none; use an unconditional prior"
-        )
     return scene_type, resolved
 
 

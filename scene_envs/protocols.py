@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib import import_module
 from typing import Any, Protocol, runtime_checkable
 
@@ -90,6 +91,42 @@ class PriorLike(Protocol):
         self, batch: SceneBatch, mask: Tensor, *, num_steps: int, generators: list[Generator] | None = None
     ) -> SceneBatch:
         """Regenerate the slots where ``mask`` (B, N) is True, keep the others bit-identical."""
+        ...
+
+
+class PromptedPriorLike(PriorLike, Protocol):
+    """A prior whose ``conditional`` is True: it reads prompts; see ``agents.prompt_reading.PromptReader``."""
+
+    @property
+    def prompt_space(self) -> tuple[int, int]:
+        """How many tokens a prompt has at most, and how many different ones there are; 0 is padding."""
+        ...
+
+    def read_prompts(self, prompts: Sequence[str], slots: int) -> Tensor:
+        """Token indices (B, L) int64 on the CPU; ``""`` stands for no prompt."""
+        ...
+
+    def encode_tokens(self, indices: Tensor) -> Any:
+        """What the network attends to, from token indices (B, L)."""
+        ...
+
+    def transition(
+        self, x_t: Tensor, step: int, table: StepTableLike, *, text: Any = None, guidance: float = 0.0
+    ) -> Any:
+        """As for any prior, given ``text`` as :meth:`encode_tokens` returns it."""
+        ...
+
+    def inpaint(
+        self,
+        batch: SceneBatch,
+        mask: Tensor,
+        *,
+        num_steps: int,
+        generators: list[Generator] | None = None,
+        prompt: str | Sequence[str] | None = None,
+        guidance: float = 0.0,
+    ) -> SceneBatch:
+        """As for any prior, the whole scenes following ``prompt``."""
         ...
 
 
