@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from agents.denoiser import autocast
 from agents.diffusion import CategoricalProcess, GaussianProcess
@@ -13,6 +15,14 @@ from agents.diffusion.gaussian import Moments
 from agents.diffusion.reverse_steps import state_of
 from agents.networks.mixed_flux import POSE, MixedFlux, MixedFluxConfig
 from agents.networks.text import TextConfig, TextEncoder
+from agents.packing import run_packed, take_slots
+from scene_envs.errors import InvalidInputError, unknown_name
+
+EMPTY_SLOTS = ("attended", "dropped")
+"""What a network does with slots that are known to be empty."""
+
+_CERTAIN = 30.0
+"""How far, in nats, other categories are behind one that is known."""
 
 _LARGEST_INPUT = 20.0
 """Bound on scaled network inputs: a pose that its category never has should not drown the others."""
@@ -42,8 +52,11 @@ class MixedPriorConfig:
         given_share: share of training scenes in which some poses or categories are given, for inpainting.
         text: size and vocabulary of the text encoder; None for a prior that reads no prompts.
         noise_floor: lowest noise-to-signal ratio of the ``"karras"`` schedule, in normalised units.
+        noise_ceiling: highest.
         timesteps: law of training timesteps, ``"lognormal"`` (of the noise-to-signal ratio) or ``"uniform"``.
         loss_weighting: of the pose loss by timestep, ``"none"`` or ``"min_snr"``.
+        empty_slots: ``"dropped"`` leaves slots that are known to be empty out of the network, which saves most of the
+            work at low noise and needs an absorbing kernel; ``"attended"`` is the paper's.
         clip: bound on denoised poses while sampling, normalised units; 0 for none (1 is the paper's).
     """
 
@@ -63,8 +76,10 @@ class MixedPriorConfig:
     given_share: float = 0.3
     text: TextConfig | None = None
     noise_floor: float = 0.002
+    noise_ceiling: float = 80.0
     timesteps: str = "lognormal"
     loss_weighting: str = "none"
+    empty_slots: str = "attended"
     clip: float = 0.0
 
 
@@ -111,8 +126,17 @@ class MixedDenoiser(nn.Module):
         poses: GaussianProcess,
         categories: CategoricalProcess,
         text_encoder: TextEncoder | None = None,
+        empty_slots: str = "attended",
     ) -> None:
         super().__init__()
+        if empty_slots not in EMPTY_SLOTS:
+            raise unknown_name("treatment of empty slots", empty_slots, EMPTY_SLOTS)
+        self.drops_empty = empty_slots == "dropped"
+        if self.drops_empty and not categories.only_absorbs:
+            raise InvalidInputError(
+                f"empty_slots='dropped' needs a kernel that only absorbs, not {categories.schedule.name!r}: "
+                "what is seen to be empty must be empty; take kernel='early_absorbing'"
+            )
         by_category = poses.preconditioning.by_category
         mean, std = (None, None) if by_category is None else by_category.given_state(categories)
         self._mean: Tensor | None
@@ -156,11 +180,22 @@ class MixedDenoiser(nn.Module):
             scaled = torch.where(exact, self.poses.network_input(pose, torch.zeros_like(t)), scaled)
             position = torch.where(exact, pose[..., :3], position)
             level = torch.where(given.pose, torch.zeros_like(level), level)
+        time = (t - 1).to(pose.dtype) if not self.network.config.frequencies else 250.0 * ratio.log()
+        inputs = [scaled, states, position, level, *([] if given is None else [given.flags()])]
+        if self.drops_empty:
+            output, logits = self._on_present(inputs, time, text)
+            return output, torch.where((states < self.categories.categories)[..., None], self._certain(states), logits)
+        return self._run(inputs, time, text)
+
+    def _run(
+        self, inputs: Sequence[Tensor], time: Tensor, text: Text | None, slot_mask: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """The network on scaled poses, states, positions, noise levels and, where there are any, given flags."""
+        scaled, states, position, level, *flags = inputs
         tokens, mask = (None, None) if text is None else text
-        network: MixedFlux = self.network
-        time = (t - 1).to(pose.dtype) if not network.config.frequencies else 250.0 * ratio.log()
-        with autocast(x_t, self.precision):
-            output, logits = network(
+        extra = {} if slot_mask is None else {"slot_mask": slot_mask}
+        with autocast(scaled, self.precision):
+            output, logits = self.network(
                 scaled,
                 states,
                 time,
@@ -168,9 +203,25 @@ class MixedDenoiser(nn.Module):
                 text_mask=mask,
                 position=position,
                 noise_level=level,
-                given=None if given is None else given.flags(),
+                given=flags[0] if flags else None,
+                **extra,
             )
-        return output.to(x_t.dtype), logits.to(x_t.dtype)
+        return output.to(scaled.dtype), logits.to(scaled.dtype)
+
+    def _on_present(self, inputs: Sequence[Tensor], time: Tensor, text: Text | None) -> tuple[Tensor, Tensor]:
+        """The network on the slots that are not known to be empty; 0 on the others."""
+        present = inputs[1] != self.categories.categories - 1
+
+        def run(rows: Tensor, index: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+            words = None if text is None else (text[0][rows], text[1][rows])
+            return self._run([take_slots(x, rows, index) for x in inputs], time[rows], words, mask)
+
+        return run_packed(present, run, (POSE, self.categories.categories))
+
+    def _certain(self, states: Tensor) -> Tensor:
+        """(B, N, K) logits of categories that are what they are seen to be."""
+        count = self.categories.categories
+        return _CERTAIN * (F.one_hot(states.clamp(max=count - 1), count).float() - 1.0)
 
     def forward(
         self, x_t: Tensor, t: Tensor, given: Given | None = None, text: tuple[Tensor, Tensor] | None = None

@@ -81,13 +81,15 @@ class MixedPrior(PromptReader, ScenePrior):
             raise unknown_name("category loss", config.category_loss, CATEGORY_LOSSES)
         self.mixed = config
         self._keep(config, normalizer, preconditioning, card, residual)
-        schedule = make_schedule(config.schedule, config.num_timesteps, config.noise_floor)
+        schedule = make_schedule(config.schedule, config.num_timesteps, config.noise_floor, config.noise_ceiling)
         self.process = GaussianProcess(schedule, config.prediction, preconditioning)
         self.categories = CategoricalProcess(
             make_categorical_schedule(config.kernel, config.num_timesteps), config.network.categories
         )
         encoder = None if config.text is None else TextEncoder(config.text)
-        self.denoiser = MixedDenoiser(MixedFlux(config.network), self.process, self.categories, encoder)
+        self.denoiser = MixedDenoiser(
+            MixedFlux(config.network), self.process, self.categories, encoder, config.empty_slots
+        )
         self._timestep_weights = timestep_weights(config.timesteps, schedule, config.noise_mean, config.noise_std)
 
     @classmethod

@@ -45,6 +45,8 @@ def mixed_loss(
     if given is not None:
         weight = weight * (~given.pose)[..., None]
         drawn = drawn * (~given.category)
+    if prior.denoiser.drops_empty:  # what is seen is certain
+        drawn = drawn * (state_of(x_t[..., POSE:]) == prior.num_categories)
     pose_loss = (error.square() * weight).sum(dim=(1, 2)) / weight.sum(dim=(1, 2)).clamp(min=1.0)
     if config.category_loss == "bound":
         states = x_t[..., POSE:]

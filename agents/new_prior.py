@@ -72,6 +72,8 @@ def build_prior(
         category_loss=config.category_loss,
         text=text,
         noise_floor=config.noise_floor,
+        noise_ceiling=config.noise_ceiling,
+        empty_slots=config.empty_slots,
         timesteps=config.timesteps,
         loss_weighting=config.loss_weighting,
     )

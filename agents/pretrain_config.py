@@ -34,6 +34,7 @@ class PretrainConfig:
         prediction: what the network predicts (``karras``, ``epsilon``, ``x0``, ``v``).
         schedule: noise schedule (``karras``, ``linear``, ``cosine``).
         noise_floor: lowest noise-to-signal ratio of the karras schedule, in normalised units.
+        noise_ceiling: highest noise-to-signal ratio of the karras schedule.
         timesteps: law of training timesteps, ``lognormal`` (of the noise-to-signal ratio) or ``uniform``.
         loss_weighting: of the loss by timestep, ``none`` or ``min_snr``.
         moments: whose mean and spread scale what the network reads and says: those of each ``category`` (mixed
@@ -46,6 +47,8 @@ class PretrainConfig:
         process: ``continuous`` (categories as numbers) or ``mixed`` (categories as discrete states).
         kernel: of the categories of a mixed prior (``mask_and_replace``, ``absorbing``, ``early_absorbing``,
             ``uniform``).
+        empty_slots: whether slots known to be empty are ``attended`` (the paper's) or ``dropped`` from the network of a
+            mixed prior, which needs an absorbing kernel and saves most of the work.
         text: whether a mixed prior reads prompts.
         prompt_dropout: share of training scenes whose prompt is withheld, for classifier-free guidance.
         seed: of weights, batches and noise.
@@ -80,6 +83,7 @@ class PretrainConfig:
     prediction: str = "karras"
     schedule: str = "karras"
     noise_floor: float = 0.002
+    noise_ceiling: float = 80.0
     timesteps: str = "lognormal"
     loss_weighting: str = "none"
     moments: str = "feature"
@@ -89,6 +93,7 @@ class PretrainConfig:
     matmul_precision: str = "highest"
     process: str = "continuous"
     kernel: str = "mask_and_replace"
+    empty_slots: str = "attended"
     text: bool = False
     prompt_dropout: float = 0.1
     compile: bool = False

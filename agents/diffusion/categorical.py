@@ -69,9 +69,9 @@ def _mask_and_replace(num_timesteps: int) -> tuple[Tensor, Tensor]:
 
 
 def _early_absorbing(num_timesteps: int) -> tuple[Tensor, Tensor]:
-    """Absorbing from T/4 on: a chain has decided what there is before it decides to a centimetre where it is."""
+    """Absorbing from T/2 on: a chain has decided what there is before it decides where, from coarse to fine."""
     u = torch.linspace(0, 1, num_timesteps + 1, dtype=torch.float64)
-    mask = torch.maximum(1e-5 * u, (u - 0.25) / 0.75)
+    mask = torch.maximum(1e-5 * u, (u - 0.5) / 0.5)
     return 1.0 - mask, mask
 
 
@@ -109,6 +109,11 @@ class CategoricalProcess:
     def __init__(self, schedule: CategoricalSchedule, categories: int) -> None:
         self.schedule = schedule
         self.categories = categories
+
+    @property
+    def only_absorbs(self) -> bool:
+        """Whether a category is either what it was or masked: what is seen can be trusted."""
+        return not bool(_replaced(self.schedule.keep, self.schedule.mask).any())
 
     # -- forward --------------------------------------------------------------------------------
 

@@ -72,12 +72,14 @@ _SCHEDULES: dict[str, Callable[[int], Tensor]] = {
 }
 
 
-def make_schedule(name: str, num_timesteps: int = 1000, noise_floor: float = 0.002) -> NoiseSchedule:
-    """The schedule called ``name`` with ``num_timesteps`` levels; ``"karras"`` starts at ``noise_floor``."""
+def make_schedule(
+    name: str, num_timesteps: int = 1000, noise_floor: float = 0.002, noise_ceiling: float = 80.0
+) -> NoiseSchedule:
+    """The schedule called ``name`` with ``num_timesteps`` levels; ``"karras"`` goes from floor to ceiling."""
     if name not in _SCHEDULES:
         raise unknown_name("noise schedule", name, _SCHEDULES)
     if num_timesteps < 2:
         raise InvalidInputError(f"a noise schedule needs at least 2 timesteps, got {num_timesteps}")
     if name == "karras":
-        return NoiseSchedule(name, karras_alpha_bar(num_timesteps, noise_floor))
+        return NoiseSchedule(name, karras_alpha_bar(num_timesteps, noise_floor, noise_ceiling))
     return NoiseSchedule(name, _SCHEDULES[name](num_timesteps))

@@ -187,6 +187,7 @@ class MixedFlux(nn.Module):
         position: Tensor | None = None,
         noise_level: Tensor | None = None,
         given: Tensor | None = None,
+        slot_mask: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Predict.
 
@@ -199,6 +200,7 @@ class MixedFlux(nn.Module):
             position: (B, N, 3) translations in signal units, for the Fourier features.
             noise_level: (B, N) noise-to-signal ratio of ``position``.
             given: (B, N) int64, 1 where the pose is given, plus 2 where the category is; None for nowhere.
+            slot_mask: (B, N) bool, False for filling that nothing may attend to; None where there is none.
 
         Returns:
             pose output (B, N, 12) and logits (B, N, K) of the clean category.
@@ -210,7 +212,7 @@ class MixedFlux(nn.Module):
         scene = self.scene_in(features)
         words = self._words(text, pose)
         count = 0 if words is None else words.shape[1]
-        masks = iter(self._masks(text_mask, count, position, noise_level, pose))
+        masks = iter(self._masks(text_mask, slot_mask, count, position, noise_level, pose))
         if words is not None:
             for block in self.double_blocks:
                 scene, words = block(scene, words, condition, next(masks))
@@ -229,12 +231,20 @@ class MixedFlux(nn.Module):
         return result
 
     def _masks(
-        self, text_mask: Tensor | None, count: int, position: Tensor | None, noise_level: Tensor | None, pose: Tensor
+        self,
+        text_mask: Tensor | None,
+        slot_mask: Tensor | None,
+        count: int,
+        position: Tensor | None,
+        noise_level: Tensor | None,
+        pose: Tensor,
     ) -> list[Tensor] | list[None]:
         """What each block adds to its attention logits, or where it may attend; ``count`` tokens are text."""
         mask = None
-        if text_mask is not None:
-            mask = torch.cat([text_mask, text_mask.new_ones(pose.shape[:2])], dim=1)[:, None, None]
+        if text_mask is not None or slot_mask is not None:
+            everywhere = torch.ones(len(pose), count + pose.shape[1], dtype=torch.bool, device=pose.device)
+            words = everywhere[:, :count] if text_mask is None or not count else text_mask
+            mask = torch.cat([words, everywhere[:, count:] if slot_mask is None else slot_mask], dim=1)[:, None, None]
         if self.bias is None:
             return [mask] * (len(self.double_blocks) + len(self.single_blocks))  # type: ignore[return-value]
         if position is None or noise_level is None:
