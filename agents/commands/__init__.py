@@ -17,6 +17,7 @@ COMMANDS = {
     "export": "write scenes for simulators and viewers: URDF, SDF, Drake, MJCF, USD, GLB, arrays",
     "view": "write a page that shows scenes in a browser: a dataset, samples, a prior or a grammar",
     "evaluate": "measure the samples of a prior against real scenes",
+    "tables": "train and measure priors for the paper's tables and that of precision",
     "priors": "list the priors that ship with the package",
     "rewards": "list the rewards, those of installed packages included",
     "import-checkpoint": "make a prior of a checkpoint of the paper's authors",
