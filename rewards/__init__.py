@@ -10,6 +10,7 @@ from rewards.contract import check_reward
 from rewards.evaluation import evaluate_reward
 from rewards.feasible_objects import FeasibleObjects
 from rewards.object_count import ObjectCount
+from rewards.prompt_match import PromptMatch
 from rewards.registry import (
     RewardInfo,
     allow_reward_targets,
@@ -27,6 +28,7 @@ __all__ = [
     "Gate",
     "ObjectCount",
     "Product",
+    "PromptMatch",
     "Reward",
     "RewardContext",
     "RewardInfo",

@@ -68,7 +68,8 @@ class _Subject:
     def score(self, batch: SceneBatch) -> RewardOutput:
         context = self.given_context
         if context is None:
-            context = RewardContext(prompts=tuple(f"A scene with {int(n)} objects." for n in batch.counts))
+            counts = batch.counts.tolist()
+            context = RewardContext(prompts=tuple(f"A scene with {n} object{'s' * (n != 1)}." for n in counts))
         return evaluate_reward(self.reward, batch, context, strict=True)
 
     @property

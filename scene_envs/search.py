@@ -91,6 +91,8 @@ class SearchEnv(gym.Env[Any, Any]):
     | `objective_scale` | `None` | objective value at which Φ = 1; `None` is the number of free slots |
     | `workers` | `0` | processes for physics in the objective; 0 computes in this one |
     | `render_mode` | `None` | `"rgb_array"` renders the current scene |
+    | `prompt` | `None` | what all scenes should hold, for priors that read prompts; the objective sees it too |
+    | `guidance` | `0.0` | weight of classifier-free guidance, which doubles the NFE; needs a prompt |
 
     ## Vectorized environment
 
@@ -117,6 +119,8 @@ class SearchEnv(gym.Env[Any, Any]):
         objective_scale: float | None = None,
         workers: int = 0,
         render_mode: str | None = None,
+        prompt: str | None = None,
+        guidance: float = 0.0,
     ) -> None:
         self.render_mode = check_render_mode(render_mode)
         self.problem = SearchProblem(
@@ -130,6 +134,8 @@ class SearchEnv(gym.Env[Any, Any]):
             mask=mask,
             objective_scale=objective_scale,
             workers=workers,
+            prompt=prompt,
+            guidance=guidance,
         )
         slot_count = self.problem.slots
         self.observation_space = spaces.Dict(

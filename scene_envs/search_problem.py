@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from scene_envs.env_prompts import EnvPrompts
 from scene_envs.env_reward import RewardScorer, Score
 from scene_envs.env_spaces import check_slots, prior_device, resolve_scene_and_prior
 from scene_envs.errors import InvalidInputError
@@ -26,11 +27,12 @@ class SearchProblem:
     rounding by about 1e-6, never the random numbers.
 
     Args:
-        scene, objective, branching, max_depth, num_steps, prior, slots, mask, objective_scale, workers: as for
-            ``SearchEnv``.
+        scene, objective, branching, max_depth, num_steps, prior, slots, mask, objective_scale, workers, prompt,
+            guidance: as for ``SearchEnv``.
 
     Attributes:
-        evaluations: denoiser evaluations (NFE) spent so far, ``num_steps`` per generated scene.
+        evaluations: denoiser evaluations (NFE) spent so far, ``num_steps`` per generated scene and twice that many with
+            guidance.
 
     >>> from agents.prior import tiny_prior
     >>> problem = SearchProblem(prior=tiny_prior(), objective="object_count", num_steps=2, max_depth=1)
@@ -53,6 +55,8 @@ class SearchProblem:
         mask: Any = "infeasible",
         objective_scale: float | None = None,
         workers: int = 0,
+        prompt: str | None = None,
+        guidance: float = 0.0,
     ) -> None:
         for name, number in (("branching", branching), ("max_depth", max_depth), ("num_steps", num_steps)):
             if not isinstance(number, int) or number < 1:
@@ -65,6 +69,10 @@ class SearchProblem:
         self.scale = float(self.slots - len(self.scene_type.fixed)) if objective_scale is None else objective_scale
         if not (np.isfinite(self.scale) and self.scale > 0):
             raise InvalidInputError(f"objective_scale={objective_scale!r} must be positive and finite")
+        if prompt is not None and not isinstance(prompt, str):
+            raise InvalidInputError(f"prompt={prompt!r}: a search follows one text, or None")
+        self.prompting = EnvPrompts(self.prior, prompt, guidance, self.slots)
+        self.prompt = self.prompting.draw(np.random.default_rng(0)) if self.prompting.given else None
         self.mask_generator = resolve_mask_generator(mask)
         self.scorer = RewardScorer(objective, workers)
         self.evaluations = 0
@@ -127,13 +135,19 @@ class SearchProblem:
         return changeable
 
     def _inpaint(self, batch: SceneBatch, masks: Tensor, noises: list[torch.Generator]) -> SceneBatch:
-        self.evaluations += self.num_steps * len(batch)
+        guidance, reader = self.prompting.guidance, self.prompting.reader
+        self.evaluations += self.num_steps * len(batch) * (2 if guidance else 1)
         batch, masks = batch.to(self.device), masks.to(self.device)
-        return self.prior.inpaint(batch, masks, num_steps=self.num_steps, generators=noises).to("cpu")
+        if reader is None or self.prompt is None:
+            return self.prior.inpaint(batch, masks, num_steps=self.num_steps, generators=noises).to("cpu")
+        made = reader.inpaint(
+            batch, masks, num_steps=self.num_steps, generators=noises, prompt=self.prompt, guidance=guidance
+        )
+        return made.to("cpu")
 
     def _score(self, batch: SceneBatch, origins: Sequence[tuple[int, tuple[int, ...], float]]) -> list[SearchState]:
         """States of ``batch``, given each one's (seed, path, value of the parent)."""
-        score = self.scorer(batch)
+        score = self.scorer(batch, None if self.prompt is None else [self.prompt] * len(batch))
         return [self._state(batch[i], score.row(i), *origin) for i, origin in enumerate(origins)]
 
     def _state(
