@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor, nn
 
-from agents.evaluation.judging import Accuracy, Forward, JudgeConfig, Split, check_classes, judge
+from agents.evaluation.judging import FEWEST, Accuracy, Forward, JudgeConfig, Split, check_classes, judge
 from agents.evaluation.scene_tokens import WAVE_FEATURES, SceneTokens, blurred, scene_tokens
 from agents.evaluation.set_network import SetNetwork, SetNetworkConfig
 from scene_envs.errors import InvalidInputError
@@ -13,6 +15,9 @@ from scene_envs.scene import SceneBatch
 
 RESOLUTION = (1e-3, 1e-2)
 """Standard deviation (m, rad) of the noise both classes get: what a feasible object may move."""
+
+MOST_OBJECTS = 50_000
+"""Objects to train on, both classes together: scenes of many objects need fewer scenes, and cost more each."""
 
 _PRIOR_COUNT = 4.0
 """Weight of the statistics over all categories in those of one category, in objects."""
@@ -43,7 +48,7 @@ def classifier_accuracy(
         seeds: repetitions with other splits and weights.
         seed: the first of them.
         resolution: standard deviation of the noise (m, rad); (0, 0) judges at full precision.
-        config: sizes of the parts, and how the classifier is trained.
+        config: sizes of the parts, and how the classifier is trained; it trains on at most 50,000 objects.
 
     Returns:
         Accuracy as a fraction: 0.5 when nothing tells them apart.
@@ -75,7 +80,16 @@ def classifier_accuracy(
 
         return network, forward
 
-    return judge(len(real), len(fake), prepare, seeds=seeds, seed=seed, config=config or JudgeConfig())
+    return judge(
+        len(real), len(fake), prepare, seeds=seeds, seed=seed, config=_affordable(config or JudgeConfig(), tokens)
+    )
+
+
+def _affordable(config: JudgeConfig, tokens: SceneTokens) -> JudgeConfig:
+    """The protocol with so few training scenes that they hold no more than ``MOST_OBJECTS``."""
+    per_scene = float(tokens.present.sum()) / len(tokens)
+    most = max(FEWEST, int(0.5 * MOST_OBJECTS / max(per_scene, 1.0)))
+    return replace(config, most_train=min(config.most_train, most))
 
 
 class _Standardisation:

@@ -15,6 +15,9 @@ from scene_envs.errors import InvalidInputError
 FEWEST = 20
 """Scenes of each class below which no classifier is trained."""
 
+_SURE = 5e-3
+"""Validation loss (nats) below which training stops: the classes are told apart."""
+
 
 @dataclass(frozen=True)
 class Accuracy:
@@ -60,8 +63,8 @@ class JudgeConfig:
     validation_fraction: float = 0.15
     most_train: int = 1000
     most_validation: int = 250
-    epochs: int = 10
-    patience: int = 3
+    epochs: int = 8
+    patience: int = 2
     batch_size: int = 64
     learning_rate: float = 4e-3
     weight_decay: float = 0.02
@@ -166,7 +169,7 @@ def _train(network: nn.Module, forward: Forward, labels: Tensor, split: Split, c
         if value < best:
             best, since = value, 0
             best_state = {name: tensor.clone() for name, tensor in network.state_dict().items()}
-        if since >= config.patience or value < 1e-3:
+        if since >= config.patience or value < _SURE:
             break
     network.load_state_dict(best_state)
 

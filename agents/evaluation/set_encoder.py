@@ -47,7 +47,7 @@ class SetEncoder(nn.Module):
         super().__init__()
         self.vocabulary = tuple(vocabulary)
         self.config = config or SetNetworkConfig(
-            _OWN, len(self.vocabulary) + 2, FEATURES, hidden=64, heads=4, blocks=2, dropout=0.0
+            _OWN, len(self.vocabulary) + 2, FEATURES, hidden=64, heads=2, blocks=1, dropout=0.0
         )
         self.network = SetNetwork(self.config)
         self.mean: Tensor

@@ -34,7 +34,6 @@ DAMAGES = 5
 """Kinds of damage: position noise, rotation noise, swapped assets, moved objects, removed objects."""
 
 _UNKNOWN_SHARE = 0.1
-_KEPT_SHARE = 0.6
 _TEMPERATURE = 0.2
 
 
@@ -51,9 +50,9 @@ class SetEncoderTraining:
         content_weight: weight of the loss on asset counts.
     """
 
-    scenes: int = 600
-    steps: int = 2100
-    batch_size: int = 32
+    scenes: int = 160
+    steps: int = 700
+    batch_size: int = 16
     learning_rate: float = 2e-3
     contrast_weight: float = 0.2
     content_weight: float = 0.5
@@ -159,7 +158,7 @@ def _train(encoder: SetEncoder, pools: Sequence[SceneBatch], config: SetEncoderT
         features = encoder(scene_tokens(damaged), names)
         damage_loss = F.mse_loss(heads["damage"](features), amounts)
         content_loss = F.mse_loss(heads["content"](features), _log_counts(encoder, damaged))
-        halves = [encoder(scene_tokens(_part_of(clean, generator)), names) for _ in range(2)]
+        halves = [encoder(scene_tokens(half), names) for half in _halves(clean, generator)]
         first, second = (F.normalize(heads["contrast"](half), dim=-1) for half in halves)
         similarity = first @ second.T / _TEMPERATURE
         target = torch.arange(len(clean))
@@ -170,9 +169,9 @@ def _train(encoder: SetEncoder, pools: Sequence[SceneBatch], config: SetEncoderT
         nn.utils.clip_grad_norm_(parameters, 1.0)
         optimizer.step()
         schedule.step()
-        if step % 50 < len(pools) and step % len(pools) == 0:
+        if step % 35 < len(pools):
             parts = ", ".join(
-                f"{name} {float(value):.3f}"
+                f"{name} {float(value.detach()):.3f}"
                 for name, value in (("damage", damage_loss), ("content", content_loss), ("contrast", contrast_loss))
             )
             _LOGGER.info("set encoder, step %d of %d: %s", step, config.steps, parts)
@@ -201,12 +200,15 @@ def _some_unknown(encoder: SetEncoder, batch: SceneBatch, generator: torch.Gener
     return names.masked_fill(hidden, encoder.unknown)
 
 
-def _part_of(batch: SceneBatch, generator: torch.Generator) -> SceneBatch:
-    """A random part of the free objects of each scene, slightly moved."""
-    kept = torch.rand(batch.is_free.shape, generator=generator) < _KEPT_SHARE
-    categories = batch.categories.masked_fill(batch.is_free & ~kept, batch.scene_type.num_assets)
-    part = SceneBatch.from_parts(batch.translations, batch.rotations, categories, batch.scene_type)
-    return blurred(part, 2e-3, 2e-2, generator)
+def _halves(batch: SceneBatch, generator: torch.Generator) -> tuple[SceneBatch, SceneBatch]:
+    """The free objects of each scene dealt into two, slightly moved; both keep the welded ones."""
+    first = torch.rand(batch.is_free.shape, generator=generator) < 0.5
+    empty, halves = batch.scene_type.num_assets, []
+    for kept in (first, ~first):
+        categories = batch.categories.masked_fill(batch.is_free & ~kept, empty)
+        half = SceneBatch.from_parts(batch.translations, batch.rotations, categories, batch.scene_type)
+        halves.append(blurred(half, 2e-3, 2e-2, generator))
+    return halves[0], halves[1]
 
 
 def _log_counts(encoder: SetEncoder, batch: SceneBatch) -> Tensor:

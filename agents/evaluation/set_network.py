@@ -31,7 +31,7 @@ class SetNetworkConfig:
     categories: int
     outputs: int
     hidden: int = 32
-    heads: int = 4
+    heads: int = 2
     blocks: int = 1
     inducing: int = 8
     dropout: float = 0.1
