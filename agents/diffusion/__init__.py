@@ -19,9 +19,11 @@ from agents.diffusion.reverse_steps import (
 )
 from agents.diffusion.schedules import NoiseSchedule, make_schedule
 from agents.diffusion.step_tables import StepTable
+from agents.diffusion.weighting import LOSS_WEIGHTINGS, check_weighting, loss_weights
 
 __all__ = [
     "CATEGORICAL_KERNELS",
+    "LOSS_WEIGHTINGS",
     "PREDICTIONS",
     "TIMESTEP_LAWS",
     "CategoricalProcess",
@@ -35,9 +37,11 @@ __all__ = [
     "ResidualVariance",
     "ReverseStep",
     "StepTable",
+    "check_weighting",
     "concatenate_steps",
     "gaussian_log_prob",
     "lognormal_timesteps",
+    "loss_weights",
     "make_categorical_schedule",
     "make_schedule",
     "sample_categorical",

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from agents.diffusion.moments import Preconditioning
 from agents.diffusion.schedules import NoiseSchedule
-from scene_envs.errors import unknown_name
+from scene_envs.errors import InvalidInputError, unknown_name
 
 Moments = tuple[Tensor, Tensor]
 """Mean and standard deviation."""
@@ -104,30 +104,42 @@ class GaussianProcess:
     # -- reverse --------------------------------------------------------------------------------
 
     def posterior(
-        self, x_t: Tensor, x0: Tensor, t: int, previous: int, residual: Tensor | None = None
+        self, x_t: Tensor, x0: Tensor, t: int, previous: int, residual: Tensor | None = None, eta: float = 1.0
     ) -> tuple[Tensor, Tensor]:
-        """p(x_s | x_t) for a stride t -> s, given the denoised scene (Ho et al. 2020, Eqs. 6-7, any s < t).
+        """p(x_s | x_t) for a stride t -> s, given the denoised scene (Song et al. 2021, Eqs. 12 and 16, any s < t).
+
+        With ``eta`` 1 these are Eqs. 6-7 of Ho et al. (2020), with 0 the deterministic chain of DDIM.
 
         Args:
             x_t: (B, N, D).
             x0: (B, N, D) denoised scene.
             t: where the stride starts.
             previous: where it ends, s.
-            residual: (D,) or () expected squared error of ``x0``; None takes ``x0`` as exact (Ho et al.).
-                Given, the variance is the optimal one of Bao et al. (2022), Theorem 1.
+            residual: (D,) or () expected squared error of ``x0``; None takes ``x0`` as exact (Ho et al.). Given, the
+                variance of ``eta`` 1 is the optimal one of Bao et al. (2022), Theorem 1; what the error adds is scaled
+                by the square of ``eta``, so that 0 is deterministic all the same.
+            eta: noise of the chain, 0..1.
 
         Returns:
-            mean (B, N, D) and std, () or (D,); 0 when ``previous`` is 0.
+            mean (B, N, D) and std, () or (D,); 0 when ``previous`` or ``eta`` is 0.
+
+        Raises:
+            InvalidInputError: ``eta`` is outside 0..1, or the stride is not within 0..T.
         """
+        if not 0.0 <= eta <= 1.0:
+            raise InvalidInputError(f"eta={eta} is outside 0..1: 1 is the ancestral chain, 0 the deterministic one")
+        if not 0 <= previous < t <= self.schedule.num_timesteps:
+            raise InvalidInputError(
+                f"the step {t} -> {previous} is not a stride down within 0..{self.schedule.num_timesteps}, "
+                "the timesteps of the schedule"
+            )
         alpha_bar = self.schedule.alpha_bar
         a_t, a_s = alpha_bar[t], alpha_bar[previous]
-        a_ts = a_t / a_s
-        beta = 1.0 - a_ts
-        x0_weight = float(a_s.sqrt() * beta / (1.0 - a_t))
-        xt_weight = float(a_ts.sqrt() * (1.0 - a_s) / (1.0 - a_t))
-        variance = (1.0 - a_s) / (1.0 - a_t) * beta
+        variance = eta**2 * (1.0 - a_s) / (1.0 - a_t) * (1.0 - a_t / a_s)
+        xt_weight = float(((1.0 - a_s - variance).clamp(min=0.0) / (1.0 - a_t)).sqrt())
+        x0_weight = float(a_s.sqrt() - a_t.sqrt() * xt_weight)
         if residual is not None and previous > 0:
-            variance = variance + x0_weight**2 * residual.double().cpu()
+            variance = variance + (eta * x0_weight) ** 2 * residual.double().cpu()
         return x0_weight * x0 + xt_weight * x_t, variance.sqrt().float().to(x_t.device)
 
     def _moments(self, like: Tensor, moments: Moments | None) -> Moments:

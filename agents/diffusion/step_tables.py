@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -44,7 +45,12 @@ class StepTable:
         Args:
             num_timesteps: T of the schedule.
             num_steps: S; need not divide T.
+
+        Raises:
+            InvalidInputError: ``num_steps`` is not a whole number in 1..T.
         """
+        if not isinstance(num_steps, int) or isinstance(num_steps, bool):
+            raise InvalidInputError(f"num_steps={num_steps!r} must be a whole number in 1..{num_timesteps}")
         if not 1 <= num_steps <= num_timesteps:
             raise InvalidInputError(f"num_steps={num_steps} is outside 1..{num_timesteps}, the prior's timesteps")
         if num_steps == 1:
@@ -54,7 +60,19 @@ class StepTable:
         return cls(t, torch.cat([t[1:], torch.zeros(1, dtype=torch.int64)]))
 
     @classmethod
-    def from_timesteps(cls, timesteps: list[int]) -> StepTable:
-        """From the timesteps alone, in decreasing order; the last step lands on 0."""
+    def from_timesteps(cls, timesteps: Sequence[int], num_timesteps: int | None = None) -> StepTable:
+        """From the timesteps alone, in decreasing order; the last step lands on 0.
+
+        Args:
+            timesteps: such as another library's, in 1..T.
+            num_timesteps: T, for a check against it; a process refuses later what is above its own.
+
+        Raises:
+            InvalidInputError: they are not in decreasing order, or outside 1..T.
+        """
         t = torch.tensor(timesteps, dtype=torch.int64)
+        if num_timesteps is not None and len(t) and not 1 <= int(t.min()) <= int(t.max()) <= num_timesteps:
+            raise InvalidInputError(
+                f"timesteps {int(t.min())}..{int(t.max())} are outside 1..{num_timesteps}, the prior's timesteps"
+            )
         return cls(t, torch.cat([t[1:], torch.zeros(1, dtype=torch.int64)]))
