@@ -88,6 +88,8 @@ def value(column: Column, figures: Figures) -> float | None:
 def error(column: Column, figures: Figures) -> float | None:
     """The standard error beside :func:`value`: √(p (1 − p) / n) of a share of n, or as it was measured.
 
+    None where nothing was measured, and for a share of all or none, of which the formula says nothing.
+
     >>> share = Column("good", "good %", 100.0, error="trials", binomial=True)
     >>> error(share, {"good": 0.5, "trials": 100})
     5.0
@@ -97,7 +99,7 @@ def error(column: Column, figures: Figures) -> float | None:
         return None
     if not column.binomial:
         return other * column.scale
-    return math.sqrt(max(0.0, number * (1.0 - number)) / other) * column.scale if other > 0 else None
+    return math.sqrt(number * (1.0 - number) / other) * column.scale if other > 0 and 0 < number < 1 else None
 
 
 def text(column: Column, figures: Figures) -> str:
@@ -118,13 +120,15 @@ def text(column: Column, figures: Figures) -> str:
 def format_number(number: float, digits: int = 3) -> str:
     """``number`` with ``digits`` significant digits, never in exponents.
 
-    >>> format_number(0.01234), format_number(1234567.0), format_number(12.0)
-    ('0.0123', '1,234,567', '12.0')
+    >>> format_number(0.01234), format_number(1234567.0), format_number(12.0), format_number(1e-6)
+    ('0.0123', '1,234,567', '12.0', '<0.0001')
     """
     if number == 0:
         return "0"
+    if 0 < number < 1e-4:
+        return "<0.0001"
     places = digits - 1 - math.floor(math.log10(abs(number)))
-    return f"{number:,.{max(0, min(8, places))}f}"
+    return f"{number:,.{max(0, min(6, places))}f}"
 
 
 def _column(name: str) -> Column:

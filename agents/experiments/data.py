@@ -86,8 +86,8 @@ class RowData:
 
 
 def trained_numbers(prior: ScenePrior) -> int:
-    """How many numbers of ``prior`` are trained, those of its text encoder included."""
-    return sum(parameter.numel() for parameter in prior.denoiser.parameters() if parameter.requires_grad)
+    """How many numbers of the network of ``prior`` are trained; its text encoder is not part of it."""
+    return sum(parameter.numel() for parameter in prior.denoiser.network.parameters() if parameter.requires_grad)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from agents.experiments import columns as columns_
 from agents.experiments.columns import Column
@@ -12,11 +12,16 @@ from agents.experiments.tables import FilledTable, Line
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-DOT, FLOOR, FAINT, INK = "#0f766e", "#b45309", "#e8ebee", "#1c2733"
-_LINE_HEIGHT, _MARGIN, _PANEL_WIDTH, _LABEL_WIDTH = 0.235, 1.15, 2.9, 3.1
+DOT, FLOOR, FAINT, SOFT, INK = "#0f766e", "#b45309", "#e8ebee", "#99a3ad", "#1c2733"
+_LINE, _ABOVE, _BELOW = 0.23, 0.62, 0.58
+"""Heights in inches: of a line, and of what stands above and below the lines of a table."""
+_LABELS, _PANEL, _GAP = 2.75, 2.55, 0.3
+"""Widths in inches: of the labels, of a panel, between panels."""
 _LOGARITHMIC = 30.0
 """Columns whose largest number is this many times the smallest get a logarithmic axis."""
+_BETTER = {"low": "  (lower is better)", "high": "  (higher is better)", "": ""}
 
 
 def draw(tables: Sequence[FilledTable], path: Path) -> Path | None:
@@ -26,27 +31,22 @@ def draw(tables: Sequence[FilledTable], path: Path) -> Path | None:
         tables: with their numbers.
         path: of the PNG.
     """
-    shown = [(filled, _plotted(filled), _lines(filled)) for filled in tables]
-    shown = [one for one in shown if one[1] and one[2]]
-    if not shown:
+    chosen = [(filled, _plotted(filled)) for filled in tables]
+    chosen = [(filled, columns) for filled, columns in chosen if columns]
+    if not chosen:
         return None
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    heights = [_MARGIN + _LINE_HEIGHT * len(lines) for _, _, lines in shown]
-    across = max(len(chosen) for _, chosen, _ in shown)
-    figure = Figure(figsize=(_LABEL_WIDTH + _PANEL_WIDTH * across, sum(heights)), dpi=130, layout="constrained")
+    across = max(len(columns) for _, columns in chosen)
+    width = _LABELS + across * (_PANEL + _GAP)
+    height = sum(_height(filled) for filled, _ in chosen)
+    figure = Figure(figsize=(width, height), dpi=130)
     FigureCanvasAgg(figure)
-    parts = figure.subfigures(len(shown), 1, height_ratios=heights, squeeze=False)[:, 0]
-    for part, (filled, chosen, lines) in zip(parts, shown, strict=True):
-        part.suptitle(filled.table.title, x=0.01, ha="left", fontsize=11, fontweight="bold", color=INK)
-        panels = part.subplots(1, across, sharey=True, squeeze=False)[0]
-        for panel, column in zip(panels, chosen, strict=False):
-            _draw_panel(panel, column, lines, filled.lines[-1])
-        for panel in panels[len(chosen) :]:
-            panel.set_visible(False)
-        panels[0].set_yticks(range(len(lines)), [line.label for line in lines], fontsize=8.5)
-        panels[0].set_ylim(len(lines) - 0.4, -0.6)
+    top = height
+    for filled, columns in chosen:
+        _draw_table(figure, filled, columns, top)
+        top -= _height(filled)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
     return path
@@ -54,44 +54,58 @@ def draw(tables: Sequence[FilledTable], path: Path) -> Path | None:
 
 def _plotted(filled: FilledTable) -> list[Column]:
     """One column per name of ``plotted``: the first of those that the name stands for."""
-    figures = [line.figures for line in filled.lines]
+    figures = [line.figures for line in filled.lines[:-1]]
     expanded = [columns_.expand([name], figures) for name in filled.table.plotted]
     return [found[0] for found in expanded if found]
 
 
-def _lines(filled: FilledTable) -> list[Line]:
-    """The rows, without real scenes."""
-    return list(filled.lines[:-1])
+def _height(filled: FilledTable) -> float:
+    return _ABOVE + _LINE * len(filled.lines[:-1]) + _BELOW
+
+
+def _draw_table(figure: Figure, filled: FilledTable, columns: Sequence[Column], top: float) -> None:
+    """The panels of one table below ``top`` (inches from the bottom of the figure)."""
+    *lines, real = filled.lines
+    width, height = figure.get_size_inches()
+    figure.text(0.12 / width, (top - 0.12) / height, filled.table.title, fontsize=11, fontweight="bold", color=INK,
+                va="top")  # fmt: skip
+    bottom, tall = top - _ABOVE - _LINE * len(lines), _LINE * len(lines)
+    for number, column in enumerate(columns):
+        left = _LABELS + number * (_PANEL + _GAP)
+        panel = figure.add_axes((left / width, bottom / height, _PANEL / width, tall / height))
+        _draw_panel(panel, column, lines, real)
+        panel.set_ylim(len(lines) - 0.5, -0.5)
+        panel.set_yticks(range(len(lines)), [line.label for line in lines] if not number else [], fontsize=8.5)
 
 
 def _draw_panel(panel: Axes, column: Column, lines: Sequence[Line], real: Line) -> None:
     numbers = [columns_.value(column, line.figures) for line in lines]
     floor = columns_.value(column, real.figures)
+    _scale(panel, column, [number for number in (*numbers, floor) if number is not None])
     for height, (line, number) in enumerate(zip(lines, numbers, strict=True)):
         if number is None:
-            panel.text(0.02, height, "failed" if line.failure else "no data", fontsize=7, va="center", color="#99a3ad",
+            panel.text(0.02, height, "failed" if line.failure else "no data", fontsize=7, va="center", color=SOFT,
                        transform=panel.get_yaxis_transform())  # fmt: skip
             continue
         spread = columns_.error(column, line.figures)
-        panel.errorbar(number, height, xerr=spread, fmt="o", color=DOT, markersize=5, elinewidth=1.2, capsize=0)
-    _scale(panel, [number for number in (*numbers, floor) if number is not None])
+        panel.errorbar(number, height, xerr=spread, fmt="o", color=DOT, markersize=5, elinewidth=1.2, clip_on=False)
     if floor is not None:
-        panel.axvline(floor, color=FLOOR, linestyle="--", linewidth=1.2)
+        panel.axvline(floor, color=FLOOR, linestyle="--", linewidth=1.2, clip_on=False)
         panel.text(floor, 1.0, "real", color=FLOOR, fontsize=7.5, ha="center", va="bottom",
                    transform=panel.get_xaxis_transform())  # fmt: skip
-    panel.set_xlabel(f"{column.title}{_ARROWS[column.better]}", fontsize=8.5, color=INK)
     for start, line in enumerate(lines):
         if start and line.group != lines[start - 1].group:
-            panel.axhline(start - 0.5, color="#99a3ad", linewidth=0.8)
+            panel.axhline(start - 0.5, color=SOFT, linewidth=0.8)
+    panel.set_xlabel(f"{column.title}{_BETTER[column.better]}", fontsize=8.5, color=INK)
     panel.spines[["top", "right", "left"]].set_visible(False)
     panel.grid(axis="both", color=FAINT, linewidth=0.8)
     panel.set_axisbelow(True)
-    panel.tick_params(labelsize=8, length=0)
+    panel.tick_params(labelsize=8, length=0, which="both")
 
 
-_ARROWS = {"low": "  (lower is better)", "high": "  (higher is better)", "": ""}
-
-
-def _scale(panel: Any, numbers: Sequence[float]) -> None:
-    if numbers and min(numbers) > 0 and max(numbers) > _LOGARITHMIC * min(numbers):
+def _scale(panel: Axes, column: Column, numbers: Sequence[float]) -> None:
+    """Shares from none to all; other columns as wide as their numbers, logarithmic where they differ much."""
+    if column.scale == 100.0:
+        panel.set_xlim(0, 100)
+    elif numbers and min(numbers) > 0 and max(numbers) > _LOGARITHMIC * min(numbers):
         panel.set_xscale("log")

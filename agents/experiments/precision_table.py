@@ -58,11 +58,11 @@ _NEEDS = {
 """Keys that are read only where another key has a value."""
 
 
-def one_factor_at_a_time(prefix: str, base: Mapping[str, Any], group: str) -> tuple[Entry, ...]:
+def one_factor_at_a_time(prefix: str, base: Mapping[str, Any], title: str) -> tuple[Entry, ...]:
     """``base``, then every setting of every factor that differs from it and that it reads, and two capacities."""
     standard = {key.name: key.default for key in fields(PretrainConfig)}
-    here = {**standard, **base}
-    entries = [Entry("as it is", Row(prefix, base), group=group)]
+    here, group = {**standard, **base}, f"from {title}"
+    entries = [Entry(title, Row(prefix, base), group=group)]
     for label, keys in FACTORS:
         changed = {key: value for key, value in keys.items() if here[key] != value}
         if not changed or any(here[_NEEDS[key][0]] != _NEEDS[key][1] for key in keys if key in _NEEDS):
@@ -76,8 +76,8 @@ def one_factor_at_a_time(prefix: str, base: Mapping[str, Any], group: str) -> tu
 
 def precision() -> Table:
     """Every factor, from the default and from the paper's setting."""
-    ours = one_factor_at_a_time("flux_mixed", plain_row("flux", "mixed").overrides, "from the default")
-    paper = one_factor_at_a_time("paper", PAPER, "from the paper's setting")
+    ours = one_factor_at_a_time("flux_mixed", plain_row("flux", "mixed").overrides, "the default")
+    paper = one_factor_at_a_time("paper", PAPER, "the paper's setting")
     return Table(
         "precision", "Precision",
         "Raw samples, no row projected or settled. Each line changes one thing of the first line of its part. Equal "

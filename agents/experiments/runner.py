@@ -15,7 +15,7 @@ from agents.experiments.measuring import measure_real, sample_and_measure
 from agents.experiments.rows import Row, Table
 from agents.experiments.settings import TablesConfig
 from agents.experiments.tables import REAL, FilledTable, Line, csv_text, markdown
-from agents.experiments.training import check_runs, read_json, sized_config, target_parameters, train, write_json
+from agents.experiments.training import Sizes, check_runs, read_json, target_parameters, train, write_json
 from scene_envs.errors import SceneEnvsError, TrainingError
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def run_tables(settings: TablesConfig, say: Say) -> dict[str, Any]:
     say(f"{len(rows)} rows for {len(tables)} tables; reading {settings.data}")
     check_runs(rows, settings)
     data = RowData.load(settings)
-    real = RealScenes.of(data, settings)
+    real, sizes = RealScenes.of(data, settings), Sizes(settings, data)
     results = {row.name: RowResult({}, _PENDING) for row in rows}
     with PhysicsPool(workers=settings.workers) as pool:
         floor = _measured_once(
@@ -75,7 +75,7 @@ def run_tables(settings: TablesConfig, say: Say) -> dict[str, Any]:
         started, worked = time.perf_counter(), 0
         for number, row in enumerate(rows, 1):
             begun = time.perf_counter()
-            results[row.name], fresh = _run_row(row, tables, settings, data, real, pool)
+            results[row.name], fresh = _run_row(row, tables, sizes, real, pool)
             worked += fresh
             write_tables(tables, results, floor, settings, real)
             each = (time.perf_counter() - started) / max(1, worked)
@@ -120,19 +120,19 @@ def write_tables(
 def _run_row(
     row: Row,
     tables: Sequence[Table],
-    settings: TablesConfig,
-    data: RowData,
+    sizes: Sizes,
     real: RealScenes,
     pool: PhysicsPool,
 ) -> tuple[RowResult, bool]:
     """The row's result, and whether it took work; a row that fails says why and stops nothing."""
+    settings = sizes.settings
     kinds = sorted({entry.prompted for table in tables for entry in table.entries if entry.row.name == row.name})
     result, fresh = RowResult({}), False
     try:
-        config = sized_config(row, settings, data)
+        config = sizes.config(row)
         directory = Path(config.output)
         fresh = not all((directory / f"{_kind(prompted)}.json").exists() for prompted in kinds)
-        trained = train(config, target_parameters(row, settings), data)
+        trained = train(config, target_parameters(row, settings), sizes.data)
         costs = {
             "parameters": float(trained["parameters"]),
             "seconds_per_step": trained["seconds"] / max(1, trained["trained_steps"]),

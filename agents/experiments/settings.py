@@ -16,7 +16,7 @@ class Size:
     Attributes:
         iterations: optimiser steps of a row.
         batch_size: scenes per step.
-        parameters: trained numbers of a row's network, text encoder included.
+        parameters: trained numbers of a row's network, its text encoder not counted.
         count: samples that are measured.
         num_steps: denoising steps per sample.
         classifier_seeds: splits over which a classifier's accuracy is averaged.

@@ -18,6 +18,8 @@ from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
 CONFIG_NAME, METRICS_NAME = "row.json", "metrics.json"
 _RUN_ONLY = ("output", "device", "log_every", "evaluate_every", "checkpoint_every", "pictures_every", "tensorboard")
 """Keys that may change between the parts of a resumed run."""
+_SHAPING = ("network", "process", "text", "rotation", "attention", "frequencies", "hidden", "depth", "heads")
+"""Keys that the number of parameters depends on."""
 
 
 def run_config(row: Row, settings: TablesConfig, hidden: int | None = None) -> PretrainConfig:
@@ -33,43 +35,63 @@ def run_config(row: Row, settings: TablesConfig, hidden: int | None = None) -> P
             raise unknown_name("pretrain key", key, known)
     if hidden is not None:
         keys["hidden"] = hidden
-    return PretrainConfig(**{**keys, "output": str(Path(settings.output) / "runs" / row.name)})
+    return PretrainConfig(**{**keys, "output": str(run_folder(row, settings))})
+
+
+def run_folder(row: Row, settings: TablesConfig) -> Path:
+    """Where the run of ``row`` lives."""
+    return Path(settings.output) / "runs" / row.name
 
 
 def match_width(parameters: int, heads: int, count: Callable[[int], int]) -> int:
-    """The width, a multiple of twice ``heads``, at which ``count(width)`` is nearest to ``parameters``.
+    """The width, a multiple of ``heads``, at which ``count(width)`` is nearest to ``parameters``.
 
     ``count`` must grow with the width.
 
     >>> match_width(10_000, 4, lambda width: width**2)
-    96
+    100
     """
-    step = 2 * heads
     low, high = 1, 2
-    while count(high * step) < parameters:
+    while count(high * heads) < parameters:
         low, high = high, 2 * high
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (middle, high) if count(middle * step) < parameters else (low, middle)
-    return min((low * step, high * step), key=lambda width: abs(count(width) - parameters))
+        low, high = (middle, high) if count(middle * heads) < parameters else (low, middle)
+    return min((low * heads, high * heads), key=lambda width: abs(count(width) - parameters))
 
 
-def sized_config(row: Row, settings: TablesConfig, data: RowData) -> PretrainConfig:
-    """The run of ``row`` with the width that gives it its share of the parameters; a run that exists keeps its own."""
-    before = read_json(Path(settings.output) / "runs" / row.name / CONFIG_NAME)
-    if before is not None:
-        return run_config(row, settings, int(before["config"]["hidden"]))
-    config = run_config(row, settings)
-    if "hidden" in settings.pretraining:
-        return config
-    counted: dict[int, int] = {}
+class Sizes:
+    """Widths of rows, each kind of network counted once.
 
-    def count(width: int) -> int:
-        if width not in counted:
-            counted[width] = data.count_parameters(replace(config, hidden=width))
-        return counted[width]
+    Args:
+        settings: the keys of the command.
+        data: what priors are built for.
+    """
 
-    return replace(config, hidden=match_width(target_parameters(row, settings), config.heads, count))
+    def __init__(self, settings: TablesConfig, data: RowData) -> None:
+        self.settings, self.data = settings, data
+        self._counted: dict[tuple[Any, ...], int] = {}
+
+    def config(self, row: Row) -> PretrainConfig:
+        """The run of ``row``, as wide as its parameters ask for; a run that exists keeps its width."""
+        before = read_json(run_folder(row, self.settings) / CONFIG_NAME)
+        if before is not None:
+            return run_config(row, self.settings, int(before["config"]["hidden"]))
+        config = run_config(row, self.settings)
+        if "hidden" in self.settings.pretraining:
+            return config
+        width = match_width(
+            target_parameters(row, self.settings),
+            config.heads,
+            lambda hidden: self._count(replace(config, hidden=hidden)),
+        )
+        return replace(config, hidden=width)
+
+    def _count(self, config: PretrainConfig) -> int:
+        shape = tuple(getattr(config, key) for key in _SHAPING)
+        if shape not in self._counted:
+            self._counted[shape] = self.data.count_parameters(config)
+        return self._counted[shape]
 
 
 def check_runs(rows: Iterable[Row], settings: TablesConfig) -> None:
@@ -79,7 +101,7 @@ def check_runs(rows: Iterable[Row], settings: TablesConfig) -> None:
         InvalidInputError: keys of a run differ from those asked for now.
     """
     for row in rows:
-        before = read_json(Path(settings.output) / "runs" / row.name / CONFIG_NAME)
+        before = read_json(run_folder(row, settings) / CONFIG_NAME)
         if before is not None:
             config = run_config(row, settings, int(before["config"]["hidden"]))
             _check_unchanged(before, config, target_parameters(row, settings))
