@@ -13,7 +13,8 @@ from agents.denoiser import autocast
 from agents.diffusion import CategoricalProcess, GaussianProcess
 from agents.diffusion.gaussian import Moments
 from agents.diffusion.reverse_steps import state_of
-from agents.networks.mixed_flux import POSE, MixedFlux, MixedFluxConfig
+from agents.networks.mixed_flux import POSE
+from agents.networks.registry import MixedNetworkConfig
 from agents.networks.text import TextConfig, TextEncoder
 from agents.packing import run_packed, take_slots
 from scene_envs.errors import InvalidInputError, unknown_name
@@ -38,7 +39,7 @@ class MixedPriorConfig:
     Attributes:
         scene_type: name of its scene type.
         slots: slots per scene that it was trained on.
-        network: size of its denoiser.
+        network: kind and size of its denoiser.
         schedule: noise schedule of the poses, ``"karras"``, ``"linear"`` or ``"cosine"``.
         prediction: ``"karras"``, ``"epsilon"``, ``"x0"`` or ``"v"``, of the poses.
         kernel: of the categories, one of :data:`~agents.diffusion.CATEGORICAL_KERNELS`.
@@ -62,7 +63,7 @@ class MixedPriorConfig:
 
     scene_type: str
     slots: int
-    network: MixedFluxConfig
+    network: MixedNetworkConfig
     schedule: str = "karras"
     prediction: str = "karras"
     kernel: str = "mask_and_replace"
@@ -122,7 +123,7 @@ class MixedDenoiser(nn.Module):
 
     def __init__(
         self,
-        network: MixedFlux,
+        network: nn.Module,
         poses: GaussianProcess,
         categories: CategoricalProcess,
         text_encoder: TextEncoder | None = None,
@@ -180,7 +181,8 @@ class MixedDenoiser(nn.Module):
             scaled = torch.where(exact, self.poses.network_input(pose, torch.zeros_like(t)), scaled)
             position = torch.where(exact, pose[..., :3], position)
             level = torch.where(given.pose, torch.zeros_like(level), level)
-        time = (t - 1).to(pose.dtype) if not self.network.config.frequencies else 250.0 * ratio.log()
+        octaves: int = self.network.config.frequencies  # type: ignore[union-attr, assignment]
+        time = 250.0 * ratio.log() if octaves else (t - 1).to(pose.dtype)
         inputs = [scaled, states, position, level, *([] if given is None else [given.flags()])]
         if self.drops_empty:
             output, logits = self._on_present(inputs, time, text)

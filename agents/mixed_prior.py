@@ -28,7 +28,8 @@ from agents.diffusion import (
 from agents.diffusion.reverse_steps import state_of
 from agents.mixed_denoiser import Given, MixedDenoiser, MixedPriorConfig, Text
 from agents.mixed_training import mixed_loss
-from agents.networks.mixed_flux import POSE, MixedFlux, MixedFluxConfig
+from agents.networks.mixed_flux import POSE, MixedFluxConfig
+from agents.networks.registry import build_network, config_from_state, config_state
 from agents.networks.text import TextConfig, TextEncoder
 from agents.prior import ScenePrior
 from agents.prompt_reading import PromptReader, prompt_words
@@ -88,7 +89,7 @@ class MixedPrior(PromptReader, ScenePrior):
         )
         encoder = None if config.text is None else TextEncoder(config.text)
         self.denoiser = MixedDenoiser(
-            MixedFlux(config.network), self.process, self.categories, encoder, config.empty_slots
+            build_network(config.network), self.process, self.categories, encoder, config.empty_slots
         )
         self._timestep_weights = timestep_weights(config.timesteps, schedule, config.noise_mean, config.noise_std)
 
@@ -105,18 +106,12 @@ class MixedPrior(PromptReader, ScenePrior):
         text = fields.get("text")
         if text is not None:
             text = TextConfig(**{**text, "words": tuple(text["words"])})
-        fields = {
-            **fields,
-            "network": MixedFluxConfig(
-                **{**fields["network"], "unit": tuple(fields["network"].get("unit", (1.0, 1.0, 1.0)))}
-            ),
-            "text": text,
-        }
+        fields = {**fields, "network": config_from_state(fields["network"], "mixed"), "text": text}
         return cls(MixedPriorConfig(**fields), normalizer, preconditioning, card, residual)
 
     def config_state(self) -> dict[str, Any]:
         """The ``prior`` entry of the configuration file."""
-        return asdict(self.mixed)
+        return {**asdict(self.mixed), "network": config_state(self.mixed.network)}
 
     @classmethod
     def tiny(cls, scene_type: SceneType, slots: int, normalizer: Normalizer, text: bool = False) -> MixedPrior:
@@ -227,6 +222,7 @@ class MixedPrior(PromptReader, ScenePrior):
         text: Text | None = None,
         guidance: float = 0.0,
         free: Text | None = None,
+        eta: float = 1.0,
     ) -> MixedStep:
         """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters.
 
@@ -238,6 +234,7 @@ class MixedPrior(PromptReader, ScenePrior):
             text: tokens (B, L, W) and their mask (B, L); None for no prompt.
             guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional, on poses and logits.
             free: what stands for no prompt, as :meth:`unconditional` gives it; encoded anew when None.
+            eta: noise of the pose, 1 for the ancestral step and 0 for a certain one; categories are drawn all the same.
         """
         t, previous = int(table.timesteps[step]), int(table.previous[step])
         levels = torch.full((x_t.shape[0],), t, device=x_t.device)
@@ -252,7 +249,7 @@ class MixedPrior(PromptReader, ScenePrior):
         if self.mixed.clip:
             pose = pose.clamp(-self.mixed.clip, self.mixed.clip)
         residual = None if self.residual is None else self.residual.at(t)
-        mean, std = self.process.posterior(x_t[..., :POSE], pose, t, previous, residual)
+        mean, std = self.process.posterior(x_t[..., :POSE], pose, t, previous, residual, eta)
         states = x_t[..., POSE:]
         probs = self.categories.posterior(state_of(states), logits.softmax(dim=-1), t, previous)
         slots, fixed = x_t.shape[1], len(self.scene_type.fixed)
@@ -281,7 +278,7 @@ class MixedPrior(PromptReader, ScenePrior):
     @torch.no_grad()
     def run_chain(
         self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None, given: Given | None = None,
-        text: Text | None = None, guidance: float = 0.0, resample: int = 1,
+        text: Text | None = None, guidance: float = 0.0, resample: int = 1, eta: float = 1.0,
     ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D) from x_T, with given entries kept.
 
@@ -290,7 +287,7 @@ class MixedPrior(PromptReader, ScenePrior):
             table: the chain.
             noises: one generator for all scenes, or one per scene; None for torch's own.
             given: entries that carry no noise.
-            text, guidance: as in :meth:`transition`.
+            text, guidance, eta: as in :meth:`transition`.
             resample: how often each step is taken, going back in between.
         """
         free = self.unconditional(len(x)) if text is None or guidance else None
@@ -301,7 +298,9 @@ class MixedPrior(PromptReader, ScenePrior):
                 if again:
                     x = self._renoise(x, after, level, draw_noise(x, noises))
                     x = x if given is None else given.write(x)
-                reverse = self.transition(x, step, table, given=given, text=text, guidance=guidance, free=free)
+                reverse = self.transition(
+                    x, step, table, given=given, text=text, guidance=guidance, free=free, eta=eta
+                )
                 x = reverse.from_noise(draw_noise(x, noises))
                 x = x if given is None else given.write(x)
         return x
@@ -321,10 +320,11 @@ class MixedPrior(PromptReader, ScenePrior):
         num_steps: int,
         slots: int | None,
         generator: Generator,
+        eta: float,
     ) -> Tensor:
         text = None if prompts is None else self.encode_prompts(prompts)
         start = self.initial(count, self.mixed.slots if slots is None else slots, generator)
-        return self.run_chain(start, self.step_table(num_steps), generator, text=text, guidance=guidance)
+        return self.run_chain(start, self.step_table(num_steps), generator, text=text, guidance=guidance, eta=eta)
 
     # -- the training loss ----------------------------------------------------------------------
 

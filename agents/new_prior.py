@@ -13,7 +13,8 @@ from agents.denoiser import PriorConfig
 from agents.diffusion import CategoryMoments, Preconditioning
 from agents.mixed_denoiser import MixedPriorConfig
 from agents.mixed_prior import MixedPrior
-from agents.networks import FluxConfig, MixedFluxConfig, TextConfig, vocabulary
+from agents.networks import FluxConfig, TextConfig, vocabulary
+from agents.networks.registry import ContinuousNetworkConfig, network_config
 from agents.pretrain_config import PretrainConfig
 from agents.prior import PROCESSES, ScenePrior
 from scene_envs.errors import InvalidInputError, unknown_name
@@ -49,18 +50,21 @@ def build_prior(
     if config.process != "mixed":
         raise unknown_name("process", config.process, PROCESSES)
     text = TextConfig(vocabulary(prompt for group in prompts for prompt in group)) if config.text else None
-    mixed_network = MixedFluxConfig(
-        scene_type.num_assets + 1,
+    mixed_network = network_config(
+        config.network,
+        "mixed",
+        features=scene_type.features,
+        categories=scene_type.num_assets + 1,
         hidden=config.hidden,
-        double_blocks=max(1, config.depth // 3),
-        single_blocks=config.depth,
+        depth=config.depth,
         heads=config.heads,
-        embedding=config.hidden,
         text_width=0 if text is None else text.width,
         attention=config.attention,
         frequencies=config.frequencies,
         unit=_unit(normalizer),
     )
+    if isinstance(mixed_network, ContinuousNetworkConfig):
+        raise TypeError("the registry gave a continuous network for a mixed prior")
     mixed_config = MixedPriorConfig(
         config.scene,
         raw.shape[1],
