@@ -88,6 +88,12 @@ def workspace_fraction(batch: SceneBatch) -> float:
     return int(batch.in_workspace.sum()) / present
 
 
+def out_of_workspace_rate(batch: SceneBatch) -> float:
+    """Share of the free objects whose frame is outside the workspace; 0 where there are none."""
+    free = batch.is_free
+    return int((free & ~batch.in_workspace).sum()) / max(int(free.sum()), 1)
+
+
 def _chunk_errors(batch: SceneBatch, supports: Sequence[Support]) -> list[tuple[str, Tensor]]:
     """The errors (K,) of each support's objects."""
     gaps = torch.stack([_height_gap(batch, support) for support in supports])  # (S, B, N)

@@ -42,7 +42,10 @@ def test_real_scenes_score_as_real(real: SceneBatch) -> None:
     assert figures["objects_mean"] == pytest.approx(float(real.counts.double().mean()))
     assert figures["free_objects_mean"] == figures["objects_mean"] - 1  # the table
     assert (figures["objects_min"], figures["objects_max"]) == (int(real.counts.min()), int(real.counts.max()))
-    assert figures["category_kl"] == figures["count_wasserstein"] == 0.0
+    assert figures["category_kl"] == figures["category_kl_e4"] == figures["count_wasserstein"] == 0.0
+    assert figures["collision_rate"] == figures["out_of_workspace_rate"] == figures["duplicates"] == 0.0
+    assert figures["median_total_penetration_cm"] == figures["median_total_pair_penetration_cm"] == 0.0
+    assert figures["stable_fraction"] == 1.0
     assert figures["workspace_fraction"] == figures["feasible_fraction"] == 1.0
     assert figures["feasible_objects"] == figures["free_objects_mean"]
     assert figures["height_error_table_mm"] < 1e-3
@@ -56,6 +59,7 @@ def test_scenes_two_millimetres_too_high_are_measured_as_such(real: SceneBatch) 
     assert figures["height_error_table_mm"] == pytest.approx(2.0, abs=1e-3)
     assert figures["height_error_stack_mm"] == pytest.approx(0.0, abs=1e-3)
     assert figures["feasible_fraction"] == 0.0  # everything falls further than 1 mm
+    assert figures["stable_fraction"] == 0.0
     assert figures["deeper_than_1mm_fraction"] == 0.0
 
 
@@ -78,6 +82,9 @@ def test_the_deep_ones_are_counted_apart(real: SceneBatch) -> None:
     assert figures["overlapping_pairs"] == 0.5
     assert figures["overlap_median_mm"] == pytest.approx(12.0, abs=0.05)
     assert figures["feasible_fraction"] == figures["feasible_objects"] == 0.5
+    assert figures["collision_rate"] == 0.5
+    assert figures["median_total_pair_penetration_cm"] == pytest.approx(0.6, abs=5e-3)  # half of 12 mm
+    assert figures["median_total_penetration_cm"] >= figures["median_total_pair_penetration_cm"]
     assert "height_error_stack_mm" not in figures  # nothing is on a stack
 
 
@@ -87,6 +94,30 @@ def test_ready_figures_are_those_after_projection_and_settling() -> None:
     assert figures["feasible_objects"] == 0.0
     assert figures["ready_objects"] == figures["ready_fraction"] == 1.0
     assert figures["ready_invalid_fraction"] == 0.0
+
+
+def test_the_category_divergence_is_printed_in_ten_thousandths() -> None:
+    figures = measure_samples(one_object("teapot", 0.0), one_object("teacup", 0.0), ready=False)
+    assert figures["category_kl_e4"] == pytest.approx(1e4 * figures["category_kl"])
+    table = figure_table(figures)
+    assert "| category_kl_e4 |" in table
+    assert "| category_kl |" not in table
+
+
+def test_objects_outside_the_workspace_are_counted_among_free_ones(real: SceneBatch) -> None:
+    moved = one_object("teapot", 0.0)
+    translations = moved.translations.clone()
+    translations[0, 1, 0] = 0.6
+    figures = measure_samples(moved.with_poses(translations, moved.rotations), real, ready=False)
+    assert figures["out_of_workspace_rate"] == 1.0
+    assert figures["workspace_fraction"] == 0.5  # the table is in it
+
+
+def test_overlap_does_not_make_an_object_unstable_that_does_not_move() -> None:
+    raised = one_object("teapot", 0.5)
+    figures = measure_samples(raised, raised, ready=False)
+    assert figures["stable_fraction"] == 0.0  # it falls
+    assert figures["collision_rate"] == 0.0
 
 
 def test_the_floor_is_the_same_figures_of_real_scenes(real: SceneBatch) -> None:
@@ -116,7 +147,8 @@ def test_grammar_scenes_follow_their_seed() -> None:
 def test_table_lists_every_figure(real: SceneBatch) -> None:
     figures = measure_samples(real, real, ready=False)
     rows = figure_table(figures).splitlines()[2:]
-    assert [row.split("|")[1].strip() for row in rows] == list(figures)
+    assert [row.split("|")[1].strip() for row in rows] == [name for name in figures if name != "category_kl"]
+    assert all(row.split("|")[4].strip() for row in rows)  # each says how to read it
 
 
 def test_nothing_to_measure_is_refused(real: SceneBatch) -> None:

@@ -1,0 +1,247 @@
+"""Are samples copies: of each other, or of training scenes? Distances between scenes as sets of objects."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import SceneBatch
+from scene_envs.scene_types import SceneType
+
+DUPLICATE = 0.01
+"""Objects this close (m) stand in the same place."""
+CANDIDATES = 32
+"""Scenes whose exact distance is computed, the nearest by their features."""
+
+_ROWS = 256
+"""Scenes whose features are compared with all others at once."""
+_WAVES = 12
+"""Test functions of the position, for each asset."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Neighbors:
+    """The nearest of some scenes, for each of B others.
+
+    Attributes:
+        distance: (B,) m, to the nearest; see :func:`scene_distances`.
+        index: (B,) int64, which it is.
+        copied: (B,) bool: it has the same assets, each within 1 cm of its counterpart.
+    """
+
+    distance: Tensor
+    index: Tensor
+    copied: Tensor
+
+
+def cutoff(scene_type: SceneType) -> float:
+    """The cost (m) of an object without counterpart: a quarter of the longer horizontal side of the workspace.
+
+    >>> from scene_envs.scene_types import get_scene_type
+    >>> cutoff(get_scene_type("dimsum_table"))
+    0.245
+    """
+    low, high = scene_type.workspace
+    return 0.25 * max(high[0] - low[0], high[1] - low[1])
+
+
+def scene_distances(batch: SceneBatch, other: SceneBatch) -> Tensor:
+    """(B,) m: how far each scene is from its counterpart in ``other``, as sets of objects; orientations do not count.
+
+    The OSPA distance of order 1 (Schuhmacher, Vo and Vo, 2008): objects are matched one to one at the least total
+    cost, where a match costs the distance of the two positions, at most c, and c when the assets differ; each object
+    without match costs c. The total is divided by the number of objects of the larger scene. Fixed welded objects
+    are left out; c is :func:`cutoff`. The assignment is exact: what Sinkhorn iterations converge to when their
+    regularisation goes to zero.
+
+    >>> from scene_envs.grammars import get_grammar
+    >>> scenes = get_grammar("dimsum_table").sample(np.random.default_rng(0), 2)
+    >>> shuffled = SceneBatch(scenes.tensor.flip(1), scenes.scene_type)
+    >>> scene_distances(shuffled, scenes)
+    tensor([0., 0.], dtype=torch.float64)
+
+    Raises:
+        InvalidInputError: another number of scenes, or scenes of other assets.
+    """
+    _check_same_assets(batch, other)
+    if len(batch) != len(other):
+        raise InvalidInputError(f"{len(batch)} scenes have no counterparts in {len(other)}; give as many")
+    limit = cutoff(batch.scene_type)
+    pairs = zip(_objects(batch), _objects(other), strict=True)
+    return torch.tensor([_distance(first, second, limit) for first, second in pairs], dtype=torch.float64)
+
+
+def nearest_scenes(batch: SceneBatch, others: SceneBatch, *, candidates: int = CANDIDATES) -> Neighbors:
+    """The scene of ``others`` that is nearest to each scene of ``batch``, by :func:`scene_distances`.
+
+    The distance is computed exactly for the ``candidates`` scenes that are nearest by features: sums over the objects
+    of an asset of bounded functions of the position with slope 1, whose differences never exceed the total cost
+    (Kantorovich duality).
+
+    Raises:
+        InvalidInputError: no scenes, or scenes of other assets.
+    """
+    _check_same_assets(batch, others)
+    if not len(others) or not len(batch):
+        raise InvalidInputError(f"{len(batch)} scenes have no nearest among {len(others)}: both need at least one")
+    limit = cutoff(batch.scene_type)
+    chosen = _nearest_features(_features(batch, limit), _features(others, limit), min(candidates, len(others)))
+    mine, theirs = _objects(batch), _Lazy(others)
+    distance, index, copied = torch.zeros(len(batch), dtype=torch.float64), torch.zeros(len(batch)).long(), []
+    for row, columns in enumerate(chosen.tolist()):
+        found = [_distance(mine[row], theirs[column], limit) for column in columns]
+        best = int(np.argmin(found))
+        distance[row], index[row] = found[best], columns[best]
+        copied.append(any(_is_copy(mine[row], theirs[column]) for column in columns))
+    return Neighbors(distance, index, torch.tensor(copied))
+
+
+def novelty(samples: Neighbors, real: Neighbors) -> float:
+    """Median distance of samples to their nearest training scene, over that of held-out real scenes.
+
+    At least 1 for samples that are as new as real scenes, 0 for copies; infinite when the held-out scenes are copies
+    of training scenes themselves and the samples are not.
+
+    Args:
+        samples: nearest training scenes of the samples.
+        real: nearest training scenes, the same ones, of real scenes that are not among them.
+    """
+    above, below = float(samples.distance.median()), float(real.distance.median())
+    return above / below if below > 0 else (1.0 if above == 0 else math.inf)
+
+
+def duplicates(batch: SceneBatch) -> float:
+    """Share of the scenes that another of the batch repeats: the same assets, each within 1 cm of its counterpart.
+
+    >>> duplicates(SceneBatch.empty("dimsum_table", 4))
+    1.0
+    """
+    objects = _objects(batch)
+    groups: dict[bytes, list[int]] = {}
+    for row, (categories, _) in enumerate(objects):
+        groups.setdefault(categories.tobytes(), []).append(row)
+    repeated: set[int] = set()
+    for rows in groups.values():
+        for first, second in _close_pairs([objects[row][1] for row in rows]):
+            pair = rows[first], rows[second]
+            if not repeated.issuperset(pair) and _is_copy(objects[pair[0]], objects[pair[1]]):
+                repeated.update(pair)
+    return len(repeated) / len(batch)
+
+
+# -- one scene: its categories (n,), ascending, and positions (n, 3) m ------------------------------
+
+_Scene = tuple[NDArray[np.int64], Array]
+
+
+def _objects(batch: SceneBatch) -> list[_Scene]:
+    scenes = _Lazy(batch)
+    return [scenes[row] for row in range(len(batch))]
+
+
+class _Lazy:
+    """Scenes as sorted arrays, made when asked for."""
+
+    def __init__(self, batch: SceneBatch) -> None:
+        self.present = _counted(batch).cpu().numpy()
+        self.categories = batch.categories.cpu().numpy()
+        self.positions = batch.translations.double().cpu().numpy()
+        self.known: dict[int, _Scene] = {}
+
+    def __getitem__(self, row: int) -> _Scene:
+        if row not in self.known:
+            slots = np.flatnonzero(self.present[row])
+            slots = slots[np.argsort(self.categories[row, slots], kind="stable")]
+            self.known[row] = self.categories[row, slots], self.positions[row, slots]
+        return self.known[row]
+
+
+def _counted(batch: SceneBatch) -> Tensor:
+    """(B, N) bool: objects, but for the fixed welded ones that are in every scene."""
+    fixed = {item.asset for item in batch.scene_type.fixed} & set(batch.scene_type.welded)
+    categories = torch.tensor([batch.scene_type.assets.index(name) for name in fixed], dtype=torch.long)
+    return ~batch.is_empty & ~torch.isin(batch.categories, categories.to(batch.tensor.device))
+
+
+def _distance(first: _Scene, second: _Scene, limit: float) -> float:
+    from scipy.optimize import linear_sum_assignment
+
+    count, most = len(first[0]), max(len(first[0]), len(second[0]))
+    if not most:
+        return 0.0
+    apart = np.sqrt(((first[1][:, None] - second[1][None]) ** 2).sum(axis=-1))
+    cost = np.where(first[0][:, None] == second[0][None], np.minimum(apart, limit), limit)
+    rows, columns = linear_sum_assignment(cost)
+    matched = float(cost[rows, columns].sum())
+    return (matched + limit * (most - min(count, len(second[0])))) / most
+
+
+def _is_copy(first: _Scene, second: _Scene) -> bool:
+    """Whether the assets are the same and can be matched so that all are within :data:`DUPLICATE`."""
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import maximum_bipartite_matching
+
+    if not np.array_equal(first[0], second[0]):
+        return False
+    near = ((first[1][:, None] - second[1][None]) ** 2).sum(axis=-1) <= DUPLICATE**2
+    near &= first[0][:, None] == second[0][None]
+    if not near.any(axis=1).all():
+        return False
+    return bool((maximum_bipartite_matching(csr_matrix(near)) >= 0).all())
+
+
+def _close_pairs(positions: list[Array]) -> NDArray[np.int64]:
+    """(P, 2): scenes of the same assets whose centres are near enough for them to be copies."""
+    from scipy.spatial import KDTree
+
+    if len(positions) < 2:
+        return np.empty((0, 2), dtype=np.int64)
+    centers = np.stack([scene.mean(axis=0) if len(scene) else np.zeros(3) for scene in positions])
+    pairs: NDArray[np.int64] = KDTree(centers).query_pairs(DUPLICATE * 1.001, output_type="ndarray")
+    return pairs
+
+
+# -- features --------------------------------------------------------------------------------------
+
+
+def _features(batch: SceneBatch, limit: float) -> Tensor:
+    """(B, C * (1 + waves)) m: per asset, the sums over its objects of functions with slope <= 1 and range <= ``limit``.
+
+    They are the constant ``limit`` / 2, and waves of the position in random directions, the same for all scenes.
+    """
+    generator = torch.Generator().manual_seed(0)
+    direction = torch.nn.functional.normalize(torch.randn(3, _WAVES, generator=generator), dim=0)
+    length = limit / 2 * torch.logspace(0, 1, _WAVES, 2.0)  # slope 1 at amplitude limit / 2 when length = limit / 2
+    phase = 2 * math.pi * torch.rand(_WAVES, generator=generator)
+    chunks = []
+    for start in range(0, len(batch), 1024):
+        part = batch[start : start + 1024].to("cpu")
+        one_hot = part.tensor[..., 12:-1] * _counted(part).unsqueeze(-1)  # (b, N, C)
+        waves = (limit / 2) * torch.sin(part.translations @ direction / length + phase)  # (b, N, waves)
+        waves = torch.cat([torch.full_like(waves[..., :1], limit / 2), waves], dim=-1)
+        chunks.append(torch.einsum("bnc,bnw->bcw", one_hot, waves).flatten(1))
+    return torch.cat(chunks)
+
+
+def _nearest_features(features: Tensor, others: Tensor, count: int) -> Tensor:
+    """(B, count) int64: rows of ``others`` with the nearest features."""
+    used = (features != 0).any(dim=0) | (others != 0).any(dim=0)
+    features, others = features[:, used], others[:, used]
+    chunks = features.split(_ROWS)
+    return torch.cat([torch.cdist(chunk, others).topk(count, dim=1, largest=False).indices for chunk in chunks])
+
+
+def _check_same_assets(batch: SceneBatch, other: SceneBatch) -> None:
+    if batch.scene_type.assets != other.scene_type.assets:
+        raise InvalidInputError(
+            f"scenes of {batch.scene_type.name!r} cannot be compared with scenes of {other.scene_type.name!r}: "
+            "their assets differ"
+        )

@@ -1,0 +1,146 @@
+"""Overlap and stability of scenes, from what the physics computed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import SceneBatch
+
+if TYPE_CHECKING:
+    from scene_envs.physics import EquilibriumResult, ObjectPair, PenetrationResult, PhysicsPool
+
+CONTACT = 1e-5
+"""Pairs whose hulls overlap by less than this (m) are in contact, not penetrating: float32 poses are no finer."""
+COLLISION = 1e-3
+"""Pairs that overlap deeper than this (m) collide."""
+MAX_DISPLACEMENT, MAX_ROTATION = 1e-3, 1e-2
+"""An object that moves (m) or turns (rad) further in simulation is not stable."""
+
+
+def physics_figures(batch: SceneBatch, pool: PhysicsPool | None = None) -> dict[str, float]:
+    """Overlap, stability and feasibility of scenes as they are; the meaning of each name is on the docs' page.
+
+    Scenes whose physics failed leave the figures of that computation.
+
+    Args:
+        batch: the scenes.
+        pool: worker processes; None computes in this process.
+    """
+    return {**_overlap(batch, pool), **_stability(batch, pool), **_feasibility(batch, pool)}
+
+
+def ready_figures(batch: SceneBatch, pool: PhysicsPool | None = None) -> dict[str, float]:
+    """Objects that are simulation-ready after projection and settling."""
+    from scene_envs.physics import make_ready
+
+    result = make_ready(batch, pool=pool)
+    figures = {"ready_invalid_fraction": 1.0 - float(result.valid.double().mean())}
+    return {**figures, **_per_scene_and_fraction("ready", batch, result.counts, result.valid)}
+
+
+def penetration_totals(result: PenetrationResult) -> tuple[Tensor, Tensor]:
+    """(V,), (V,) m: total penetration of each valid scene, over pairs of convex parts and over pairs of objects.
+
+    The first is the literature's: the sum over all colliding pairs of collision geometries. It grows with the number
+    of parts an asset is made of. The second counts each pair of objects once, with its deepest overlap. Pairs in
+    contact (:data:`CONTACT`) are left out of both.
+    """
+    scenes = _valid_pairs(result)
+    geometry = [sum(pair.total for pair in pairs) for pairs in scenes]
+    objects = [sum(pair.depth for pair in pairs) for pairs in scenes]
+    return torch.tensor(geometry, dtype=torch.float64), torch.tensor(objects, dtype=torch.float64)
+
+
+def collision_rate(result: PenetrationResult) -> float:
+    """Share of the valid scenes in which some pair of objects overlaps deeper than 1 mm.
+
+    Raises:
+        InvalidInputError: no scene is valid.
+    """
+    scenes = _valid_pairs(result)
+    if not scenes:
+        raise InvalidInputError("the physics judged none of the scenes, so they have no collision rate")
+    return float(np.mean([any(pair.depth > COLLISION for pair in pairs) for pairs in scenes]))
+
+
+def stable_fraction(batch: SceneBatch, result: EquilibriumResult) -> float:
+    """Share of free objects that move at most 1 mm and turn at most 0.01 rad in simulation, whatever they overlap.
+
+    Args:
+        batch: the scenes.
+        result: their motion, nothing removed.
+
+    Raises:
+        InvalidInputError: no valid scene holds a free object.
+    """
+    free = batch.is_free.cpu() & result.valid.unsqueeze(-1)
+    if not bool(free.any()):
+        raise InvalidInputError("no free object was simulated, so there is no stable fraction")
+    stable = (result.displacement <= MAX_DISPLACEMENT) & (result.rotation <= MAX_ROTATION)
+    return float(stable[free].double().mean())
+
+
+def _overlap(batch: SceneBatch, pool: PhysicsPool | None) -> dict[str, float]:
+    from scene_envs.physics import penetration
+
+    result = penetration(batch, pool=pool)
+    scenes = _valid_pairs(result)
+    if not scenes:
+        return {}
+    per_geometry, per_pair = penetration_totals(result)
+    figures = {
+        "median_total_penetration_cm": 100 * float(per_geometry.quantile(0.5)),
+        "median_total_pair_penetration_cm": 100 * float(per_pair.quantile(0.5)),
+        "collision_rate": collision_rate(result),
+    }
+    depths = [pair.depth for pairs in scenes for pair in pairs]
+    figures["overlapping_pairs"] = len(depths) / len(scenes)
+    if depths:
+        figures["overlap_median_mm"] = 1e3 * float(np.quantile(depths, 0.5))
+        figures["overlap_p95_mm"] = 1e3 * float(np.quantile(depths, 0.95))
+    free = batch.is_free.cpu() & result.valid.unsqueeze(-1)
+    if bool(free.any()):
+        figures["deeper_than_1mm_fraction"] = float((result.depth[free] > COLLISION).double().mean())
+        figures["deeper_than_1cm_fraction"] = float((result.depth[free] > 1e-2).double().mean())
+    return figures
+
+
+def _stability(batch: SceneBatch, pool: PhysicsPool | None) -> dict[str, float]:
+    from scene_envs.physics import equilibrium
+
+    result = equilibrium(batch, pool=pool)
+    simulated = bool((batch.is_free.cpu() & result.valid.unsqueeze(-1)).any())
+    return {"stable_fraction": stable_fraction(batch, result)} if simulated else {}
+
+
+def _feasibility(batch: SceneBatch, pool: PhysicsPool | None) -> dict[str, float]:
+    from scene_envs.physics import feasibility
+
+    result = feasibility(batch, pool=pool)
+    figures = {"invalid_fraction": 1.0 - float(result.valid.double().mean())}
+    return {**figures, **_per_scene_and_fraction("feasible", batch, result.counts, result.valid)}
+
+
+def _per_scene_and_fraction(name: str, batch: SceneBatch, counts: Tensor, valid: Tensor) -> dict[str, float]:
+    """Mean of ``counts`` (B,) over valid scenes, and their sum as a share of the free objects there."""
+    figures = {}
+    if bool(valid.any()):
+        figures[f"{name}_objects"] = float(counts[valid].double().mean())
+        free = int(batch.is_free.cpu()[valid].sum())
+        if free:
+            figures[f"{name}_fraction"] = int(counts[valid].sum()) / free
+    return figures
+
+
+def _valid_pairs(result: PenetrationResult) -> list[list[ObjectPair]]:
+    """The penetrating pairs of each valid scene."""
+    return [
+        [pair for pair in pairs if pair.depth > CONTACT]
+        for pairs, valid in zip(result.pairs, result.valid.tolist(), strict=True)
+        if valid
+    ]
