@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from agents.diffusion import GaussianProcess
-from agents.networks import FluxConfig
+from agents.networks.registry import ContinuousNetworkConfig
 
 
 @dataclass(frozen=True)
@@ -18,24 +18,44 @@ class PriorConfig:
     Attributes:
         scene_type: name of its scene type.
         slots: slots per scene that it was trained on.
-        network: size of its denoiser.
+        network: kind and size of its denoiser, any configuration of a continuous network.
         schedule: noise schedule, ``"karras"``, ``"linear"`` or ``"cosine"``.
         prediction: ``"karras"``, ``"epsilon"``, ``"x0"`` or ``"v"``.
         num_timesteps: T of the schedule.
         noise_mean: mean of ln(noise-to-signal) over training timesteps.
         noise_std: its standard deviation.
         translation_weight: weight of x, y, z in the pretraining loss, other features having 1.
+        rotation: what is diffused as rotation, ``"matrix"``, ``"quaternion"`` or ``"axis_angle"``.
+        timesteps: law of training timesteps, ``"lognormal"`` (of the noise-to-signal ratio) or ``"uniform"``; None is
+            what was published with the prediction, lognormal for ``"karras"`` and uniform for the others.
+        loss_weighting: of the loss by timestep, ``"none"`` or ``"min_snr"``.
+        noise_floor: lowest noise-to-signal ratio of the ``"karras"`` schedule, in normalised units.
+        clip: bound on denoised scenes while sampling, normalised units; 0 for none (1 is that of Ho et al. 2020).
     """
 
     scene_type: str
     slots: int
-    network: FluxConfig
+    network: ContinuousNetworkConfig
     schedule: str = "karras"
     prediction: str = "karras"
     num_timesteps: int = 1000
     noise_mean: float = -1.8
     noise_std: float = 2.1
     translation_weight: float = 3.0
+    rotation: str = "matrix"
+    timesteps: str | None = None
+    loss_weighting: str = "none"
+    noise_floor: float = 0.002
+    clip: float = 0.0
+
+
+def timestep_law(timesteps: str | None, prediction: str) -> str:
+    """The law of training timesteps: the given one, or that which was published with ``prediction``.
+
+    >>> timestep_law(None, "epsilon"), timestep_law(None, "karras"), timestep_law("lognormal", "v")
+    ('uniform', 'lognormal', 'lognormal')
+    """
+    return timesteps or ("lognormal" if prediction == "karras" else "uniform")
 
 
 def autocast(like: Tensor, precision: torch.dtype) -> torch.autocast:

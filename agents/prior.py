@@ -157,30 +157,41 @@ class ScenePrior(nn.Module, ABC):
         """The reverse steps of a chain of ``num_steps``, any number in 1..T."""
         return StepTable.spaced(self.config.num_timesteps, num_steps)
 
+    @property
+    def features(self) -> int:
+        """D, numbers per slot of what is denoised."""
+        return self.scene_type.features
+
+    @property
+    def is_constant(self) -> Tensor:
+        """(D,) bool: features that never vary."""
+        return self.normalizer.is_constant
+
     def known(self, slots: int) -> Tensor:
         """(slots, D) bool: entries that are clamped (fixed welded slots, constant features)."""
-        known = self.normalizer.is_constant.to(self._fixed.device).expand(slots, -1).clone()
+        known = self.is_constant.to(self._fixed.device).expand(slots, -1).clone()
         known[: len(self.scene_type.fixed)] = True
         return known
 
     def clamp(self, x: Tensor) -> Tensor:
         """``x`` (B, N, D) with its known entries set to their values."""
         count = len(self.scene_type.fixed)
-        x = torch.where(self.normalizer.is_constant.to(x.device), torch.zeros_like(x), x)
+        x = torch.where(self.is_constant.to(x.device), torch.zeros_like(x), x)
         if count:
             x = torch.cat([self._fixed[:count].to(x).expand(x.shape[0], -1, -1), x[:, count:]], dim=1)
         return x
 
     def initial(self, count: int, slots: int, generator: Generator | None = None) -> Tensor:
         """x_T (count, slots, D): standard normal with the known entries clamped."""
-        noise = torch.randn(count, slots, self.scene_type.features, generator=generator, device=self._fixed.device)
+        noise = torch.randn(count, slots, self.features, generator=generator, device=self._fixed.device)
         return self.clamp(noise)
 
     @abstractmethod
-    def transition(self, x_t: Tensor, step: int, table: StepTableLike) -> ReverseStep:
+    def transition(self, x_t: Tensor, step: int, table: StepTableLike, *, eta: float = 1.0) -> ReverseStep:
         """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters.
 
-        Known entries are certain; at the last step all are.
+        Known entries are certain; at the last step all are. ``eta`` scales the noise of what is continuous, as in
+        :meth:`sample`.
         """
 
     @abstractmethod
@@ -198,14 +209,20 @@ class ScenePrior(nn.Module, ABC):
 
     @torch.no_grad()
     def sample_tensor(
-        self, count: int, *, num_steps: int = 50, slots: int | None = None, generator: Generator | None = None
+        self,
+        count: int,
+        *,
+        num_steps: int = 50,
+        slots: int | None = None,
+        generator: Generator | None = None,
+        eta: float = 1.0,
     ) -> Tensor:
         """``count`` denoised scenes x_0 (count, slots, D), normalised, from one batch."""
         table = self.step_table(num_steps)
         x = self.initial(count, self.config.slots if slots is None else slots, generator)
         for step in range(len(table)):
             noise = torch.randn(x.shape, generator=generator, device=x.device)
-            x = self.transition(x, step, table).from_noise(noise)
+            x = self.transition(x, step, table, eta=eta).from_noise(noise)
         return x
 
     def sample(
@@ -218,6 +235,7 @@ class ScenePrior(nn.Module, ABC):
         slots: int | None = None,
         seed: int = 0,
         batch_size: int = 64,
+        eta: float = 1.0,
     ) -> SceneBatch:
         """``count`` scenes by ancestral sampling (Ho et al. 2020, Algorithm 2) over ``num_steps`` strides.
 
@@ -230,6 +248,8 @@ class ScenePrior(nn.Module, ABC):
             slots: slots per scene; more than trained is allowed.
             seed: of the torch generator; the same seed and batch size give the same scenes.
             batch_size: scenes denoised at once.
+            eta: noise of the reverse steps of what is continuous (Song et al. 2021, Eq. 16): 1 is the ancestral chain,
+                0 makes all but x_T, and the discrete categories of a mixed prior, deterministic.
         """
         if count < 1:
             raise InvalidInputError(f"count={count}: ask for at least one scene")
@@ -238,7 +258,7 @@ class ScenePrior(nn.Module, ABC):
         chunks, done = [], 0
         for size in _chunk_sizes(count, batch_size):
             asked = None if prompts is None else prompts[done : done + size]
-            chunks.append(self._sample_chunk(size, asked, guidance, num_steps, slots, generator))
+            chunks.append(self._sample_chunk(size, asked, guidance, num_steps, slots, generator, eta))
             done += size
         return self.decode(torch.cat(chunks))
 
@@ -250,9 +270,10 @@ class ScenePrior(nn.Module, ABC):
         num_steps: int,
         slots: int | None,
         generator: Generator,
+        eta: float,
     ) -> Tensor:
         """A chunk of :meth:`sample`; priors that read prompts override it."""
-        return self.sample_tensor(count, num_steps=num_steps, slots=slots, generator=generator)
+        return self.sample_tensor(count, num_steps=num_steps, slots=slots, generator=generator, eta=eta)
 
     def decode(self, x: Tensor) -> SceneBatch:
         """Scenes from normalised x_0 (B, N, D); known entries take their exact values."""

@@ -75,7 +75,7 @@ class UnionTable:
         """See :class:`TrainingData`."""
         chosen = torch.randint(len(self.datasets), (count,), generator=generator)
         places = torch.rand(count, generator=generator)
-        scenes = torch.empty(count, self.prior.scene_type.slots, self.prior.scene_type.features)
+        scenes = torch.empty(count, self.prior.scene_type.slots, self.prior.features)
         texts: list[Sequence[str]] = [()] * count
         for number, dataset in enumerate(self.datasets):
             rows = torch.nonzero(chosen == number).flatten()

@@ -81,5 +81,9 @@ def make_schedule(
     if num_timesteps < 2:
         raise InvalidInputError(f"a noise schedule needs at least 2 timesteps, got {num_timesteps}")
     if name == "karras":
+        if not 0.0 < noise_floor < noise_ceiling:
+            raise InvalidInputError(
+                f"noise_floor={noise_floor:g} must be positive and below noise_ceiling={noise_ceiling:g}"
+            )
         return NoiseSchedule(name, karras_alpha_bar(num_timesteps, noise_floor, noise_ceiling))
     return NoiseSchedule(name, _SCHEDULES[name](num_timesteps))

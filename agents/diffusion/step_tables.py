@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Integral
 
 import torch
 from torch import Tensor
@@ -49,7 +50,7 @@ class StepTable:
         Raises:
             InvalidInputError: ``num_steps`` is not a whole number in 1..T.
         """
-        if not isinstance(num_steps, int) or isinstance(num_steps, bool):
+        if not isinstance(num_steps, Integral) or isinstance(num_steps, bool):
             raise InvalidInputError(f"num_steps={num_steps!r} must be a whole number in 1..{num_timesteps}")
         if not 1 <= num_steps <= num_timesteps:
             raise InvalidInputError(f"num_steps={num_steps} is outside 1..{num_timesteps}, the prior's timesteps")
