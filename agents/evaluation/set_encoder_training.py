@@ -116,7 +116,8 @@ def damage(batch: SceneBatch, generator: torch.Generator) -> tuple[SceneBatch, T
     rotation = torch.where(some[:, 1], 1e-2 * 50.0 ** uniform(count), 0.0)
     shares = 0.6 * uniform(count, 3) * some[:, 2:]
     swapped, moved, removed = ((uniform(*free.shape) < shares[:, i, None]) & free for i in range(3))
-    noisy = blurred(batch, *(scale[:, None, None] * free[..., None] for scale in (position, rotation)), generator)
+    on_free = free[..., None].float()
+    noisy = blurred(batch, position[:, None, None] * on_free, rotation[:, None, None] * on_free, generator)
     offset = 0.6 * (uniform(*free.shape, 3) - 0.5) * torch.tensor([1.0, 1.0, 0.2]) * moved[..., None]
     candidates = [c for c in range(batch.scene_type.num_assets) if c not in batch.scene_type.welded_categories]
     other = torch.tensor(candidates)[torch.randint(len(candidates), free.shape, generator=generator)]
