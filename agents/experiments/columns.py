@@ -50,6 +50,7 @@ COLUMNS: dict[str, Column] = {
         _share("feasible_fraction", "feasible objects", "high", "free_objects"),
         _share("stable_fraction", "stable objects", "high", "free_objects"),
         Column("count_wasserstein", "count W₁", 1.0, 3, "low"),
+        _share("prompt_following", "prompts followed", "high", "prompt_following_number"),
         _share("prompt_counts", "counts followed", "high", "prompt_counts_number"),
         _share("prompt_names", "names followed", "high", "prompt_names_number"),
         _share("prompt_relations", "relations followed", "high", "prompt_relations_number"),

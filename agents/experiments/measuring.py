@@ -36,8 +36,14 @@ def sample_and_measure(
 
 
 def measure_real(real: RealScenes, settings: TablesConfig, pool: PhysicsPool | None) -> dict[str, float]:
-    """Figures of real scenes against other real scenes: no sampler can be expected to do better."""
-    return measure(real.others, real.reference, real.prompts, settings, pool)
+    """Figures of real scenes against other real scenes: no sampler can be expected to do better.
+
+    With prompts, ``chance_prompt_counts`` and so on are those of real scenes that were given the prompts of others.
+    """
+    from agents.evaluation import prompt_chance
+
+    figures = measure(real.others, real.reference, real.prompts, settings, pool)
+    return {**figures, **(prompt_chance(real.others, real.prompts) if real.prompts else {})}
 
 
 def measure(
@@ -94,6 +100,6 @@ def _frechet(samples: SceneBatch, reference: SceneBatch) -> dict[str, float]:
 
 
 def _prompts(samples: SceneBatch, prompts: Sequence[str]) -> Mapping[str, float]:
-    from agents.evaluation.prompt_following import prompt_following
+    from agents.evaluation import prompt_following
 
-    return prompt_following(samples, prompts)
+    return {**prompt_following(samples, prompts), "prompt_following_number": float(len(prompts))}

@@ -13,7 +13,7 @@ _SCENE_COLUMNS = (
     "stable_fraction",
     "count_wasserstein",
 )
-_PROMPT_COLUMNS = ("prompt_counts", "prompt_names", "prompt_relations")
+_PROMPT_COLUMNS = ("prompt_following", "prompt_counts", "prompt_names", "prompt_relations")
 _PLOTTED = ("classifier_accuracy", "frechet_scene_distance", "feasible_fraction")
 
 

@@ -189,8 +189,15 @@ def _fill(table: Table, results: dict[str, RowResult], floor: dict[str, float], 
     lines.append(Line(REAL, "", "real scenes" if any(line.group for line in lines) else "", floor))
     note = table.note
     if any(entry.prompted for entry in table.entries):
-        note += f" Guidance w = {settings.guidance:g}."
+        note += f" Guidance w = {settings.guidance:g}.{_chance(floor)}"
     return FilledTable(table, tuple(lines), note)
+
+
+def _chance(floor: dict[str, float]) -> str:
+    """What ignoring the prompt scores, in words."""
+    kinds = ("counts", "names", "relations")
+    found = [f"{kind} {100 * floor[name]:.0f} %" for kind in kinds if (name := f"chance_prompt_{kind}") in floor]
+    return f" Real scenes that were given the prompts of others follow {', '.join(found)}." if found else ""
 
 
 def _lead(settings: TablesConfig, real: RealScenes) -> str:
