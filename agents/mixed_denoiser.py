@@ -25,9 +25,6 @@ EMPTY_SLOTS = ("attended", "dropped")
 _CERTAIN = 30.0
 """How far, in nats, other categories are behind one that is known."""
 
-_LARGEST_INPUT = 20.0
-"""Bound on scaled network inputs: a pose that its category never has should not drown the others."""
-
 Text = tuple[Tensor, Tensor]
 """Tokens (B, L, W) and their mask (B, L)."""
 
@@ -174,7 +171,7 @@ class MixedDenoiser(nn.Module):
         alpha, _ = self.poses.rates(t, pose)
         ratio = (self.poses.sigma[t.cpu()] / self.poses.alpha[t.cpu()]).to(x_t.device)
         level = ratio[:, None].expand(pose.shape[:2])
-        scaled = self.poses.network_input(pose, t, self.moments(states, t)).clamp(-_LARGEST_INPUT, _LARGEST_INPUT)
+        scaled = self.poses.network_input(pose, t)
         position = pose[..., :3] / alpha
         if given is not None:
             exact = given.pose[..., None]

@@ -19,6 +19,7 @@ class PretrainConfig:
         batch_size: scenes per step, over all processes and parts.
         accumulate: parts in which a process takes its scenes, one after the other, to save memory.
         precision: number format of the network in training, ``float32`` or ``bfloat16`` (autocast).
+        optimizer: ``adamw``, or ``muon`` for Muon on the matrices inside blocks and AdamW on the rest.
         learning_rate: peak learning rate.
         final_learning_rate: where the cosine ends, as a fraction of the peak.
         warmup: steps of linear warm-up.
@@ -68,6 +69,7 @@ class PretrainConfig:
     batch_size: int = 128
     accumulate: int = 1
     precision: str = "float32"
+    optimizer: str = "adamw"
     learning_rate: float = 1e-3
     final_learning_rate: float = 0.01
     warmup: int = 100

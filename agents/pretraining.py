@@ -20,6 +20,7 @@ from agents.averaging import Averaged, WeightAverage
 from agents.checkpoints import load_checkpoint, save_checkpoint
 from agents.mixed_prior import MixedPrior
 from agents.new_prior import build_prior
+from agents.optimizers import build_optimizer
 from agents.parallel import World
 from agents.pretrain_config import PretrainConfig
 from agents.prior import ScenePrior
@@ -34,6 +35,7 @@ from scene_envs.scene_types import register_scene_type
 logger = logging.getLogger(__name__)
 
 _PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+_MATMUL_PRECISIONS = ("highest", "high", "medium")
 _SAMPLE = 1024
 """Scenes of a grammar to which the moments and the vocabulary are fitted."""
 _HELD_OUT = 512
@@ -86,9 +88,10 @@ class Pretrainer:
             raise unknown_name("precision", config.precision, _PRECISIONS)
         prior.denoiser.precision = _PRECISIONS[config.precision]
         self.average = WeightAverage(self.network, config.ema)
-        self.optimizer = torch.optim.AdamW(
-            self.network.parameters(), betas=(0.9, 0.99), weight_decay=config.weight_decay
-        )
+        self.optimizer = build_optimizer(config.optimizer, self.network, config.weight_decay)
+        if config.matmul_precision not in _MATMUL_PRECISIONS:
+            raise unknown_name("matmul_precision", config.matmul_precision, _MATMUL_PRECISIONS)
+        torch.set_float32_matmul_precision(config.matmul_precision)
         self.step = 0
         self.seconds = 0.0
         self.directory = Path(config.output)

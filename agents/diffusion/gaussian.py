@@ -57,15 +57,12 @@ class GaussianProcess:
 
     # -- what the network sees and says ---------------------------------------------------------
 
-    def network_input(self, x_t: Tensor, t: Tensor, moments: Moments | None = None) -> Tensor:
-        """x_t scaled to unit variance per feature (Karras et al. 2022, c_in); raw for other predictions.
-
-        ``moments``, here and below, are mean and std that broadcast against ``x_t``; None takes those of all data.
-        """
+    def network_input(self, x_t: Tensor, t: Tensor) -> Tensor:
+        """x_t scaled to unit variance per feature (Karras et al. 2022, c_in); raw for other predictions."""
         if self.prediction != "karras":
             return x_t
         alpha, sigma = self.rates(t, x_t)
-        mean, std = self._moments(x_t, moments)
+        mean, std = self._moments(x_t, None)
         return (x_t - alpha * mean) / (alpha**2 * std**2 + sigma**2).sqrt()
 
     def x0_from_output(self, x_t: Tensor, t: Tensor, output: Tensor, moments: Moments | None = None) -> Tensor:
@@ -73,6 +70,9 @@ class GaussianProcess:
 
         ``karras``: skip and output scaling of Karras et al. (2022), Table 1, in variance-preserving
         coordinates and with per-feature moments; ``epsilon``: predicted noise; ``v``: Salimans and Ho (2022).
+
+        ``moments``, here and in :meth:`target`, are mean and std that broadcast against ``x_t`` and scale the output;
+        None takes those of all data, by which the input is always scaled: positions must stay comparable.
         """
         alpha, sigma = self.rates(t, x_t)
         if self.prediction == "karras":

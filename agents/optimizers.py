@@ -1,0 +1,105 @@
+"""Optimisers of a pretraining run: AdamW, and Muon for the matrices inside transformer blocks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from scene_envs.errors import unknown_name
+
+OPTIMIZERS = ("adamw", "muon")
+"""What :func:`build_optimizer` builds."""
+
+_BETAS, _EPS = (0.9, 0.99), 1e-8
+_MOMENTUM = 0.95
+_COEFFICIENTS = (3.4445, -4.7750, 2.0315)
+"""Of the quintic Newton-Schulz iteration (Jordan et al. 2024)."""
+
+
+def build_optimizer(name: str, network: nn.Module, weight_decay: float) -> torch.optim.Optimizer:
+    """An optimiser of all parameters of ``network``; every group's ``lr`` is the rate of AdamW.
+
+    Args:
+        name: ``"adamw"``, or ``"muon"`` for Muon on the matrices inside ``blocks`` and AdamW on the rest.
+        network: what is trained.
+        weight_decay: decoupled.
+    """
+    if name not in OPTIMIZERS:
+        raise unknown_name("optimizer", name, OPTIMIZERS)
+    if name == "adamw":
+        return torch.optim.AdamW(network.parameters(), betas=_BETAS, weight_decay=weight_decay)
+    matrices = [p for key, p in network.named_parameters() if p.ndim == 2 and "blocks." in key]
+    inside = {id(p) for p in matrices}
+    others = [p for p in network.parameters() if id(p) not in inside]
+    return MuonAdamW(matrices, others, weight_decay=weight_decay)
+
+
+class MuonAdamW(torch.optim.Optimizer):
+    """Muon (Jordan et al. 2024) on matrices and AdamW on everything else, under one learning rate.
+
+    The update of a matrix is its momentum made orthogonal, scaled so that its root mean square is that of AdamW's
+    (Liu et al. 2025), in float32: ``torch.optim.Muon`` iterates in bfloat16, which is very slow on most CPUs.
+
+    Args:
+        matrices: two-dimensional parameters, updated by Muon.
+        others: parameters updated by AdamW.
+        lr: learning rate of both.
+        weight_decay: decoupled, of both.
+
+    >>> weight = nn.Parameter(torch.eye(2))
+    >>> optimizer = MuonAdamW([weight], [], lr=0.1, weight_decay=0.0)
+    >>> weight.grad = torch.tensor([[1.0, 0.0], [0.0, 1e-3]])
+    >>> optimizer.step()
+    >>> bool((torch.eye(2) - weight)[0, 0] > 0.015)
+    True
+    """
+
+    def __init__(
+        self, matrices: list[nn.Parameter], others: list[nn.Parameter], lr: float = 1e-3, weight_decay: float = 0.01
+    ) -> None:
+        groups = [{"params": matrices, "kind": "muon"}, {"params": others, "kind": "adamw"}]
+        super().__init__([group for group in groups if group["params"]], {"lr": lr, "weight_decay": weight_decay})
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
+        """One update of every parameter that has a gradient; a closure is not supported."""
+        for group in self.param_groups:
+            update = self._muon if group["kind"] == "muon" else self._adamw
+            for parameter in group["params"]:
+                if parameter.grad is not None:
+                    parameter.mul_(1.0 - group["lr"] * group["weight_decay"])
+                    parameter.add_(update(parameter.grad, self.state[parameter]), alpha=-group["lr"])
+
+    @staticmethod
+    def _muon(gradient: Tensor, state: dict[str, Any]) -> Tensor:
+        momentum = state.setdefault("momentum", torch.zeros_like(gradient))
+        momentum.lerp_(gradient, 1.0 - _MOMENTUM)
+        direction = orthogonalised(gradient.lerp(momentum, _MOMENTUM))
+        return 0.2 * math.sqrt(max(gradient.shape)) * direction
+
+    @staticmethod
+    def _adamw(gradient: Tensor, state: dict[str, Any]) -> Tensor:
+        if not state:
+            state |= {"step": 0, "mean": torch.zeros_like(gradient), "square": torch.zeros_like(gradient)}
+        state["step"] += 1
+        state["mean"].lerp_(gradient, 1.0 - _BETAS[0])
+        state["square"].mul_(_BETAS[1]).addcmul_(gradient, gradient, value=1.0 - _BETAS[1])
+        mean = state["mean"] / (1.0 - _BETAS[0] ** state["step"])
+        result: Tensor = mean / ((state["square"] / (1.0 - _BETAS[1] ** state["step"])).sqrt() + _EPS)
+        return result
+
+
+def orthogonalised(matrix: Tensor, steps: int = 5) -> Tensor:
+    """``matrix`` (M, N) with all singular values brought near 1, between 0.7 and 1.2, by Newton-Schulz iterations."""
+    a, b, c = _COEFFICIENTS
+    tall = matrix.shape[0] > matrix.shape[1]
+    x = matrix.T if tall else matrix
+    x = x / x.norm().clamp(min=1e-7)
+    for _ in range(steps):
+        gram = x @ x.T
+        x = torch.addmm(x, torch.addmm(gram, gram, gram, beta=b, alpha=c), x, beta=a)
+    return x.T if tall else x
