@@ -1,15 +1,41 @@
 """Denoiser networks."""
 
+from agents.networks.diffuscene import DiffuScene, DiffuSceneConfig, MixedDiffuScene, MixedDiffuSceneConfig
 from agents.networks.flux import FluxConfig, FluxDenoiser
+from agents.networks.midiffusion import MiDiffusion, MiDiffusionConfig, MixedMiDiffusion, MixedMiDiffusionConfig
 from agents.networks.mixed_flux import MixedFlux, MixedFluxConfig
+from agents.networks.registry import (
+    NETWORKS,
+    build_network,
+    config_from_state,
+    config_state,
+    match_parameters,
+    network_config,
+    parameter_count,
+)
 from agents.networks.text import TextConfig, TextEncoder, vocabulary
 
 __all__ = [
+    "NETWORKS",
+    "DiffuScene",
+    "DiffuSceneConfig",
     "FluxConfig",
     "FluxDenoiser",
+    "MiDiffusion",
+    "MiDiffusionConfig",
+    "MixedDiffuScene",
+    "MixedDiffuSceneConfig",
     "MixedFlux",
     "MixedFluxConfig",
+    "MixedMiDiffusion",
+    "MixedMiDiffusionConfig",
     "TextConfig",
     "TextEncoder",
+    "build_network",
+    "config_from_state",
+    "config_state",
+    "match_parameters",
+    "network_config",
+    "parameter_count",
     "vocabulary",
 ]
