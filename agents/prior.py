@@ -21,7 +21,7 @@ from agents.diffusion import (
     StepTable,
 )
 from agents.inpainting import inpaint
-from agents.prior_files import read_prior, write_prior
+from agents.prior_files import read_prior, to_precision, write_prior
 from agents.prompt_room import check_prompts
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError, unknown_name
 from scene_envs.normalizer import Normalizer
@@ -128,8 +128,13 @@ class ScenePrior(nn.Module, ABC):
             raise CorruptFileError(f"the weights of the prior {str(name)!r} do not fit its network: {error}") from error
         return prior.eval()
 
-    def save(self, directory: str | os.PathLike[str]) -> Path:
-        """Write ``config.json`` and ``model.safetensors`` into ``directory``."""
+    def save(self, directory: str | os.PathLike[str], precision: str = "float32") -> Path:
+        """Write ``config.json`` and ``model.safetensors`` into ``directory``.
+
+        Args:
+            directory: folder, made if need be.
+            precision: of the weights in the file, ``"float32"`` or ``"float16"``; loaded weights are float32 again.
+        """
         state = {
             "process": self.process_name,
             "prior": self.config_state(),
@@ -138,7 +143,7 @@ class ScenePrior(nn.Module, ABC):
             "normalizer_state": self.normalizer.state(),
             "card": self.card,
         }
-        tensors = self.weights()
+        tensors = to_precision(self.weights(), precision)
         if self.residual is not None:
             tensors |= {_LEVELS: self.residual.timesteps, _RESIDUAL: self.residual.variance}
         return write_prior(directory, state, tensors)

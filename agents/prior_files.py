@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
@@ -17,6 +18,8 @@ from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
 SHIPPED = Path(__file__).parent / "priors"
 CONFIG_NAME = "config.json"
 WEIGHTS_NAME = "model.safetensors"
+PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
+"""Number formats of the weights in a file."""
 
 
 def list_priors() -> list[str]:
@@ -35,6 +38,32 @@ def find_prior(name: str | os.PathLike[str]) -> Path:
     raise unknown_name("prior", str(name), list_priors())
 
 
+def to_precision(weights: Mapping[str, Tensor], precision: str) -> dict[str, Tensor]:
+    """Weights in the number format of a file; half precision keeps 11 bits, a relative error of at most 2^-11.
+
+    Args:
+        weights: trained tensors by name.
+        precision: ``"float32"`` or ``"float16"``.
+
+    Raises:
+        UnknownNameError: another format.
+        InvalidInputError: a weight beyond the range of the format (its tensor is named).
+
+    >>> to_precision({"bias": torch.tensor([0.1])}, "float16")["bias"].dtype
+    torch.float16
+    """
+    if precision not in PRECISIONS:
+        raise unknown_name("precision", precision, PRECISIONS)
+    kind = PRECISIONS[precision]
+    for name, tensor in weights.items():
+        if tensor.is_floating_point() and bool((tensor.abs() > torch.finfo(kind).max).any()):
+            raise InvalidInputError(
+                f"weight {name!r} reaches {float(tensor.abs().max()):.3g}, beyond the {torch.finfo(kind).max:.3g} of "
+                f"{precision}; save the prior with precision='float32'"
+            )
+    return {name: tensor.to(kind) if tensor.is_floating_point() else tensor for name, tensor in weights.items()}
+
+
 def write_prior(directory: str | os.PathLike[str], config: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Path:
     """Write a prior's configuration and weights, each file atomically."""
     directory = Path(directory)
@@ -50,7 +79,7 @@ def write_prior(directory: str | os.PathLike[str], config: Mapping[str, Any], te
 
 
 def read_prior(name: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Configuration and weights of a prior.
+    """Configuration and weights of a prior, floats in float32 whatever the file holds.
 
     Raises:
         UnknownNameError: no shipped prior has that name (the nearest one is offered).
@@ -63,7 +92,8 @@ def read_prior(name: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, 
         raise CorruptFileError(f"{str(directory / CONFIG_NAME)!r} is not valid JSON: {error}") from error
     weights = directory / WEIGHTS_NAME
     try:
-        return config, load_file(weights)
+        tensors = load_file(weights)
+        return config, {name: t.float() if t.is_floating_point() else t for name, t in tensors.items()}
     except FileNotFoundError:
         raise CorruptFileError(f"the prior at {str(directory)!r} lacks its weights, {WEIGHTS_NAME}") from None
     except SafetensorError as error:
