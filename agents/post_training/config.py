@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
+from agents.post_training.prompts import check_prompt
 from rewards import reward_name
 from scene_envs.errors import InvalidInputError
 
@@ -49,6 +50,10 @@ class PostTrainConfig:
         regularisation: coefficient of the pretraining loss on real scenes.
         regularisation_batch: real scenes per update.
         real_scenes: ``"grammar"``, or the directory of a dataset.
+        prompt: what the scenes should hold, for priors that read prompts: one text, a list of texts, ``"data"`` for the
+            prompts of the real scenes, or ``"grammar"`` for descriptions of the grammar's; null for anything.
+        guidance: weight of classifier-free guidance in the policy, 0 for none; needs a prompt.
+        scenes_per_prompt: scenes of a batch that share a prompt; advantages are taken among them.
         bank_size: how many real scenes are drawn (grammar) or read (dataset), the held-out ones included.
         learning_rate: of AdamW.
         warmup: updates over which the learning rate rises linearly.
@@ -88,6 +93,9 @@ class PostTrainConfig:
     regularisation: float = 0.5
     regularisation_batch: int = 48
     real_scenes: str = "grammar"
+    prompt: Any = None
+    guidance: float = 0.0
+    scenes_per_prompt: int = 8
     bank_size: int = 4096
     learning_rate: float = 5e-5
     warmup: int = 0
@@ -110,6 +118,9 @@ class PostTrainConfig:
         for name in ("iterations", "num_steps", "gradient_steps", "updates", "regularisation_batch", "guard_every"):
             self._at_least(name, 1)
         self._at_least("batch_size", 2)
+        self._at_least("scenes_per_prompt", 2)
+        self.prompt = list(self.prompt) if isinstance(self.prompt, tuple) else self.prompt
+        check_prompt(self.prompt, self.guidance)
         self._at_least("guard_scenes", 1)
         self._at_least("checkpoint_every", 1)
         self._at_least("max_invalid", 1)

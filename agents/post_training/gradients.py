@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Generator, Tensor, nn
 
+from agents.mixed_prior import MixedPrior
 from agents.post_training.losses import DDPOSFLoss
 from agents.post_training.rollouts import Rollout
 from agents.prior import ScenePrior
@@ -72,7 +73,13 @@ def accumulate_policy_gradient(
 
 
 def add_regularisation_gradient(
-    prior: ScenePrior, x0: Tensor, coefficient: float, generator: Generator, *, chunk: int | None = None
+    prior: ScenePrior,
+    x0: Tensor,
+    coefficient: float,
+    generator: Generator,
+    *,
+    chunk: int | None = None,
+    prompts: Sequence[str] | None = None,
 ) -> tuple[float, float]:
     """Add ``coefficient`` times the gradient of the pretraining loss to ``.grad``.
 
@@ -82,6 +89,7 @@ def add_regularisation_gradient(
         coefficient: of the loss, which is a mean over scenes and entries.
         generator: source of timesteps and noise (CPU).
         chunk: scenes per pass.
+        prompts: of the scenes, ``""`` for none; None for a prior that reads none.
 
     Returns:
         The pretraining loss, and the norm of ``coefficient`` times its gradient.
@@ -90,8 +98,10 @@ def add_regularisation_gradient(
         return 0.0, 0.0
     parameters = [p for p in prior.parameters() if p.requires_grad]
     value, gradients = 0.0, [torch.zeros_like(p) for p in parameters]
-    for part in x0.split(chunk or len(x0)):
-        loss = prior.pretraining_loss(part, generator) * (len(part) / len(x0))
+    size = chunk or len(x0)
+    for start in range(0, len(x0), size):
+        part, texts = x0[start : start + size], None if prompts is None else prompts[start : start + size]
+        loss = prompted_loss(prior, part, texts, generator).mean() * (len(part) / len(x0))
         value += float(loss.detach())
         for total, gradient in zip(gradients, torch.autograd.grad(loss, parameters, allow_unused=True), strict=True):
             if gradient is not None:
@@ -99,6 +109,15 @@ def add_regularisation_gradient(
     for parameter, gradient in zip(parameters, gradients, strict=True):
         parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
     return value, float(_norm(gradients))
+
+
+def prompted_loss(prior: ScenePrior, x0: Tensor, prompts: Sequence[str] | None, generator: Generator | None) -> Tensor:
+    """(B,) pretraining losses of real scenes ``x0`` (B, N, D), given their prompts if there are any."""
+    if prompts is None or not isinstance(prior, MixedPrior):
+        return prior.pretraining_loss(x0, generator, "none")
+    with torch.no_grad():
+        text = prior.encode_prompts(prompts)
+    return prior.pretraining_loss(x0, generator, "none", text=text)
 
 
 def gradient_norm(parameters: Iterable[nn.Parameter]) -> float:

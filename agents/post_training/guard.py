@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
+from agents.post_training.gradients import prompted_loss
 from agents.prior import ScenePrior
 from scene_envs.scene import SceneBatch
+
+_CHUNK = 256
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,7 @@ class Guard:
         heldout: (K, N, D) normalised real scenes that the regularisation never sees.
         limit: largest ratio of a checkpoint worth keeping.
         seed: of the fixed timesteps and noise.
+        prompts: one of each held-out scene; None measures without.
 
     >>> from agents.prior import tiny_prior
     >>> prior = tiny_prior()
@@ -52,8 +57,9 @@ class Guard:
     1.0
     """
 
-    def __init__(self, heldout: Tensor, limit: float, seed: int) -> None:
+    def __init__(self, heldout: Tensor, limit: float, seed: int, prompts: Sequence[str] | None = None) -> None:
         self.heldout = heldout
+        self.prompts = prompts
         self.limit = limit
         self.seed = seed
         self.base_loss = float("nan")
@@ -71,6 +77,13 @@ class Guard:
         from agents.pretraining import heldout_loss
 
         device = next(prior.parameters()).device
+        if self.prompts is not None:
+            generator = Generator().manual_seed(self.seed)
+            losses = [
+                prompted_loss(prior, x0.to(device), self.prompts[start : start + _CHUNK], generator)
+                for start, x0 in zip(range(0, len(self.heldout), _CHUNK), self.heldout.split(_CHUNK), strict=True)
+            ]
+            return float(torch.cat(losses).mean())
         return heldout_loss(prior, self.heldout.to(device), seed=self.seed)
 
     def check(

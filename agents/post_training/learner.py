@@ -9,6 +9,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from agents.averaging import WeightAverage
+from agents.mixed_prior import MixedPrior
 from agents.post_training.advantages import compute_advantages
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.gradients import (
@@ -19,9 +20,11 @@ from agents.post_training.gradients import (
 )
 from agents.post_training.losses import DDPOSFLoss
 from agents.post_training.policy import DenoisingPolicy, gradient_weights
+from agents.post_training.prompts import PromptDeck, prompt_groups
 from agents.post_training.real_scenes import RealScenes
 from agents.post_training.rollouts import Rollout, collect, stream_seed
 from agents.prior import ScenePrior
+from agents.prompt_room import no_text
 from scene_envs.denoising_torchrl import DenoisingTorchRLEnv
 
 
@@ -44,8 +47,12 @@ class Learner:
     def __init__(self, config: PostTrainConfig, prior: ScenePrior) -> None:
         self.config = config
         self.prior = deepcopy(prior).to(config.device).eval()
+        if config.prompt is not None and not self.prior.conditional:
+            raise no_text(self.prior.scene_type, config.prompt)
+        if isinstance(self.prior, MixedPrior):
+            self.prior.freeze_text()
         self.slots = self.prior.config.slots if config.slots is None else config.slots
-        self.policy = DenoisingPolicy(self.prior, config.num_steps, chunk=config.chunk)
+        self.policy = DenoisingPolicy(self.prior, config.num_steps, chunk=config.chunk, guidance=config.guidance)
         self.stds = self.policy.stds(self.slots).cpu()
         weights = gradient_weights(
             self.stds, min_std=config.min_std, skip_first=config.skip_first, weighting=config.step_weighting
@@ -61,7 +68,9 @@ class Learner:
             prior=self.prior,
             slots=self.slots,
             workers=config.workers,
+            prompt=config.prompt,
         )
+        self.deck: PromptDeck | None = None
         self.parameters = [p for p in self.prior.parameters() if p.requires_grad]
         self.optimizer = torch.optim.AdamW(
             self.parameters, lr=config.learning_rate, weight_decay=config.weight_decay, betas=(0.9, 0.999)
@@ -72,15 +81,27 @@ class Learner:
         """Stop physics workers, if any."""
         self.env.close()
 
+    def deal_prompts(self, scenes: RealScenes) -> None:
+        """Make the deck from which the prompts of batches come; nothing without prompts."""
+        config = self.config
+        if config.prompt is not None and scenes.prompts is not None:
+            self.deck = PromptDeck.of(
+                self.prior, config.prompt, config.scenes_per_prompt, self.slots, scenes.prompts, len(scenes.train)
+            )
+
     def rollout(self, iteration: int) -> Rollout:
         """A batch of fresh scenes."""
-        return collect(self.env, self.policy, seed=self.config.seed, iteration=iteration)
+        prompts = None
+        if self.deck is not None:
+            prompts = self.deck.deal(self.config.batch_size, self._generator("prompts", iteration))
+        return collect(self.env, self.policy, seed=self.config.seed, iteration=iteration, prompts=prompts)
 
     def advantage(self, rollout: Rollout) -> Tensor:
-        """(B,) or (B, N), as ``credit`` says."""
+        """(B,) or (B, N), as ``credit`` says; among the scenes of the same prompt where there are prompts."""
         config = self.config
         reward, valid = credited_reward(rollout, config.credit)
-        return compute_advantages(reward, valid, baseline=config.baseline, clip=config.advantage_clip)
+        groups = None if rollout.prompts is None else prompt_groups(rollout.prompts).to(reward.device)
+        return compute_advantages(reward, valid, baseline=config.baseline, clip=config.advantage_clip, groups=groups)
 
     def accumulate(self, rollout: Rollout, advantage: Tensor, scenes: RealScenes, index: int) -> dict[str, float]:
         """Put both gradients into ``.grad`` and measure them apart.
@@ -97,9 +118,9 @@ class Learner:
         self.optimizer.zero_grad(set_to_none=True)
         policy = accumulate_policy_gradient(self.loss, rollout, advantage, steps, scale=scale)
         generator = self._generator("real", index)
-        x0 = scenes.batch(config.regularisation_batch, generator)
+        x0, prompts = scenes.batch(config.regularisation_batch, generator)
         real_loss, real_norm = add_regularisation_gradient(
-            self.prior, x0, config.regularisation, generator, chunk=config.chunk
+            self.prior, x0, config.regularisation, generator, chunk=config.chunk, prompts=prompts
         )
         return {
             "policy_loss": policy.loss,

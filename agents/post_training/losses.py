@@ -42,6 +42,9 @@ class DDPOSFLoss(LossModule):
         sample_log_prob: (B, N) float, log-probability per slot at sampling; read when clipping, and optional
             without. Default ``"slot_log_prob"``.
         valid: (B,) or (B, 1) bool, optional; False rows are left out of the mean. Default ``"valid"``.
+        text, text_mask: (B, L, W) tokens and (B, L) their mask, optional, as the policy saw them. Default ``"text"``
+            and ``"text_mask"``.
+        prompt: (B, L) int64 token indices, optional, read where ``text`` is missing. Default ``"prompt"``.
 
     Args:
         policy: what is optimised.
@@ -72,6 +75,9 @@ class DDPOSFLoss(LossModule):
         advantage: NestedKey = "advantage"
         sample_log_prob: NestedKey = "slot_log_prob"
         valid: NestedKey = "valid"
+        text: NestedKey = "text"
+        text_mask: NestedKey = "text_mask"
+        prompt: NestedKey = "prompt"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -133,12 +139,14 @@ class DDPOSFLoss(LossModule):
             raise InvalidInputError(f"clipping needs the log-probabilities at sampling under {keys.sample_log_prob!r}")
         valid = flat.get(keys.valid, None)
         kept = torch.ones_like(timestep, dtype=torch.bool) if valid is None else valid.reshape(-1)
+        text = self._text(flat)
         total = scene.new_zeros(())
         largest, clipped = scene.new_zeros(()), scene.new_zeros(())
         for t in timestep.unique().tolist():
             rows = timestep == t
             step = self.policy.step_of(int(t))
-            log_prob = self.policy.log_prob(scene[rows], step, action[rows])  # (b, N)
+            asked = None if text is None else (text[0][rows], text[1][rows])
+            log_prob = self.policy.log_prob(scene[rows], step, action[rows], asked)  # (b, N)
             earlier = None if old is None else old[rows].detach()
             if earlier is not None:
                 largest = torch.maximum(largest, (log_prob.detach() - earlier).sum(dim=-1).abs().max())
@@ -164,6 +172,14 @@ class DDPOSFLoss(LossModule):
         bounded = ratio.clamp(1 - self.clip_epsilon, 1 + self.clip_epsilon)
         surrogate = torch.minimum(ratio * advantage, bounded * advantage)
         return surrogate.sum(dim=1), (ratio != bounded).float().mean(dim=1).detach()
+
+    def _text(self, flat: TensorDictBase) -> tuple[Tensor, Tensor] | None:
+        keys = self.tensor_keys
+        tokens, mask = flat.get(keys.text, None), flat.get(keys.text_mask, None)
+        if tokens is not None and mask is not None:
+            return tokens.detach(), mask
+        prompt = flat.get(keys.prompt, None)
+        return None if prompt is None else self.policy.read(prompt)
 
     def _advantage(self, flat: TensorDictBase, shape: torch.Size) -> Tensor:
         advantage = flat.get(self.tensor_keys.advantage).detach()

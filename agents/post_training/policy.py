@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -9,19 +11,24 @@ from torch import Generator, Tensor
 
 from agents.diffusion import ReverseStep, concatenate_steps
 from scene_envs.errors import InvalidInputError
-from scene_envs.protocols import PriorLike, StepTableLike
+from scene_envs.protocols import PriorLike, PromptedPriorLike, StepTableLike
+
+Text = tuple[Tensor, Tensor]
+"""What a network attends to: tokens (B, L, W) and their mask (B, L)."""
 
 
 class DenoisingPolicy(TensorDictModuleBase):
-    """The reverse chain of a prior as a policy: action x_{t-1} ~ p(. | x_t), state (x_t, t).
+    """The reverse chain of a prior as a policy: action x_{t-1} ~ p(. | x_t), state (x_t, t, prompt).
 
-    Works as a torchrl policy (``env.rollout(n, policy)``): reads ``scene`` (B, N, D) and ``timestep`` (B, 1),
-    writes ``action`` (B, N, D) and ``action_log_prob`` (B,), the latter summed over all random entries.
+    Works as a torchrl policy (``env.rollout(n, policy)``): reads ``scene`` (B, N, D), ``timestep`` (B, 1) and, when the
+    prior reads prompts, ``prompt`` (B, L), writes ``action`` (B, N, D) and ``action_log_prob`` (B,), the latter summed
+    over all random entries.
 
     Args:
         prior: what denoises; its parameters are the policy's.
         num_steps: steps of the chain, as in the environment.
         chunk: scenes denoised at once, in sampling and in log-probabilities alike; None takes all.
+        guidance: w of classifier-free guidance; the guided chain is the policy then.
 
     >>> from agents.prior import tiny_prior
     >>> from scene_envs.denoising_torchrl import DenoisingTorchRLEnv
@@ -34,12 +41,13 @@ class DenoisingPolicy(TensorDictModuleBase):
     in_keys = ["scene", "timestep"]  # noqa: RUF012  (torchrl reads lists)
     out_keys = ["action", "action_log_prob"]  # noqa: RUF012
 
-    def __init__(self, prior: PriorLike, num_steps: int, *, chunk: int | None = None) -> None:
+    def __init__(self, prior: PriorLike, num_steps: int, *, chunk: int | None = None, guidance: float = 0.0) -> None:
         super().__init__()
         if chunk is not None and chunk < 1:
             raise InvalidInputError(f"chunk={chunk}: at least one scene must be denoised at a time")
         self.prior = prior
         self.chunk = chunk
+        self.guidance = guidance
         self.table: StepTableLike = prior.step_table(num_steps)
         self._step_of = {int(t): step for step, t in enumerate(self.table.timesteps.tolist())}
 
@@ -55,21 +63,46 @@ class DenoisingPolicy(TensorDictModuleBase):
             )
         return self._step_of[timestep]
 
-    def distribution(self, x_t: Tensor, step: int) -> ReverseStep:
-        """p(x_{t-1} | x_t) of ``x_t`` (B, N, D); differentiable in the prior's parameters."""
-        parts = [self.prior.transition(part, step, self.table) for part in x_t.split(self.chunk or x_t.shape[0])]
-        return concatenate_steps(parts)
+    @torch.no_grad()
+    def read(self, prompt: Tensor) -> Text:
+        """What the network attends to, from the token indices (B, L) that an environment shows.
 
-    def draw(self, x_t: Tensor, step: int, generator: Generator | None = None) -> tuple[Tensor, Tensor]:
+        Without gradients: post-training leaves the text encoder as it is.
+        """
+        tokens, mask = cast(PromptedPriorLike, self.prior).encode_tokens(prompt)
+        return tokens, mask
+
+    def distribution(self, x_t: Tensor, step: int, text: Text | None = None) -> ReverseStep:
+        """p(x_{t-1} | x_t) of ``x_t`` (B, N, D) given ``text``; differentiable in the prior's parameters."""
+        size = self.chunk or x_t.shape[0]
+        return concatenate_steps(
+            [
+                self._transition(x_t[rows], step, None if text is None else (text[0][rows], text[1][rows]))
+                for rows in (slice(start, start + size) for start in range(0, x_t.shape[0], size))
+            ]
+        )
+
+    def _transition(self, x_t: Tensor, step: int, text: Text | None) -> ReverseStep:
+        reverse: ReverseStep
+        if text is None:
+            reverse = self.prior.transition(x_t, step, self.table)
+        else:
+            prior = cast(PromptedPriorLike, self.prior)
+            reverse = prior.transition(x_t, step, self.table, text=text, guidance=self.guidance)
+        return reverse
+
+    def draw(
+        self, x_t: Tensor, step: int, generator: Generator | None = None, text: Text | None = None
+    ) -> tuple[Tensor, Tensor]:
         """An action (B, N, D) and its log-probability per slot (B, N), without gradients."""
         with torch.no_grad():
-            reverse = self.distribution(x_t, step)
+            reverse = self.distribution(x_t, step, text)
             action = reverse.from_noise(torch.randn(x_t.shape, generator=generator, device=x_t.device))
             return action, reverse.log_prob(action)
 
-    def log_prob(self, x_t: Tensor, step: int, action: Tensor) -> Tensor:
+    def log_prob(self, x_t: Tensor, step: int, action: Tensor, text: Text | None = None) -> Tensor:
         """(B, N) log-probability per slot of ``action``; states and actions are taken as constants."""
-        return self.distribution(x_t.detach(), step).log_prob(action.detach())
+        return self.distribution(x_t.detach(), step, text).log_prob(action.detach())
 
     def random_entries(self, slots: int) -> int:
         """How many random variables a step of the chain draws for a scene; the other entries are known."""
@@ -91,13 +124,16 @@ class DenoisingPolicy(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write an action and its log-probability; rows may be at different steps."""
         scene, timestep = tensordict["scene"], tensordict["timestep"].squeeze(-1)
+        prompt = tensordict.get("prompt", None)
+        text = None if prompt is None else self.read(prompt)
         action = scene.clone()
         log_prob = torch.zeros(scene.shape[:-2], device=scene.device)
         for t in timestep.unique().tolist():
             rows = timestep == t
             if t == 0:  # a finished episode that waits for its reset
                 continue
-            action[rows], per_slot = self.draw(scene[rows], self.step_of(t))
+            asked = None if text is None else (text[0][rows], text[1][rows])
+            action[rows], per_slot = self.draw(scene[rows], self.step_of(t), text=asked)
             log_prob[rows] = per_slot.sum(dim=-1)
         tensordict.set("action", action)
         tensordict.set("action_log_prob", log_prob)

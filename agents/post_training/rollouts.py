@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,12 +10,12 @@ import torch
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
-from agents.post_training.policy import DenoisingPolicy
+from agents.post_training.policy import DenoisingPolicy, Text
 from scene_envs.denoising_torchrl import DenoisingTorchRLEnv
 from scene_envs.errors import TrainingError
 from scene_envs.scene import SceneBatch
 
-STREAMS = ("start", "noise", "steps", "real", "bank", "guard")
+STREAMS = ("start", "noise", "steps", "real", "bank", "guard", "prompts")
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,8 @@ class Rollout:
         per_object: (B, N) credit per slot, or None.
         terms: named (B,) parts of the reward.
         batch: the finished scenes.
+        prompts: one per scene, or None without prompts.
+        text: what the network attended to, tokens (B, L, W) and mask (B, L); None when the prior reads no prompts.
     """
 
     scenes: Tensor
@@ -43,21 +45,23 @@ class Rollout:
     per_object: Tensor | None
     terms: Mapping[str, Tensor]
     batch: SceneBatch
+    prompts: tuple[str, ...] | None = None
+    text: Text | None = None
 
     def transitions(self, step: int, advantage: Tensor, rows: slice = slice(None)) -> TensorDict:
         """The transitions of one step as ``DDPOSFLoss`` reads them."""
         scene = self.scenes[step][rows]
-        return TensorDict(
-            {
-                "scene": scene,
-                "timestep": self.timesteps[step].expand(scene.shape[0], 1),
-                "action": self.actions[step][rows],
-                "slot_log_prob": self.slot_log_prob[step][rows],
-                "advantage": advantage[rows],
-                "valid": self.valid[rows],
-            },
-            [scene.shape[0]],
-        )
+        fields = {
+            "scene": scene,
+            "timestep": self.timesteps[step].expand(scene.shape[0], 1),
+            "action": self.actions[step][rows],
+            "slot_log_prob": self.slot_log_prob[step][rows],
+            "advantage": advantage[rows],
+            "valid": self.valid[rows],
+        }
+        if self.text is not None:
+            fields |= {"text": self.text[0][rows], "text_mask": self.text[1][rows]}
+        return TensorDict(fields, [scene.shape[0]])
 
 
 def stream_seed(seed: int, stream: str, iteration: int = 0) -> int:
@@ -66,7 +70,14 @@ def stream_seed(seed: int, stream: str, iteration: int = 0) -> int:
     return int(words[0]) >> 1
 
 
-def collect(env: DenoisingTorchRLEnv, policy: DenoisingPolicy, *, seed: int, iteration: int = 0) -> Rollout:
+def collect(
+    env: DenoisingTorchRLEnv,
+    policy: DenoisingPolicy,
+    *,
+    seed: int,
+    iteration: int = 0,
+    prompts: Sequence[str] | None = None,
+) -> Rollout:
     """Run ``policy`` to the end of one episode in each of the environment's rows.
 
     Args:
@@ -74,15 +85,19 @@ def collect(env: DenoisingTorchRLEnv, policy: DenoisingPolicy, *, seed: int, ite
         policy: draws x_{t-1}; must have the environment's number of steps.
         seed: of the run; x_T and the chain's noise hang on it and on ``iteration`` alone.
         iteration: which batch of the run this is.
+        prompts: one per row; None draws them as the environment was told. Text is encoded once, at the start.
     """
     with torch.random.fork_rng(devices=[]):  # set_seed touches the global generator
         env.set_seed(stream_seed(seed, "start", iteration))
     device = env.core.device
     generator = Generator(device).manual_seed(stream_seed(seed, "noise", iteration))
     log_probs: list[Tensor] = []
+    texts: list[Text] = []
 
     def act(x_t: Tensor, step: int) -> Tensor:
-        action, log_prob = policy.draw(x_t, step, generator)
+        if step == 0 and env.core.prompting.reader is not None:
+            texts.append(policy.read(env.core.observation()["prompt"]))
+        action, log_prob = policy.draw(x_t, step, generator, texts[0] if texts else None)
         if not bool(torch.isfinite(log_prob).all()):
             raise TrainingError(
                 f"the prior gave values that are not finite at step {step} of iteration {iteration + 1}; "
@@ -91,7 +106,7 @@ def collect(env: DenoisingTorchRLEnv, policy: DenoisingPolicy, *, seed: int, ite
         log_probs.append(log_prob)
         return action
 
-    result = env.collect(act)
+    result = env.collect(act, prompts)
     return Rollout(
         scenes=result.scenes,
         actions=result.actions,
@@ -102,4 +117,6 @@ def collect(env: DenoisingTorchRLEnv, policy: DenoisingPolicy, *, seed: int, ite
         per_object=result.score.per_object,
         terms=result.score.terms,
         batch=result.batch,
+        prompts=result.prompts,
+        text=texts[0] if texts else None,
     )

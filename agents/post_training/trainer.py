@@ -13,6 +13,7 @@ from agents.post_training.curves import draw_curve
 from agents.post_training.guard import Guard, realism
 from agents.post_training.learner import Learner, NonFiniteGradient, is_finite
 from agents.post_training.progress import Progress
+from agents.post_training.prompts import PROMPTS_NAME, GrammarPrompts, PromptSets, load_prompts, save_prompts
 from agents.post_training.real_scenes import RealScenes, real_scenes
 from agents.post_training.rollouts import Rollout, stream_seed
 from agents.post_training.run_files import (
@@ -130,17 +131,24 @@ class PostTrainer:
 
     def prepare(self, *, reuse_scenes: bool = False) -> None:
         """Draw the real scenes, or reuse those kept beside a run that is resumed, and make the guard."""
-        config, path = self.config, self.directory / SCENES_NAME
+        config, path, texts = self.config, self.directory / SCENES_NAME, self.directory / PROMPTS_NAME
+        seed = stream_seed(config.seed, "bank")
         if reuse_scenes and path.exists():
             batch = SceneBatch.load(path)
         else:
-            seed = stream_seed(config.seed, "bank")
             slots = self.learner.slots
-            batch = real_scenes(self.prior, config.real_scenes, config.bank_size, seed=seed, slots=slots)
+            batch, found = real_scenes(self.prior, config.real_scenes, config.bank_size, seed=seed, slots=slots)
             _writing(f"the real scenes {str(path)!r}", lambda: batch.save(path))
+            if found is not None and self.prior.conditional:
+                _writing(f"their prompts {str(texts)!r}", lambda: save_prompts(texts, found))
+        prompts: PromptSets | None = None
+        if self.prior.conditional:
+            prompts = load_prompts(texts) if texts.exists() else GrammarPrompts(batch, seed)
         x0 = self.prior.encode(batch.to(config.device))
-        self.scenes = RealScenes.split(x0, config.guard_scenes)
-        self.guard = Guard(self.scenes.heldout, config.guard_limit, stream_seed(config.seed, "guard"))
+        self.scenes = RealScenes.split(x0, config.guard_scenes, prompts)
+        asked = self.scenes.heldout_prompts()
+        self.guard = Guard(self.scenes.heldout, config.guard_limit, stream_seed(config.seed, "guard"), asked)
+        self.learner.deal_prompts(self.scenes)
 
     def step(self) -> tuple[Rollout, dict[str, float]]:
         """One iteration: a batch of fresh scenes and its updates. Returns the scenes and the row for the log."""

@@ -1,0 +1,129 @@
+"""The prompts of a post-training run: which there are, and which scene of a batch follows which."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Generator, Tensor
+
+from agents.prior import ScenePrior
+from scene_envs.datasets.prompts import describe_all
+from scene_envs.env_prompts import PROMPT_SOURCES, grammar_prompts
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import SceneBatch
+
+PROMPTS_NAME = "real_prompts.json"
+_PER_SCENE = 3
+
+PromptSets = Callable[[int], Sequence[str]]
+"""All prompts of a real scene, by its index."""
+
+
+def check_prompt(prompt: Any, guidance: float) -> None:
+    """Refuse what is neither a prompt, a list of them, a source of prompts nor None, and guidance without one."""
+    texts = [prompt] if isinstance(prompt, str) else prompt
+    good = prompt is None or (
+        isinstance(texts, list | tuple) and texts and all(isinstance(t, str) and t for t in texts)
+    )
+    if not good:
+        raise InvalidInputError(
+            f"prompt={prompt!r} must be a text, a list of texts, one of {', '.join(PROMPT_SOURCES)}, or null"
+        )
+    if not math.isfinite(guidance):
+        raise InvalidInputError(f"guidance={guidance} must be a finite number; 0 follows the prompt as it is")
+    if guidance and prompt is None:
+        raise InvalidInputError(
+            f"guidance={guidance:g} strengthens a prompt, and prompt is null; give prompt=, or leave guidance=0"
+        )
+
+
+class GrammarPrompts:
+    """Descriptions of scenes that have none, each written when it is first asked for.
+
+    Args:
+        batch: the scenes.
+        seed: what is said of scene i hangs on it and on i alone.
+    """
+
+    def __init__(self, batch: SceneBatch, seed: int) -> None:
+        self.batch, self.seed = batch, seed
+        self._written: dict[int, tuple[str, ...]] = {}
+
+    def __call__(self, index: int) -> Sequence[str]:
+        """All prompts of scene ``index``."""
+        if index not in self._written:
+            rng = np.random.default_rng([self.seed, index])
+            (self._written[index],) = describe_all(self.batch[index], rng, count=_PER_SCENE)
+        return self._written[index]
+
+
+class PromptDeck:
+    """Deals the prompts of batches.
+
+    Args:
+        prompt: one text, a list, ``"data"`` (the prompts of real scenes) or ``"grammar"``.
+        share: scenes of a batch that share a prompt, so that they can be compared.
+        real: prompts of real scenes by index; for ``"data"``.
+        count: how many real scenes there are.
+
+    >>> deck = PromptDeck(["A scene with two cups.", "A scene with a teapot."], share=2)
+    >>> dealt = deck.deal(4, Generator().manual_seed(0))
+    >>> dealt[0] == dealt[1] != dealt[2] == dealt[3]
+    True
+    """
+
+    def __init__(self, prompt: Any, share: int, real: PromptSets | None = None, count: int = 0) -> None:
+        self.share = share
+        self._real, self._count = real, count
+        self._texts: tuple[str, ...] = (
+            () if prompt == "data" else (prompt,) if isinstance(prompt, str) else tuple(prompt)
+        )
+
+    @classmethod
+    def of(cls, prior: ScenePrior, prompt: Any, share: int, slots: int, real: PromptSets, count: int) -> PromptDeck:
+        """The deck of a run; ``"grammar"`` is spelled out, and prompts that cannot be followed are refused."""
+        if prompt == "grammar":
+            prompt = grammar_prompts(prior.scene_type, slots)
+        return cls(prompt, share, real, count)
+
+    def deal(self, count: int, generator: Generator) -> list[str]:
+        """``count`` prompts; neighbours share one, in groups of ``share`` or a few more."""
+        groups = max(1, count // self.share)
+        different = [self._text(index, generator) for index in self._indices(groups, generator)]
+        return [different[row * groups // count] for row in range(count)]
+
+    def _indices(self, groups: int, generator: Generator) -> list[int]:
+        """Without repetition as far as there are enough."""
+        size = len(self._texts) or self._count
+        rounds = [torch.randperm(size, generator=generator) for _ in range(-(-groups // size))]
+        return torch.cat(rounds)[:groups].tolist()  # type: ignore[no-any-return]
+
+    def _text(self, index: int, generator: Generator) -> str:
+        if self._texts or self._real is None:
+            return self._texts[index]
+        texts = self._real(index)
+        return texts[int(torch.randint(len(texts), (), generator=generator))]
+
+
+def prompt_groups(prompts: Sequence[str]) -> Tensor:
+    """(B,) int64, equal for equal prompts on every worker."""
+    hashes = {text: hashlib.blake2b(text.encode(), digest_size=8).digest() for text in dict.fromkeys(prompts)}
+    return torch.tensor([int.from_bytes(hashes[text], "little", signed=True) for text in prompts])
+
+
+def save_prompts(path: Path, prompts: Sequence[Sequence[str]]) -> None:
+    """The prompts of a dataset's scenes, beside the scenes themselves."""
+    path.write_text(json.dumps([list(texts) for texts in prompts]) + "\n", encoding="utf-8")
+
+
+def load_prompts(path: Path) -> PromptSets:
+    """Inverse of :func:`save_prompts`."""
+    prompts: list[list[str]] = json.loads(path.read_text(encoding="utf-8"))
+    return prompts.__getitem__
