@@ -21,8 +21,10 @@ from scene_envs.env_spaces import (
     STATE_BOUND,
     check_action,
     check_slots,
+    decode_scenes,
     occupied,
     prior_device,
+    prior_features,
     resolve_scene_and_prior,
 )
 from scene_envs.errors import InvalidInputError, unknown_name
@@ -137,6 +139,7 @@ class DenoisingCore:
         self.num_envs = num_envs
         self.scene_type, self.prior = resolve_scene_and_prior(scene, prior)
         self.slots = check_slots(self.scene_type, slots)
+        self._features = prior_features(self.prior)
         self.action_mode = action_mode
         self.max_action = float(max_action)
         self.table = self.prior.step_table(num_steps)
@@ -161,8 +164,8 @@ class DenoisingCore:
 
     @property
     def features(self) -> int:
-        """D."""
-        return self.scene_type.features
+        """D, numbers per slot of what the prior denoises; the scene type's but for priors with other rotations."""
+        return self._features
 
     @property
     def x(self) -> Tensor:
@@ -191,11 +194,11 @@ class DenoisingCore:
 
     def scenes(self) -> SceneBatch:
         """The current scenes, decoded and on the CPU: rotations in SO(3), arg-max categories."""
-        return SceneBatch.from_tensor(self._x.cpu(), self.scene_type, normalised=self.prior.normalizer)
+        return decode_scenes(self.prior, self._x)
 
     def object_mask(self) -> Tensor:
         """(B, N) int8: slots whose arg-max category is not empty."""
-        return occupied(self._x)
+        return occupied(self._x, self.scene_type)
 
     @property
     def prompts(self) -> tuple[str, ...] | None:
@@ -210,7 +213,7 @@ class DenoisingCore:
         observed = {
             "scene": self._x.clone(),
             "timestep": torch.from_numpy(self.timesteps).unsqueeze(-1).to(self.device),
-            "object_mask": occupied(self._x),
+            "object_mask": occupied(self._x, self.scene_type),
         }
         if self._tokens is not None:
             observed["prompt"] = self._tokens.clone()
@@ -227,7 +230,7 @@ class DenoisingCore:
         info = {
             "step": self.steps,
             "timestep": self.timesteps,
-            "objects": occupied(self._x).sum(dim=-1).cpu().numpy(),
+            "objects": occupied(self._x, self.scene_type).sum(dim=-1).cpu().numpy(),
             "reward_valid": valid,
         }
         for name, term in terms.items():

@@ -44,7 +44,8 @@ class DenoisingEnv(gym.Env[Any, np.ndarray]):
     `action_mode="noise"`, where the prior takes the reverse step and the agent chooses the noise of that step.
 
     Scenes are normalised tensors of N slots by D features: translation | rotation matrix | one-hot over C assets
-    and *empty*. On `dimsum_table`, N = 34, C = 7, D = 20.
+    and *empty*. On `dimsum_table`, N = 34, C = 7, D = 20. A prior that diffuses quaternions or axis-angle vectors has
+    these in place of the matrix, and D is smaller by 5 or 6.
 
     ## Action Space
 

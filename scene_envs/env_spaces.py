@@ -12,8 +12,8 @@ from gymnasium import spaces
 from torch import Tensor
 
 from scene_envs.errors import InvalidInputError
-from scene_envs.protocols import PriorLike, resolve_prior
-from scene_envs.scene import CATEGORY, SceneBatch
+from scene_envs.protocols import EncodedPriorLike, PriorLike, resolve_prior
+from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
 STATE_BOUND = 10.0
@@ -55,9 +55,21 @@ def scene_box(bound: float, slots: int, features: int) -> spaces.Box:
     return spaces.Box(-bound, bound, (slots, features), np.float32)
 
 
-def occupied(x: Tensor) -> Tensor:
+def prior_features(prior: PriorLike) -> int:
+    """D of the scenes that the prior denoises: the scene type's, unless the prior says otherwise."""
+    return prior.features if isinstance(prior, EncodedPriorLike) else prior.scene_type.features
+
+
+def decode_scenes(prior: PriorLike, x: Tensor) -> SceneBatch:
+    """The scenes of x (B, N, D) on the CPU: rotations in SO(3), arg-max categories."""
+    if isinstance(prior, EncodedPriorLike) and prior.features != prior.scene_type.features:
+        return prior.decode(x.cpu())
+    return SceneBatch.from_tensor(x.cpu(), prior.scene_type, normalised=prior.normalizer)
+
+
+def occupied(x: Tensor, scene_type: SceneType) -> Tensor:
     """(B, N) int8: 1 where the arg-max category of normalised or raw scenes (B, N, D) is not *empty*."""
-    category = x[..., CATEGORY]
+    category = x[..., -(scene_type.num_assets + 1) :]
     return (category.argmax(dim=-1) != category.shape[-1] - 1).to(torch.int8)
 
 

@@ -94,6 +94,23 @@ class PriorLike(Protocol):
         ...
 
 
+@runtime_checkable
+class EncodedPriorLike(PriorLike, Protocol):
+    """A prior that may denoise scenes in another layout than the scene type's, such as quaternions for rotations.
+
+    The last C + 1 features of a slot are its category in every layout.
+    """
+
+    @property
+    def features(self) -> int:
+        """D, numbers per slot of what is denoised."""
+        ...
+
+    def decode(self, x: Tensor) -> SceneBatch:
+        """Scenes of x (B, N, D)."""
+        ...
+
+
 class PromptedPriorLike(PriorLike, Protocol):
     """A prior whose ``conditional`` is True: it reads prompts; see ``agents.prompt_reading.PromptReader``."""
 

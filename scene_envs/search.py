@@ -273,7 +273,7 @@ class SearchEnv(gym.Env[Any, Any]):
     def _observe(self, state: SearchState) -> tuple[Observation, dict[str, Any]]:
         scene = self.scene(state)
         normalised = scene.to_tensor(normalised=self.problem.prior.normalizer)[0].clamp(-STATE_BOUND, STATE_BOUND)
-        present = occupied(scene.tensor)[0].numpy()
+        present = occupied(scene.tensor, scene.scene_type)[0].numpy()
         observation = {
             "scene": normalised.numpy(),
             "object_mask": present,
