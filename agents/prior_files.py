@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -18,6 +20,8 @@ from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
 SHIPPED = Path(__file__).parent / "priors"
 CONFIG_NAME = "config.json"
 WEIGHTS_NAME = "model.safetensors"
+RESIDUAL = "residual."
+"""What the names of measured tensors, which are no weights, start with."""
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
 """Number formats of the weights in a file."""
 
@@ -78,6 +82,23 @@ def write_prior(directory: str | os.PathLike[str], config: Mapping[str, Any], te
     return directory
 
 
+def read_config(name: str | os.PathLike[str]) -> dict[str, Any]:
+    """Configuration of a prior; errors as for :func:`read_prior`."""
+    file = find_prior(name) / CONFIG_NAME
+    try:
+        config: dict[str, Any] = json.loads(file.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise CorruptFileError(f"{str(file)!r} is not valid JSON: {error}") from error
+    return config
+
+
+def count_parameters(name: str | os.PathLike[str]) -> int:
+    """Trained numbers in the file of a prior, whose weights are not read; errors as for :func:`read_prior`."""
+    with _weights_of(name) as file, safe_open(file, "pt") as tensors:
+        shapes = [tensors.get_slice(key).get_shape() for key in tensors.keys() if not key.startswith(RESIDUAL)]  # noqa: SIM118
+    return sum(math.prod(shape) for shape in shapes)
+
+
 def read_prior(name: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Configuration and weights of a prior, floats in float32 whatever the file holds.
 
@@ -85,15 +106,19 @@ def read_prior(name: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, 
         UnknownNameError: no shipped prior has that name (the nearest one is offered).
         CorruptFileError: a file is truncated or not what its name says.
     """
+    config = read_config(name)
+    with _weights_of(name) as file:
+        tensors = load_file(file)
+    return config, {key: value.float() if value.is_floating_point() else value for key, value in tensors.items()}
+
+
+@contextmanager
+def _weights_of(name: str | os.PathLike[str]) -> Iterator[Path]:
+    """The path of a prior's weights; what goes wrong while they are read is said in our words."""
     directory = find_prior(name)
-    try:
-        config = json.loads((directory / CONFIG_NAME).read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CorruptFileError(f"{str(directory / CONFIG_NAME)!r} is not valid JSON: {error}") from error
     weights = directory / WEIGHTS_NAME
     try:
-        tensors = load_file(weights)
-        return config, {name: t.float() if t.is_floating_point() else t for name, t in tensors.items()}
+        yield weights
     except FileNotFoundError:
         raise CorruptFileError(f"the prior at {str(directory)!r} lacks its weights, {WEIGHTS_NAME}") from None
     except SafetensorError as error:

@@ -1,7 +1,8 @@
 """The commands of ``scene-envs``, one module each, imported when the command is called.
 
 A command module has ``config()``, which returns its dataclass of keys with a sentence per field under
-``Attributes:``, and ``run(settings, run)``, which does the work. A module with ``WRITES = False`` only prints.
+``Attributes:``, and ``run(settings, run)``, which does the work. A module with ``WRITES = False`` has no
+run folder.
 """
 
 COMMANDS = {
@@ -19,6 +20,7 @@ COMMANDS = {
     "evaluate": "measure the samples of a prior against real scenes",
     "tables": "train and measure priors for the paper's tables and that of precision",
     "priors": "list the priors that ship with the package",
+    "ship": "write a prior as a folder to give away, in half precision and with a model card",
     "rewards": "list the rewards, those of installed packages included",
     "import-checkpoint": "make a prior of a checkpoint of the paper's authors",
     "check-reward": "check that a reward keeps its contract",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 
 WRITES = False
@@ -10,26 +9,32 @@ WRITES = False
 
 @dataclass
 class PriorsConfig:
-    """No keys."""
+    """The priors that ship with the package, and how good they are.
+
+    Attributes:
+        prior: show the whole model card of this one, a shipped name or the folder of a prior or a run; empty lists
+            all that ship.
+    """
+
+    prior: str = ""
 
 
 def config() -> type[PriorsConfig]:
-    """This command has no keys."""
+    """The keys of this command."""
     return PriorsConfig
 
 
 def run(settings: PriorsConfig) -> None:
-    """Print every shipped prior with the facts of its card."""
-    from agents.prior_files import CONFIG_NAME, find_prior, list_priors
+    """Print every shipped prior with its size and its figures, or one card."""
+    from agents.model_card import README, PriorFacts
+    from agents.prior_files import find_prior, list_priors
 
+    if settings.prior:
+        page = find_prior(settings.prior) / README
+        print(page.read_text(encoding="utf-8") if page.is_file() else "\n".join(PriorFacts.of(settings.prior).lines()))
+        return
     names = list_priors()
     if not names:
         print("no prior ships with this installation; train one with scene-envs pretrain")
     for name in names:
-        state = json.loads((find_prior(name) / CONFIG_NAME).read_text())
-        card = state.get("card") or {}
-        print(f"{name}: scenes of {state['prior']['scene_type']}, {state['prior']['slots']} slots")
-        for key, value in card.items():
-            if isinstance(value, int | float | str):
-                text = f"{value:.4g}" if isinstance(value, float) else str(value)
-                print(f"    {key.replace('_', ' ')}: {text}")
+        print("\n".join(PriorFacts.of(name).lines()))
