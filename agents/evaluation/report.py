@@ -27,7 +27,7 @@ READING: dict[str, str] = {
     r"height_error_(\w+)_p95_mm": "95 % quantile of the same",
     r"height_error_(\w+)_mm": "median distance in height to the support ({}); lower is better",
     "median_total_penetration_cm": "per scene, summed over pairs of convex parts (the literature's); lower is better",
-    "median_total_pair_penetration_cm": "per scene, over pairs of objects, the deepest overlap of each; lower is better",
+    "median_total_pair_penetration_cm": "per scene, the deepest overlap of each pair of objects; lower is better",
     "collision_rate": "scenes with two objects more than 1 mm in each other; lower is better",
     "overlapping_pairs": "penetrating pairs of objects per scene; lower is better",
     "overlap_median_mm": "depth over the penetrating pairs; lower is better",
@@ -94,4 +94,6 @@ def how_to_read(name: str) -> str:
 
 
 def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.4g}"
+    if value is None:
+        return ""
+    return f"{value:.0f}" if 1e4 <= abs(value) < 1e9 else f"{value:.4g}"

@@ -89,13 +89,6 @@ def test_search_writes_its_pictures_and_curve(prior, tmp_path, capsys):
     assert "by search" in capsys.readouterr().out
 
 
-def test_evaluate_tabulates_the_figures(prior, tmp_path, capsys):
-    words = ["count=2", "num_steps=1", "project=false", "workers=0"]
-    assert main(["evaluate", f"prior={prior}", *words, f"output={tmp_path}"]) == 0
-    assert metrics(tmp_path)["scenes"] == 2
-    assert "| objects_mean |" in capsys.readouterr().out
-
-
 def test_listings_and_the_contract_check(capsys):
     assert main(["priors"]) == main(["rewards"]) == main(["check-reward", "reward=object_count"]) == 0
     printed = capsys.readouterr().out

@@ -8,7 +8,7 @@ import math
 import pytest
 import torch
 
-from agents.evaluation import evaluate_prior, figure_table, grammar_scenes, measure_samples
+from agents.evaluation import evaluate_prior, figure_table, grammar_scenes, measure_samples, stable_fraction
 from agents.prior import tiny_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.physics import feasibility
@@ -128,7 +128,7 @@ def test_the_floor_is_the_same_figures_of_real_scenes(real: SceneBatch) -> None:
 
 
 def test_a_prior_is_measured_on_its_own_samples(real: SceneBatch) -> None:
-    prior = tiny_prior()
+    prior = tiny_prior(slots=6)
     figures = evaluate_prior(prior, 3, real, num_steps=2, seed=5, ready=False)
     samples = prior.sample(3, num_steps=2, seed=5)
     assert figures["num_steps"] == 2
@@ -154,3 +154,8 @@ def test_table_lists_every_figure(real: SceneBatch) -> None:
 def test_nothing_to_measure_is_refused(real: SceneBatch) -> None:
     with pytest.raises(InvalidInputError, match="cannot measure 0 scenes against 6"):
         measure_samples(real[:0], real)
+
+
+def test_what_is_centimetres_deep_is_not_stable() -> None:
+    for depth, stable in ((0.0, 1.0), (0.02, 0.0)):
+        assert stable_fraction(one_object("teapot", -depth)) == stable

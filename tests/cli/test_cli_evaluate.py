@@ -1,0 +1,152 @@
+"""``scene-envs evaluate``: what it writes, that it goes on where it stopped, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pyarrow.parquet as parquet
+import pytest
+import torch
+
+from agents.cli import main
+from agents.evaluation import grammar_scenes
+from agents.prior import tiny_prior
+from scene_envs.datasets import SceneDataset
+from scene_envs.normalizer import Normalizer
+from scene_envs.scene import SceneBatch
+
+pytest.importorskip("pybullet")
+
+QUICK = ("count=3", "num_steps=1", "workers=0", "pictures=0")
+
+
+@pytest.fixture(scope="module")
+def prior(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tiny_prior(slots=6).save(tmp_path_factory.mktemp("prior"))
+
+
+def dataset(folder: Path, scene_type: str = "dimsum_table", count: int = 24) -> Path:
+    batch = grammar_scenes(scene_type, count, seed=5)
+    prompts = ["A scene with 1 object."] * count
+    return SceneDataset(batch.tensor, prompts, Normalizer.fit(batch.tensor), batch.scene_type).save(folder)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return dataset(tmp_path_factory.mktemp("data") / "dimsum")
+
+
+def metrics(folder: Path) -> dict[str, float]:
+    found: dict[str, float] = json.loads((folder / "metrics.json").read_text())
+    return found
+
+
+def log(folder: Path) -> str:
+    return (folder / "log.txt").read_text()
+
+
+def test_every_figure_stands_beside_its_floor(prior: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
+    words = ["evaluate", f"prior={prior}", f"data={data}", *QUICK, "measures=[layout,physics,novelty]"]
+    assert main([*words, f"output={tmp_path}"]) == 0
+    found = metrics(tmp_path)
+    assert found["scenes"] == 3
+    assert found["floor_stable_fraction"] == found["floor_feasible_fraction"] == 1.0
+    assert found["floor_collision_rate"] == found["floor_copied_fraction"] == 0.0
+    shown = capsys.readouterr().out
+    assert "| figure | samples | real | how to read |" in shown
+    assert "| category_kl_e4 |" in shown
+    assert (tmp_path / "metrics.md").read_text().strip() in shown
+    assert len(SceneBatch.load(tmp_path / "scenes.safetensors")) == 3
+
+
+def test_what_is_measured_already_is_not_measured_again(prior: Path, tmp_path: Path) -> None:
+    words = ["evaluate", f"prior={prior}", *QUICK, f"output={tmp_path}"]
+    assert main([*words, "measures=layout"]) == 0
+    first, drawn = metrics(tmp_path), (tmp_path / "scenes.safetensors").stat().st_mtime_ns
+    assert main([*words, "measures=[layout,physics]"]) == 0
+    second = metrics(tmp_path)
+    assert log(tmp_path).count("layout measured in") == 1
+    assert log(tmp_path).count("physics measured in") == 1
+    assert (tmp_path / "scenes.safetensors").stat().st_mtime_ns == drawn
+    assert all(second[name] == value for name, value in first.items() if name != "evaluation")
+    assert "feasible_fraction" in second
+    assert "feasible_fraction" not in first
+
+
+def test_other_settings_or_another_prior_are_measured_anew(
+    prior: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    words = ["evaluate", *QUICK, "measures=layout", f"output={tmp_path / 'out'}"]
+    assert main([*words, f"prior={prior}"]) == 0
+    assert main([*words, f"prior={prior}", "seed=1"]) == 0
+    assert log(tmp_path / "out").count("layout measured in") == 2
+    assert "measuring anew" in capsys.readouterr().out
+    moved = tmp_path / "same_name"
+    tiny_prior(slots=6, seed=1).save(moved)
+    assert main([*words, f"prior={moved}"]) == 0
+    tiny_prior(slots=6, seed=2).save(moved)  # other weights in the same folder
+    assert main([*words, f"prior={moved}"]) == 0
+    assert log(tmp_path / "out").count("layout measured in") == 4
+
+
+def test_all_leaves_out_what_cannot_be_measured_and_says_why(
+    prior: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    assert main(["evaluate", f"prior={prior}", *QUICK, "project=false", f"output={tmp_path}"]) == 0
+    shown = capsys.readouterr().out
+    assert "- novelty not measured: novelty needs data=" in shown
+    assert "- prompts not measured: prompt-following needs a prior that reads prompts" in shown
+    assert "- classifier not measured:" in shown
+    assert "ready_objects" not in metrics(tmp_path)
+    assert "feasible_objects" in metrics(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["measures=novelty"], "novelty needs data="),
+        (["measures=prompts"], "needs a prior that reads prompts"),
+        (["measures=fid"], "FID needs fid_weights="),
+        (["measures=noveltie"], "did you mean 'novelty'"),
+        (["data=nowhere", "measures=layout"], "no dataset at 'nowhere'"),
+        (["heldout=somewhere", "measures=layout"], "needs data="),
+        (["count=1", "measures=layout"], "count >= 2"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_in_words(
+    prior: Path, tmp_path: Path, capsys: pytest.CaptureFixture, words: list[str], message: str
+) -> None:
+    assert main(["evaluate", f"prior={prior}", *QUICK, *words, f"output={tmp_path}"]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_dataset_of_another_scene_type_is_refused(prior: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    other = dataset(tmp_path / "shelves", "pantry_shelf", 8)
+    words = ["evaluate", f"prior={prior}", f"data={other}", *QUICK, "measures=layout", f"output={tmp_path / 'out'}"]
+    assert main(words) == 2
+    assert "holds scenes of 'pantry_shelf', the samples are of 'dimsum_table'" in capsys.readouterr().err
+
+
+def test_a_dataset_without_its_column_is_refused(prior: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    folder = dataset(tmp_path / "broken", count=8)
+    (shard,) = folder.glob("*.parquet")
+    parquet.write_table(parquet.read_table(shard).drop_columns(["scenes"]), shard)
+    words = ["evaluate", f"prior={prior}", f"data={folder}", *QUICK, "measures=layout", f"output={tmp_path / 'out'}"]
+    assert main(words) != 0
+    assert "scenes" in capsys.readouterr().err
+
+
+def test_a_dataset_with_a_scene_that_is_not_finite_is_refused(
+    prior: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    batch = grammar_scenes("dimsum_table", 8, seed=5)
+    tensor = batch.tensor.clone()
+    tensor[3, 2, 0] = torch.nan
+    folder = SceneDataset(tensor, ["A scene."] * 8, Normalizer.fit(batch.tensor), batch.scene_type).save(tmp_path / "n")
+    words = ["evaluate", f"prior={prior}", f"data={folder}", *QUICK, "measures=layout", f"output={tmp_path / 'out'}"]
+    assert main(words) != 0
+    message = capsys.readouterr().err
+    assert "Traceback" not in message
+    assert "row 3" in message
+    assert "slot 2" in message
