@@ -1,16 +1,10 @@
-"""Checkpoints of others: the mixed Flux model of the paper's authors, as PyTorch Lightning wrote it.
-
-Only tensors, numbers, strings and containers are read. Every other object in the file becomes an inert placeholder, so
-nothing in it is run.
-"""
+"""Checkpoints of others: the mixed Flux model of the paper's authors, as PyTorch Lightning wrote it."""
 
 from __future__ import annotations
 
 import logging
 import os
-import pickle
 import re
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,11 +13,14 @@ import torch
 from torch import Tensor
 
 from agents.diffusion import Preconditioning
+from agents.lightning_files import read_lightning
 from agents.mixed_denoiser import MixedPriorConfig
 from agents.mixed_prior import MixedPrior
+from agents.networks.bert import BertTextConfig
+from agents.networks.bert_files import BASE
 from agents.networks.mixed_flux import POSE, MixedFluxConfig
 from scene_envs.datasets import DatasetInfo, read_metadata
-from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene_types import Camera, SceneType, get_scene_type, register_scene_type
 
@@ -64,6 +61,7 @@ def import_checkpoint(
     *,
     scene: str | SceneType | None = None,
     aliases: Mapping[str, str] | None = None,
+    text_encoder: str = "",
 ) -> MixedPrior:
     """A prior from a Lightning checkpoint of the authors' mixed Flux model and the ``metadata.json`` of its data.
 
@@ -75,9 +73,14 @@ def import_checkpoint(
         scene: scene type of the prior; its assets are matched with the model paths by name. None makes a scene type
             from the metadata, whose assets have names and no geometry: it samples, and knows no physics.
         aliases: model path, or its stem, to asset name.
+        text_encoder: folder or hub name of the BERT that the checkpoint reads prompts with. Empty takes BERT-base where
+            it is at hand; where it is not, a checkpoint with text becomes a prior without prompts, and a warning says
+            so.
 
     Raises:
-        InvalidInputError: no such file, or checkpoint, metadata and scene type differ in their number of assets.
+        MissingDependencyError: ``text_encoder`` is named and ``transformers`` is not installed.
+        InvalidInputError: no such file; no such text encoder, or not one of the checkpoint's width; or checkpoint,
+            metadata and scene type differ in their number of assets.
         UnknownNameError: a model path that is no asset of ``scene``.
         CorruptFileError: not such a checkpoint; missing, extra and misshapen tensors are named.
     """
@@ -103,6 +106,7 @@ def import_checkpoint(
         prediction="epsilon",
         category_loss="bound",
         category_weight=1.0,
+        text=bert_of(config.text_width, text_encoder, file),
         given_share=0.0,
         clip=1.0,
     )
@@ -111,6 +115,40 @@ def import_checkpoint(
     prior = MixedPrior(prior_config, _with_categories(normalizer, scene_type), moments, card)
     _fill(prior.denoiser.network, tensors, file)
     return prior.eval()
+
+
+def bert_of(width: int, name: str, file: str | os.PathLike[str]) -> BertTextConfig | None:
+    """The BERT that a checkpoint reads prompts with; None for a prior without prompts.
+
+    Args:
+        width: of the checkpoint's text tokens; 0 for none.
+        name: folder or hub name; empty for BERT-base, if it is at hand.
+        file: the checkpoint, for messages.
+
+    Raises:
+        MissingDependencyError, InvalidInputError: ``name`` is given and cannot be used.
+    """
+    if not width:
+        if name:
+            raise InvalidInputError(f"{str(file)!r} was trained without text; leave text_encoder={name!r} out")
+        return None
+    try:
+        config = BertTextConfig.from_model(name or BASE, download=bool(name))
+        if config.width != width:
+            raise InvalidInputError(
+                f"{str(file)!r} reads text tokens of width {width}, and those of {config.model!r} have {config.width}"
+            )
+    except (MissingDependencyError, InvalidInputError) as error:
+        if name:
+            raise
+        _LOGGER.warning(
+            "%s reads prompts with BERT, and here it is imported without prompts: %s. Import it again with "
+            "text_encoder=FOLDER for prompts",
+            file,
+            error,
+        )
+        return None
+    return config
 
 
 def scene_type_of(info: DatasetInfo, name: str) -> SceneType:
@@ -145,29 +183,6 @@ def _reorder(tensors: dict[str, Tensor], order: Tensor) -> None:
     for name in ("logits_out.1.weight", "logits_out.1.bias"):
         if name in tensors:
             tensors[name] = tensors[name][rows]
-
-
-def read_lightning(file: str | os.PathLike[str]) -> dict[str, Any]:
-    """The content of a Lightning checkpoint: tensors and plain data; everything else is a placeholder.
-
-    Raises:
-        InvalidInputError: no such file.
-        CorruptFileError: not a checkpoint, or without a ``state_dict``.
-    """
-    path = Path(file)
-    if not path.is_file():
-        raise InvalidInputError(f"no checkpoint at {str(file)!r}")
-    try:
-        try:
-            content = torch.load(path, map_location="cpu", weights_only=True)
-        except pickle.UnpicklingError:
-            content = torch.load(path, map_location="cpu", weights_only=False, pickle_module=_Inert)
-    except (RuntimeError, EOFError, pickle.UnpicklingError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise CorruptFileError(f"{str(file)!r} is truncated or not a checkpoint of PyTorch ({reason})") from error
-    if not isinstance(content, dict) or not isinstance(content.get("state_dict"), Mapping):
-        raise CorruptFileError(f"{str(file)!r} is not a Lightning checkpoint: it has no 'state_dict'")
-    return content
 
 
 def rename(state: Mapping[str, Any], file: str | os.PathLike[str]) -> dict[str, Tensor]:
@@ -264,51 +279,3 @@ def _with_categories(normalizer: Normalizer, scene: SceneType) -> Normalizer:
     scale, offset = whole.scale.clone(), whole.min.clone()
     scale[:POSE], offset[:POSE] = normalizer.scale[:POSE], normalizer.min[:POSE]
     return Normalizer(scale, offset, whole.input_min, whole.input_max)
-
-
-class _Placeholder:
-    """Stands for an object that is not read; takes anything and does nothing."""
-
-    def __init__(self, *_: Any, **__: Any) -> None:
-        pass
-
-    def __setstate__(self, _: Any) -> None:
-        pass
-
-    def __call__(self, *_: Any, **__: Any) -> _Placeholder:
-        return self
-
-    def append(self, _: Any) -> None:
-        pass
-
-    def extend(self, _: Any) -> None:
-        pass
-
-    def __setitem__(self, _: Any, __: Any) -> None:
-        pass
-
-
-_ALLOWED = {
-    ("collections", "OrderedDict"),
-    ("torch._utils", "_rebuild_tensor_v2"),
-    ("torch._utils", "_rebuild_parameter"),
-    ("torch", "Size"),
-    ("torch", "device"),
-} | {
-    ("torch", f"{kind}Storage")
-    for kind in ("Float", "Double", "Half", "BFloat16", "Long", "Int", "Short", "Char", "Byte", "Bool")
-}
-
-
-class _Inert:
-    """A pickle module for ``torch.load`` that builds tensors and plain containers, and placeholders for the rest."""
-
-    class Unpickler(pickle.Unpickler):
-        """Finds no class but those of tensors."""
-
-        def find_class(self, module: str, name: str) -> Any:
-            """The class if it is harmless; else the placeholder."""
-            return super().find_class(module, name) if (module, name) in _ALLOWED else _Placeholder
-
-    load = staticmethod(pickle.load)
-    loads = staticmethod(pickle.loads)

@@ -135,6 +135,21 @@ class SceneType:
         """Categories of welded assets."""
         return tuple(self.assets.index(name) for name in self.welded)
 
+    @property
+    def has_geometry(self) -> bool:
+        """Whether every asset has a model here; those of a scene type made from a dataset's metadata may have none.
+
+        Without models there is no physics and there are no pictures; priors can be sampled all the same.
+
+        >>> get_scene_type("dimsum_table").has_geometry
+        True
+        """
+        from scene_envs.assets import list_assets
+        from scene_envs.assets.importing.user_library import folder_index
+
+        own = {name for folder in self.asset_folders for name in folder_index(folder).names}
+        return own.union(list_assets()).issuperset(self.assets)
+
     @cached_property
     def library(self) -> AssetLibrary:
         """The assets themselves, built on first use and shared between scene types."""

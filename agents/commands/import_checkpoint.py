@@ -21,6 +21,8 @@ class ImportCheckpointConfig:
         metadata: the metadata.json of the data it was trained on; the second word without =.
         scene: scene type whose assets its model paths name; empty makes one from the metadata.
         aliases: model path or its stem to asset name, as in {their_cup: teacup}.
+        text_encoder: folder or hub name of the BERT that the checkpoint reads prompts with; empty takes BERT-base where
+            it is at hand, and else makes a prior without prompts.
         count: scenes to sample as a trial; 0 for none.
         num_steps: denoising steps of the trial.
         seed: of the trial.
@@ -31,6 +33,7 @@ class ImportCheckpointConfig:
     metadata: str = ""
     scene: str = ""
     aliases: dict[str, str] = field(default_factory=dict)
+    text_encoder: str = ""
     count: int = 4
     num_steps: int = 50
     seed: int = 0
@@ -50,11 +53,16 @@ def run(settings: ImportCheckpointConfig, run: Run) -> None:
     if not settings.checkpoint or not settings.metadata:
         raise InvalidInputError("name the two files: scene-envs import-checkpoint FILE metadata.json")
     prior = import_checkpoint(
-        settings.checkpoint, settings.metadata, scene=settings.scene or None, aliases=settings.aliases
+        settings.checkpoint,
+        settings.metadata,
+        scene=settings.scene or None,
+        aliases=settings.aliases,
+        text_encoder=settings.text_encoder,
     )
     prior.save(run.directory / "prior")
     parameters = sum(tensor.numel() for tensor in prior.weights().values())
     run.say(f"{parameters / 1e6:.1f} M parameters, {prior.scene_type.num_assets} assets, {prior.config.slots} slots")
+    run.say("it reads prompts" if prior.conditional else "it is sampled without prompts")
     metrics = {"parameters": parameters, "trained_steps": prior.card["trained_steps"]}
     if settings.count > 0:
         batch = prior.sample(settings.count, num_steps=settings.num_steps, seed=settings.seed)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from agents.commands.export import export_scenes
@@ -11,6 +11,7 @@ from agents.commands.scenes import draw_scenes, make_ready, reward_figures
 
 if TYPE_CHECKING:
     from agents.cli_run import Run
+    from scene_envs.scene_types import SceneType
 
 
 @dataclass
@@ -70,6 +71,9 @@ def run(settings: SampleConfig, run: Run) -> None:
     formats = None if settings.export is None else resolve_formats(settings.export)
     reward = None if settings.reward is None else resolve_reward(settings.reward)
     prior = ScenePrior.load(settings.prior).to(settings.device)
+    if not prior.scene_type.has_geometry:
+        settings = _without_geometry(settings, prior.scene_type, run)
+        reward = None if settings.reward is None else reward
     started = time.perf_counter()
     batch = prior.sample(
         settings.count,
@@ -100,3 +104,16 @@ def run(settings: SampleConfig, run: Run) -> None:
             metrics["export"] = export_scenes(batch, formats, run.directory / "export", pool, run)
     run.write_metrics(metrics)
     run.say(f"written to {run.directory}")
+
+
+def _without_geometry(settings: SampleConfig, scene_type: SceneType, run: Run) -> SampleConfig:
+    """The settings for assets without models: pictures and the default reward are left out, physics is refused."""
+    from scene_envs.errors import InvalidInputError
+
+    if settings.project or settings.export is not None:
+        raise InvalidInputError(
+            f"project=true and export= need the geometry of the assets, and those of {scene_type.name!r} have none "
+            "here; import the checkpoint with scene= and aliases=, or leave both out"
+        )
+    run.say(f"the assets of {scene_type.name!r} have no geometry here: no pictures, and no reward that needs physics")
+    return replace(settings, pictures=0, reward=None if settings.reward == SampleConfig.reward else settings.reward)

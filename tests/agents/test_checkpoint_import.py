@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import logging
 import pickle
+import sys
 from pathlib import Path
 
 import pytest
 import torch
 
-from agents.checkpoint_import import import_checkpoint, read_lightning
+from agents.checkpoint_import import import_checkpoint
+from agents.lightning_files import read_lightning
 from agents.prior import ScenePrior
-from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
+from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, UnknownNameError
 from scene_envs.scene_types import get_scene_type
 from tests.agents.authors_flux import forward, random_state
 
@@ -111,6 +114,27 @@ def test_unknown_assets_need_aliases_and_without_a_scene_type_one_is_made(tmp_pa
     assert prior.scene_type.assets == tuple(order)
     assert prior.scene_type.welded == ("cafe_table",)
     assert len(prior.sample(1, num_steps=2, seed=0)) == 1
+
+
+def test_a_checkpoint_with_text_is_sampled_without_prompts_where_bert_is_not_at_hand(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    files = write_checkpoint(tmp_path, random_state(text=10))
+    with caplog.at_level(logging.WARNING):
+        prior = import_checkpoint(*files, scene=DIMSUM)
+    assert "imported without prompts" in caplog.text
+    assert "scene-envs[bert]" in caplog.text
+    assert not prior.conditional
+    assert len(prior.sample(1, num_steps=2, seed=0)) == 1
+    with pytest.raises(InvalidInputError, match="trained without text"):
+        prior.sample(1, prompt="A scene with 3 objects.", num_steps=1)
+    with pytest.raises(MissingDependencyError, match=r"scene-envs\[bert\]"):
+        import_checkpoint(*files, scene=DIMSUM, text_encoder="bert-base-uncased")
+    with pytest.raises(InvalidInputError, match="trained without text; leave text_encoder='bert-base-uncased' out"):
+        import_checkpoint(
+            *write_checkpoint(tmp_path, random_state(text=0)), scene=DIMSUM, text_encoder="bert-base-uncased"
+        )
 
 
 class _Trap:

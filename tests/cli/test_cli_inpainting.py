@@ -13,6 +13,7 @@ from agents.cli import main
 from agents.prior import ScenePrior, tiny_prior
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch
+from scene_envs.scene_types import get_scene_type
 from tests.agents.authors_flux import random_state
 from tests.agents.test_checkpoint_import import write_checkpoint
 
@@ -63,3 +64,20 @@ def test_a_checkpoint_of_the_authors_becomes_a_prior(tmp_path: Path) -> None:
     prior = ScenePrior.load(tmp_path / "run")
     saved = SceneBatch.load(tmp_path / "run" / "scenes.safetensors")
     assert torch.equal(prior.sample(2, num_steps=3, seed=0).tensor, saved.tensor)
+
+
+def test_an_imported_prior_without_geometry_is_sampled_without_physics(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    order = [f"their_{name}" for name in get_scene_type("dimsum_table").assets]
+    checkpoint, metadata = write_checkpoint(tmp_path, random_state(), order=order)
+    imported, output = tmp_path / "imported", tmp_path / "samples"
+    assert main(["import-checkpoint", str(checkpoint), str(metadata), "count=0", f"output={imported}"]) == 0
+    words = ["sample", f"prior={imported}", "count=2", "num_steps=2", "workers=0", f"output={output}"]
+    assert main(words) == 0
+    assert "have no geometry here" in capsys.readouterr().out
+    assert len(SceneBatch.load(output / "scenes.safetensors")) == 2
+    assert not (output / "gallery.png").exists()
+    assert "reward" not in json.loads((output / "metrics.json").read_text())
+    assert main([*words, "project=true"]) == 2
+    assert "have none here" in capsys.readouterr().err
