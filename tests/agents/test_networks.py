@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -272,3 +274,16 @@ def test_unknown_names_and_wrong_sizes_say_what_would_be_right() -> None:
         MixedDiffuSceneConfig(categories=8, levels=0)
     with pytest.raises(InvalidInputError, match="depth=0"):
         MixedMiDiffusionConfig(categories=8, depth=0)
+
+
+def test_the_pages_code_and_counts_hold() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "networks.md").read_text()
+    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(code, {"__name__": "docs"})
+    sizes: dict[str, Any] = {"features": 20, "categories": 8, "hidden": 192, "depth": 6, "heads": 6}
+    for process, text in (("continuous", 0), ("mixed", 0), ("mixed", 128)):
+        row = next(line for line in page.splitlines() if re.match(rf"\| {process} \| (width )?{text or 'none'} ", line))
+        printed = [int(number.replace(",", "")) for number in re.findall(r"\d+(?:,\d+)+", row)]
+        assert printed == [
+            parameter_count(network_config(name, process, text_width=text, **sizes)) for name in NETWORKS
+        ]
