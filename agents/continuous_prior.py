@@ -72,7 +72,7 @@ class ContinuousPrior(ScenePrior):
         _check_network(config, self.code)
         check_weighting(config.loss_weighting, config.prediction)
         self._keep(config, normalizer, preconditioning, card, residual)
-        schedule = make_schedule(config.schedule, config.num_timesteps, config.noise_floor)
+        schedule = make_schedule(config.schedule, config.num_timesteps, config.noise_floor, config.noise_ceiling)
         self.process = GaussianProcess(schedule, config.prediction, preconditioning)
         self.denoiser = Denoiser(build_network(config.network), self.process)
         law = timestep_law(config.timesteps, config.prediction)
@@ -155,6 +155,7 @@ class ContinuousPrior(ScenePrior):
         The std is 0 on known entries, and everywhere at the last step, which is deterministic, or where ``eta`` is 0.
         """
         t, previous = int(table.timesteps[step]), int(table.previous[step])
+        self.process.check_stride(t, previous)
         x0 = self.denoiser(x_t, torch.full((x_t.shape[0],), t, device=x_t.device))
         if self.config.clip:
             x0 = x0.clamp(-self.config.clip, self.config.clip)

@@ -103,6 +103,14 @@ class GaussianProcess:
 
     # -- reverse --------------------------------------------------------------------------------
 
+    def check_stride(self, t: int, previous: int) -> None:
+        """Raise InvalidInputError where t -> s is not a stride down within 0..T."""
+        if not 0 <= previous < t <= self.schedule.num_timesteps:
+            raise InvalidInputError(
+                f"the step {t} -> {previous} is not a stride down within 0..{self.schedule.num_timesteps}, "
+                "the timesteps of the schedule"
+            )
+
     def posterior(
         self, x_t: Tensor, x0: Tensor, t: int, previous: int, residual: Tensor | None = None, eta: float = 1.0
     ) -> tuple[Tensor, Tensor]:
@@ -128,11 +136,7 @@ class GaussianProcess:
         """
         if not 0.0 <= eta <= 1.0:
             raise InvalidInputError(f"eta={eta} is outside 0..1: 1 is the ancestral chain, 0 the deterministic one")
-        if not 0 <= previous < t <= self.schedule.num_timesteps:
-            raise InvalidInputError(
-                f"the step {t} -> {previous} is not a stride down within 0..{self.schedule.num_timesteps}, "
-                "the timesteps of the schedule"
-            )
+        self.check_stride(t, previous)
         alpha_bar = self.schedule.alpha_bar
         a_t, a_s = alpha_bar[t], alpha_bar[previous]
         variance = eta**2 * (1.0 - a_s) / (1.0 - a_t) * (1.0 - a_t / a_s)

@@ -43,6 +43,8 @@ class StepTable:
     def spaced(cls, num_timesteps: int, num_steps: int) -> StepTable:
         """``num_steps`` steps evenly spaced over 1..T, both ends included; any number from 1 to T.
 
+        One above the timesteps of diffusers' schedulers with ``timestep_spacing="linspace"``, which count from 0.
+
         Args:
             num_timesteps: T of the schedule.
             num_steps: S; need not divide T.
@@ -57,7 +59,7 @@ class StepTable:
         if num_steps == 1:
             t = torch.tensor([num_timesteps])
         else:
-            t = torch.linspace(num_timesteps, 1, num_steps, dtype=torch.float64).round().long()
+            t = torch.linspace(num_timesteps - 1, 0, num_steps, dtype=torch.float64).round().long() + 1
         return cls(t, torch.cat([t[1:], torch.zeros(1, dtype=torch.int64)]))
 
     @classmethod
