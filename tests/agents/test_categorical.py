@@ -88,6 +88,33 @@ def test_few_steps_of_the_true_denoiser_reach_the_data_whatever_their_number(nam
         assert float(state[K]) < 1e-9
 
 
+@pytest.mark.parametrize("name", KERNELS)
+@pytest.mark.parametrize(("t", "s"), [(20, 0), (20, 13), (9, 2), (2, 0)])
+def test_one_stride_is_the_composed_chain_of_single_steps(name: str, t: int, s: int) -> None:
+    """With the exact p(x_0 | x_t) a stride has, from every state, the distribution of its single steps in a row."""
+    process = _process(name)
+    data = torch.tensor([0.4, 0.3, 0.2, 0.1, 0.0], dtype=torch.float64)
+
+    def reverse(start: int, end: int) -> torch.Tensor:
+        joint = data[:, None] * process.transition(0, start)[:K]  # (x_0, x_t)
+        x0_probs = (joint / joint.sum(dim=0).clamp(min=1e-30)).T
+        return process.posterior(torch.arange(K + 1), x0_probs, start, end)
+
+    composed = torch.eye(K + 1, dtype=torch.float64)
+    for level in range(t, s, -1):
+        composed = composed @ reverse(level, level - 1)
+    possible = (data @ process.transition(0, t)[:K]) > 1e-12
+    torch.testing.assert_close(composed[possible], reverse(t, s)[possible], atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_the_first_level_of_noise_already_changes_categories(name: str) -> None:
+    """Its keep-probability (that of t = 0 where levels count from 0) is below 1, so that the last step has work."""
+    schedule = make_categorical_schedule(name, 1000)
+    assert 0 < float(schedule.keep[1]) < 1
+    assert bool((schedule.keep[1:] <= schedule.keep[:-1]).all())
+
+
 def test_noise_is_drawn_from_the_marginal() -> None:
     process = _process("mask_and_replace", 100)
     x0 = torch.full((40_000,), 2)
