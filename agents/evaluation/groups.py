@@ -31,6 +31,10 @@ class Material:
         pool: physics workers; None computes in this process.
         seed: of classifiers and prompts.
         fid_weights: path of the weights of an Inception-v3; empty for none.
+
+    >>> empty = SceneBatch.empty("dimsum_table", 2)
+    >>> measure_group("layout", Material(empty, RealScenes(empty, empty)))["floor_objects_mean"]
+    1.0
     """
 
     samples: SceneBatch

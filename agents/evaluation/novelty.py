@@ -34,7 +34,13 @@ class Neighbors:
     Attributes:
         distance: (B,) m, to the nearest; see :func:`scene_distances`.
         index: (B,) int64, which it is.
-        copied: (B,) bool: it has the same assets, each within 1 cm of its counterpart.
+        copied: (B,) bool: one of the scenes has the same assets, each within 1 cm of its counterpart.
+
+    >>> from scene_envs.grammars import get_grammar
+    >>> scenes = get_grammar("dimsum_table").sample(np.random.default_rng(0), 6)
+    >>> found = nearest_scenes(scenes[2:4], scenes)
+    >>> found.index.tolist(), found.distance.tolist(), found.copied.tolist()
+    ([2, 3], [0.0, 0.0], [True, True])
     """
 
     distance: Tensor

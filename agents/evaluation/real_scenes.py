@@ -26,6 +26,11 @@ class RealScenes:
         reference: held-out scenes that samples are compared with.
         floor: other held-out scenes: what a perfect sampler would draw.
         training: scenes that the prior may have been trained on; None when the grammar gave the others.
+
+    >>> from scene_envs.scene_types import get_scene_type
+    >>> real = RealScenes.load(get_scene_type("dimsum_table"), 2)
+    >>> len(real.reference), len(real.floor), real.training
+    (2, 2, None)
     """
 
     reference: SceneBatch

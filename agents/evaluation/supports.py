@@ -17,6 +17,9 @@ class Support:
         reach: largest horizontal distance (m) between the frames of rider and supporting object.
         catch: a rider in reach whose z is at most so far (m) off belongs here, whatever surface is nearer: for
             supports that are thinner than the errors to be told apart, such as a plate on a table.
+
+    >>> [support.kind for support in SUPPORTS["dimsum_table"]]
+    ['table', 'stack']
     """
 
     kind: str
@@ -36,6 +39,9 @@ class Container:
         riders: what may lie in them.
         reach: largest horizontal distance (m) between the frames.
         depth: largest height (m) of the rider's frame above the container's; the smallest is 1 cm.
+
+    >>> [container.names for container in CONTAINERS]
+    [('fruit_bowl',), ('bowl',), ('utensil_crock',)]
     """
 
     names: tuple[str, ...]
