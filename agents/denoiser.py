@@ -30,6 +30,7 @@ class PriorConfig:
             what was published with the prediction, lognormal for ``"karras"`` and uniform for the others.
         loss_weighting: of the loss by timestep, ``"none"`` or ``"min_snr"``.
         noise_floor: lowest noise-to-signal ratio of the ``"karras"`` schedule, in normalised units.
+        noise_ceiling: highest.
         clip: bound on denoised scenes while sampling, normalised units; 0 for none (1 is that of Ho et al. 2020).
     """
 
@@ -46,6 +47,7 @@ class PriorConfig:
     timesteps: str | None = None
     loss_weighting: str = "none"
     noise_floor: float = 0.002
+    noise_ceiling: float = 80.0
     clip: float = 0.0
 
 

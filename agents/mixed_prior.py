@@ -21,6 +21,7 @@ from agents.diffusion import (
     Preconditioning,
     ResidualVariance,
     StepTable,
+    check_weighting,
     make_categorical_schedule,
     make_schedule,
     timestep_weights,
@@ -80,6 +81,9 @@ class MixedPrior(PromptReader, ScenePrior):
             )
         if config.category_loss not in CATEGORY_LOSSES:
             raise unknown_name("category loss", config.category_loss, CATEGORY_LOSSES)
+        check_weighting(config.loss_weighting, config.prediction)
+        if config.empty_slots == "dropped" and not isinstance(config.network, MixedFluxConfig):
+            raise InvalidInputError("empty_slots='dropped' needs network='flux'; others take empty_slots='attended'")
         self.mixed = config
         self._keep(config, normalizer, preconditioning, card, residual)
         schedule = make_schedule(config.schedule, config.num_timesteps, config.noise_floor, config.noise_ceiling)
@@ -237,6 +241,7 @@ class MixedPrior(PromptReader, ScenePrior):
             eta: noise of the pose, 1 for the ancestral step and 0 for a certain one; categories are drawn all the same.
         """
         t, previous = int(table.timesteps[step]), int(table.previous[step])
+        self.process.check_stride(t, previous)
         levels = torch.full((x_t.shape[0],), t, device=x_t.device)
         given = self.seen(x_t, given)
         if free is None and (text is None or guidance):
@@ -298,9 +303,7 @@ class MixedPrior(PromptReader, ScenePrior):
                 if again:
                     x = self._renoise(x, after, level, draw_noise(x, noises))
                     x = x if given is None else given.write(x)
-                reverse = self.transition(
-                    x, step, table, given=given, text=text, guidance=guidance, free=free, eta=eta
-                )
+                reverse = self.transition(x, step, table, given=given, text=text, guidance=guidance, free=free, eta=eta)
                 x = reverse.from_noise(draw_noise(x, noises))
                 x = x if given is None else given.write(x)
         return x

@@ -8,6 +8,7 @@ import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
+from agents.diffusion import loss_weights
 from agents.diffusion.reverse_steps import state_of
 from agents.mixed_denoiser import Given, Text
 from agents.networks.mixed_flux import POSE
@@ -48,6 +49,7 @@ def mixed_loss(
     if prior.denoiser.drops_empty:  # what is seen is certain
         drawn = drawn * (state_of(x_t[..., POSE:]) == prior.num_categories)
     pose_loss = (error.square() * weight).sum(dim=(1, 2)) / weight.sum(dim=(1, 2)).clamp(min=1.0)
+    pose_loss = pose_loss * loss_weights(prior.process.schedule, t, config.prediction, config.loss_weighting).to(device)
     if config.category_loss == "bound":
         states = x_t[..., POSE:]
         losses = prior.categories.loss(category0, state_of(states), t, logits, config.auxiliary)

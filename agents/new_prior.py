@@ -13,10 +13,11 @@ from agents.denoiser import PriorConfig
 from agents.diffusion import CategoryMoments, Preconditioning
 from agents.mixed_denoiser import MixedPriorConfig
 from agents.mixed_prior import MixedPrior
-from agents.networks import FluxConfig, TextConfig, vocabulary
-from agents.networks.registry import ContinuousNetworkConfig, network_config
+from agents.networks import TextConfig, vocabulary
+from agents.networks.registry import NetworkConfig, network_config
 from agents.pretrain_config import PretrainConfig
 from agents.prior import PROCESSES, ScenePrior
+from agents.rotation_codes import SceneCode
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import POSE
@@ -25,50 +26,82 @@ from scene_envs.scene_types import get_scene_type
 MOMENTS = ("category", "feature", "scene")
 """Whose mean and standard deviation precondition a network."""
 
+_FITTED_ON = 20_000
+"""Scenes to which moments are fitted."""
+
 
 def build_prior(
     config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts: Sequence[Sequence[str]] = ()
 ) -> ScenePrior:
-    """A fresh prior whose preconditioning is fitted to the raw scenes (M, N, D).
+    """The prior that ``config`` starts from: a fresh one, its preconditioning fitted to raw scenes, or an older one.
 
     Args:
         config: the run.
-        raw: scenes.
+        raw: (M, N, D) scenes.
         normalizer: of raw scenes.
         prompts: prompts of every scene, from which a prior that reads them takes its vocabulary.
     """
-    scene_type = get_scene_type(config.scene)
-    fixed = len(scene_type.fixed)
+    if config.prior:
+        return _started(config, raw.shape[1])
+    if config.moments not in MOMENTS:
+        raise unknown_name("moments", config.moments, MOMENTS)
     if config.process == "continuous":
-        if config.text:
-            raise InvalidInputError("text=true needs process=mixed: the continuous prior reads no prompts")
-        network = FluxConfig(scene_type.features, config.hidden, config.depth, config.heads)
-        prior_config = PriorConfig(config.scene, raw.shape[1], network, config.schedule, config.prediction)
-        torch.manual_seed(config.seed)
-        sample = normalizer.normalize(raw[:20_000])
-        return ContinuousPrior(prior_config, normalizer, Preconditioning.fit(sample[:, fixed:]))
-    if config.process != "mixed":
-        raise unknown_name("process", config.process, PROCESSES)
-    text = TextConfig(vocabulary(prompt for group in prompts for prompt in group)) if config.text else None
-    mixed_network = network_config(
-        config.network,
-        "mixed",
-        features=scene_type.features,
-        categories=scene_type.num_assets + 1,
-        hidden=config.hidden,
-        depth=config.depth,
-        heads=config.heads,
-        text_width=0 if text is None else text.width,
-        attention=config.attention,
-        frequencies=config.frequencies,
-        unit=_unit(normalizer),
-    )
-    if isinstance(mixed_network, ContinuousNetworkConfig):
-        raise TypeError("the registry gave a continuous network for a mixed prior")
-    mixed_config = MixedPriorConfig(
+        return _continuous(config, raw, normalizer)
+    if config.process == "mixed":
+        return _mixed(config, raw, normalizer, prompts)
+    raise unknown_name("process", config.process, PROCESSES)
+
+
+def _started(config: PretrainConfig, slots: int) -> ScenePrior:
+    """The prior that ``config`` names, for scenes of its type.
+
+    Raises:
+        InvalidInputError: its scene type, its slots or its reading of prompts are not those of the run.
+    """
+    prior = ScenePrior.load(config.prior)
+    found = (prior.scene_type.name, prior.config.slots, prior.conditional)
+    asked = (config.scene, slots, config.text)
+    if found != asked:
+        names = ("scene type", "slots", "text")
+        wrong = ", ".join(f"{n} {f!r}, not {a!r}" for n, f, a in zip(names, found, asked, strict=True) if f != a)
+        raise InvalidInputError(f"the prior {config.prior!r} cannot be trained further on this data: it has {wrong}")
+    return prior
+
+
+def _continuous(config: PretrainConfig, raw: Tensor, normalizer: Normalizer) -> ContinuousPrior:
+    if config.text:
+        raise InvalidInputError("text=true needs process=mixed: the continuous prior reads no prompts")
+    code = SceneCode(get_scene_type(config.scene), config.rotation, normalizer)
+    prior_config = PriorConfig(
         config.scene,
         raw.shape[1],
-        mixed_network,
+        _network(config, code.features, normalizer),  # type: ignore[arg-type]
+        config.schedule,
+        config.prediction,
+        translation_weight=config.translation_weight,
+        rotation=config.rotation,
+        timesteps=config.timesteps,
+        loss_weighting=config.loss_weighting,
+        noise_floor=config.noise_floor,
+        noise_ceiling=config.noise_ceiling,
+    )
+    torch.manual_seed(config.seed)
+    moments = "feature" if config.moments == "category" else config.moments
+    return ContinuousPrior.fitted(prior_config, normalizer, raw[:_FITTED_ON], moments)
+
+
+def _mixed(config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts: Sequence[Sequence[str]]) -> MixedPrior:
+    if config.rotation != "matrix":
+        raise InvalidInputError(
+            f"rotation={config.rotation!r} needs process=continuous: mixed priors diffuse rotation matrices"
+        )
+    scene_type = get_scene_type(config.scene)
+    text = TextConfig(vocabulary(prompt for group in prompts for prompt in group)) if config.text else None
+    network = _network(config, scene_type.features, normalizer, 0 if text is None else text.width)
+    prior_config = MixedPriorConfig(
+        config.scene,
+        raw.shape[1],
+        network,  # type: ignore[arg-type]
         config.schedule,
         config.prediction,
         config.kernel,
@@ -77,29 +110,42 @@ def build_prior(
         text=text,
         noise_floor=config.noise_floor,
         noise_ceiling=config.noise_ceiling,
-        empty_slots=config.empty_slots,
         timesteps=config.timesteps,
         loss_weighting=config.loss_weighting,
+        empty_slots=config.empty_slots,
     )
     torch.manual_seed(config.seed)
-    return MixedPrior(mixed_config, normalizer, _pose_moments(config.moments, raw[:20_000, fixed:], normalizer))
+    free = raw[:_FITTED_ON, len(scene_type.fixed) :]
+    return MixedPrior(prior_config, normalizer, _pose_moments(config.moments, free, normalizer))
+
+
+def _network(config: PretrainConfig, features: int, normalizer: Normalizer, text_width: int = 0) -> NetworkConfig:
+    return network_config(
+        config.network,
+        config.process,
+        features=features,
+        categories=get_scene_type(config.scene).num_assets + 1,
+        hidden=config.hidden,
+        depth=config.depth,
+        heads=config.heads,
+        text_width=text_width,
+        attention=config.attention,
+        frequencies=config.frequencies,
+        unit=_unit(normalizer),
+    )
 
 
 def _pose_moments(kind: str, raw: Tensor, normalizer: Normalizer) -> Preconditioning:
     """Moments of the normalised poses of all objects of raw scenes (M, N, D)."""
-    if kind not in MOMENTS:
-        raise unknown_name("moments", kind, MOMENTS)
-    objects = raw[raw[..., -1] == 0]
-    poses = normalizer.normalize(objects)[..., : POSE.stop]
-    moments = Preconditioning.fit(poses)
+    poses = normalizer.normalize(raw)[..., : POSE.stop]
+    moments = Preconditioning.fit(poses[raw[..., -1] == 0])
     if kind == "scene":
         return moments.pooled()
     if kind == "feature":
         return moments
-    categories = raw[..., POSE.stop :].argmax(dim=-1).flatten()
-    every = normalizer.normalize(raw).flatten(0, 1)[:, : POSE.stop]
-    by_category = CategoryMoments.fit(every, categories, raw.shape[-1] - POSE.stop)
-    return replace(moments, by_category=by_category)
+    categories = raw[..., POSE.stop :].argmax(dim=-1)
+    count = raw.shape[-1] - POSE.stop
+    return replace(moments, by_category=CategoryMoments.fit(poses.flatten(0, 1), categories.flatten(), count))
 
 
 def _unit(normalizer: Normalizer) -> tuple[float, float, float]:

@@ -14,6 +14,8 @@ class PretrainConfig:
         data: dataset directory of training scenes; several, joined by commas, train one prior on all their scene
             types with equal chances; ``grammar`` stands for fresh scenes of the grammar without end.
         heldout: dataset directory of held-out scenes; empty takes the last 2 % of ``data``, or 512 of the grammar.
+        prior: shipped name, or folder of a prior or a run, that training starts from, whatever the keys of its size
+            and kind say; empty for a fresh one.
         output: run directory; an interrupted run in it goes on where it stopped.
         iterations: optimiser steps.
         batch_size: scenes per step, over all processes and parts.
@@ -38,8 +40,8 @@ class PretrainConfig:
         noise_ceiling: highest noise-to-signal ratio of the karras schedule.
         timesteps: law of training timesteps, ``lognormal`` (of the noise-to-signal ratio) or ``uniform``.
         loss_weighting: of the loss by timestep, ``none`` or ``min_snr``.
-        moments: whose mean and spread scale what the network reads and says: those of each ``category`` (mixed
-            priors), of each ``feature``, or of the ``scene`` as a whole.
+        moments: whose mean and spread scale what the network says: those of each ``category`` (of each feature, where
+            the process is continuous), of each ``feature``, or of the ``scene`` as a whole.
         translation_weight: weight of x, y, z in the loss, rotations having 1.
         category_loss: of a mixed prior, ``cross_entropy`` of the clean category, or ``bound``, the paper's.
         rotation: what a continuous prior diffuses as rotation: ``matrix``, ``quaternion`` or ``axis_angle``.
@@ -64,38 +66,39 @@ class PretrainConfig:
     scene: str = "dimsum_table"
     data: str = "data/dimsum_table"
     heldout: str = ""
+    prior: str = ""
     output: str = "runs/pretrain"
     iterations: int = 5000
     batch_size: int = 128
     accumulate: int = 1
     precision: str = "float32"
-    optimizer: str = "adamw"
+    optimizer: str = "muon"
     learning_rate: float = 1e-3
     final_learning_rate: float = 0.01
     warmup: int = 100
     weight_decay: float = 0.01
     clip: float = 1.0
     ema: float = 0.999
-    hidden: int = 192
+    hidden: int = 128
     depth: int = 6
-    heads: int = 6
+    heads: int = 4
     network: str = "flux"
-    attention: str = "plain"
+    attention: str = "distance"
     frequencies: int = 8
     prediction: str = "karras"
     schedule: str = "karras"
     noise_floor: float = 0.002
-    noise_ceiling: float = 80.0
+    noise_ceiling: float = 20.0
     timesteps: str = "lognormal"
     loss_weighting: str = "none"
-    moments: str = "feature"
+    moments: str = "category"
     translation_weight: float = 3.0
     category_loss: str = "cross_entropy"
     rotation: str = "matrix"
     matmul_precision: str = "highest"
-    process: str = "continuous"
-    kernel: str = "mask_and_replace"
-    empty_slots: str = "attended"
+    process: str = "mixed"
+    kernel: str = "early_absorbing"
+    empty_slots: str = "dropped"
     text: bool = False
     prompt_dropout: float = 0.1
     compile: bool = False
