@@ -20,9 +20,13 @@ class PostTrainKeys(PostTrainConfig):
     Attributes:
         report_scenes: fresh samples of the prior before and after, measured and pictured in report.html; 0 for no
             report.
+        prompt: what the scenes should hold, for priors that read prompts: a text, a list such as '["A scene with two
+            cups.", "A scene with 9 objects."]', data for the prompts of the real scenes, or grammar for descriptions of
+            the grammar's; null for anything.
     """
 
     report_scenes: int = 256
+    prompt: str | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -32,7 +36,29 @@ class PostTrainKeys(PostTrainConfig):
     @property
     def run_config(self) -> PostTrainConfig:
         """The run without its report."""
-        return PostTrainConfig(**{field.name: getattr(self, field.name) for field in fields(PostTrainConfig)})
+        values = {field.name: getattr(self, field.name) for field in fields(PostTrainConfig)}
+        return PostTrainConfig(**{**values, "prompt": read_prompts(self.prompt)})
+
+
+def read_prompts(text: str | None) -> str | list[str] | None:
+    """One prompt as it is, and a list of them where the text is one.
+
+    >>> read_prompts("A scene with a cup, a plate and a teapot."), read_prompts("[a cup, a plate]")
+    ('A scene with a cup, a plate and a teapot.', ['a cup', 'a plate'])
+    """
+    import yaml
+
+    if text is None or not text.lstrip().startswith("["):
+        return text
+    try:
+        prompts = yaml.safe_load(text)
+    except yaml.YAMLError:
+        prompts = None
+    if not isinstance(prompts, list) or not all(isinstance(prompt, str) for prompt in prompts):
+        raise InvalidInputError(
+            f'prompt={text!r} is no list of texts; write \'["A scene with two cups.", "A scene with 9 objects."]\''
+        )
+    return prompts
 
 
 def config() -> type[PostTrainKeys]:
@@ -62,6 +88,7 @@ def say_change(metrics: Mapping[str, Any], run: Run) -> None:
         ("objects", "objects per scene"),
         ("feasible_objects", "feasible as sampled"),
         ("ready_objects", "simulation-ready"),
+        ("prompt_match", "match of the prompts"),
     ):
         if before.get(name) and name in after:
             change = after[name] / before[name] - 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ from agents.post_training.report import Page, Picture, Section, Tile, write_repo
 from agents.post_training.run_files import write_metrics
 from agents.post_training.trainer import PostTrainResult
 from agents.prior import ScenePrior
-from rewards import reward_name
+from rewards import PromptMatch, RewardContext, reward_name
 from scene_envs.scene import SceneBatch
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ class Measured:
         figures: ``objects`` (mean count, welded included), ``objects_sem`` (its standard error), ``feasible_objects``
             (free, raw), ``feasible_fraction`` of free objects, ``ready_objects`` (free, after projection and
             settling, feasible and in the workspace), ``ready_objects_sem``, ``ready_fraction``, ``scenes``,
+            ``prompt_match`` (with prompts: the reward of that name), ``prompt_match_sem``,
             ``invalid_scenes`` (physics failed: left out of feasible and ready figures), and the cheap realism figures.
         raw: the samples as they came.
         ready: the same, projected and settled.
@@ -43,7 +44,14 @@ class Measured:
 
 
 def measure_prior(
-    prior: ScenePrior, count: int, *, num_steps: int = 50, seed: int = 0, pool: PhysicsPool | None = None
+    prior: ScenePrior,
+    count: int,
+    *,
+    num_steps: int = 50,
+    seed: int = 0,
+    pool: PhysicsPool | None = None,
+    prompts: Sequence[str] | None = None,
+    guidance: float = 0.0,
 ) -> Measured:
     """Sample ``count`` scenes and measure all of them; none is chosen, none is dropped.
 
@@ -53,11 +61,13 @@ def measure_prior(
         num_steps: denoiser evaluations per scene.
         seed: of the samples; the same seed for two priors starts both from the same noise.
         pool: physics workers.
+        prompts: one per scene, which the samples are then compared with; None for none.
+        guidance: weight of classifier-free guidance.
     """
     from agents.post_training.guard import realism
     from scene_envs.physics import feasibility, make_ready
 
-    raw = prior.sample(count, num_steps=num_steps, seed=seed)
+    raw = prior.sample(count, prompt=prompts, guidance=guidance, num_steps=num_steps, seed=seed)
     feasible = feasibility(raw, pool=pool)
     ready = make_ready(raw, pool=pool)
     counts = raw.counts.double()
@@ -70,6 +80,7 @@ def measure_prior(
         **_counted("ready", ready.counts, ready.valid, free),
         "invalid_scenes": float((~(feasible.valid & ready.valid)).sum()),
         **realism(raw),
+        **({} if prompts is None else _prompt_figures(raw, prompts)),
     }
     return Measured(figures, raw, ready.batch, ready.ready)
 
@@ -176,6 +187,7 @@ _LABELS = {
     "workspace_fraction": "objects in the workspace, as sampled",
     "height_error_table_mm": "height error on the table, median mm",
     "height_error_stack_mm": "height error in stacks, median mm",
+    "prompt_match": "match of prompt and scene, 1 at best",
     "invalid_scenes": "scenes whose physics failed",
 }
 
@@ -222,6 +234,13 @@ def _counted(name: str, counts: Tensor, valid: Tensor, free: Tensor) -> dict[str
         f"{name}_objects_sem": _standard_error(taken),
         f"{name}_fraction": share,
     }
+
+
+def _prompt_figures(batch: SceneBatch, prompts: Sequence[str]) -> dict[str, float]:
+    """Mean of the reward ``prompt_match``; nothing when no prompt can be read."""
+    output = PromptMatch()(batch, RewardContext(prompts=tuple(prompts)))
+    value = output.value[output.is_valid].double()
+    return {"prompt_match": float(value.mean()), "prompt_match_sem": _standard_error(value)} if len(value) else {}
 
 
 def _standard_error(values: Tensor) -> float:

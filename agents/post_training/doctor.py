@@ -172,6 +172,11 @@ def _advice(report: DoctorReport, config: PostTrainConfig) -> list[str]:
         advice.append(f"{1 - report.valid_fraction:.0%} of the scenes have no valid reward; see the log for why.")
     if report.valid_fraction > 0 and not report.reward_std > 0:
         advice.append("All rewards are equal: there is nothing to learn from. Use a graded reward or more scenes.")
+    if config.prompt is not None and report.reward_std > 0 and report.policy_gradient_norm == 0:
+        advice.append(
+            "The rewards differ between prompts but not within any: there is nothing to learn. Raise scenes_per_prompt "
+            f"from {config.scenes_per_prompt}, or use a reward that differs between scenes of one prompt."
+        )
     if config.regularisation > 0 and report.policy_gradient_norm > 0:
         if report.gradient_ratio < QUIET:
             advice.append(

@@ -112,6 +112,12 @@ class PromptDeck:
         return texts[int(torch.randint(len(texts), (), generator=generator))]
 
 
+def prompts_beside(directory: Path, batch: SceneBatch, seed: int) -> PromptSets:
+    """The prompts of a run's real scenes: those of their dataset, kept in its folder, or descriptions of them."""
+    path = directory / PROMPTS_NAME
+    return load_prompts(path) if path.exists() else GrammarPrompts(batch, seed)
+
+
 def prompt_groups(prompts: Sequence[str]) -> Tensor:
     """(B,) int64, equal for equal prompts on every worker."""
     hashes = {text: hashlib.blake2b(text.encode(), digest_size=8).digest() for text in dict.fromkeys(prompts)}

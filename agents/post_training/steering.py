@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import sys
 import time
+from pathlib import Path
 from typing import Any
+
+from torch import Generator
 
 from agents.post_training.comparison import measure_prior, write_comparison
 from agents.post_training.config import PostTrainConfig
+from agents.post_training.prompts import PromptDeck, prompts_beside
+from agents.post_training.rollouts import stream_seed
+from agents.post_training.run_files import SCENES_NAME
 from agents.post_training.trainer import post_train
 from agents.prior import ScenePrior
 from rewards import reward_name
+from scene_envs.scene import SceneBatch
 
 SAMPLE_SEED = 100_000
 """Added to the run's seed for the samples that are measured, so that training never saw their noise."""
@@ -35,7 +42,8 @@ def steer(
 
     Returns:
         The numbers of ``metrics.json``: ``before`` and ``after`` (``objects``, ``feasible_objects`` raw,
-        ``ready_objects``), ``change``, ``guard``, ``seconds`` of each part, and the run's own.
+        ``ready_objects``, and ``prompt_match`` with prompts), ``change``, ``guard``, ``seconds`` of each part, and the
+        run's own.
     """
     from scene_envs.physics import PhysicsPool
 
@@ -44,16 +52,32 @@ def steer(
     result = post_train(config, prior=base)
     trained = time.perf_counter()
     seed = config.seed + SAMPLE_SEED
+    asked = _measured_prompts(config, base, scenes)
     with PhysicsPool(workers=config.workers, timeout=_PHYSICS_TIMEOUT) as pool:
         _say(config, f"measuring {scenes} samples of the base prior")
-        before = measure_prior(base, scenes, num_steps=num_steps, seed=seed, pool=pool)
+        before = measure_prior(
+            base, scenes, num_steps=num_steps, seed=seed, pool=pool, prompts=asked, guidance=config.guidance
+        )
         _say(config, f"measuring {scenes} samples of the post-trained prior")
-        after = measure_prior(result.prior, scenes, num_steps=num_steps, seed=seed, pool=pool)
+        after = measure_prior(
+            result.prior, scenes, num_steps=num_steps, seed=seed, pool=pool, prompts=asked, guidance=config.guidance
+        )
     seconds = {"training": round(trained - started, 1), "measuring": round(time.perf_counter() - trained, 1)}
     _say(config, "drawing the report")
     title = f"Steering {base.scene_type.name.replace('_', ' ')} toward {reward_name(config.reward).replace('_', ' ')}"
     extra = {"stage_seconds": seconds, "num_steps": num_steps}
     return write_comparison(result, before, after, title=title, extra=extra)
+
+
+def _measured_prompts(config: PostTrainConfig, prior: ScenePrior, count: int) -> list[str] | None:
+    """A prompt for each measured sample, from where the run has its own; None for a run without prompts."""
+    if config.prompt is None:
+        return None
+    directory = Path(config.output)
+    batch = SceneBatch.load(directory / SCENES_NAME)
+    real = prompts_beside(directory, batch, stream_seed(config.seed, "bank"))
+    deck = PromptDeck.of(prior, config.prompt, 1, prior.config.slots, real, len(batch))
+    return deck.deal(count, Generator().manual_seed(config.seed + SAMPLE_SEED))
 
 
 def _say(config: PostTrainConfig, text: str) -> None:

@@ -13,7 +13,7 @@ from agents.post_training.curves import draw_curve
 from agents.post_training.guard import Guard, realism
 from agents.post_training.learner import Learner, NonFiniteGradient, is_finite
 from agents.post_training.progress import Progress
-from agents.post_training.prompts import PROMPTS_NAME, GrammarPrompts, PromptSets, load_prompts, save_prompts
+from agents.post_training.prompts import PROMPTS_NAME, PromptSets, prompts_beside, save_prompts
 from agents.post_training.real_scenes import RealScenes, real_scenes
 from agents.post_training.rollouts import Rollout, stream_seed
 from agents.post_training.run_files import (
@@ -143,7 +143,7 @@ class PostTrainer:
                 _writing(f"their prompts {str(texts)!r}", lambda: save_prompts(texts, found))
         prompts: PromptSets | None = None
         if self.prior.conditional:
-            prompts = load_prompts(texts) if texts.exists() else GrammarPrompts(batch, seed)
+            prompts = prompts_beside(self.directory, batch, seed)
         x0 = self.prior.encode(batch.to(config.device))
         self.scenes = RealScenes.split(x0, config.guard_scenes, prompts)
         asked = self.scenes.heldout_prompts()

@@ -47,6 +47,54 @@ def test_rearrange_moves_and_keeps_what_there_is(files: tuple[Path, Path], tmp_p
     assert (tmp_path / "gallery.png").stat().st_size > 1000
 
 
+@pytest.fixture(scope="module")
+def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tiny_prior(process="mixed", text=True).save(tmp_path_factory.mktemp("reader"))
+
+
+@pytest.mark.parametrize("command", ["complete", "rearrange"])
+def test_prompts_reach_the_prior(files: tuple[Path, Path], reader: Path, tmp_path: Path, command: str) -> None:
+    words = [command, f"scenes={files[0]}", f"prior={reader}", "num_steps=2", "pictures=0", f"output={tmp_path}"]
+    assert main([*words, "prompt=A scene with two cups, a plate and a table.", "guidance=1.5"]) == 0
+    prior, before = ScenePrior.load(reader), SceneBatch.load(files[0])
+    expected = getattr(prior, command)(
+        before, prompt="A scene with two cups, a plate and a table.", guidance=1.5, num_steps=2
+    )
+    assert torch.equal(SceneBatch.load(tmp_path / "scenes.safetensors").tensor, expected.tensor)
+
+
+def test_search_and_post_training_take_prompts(reader: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pybullet")
+    words = ["search", f"prior={reader}", "objective=prompt_match", "prompt=A scene with two cups.", "guidance=1"]
+    assert main([*words, "budget=3", "branching=2", "num_steps=2", f"output={tmp_path / 'search'}"]) == 0
+    metrics = json.loads((tmp_path / "search" / "metrics.json").read_text())
+    assert metrics["config"]["prompt"] == "A scene with two cups."
+    assert metrics["nfe"] == 3 * 2 * 2
+    assert 0.0 <= metrics["search"]["objective"] <= 1.0
+    words = ["post-train", f"prior={reader}", "reward=prompt_match", "iterations=1", "batch_size=4", "num_steps=2"]
+    words += ["regularisation_batch=2", "bank_size=9", "guard_scenes=4", "report_scenes=0", "progress=none"]
+    words += ["prompt=[A scene with two cups., A scene with 9 objects.]", "scenes_per_prompt=2", "min_std=0.0001"]
+    assert main([*words, f"output={tmp_path / 'run'}"]) == 0
+    config = json.loads((tmp_path / "run" / "metrics.json").read_text())["config"]
+    assert config["prompt"] == ["A scene with two cups.", "A scene with 9 objects."]
+
+
+def test_guidance_without_a_prompt_is_said(
+    files: tuple[Path, Path], reader: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words in (
+        ["complete", f"scenes={files[0]}", f"prior={reader}"],
+        ["rearrange", f"scenes={files[0]}", f"prior={reader}"],
+        ["sample", f"prior={reader}"],
+        ["search", f"prior={reader}"],
+        ["post-train", f"prior={reader}"],
+    ):
+        assert main([*words, "guidance=2", f"output={tmp_path / words[0]}"]) == 2
+        message = capsys.readouterr().err
+        assert "guidance=2" in message
+        assert "prompt" in message
+
+
 def test_wrong_input_is_said(files: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["complete", f"output={tmp_path}"]) == 2
     assert "scenes=" in capsys.readouterr().err

@@ -10,7 +10,7 @@ from small_runs import count_objects, small_config
 from torch import Generator
 
 from agents.mixed_prior import MixedPrior
-from agents.post_training import DDPOSFLoss, DenoisingPolicy, PostTrainer, compute_advantages, post_train
+from agents.post_training import DDPOSFLoss, DenoisingPolicy, PostTrainer, compute_advantages, post_train, steer
 from agents.post_training.doctor import diagnose
 from agents.post_training.prompts import PromptDeck, prompt_groups
 from agents.post_training.rollouts import collect
@@ -68,11 +68,13 @@ def test_scenes_are_compared_with_those_of_the_same_prompt(tmp_path: Path) -> No
     trainer.close()
 
 
-@pytest.mark.parametrize("guidance", [0.0, 1.0])
-@pytest.mark.parametrize("chunk", [None, 4])
+@pytest.mark.parametrize(("guidance", "chunk"), [(0.0, None), (1.0, 4)])
 def test_log_ratio_is_exactly_zero_before_the_first_update(tmp_path: Path, guidance: float, chunk: int | None) -> None:
     config = small_config(tmp_path, iterations=1, gradient_steps=4, chunk=chunk, prompt=TWO, guidance=guidance)
-    assert post_train(config, prior=reader()).history[0]["log_ratio"] == 0.0
+    trainer = PostTrainer(config, prior=reader())
+    trainer.prepare()
+    assert trainer.step()[1]["log_ratio"] == 0.0
+    trainer.close()
 
 
 def test_the_policy_depends_on_the_prompt_in_rollout_and_gradient() -> None:
@@ -154,6 +156,18 @@ def test_the_doctor_examines_a_prompted_run(tmp_path: Path) -> None:
     report = diagnose(small_config(tmp_path, prompt=TWO, scenes_per_prompt=3), prior=reader())
     assert report.log_ratio == 0.0
     assert report.policy_gradient_norm > 0
+    alike = small_config(tmp_path, prompt=TWO, scenes_per_prompt=3, reward=longest_prompt)
+    assert any("not within any" in line for line in diagnose(alike, prior=reader()).advice)
+
+
+def test_the_report_compares_samples_with_their_prompts(tmp_path: Path) -> None:
+    pytest.importorskip("pybullet")
+    prior = tiny_prior(process="mixed", text=True, slots=SLOTS)
+    metrics = steer(
+        small_config(tmp_path, iterations=1, prompt=TWO[:1], slots=SLOTS), scenes=2, num_steps=2, prior=prior
+    )
+    assert 0.0 <= metrics["before"]["prompt_match"] <= 1.0
+    assert "match of prompt and scene" in (tmp_path / "report.html").read_text()
 
 
 def test_prompts_that_cannot_be_followed_are_refused(tmp_path: Path) -> None:
