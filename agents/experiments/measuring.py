@@ -40,10 +40,8 @@ def measure_real(real: RealScenes, settings: TablesConfig, pool: PhysicsPool | N
 
     With prompts, ``chance_prompt_counts`` and so on are those of real scenes that were given the prompts of others.
     """
-    from agents.evaluation import prompt_chance
-
     figures = measure(real.others, real.reference, real.prompts, settings, pool)
-    return {**figures, **(prompt_chance(real.others, real.prompts) if real.prompts else {})}
+    return {**figures, **(_collect({"chance": lambda: _chance(real)}) if real.prompts else {})}
 
 
 def measure(
@@ -76,14 +74,21 @@ def measure(
     }
     if prompts:
         measures["prompt-following"] = lambda: _prompts(samples, prompts)
+    figures.update(_collect(measures))
+    return {
+        name: float(value) for name, value in figures.items() if isinstance(value, int | float) and math.isfinite(value)
+    }
+
+
+def _collect(measures: Mapping[str, Callable[[], Mapping[str, float]]]) -> dict[str, float]:
+    """The figures of all measures but those that refuse these scenes, which are logged."""
+    figures: dict[str, float] = {}
     for name, compute in measures.items():
         try:
             figures.update(compute())
         except (ImportError, InvalidInputError) as error:
             logger.warning("%s is left out: %s", name, error)
-    return {
-        name: float(value) for name, value in figures.items() if isinstance(value, int | float) and math.isfinite(value)
-    }
+    return figures
 
 
 def _classifier(samples: SceneBatch, reference: SceneBatch, settings: TablesConfig) -> dict[str, float]:
@@ -103,3 +108,9 @@ def _prompts(samples: SceneBatch, prompts: Sequence[str]) -> Mapping[str, float]
     from agents.evaluation import prompt_following
 
     return {**prompt_following(samples, prompts), "prompt_following_number": float(len(prompts))}
+
+
+def _chance(real: RealScenes) -> Mapping[str, float]:
+    from agents.evaluation import prompt_chance
+
+    return prompt_chance(real.others, real.prompts)

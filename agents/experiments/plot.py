@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DOT, FLOOR, FAINT, SOFT, INK = "#0f766e", "#b45309", "#e8ebee", "#99a3ad", "#1c2733"
-_LINE, _ABOVE, _BELOW = 0.23, 0.62, 0.58
+_LINE, _ABOVE, _BELOW = 0.23, 0.52, 0.56
 """Heights in inches: of a line, and of what stands above and below the lines of a table."""
-_LABELS, _PANEL, _GAP = 2.75, 2.55, 0.3
+_LABELS, _PANEL, _GAP = 2.75, 2.6, 0.42
 """Widths in inches: of the labels, of a panel, between panels."""
 _LOGARITHMIC = 30.0
 """Columns whose largest number is this many times the smallest get a logarithmic axis."""
@@ -96,16 +96,21 @@ def _draw_panel(panel: Axes, column: Column, lines: Sequence[Line], real: Line) 
     for start, line in enumerate(lines):
         if start and line.group != lines[start - 1].group:
             panel.axhline(start - 0.5, color=SOFT, linewidth=0.8)
-    panel.set_xlabel(f"{column.title}{_BETTER[column.better]}", fontsize=8.5, color=INK)
+    panel.set_xlabel(f"{column.title}{_BETTER[column.better]}", fontsize=8, color=INK)
     panel.spines[["top", "right", "left"]].set_visible(False)
     panel.grid(axis="both", color=FAINT, linewidth=0.8)
     panel.set_axisbelow(True)
     panel.tick_params(labelsize=8, length=0, which="both")
+    panel.tick_params(axis="y", pad=7)
 
 
 def _scale(panel: Axes, column: Column, numbers: Sequence[float]) -> None:
     """Shares from none to all; other columns as wide as their numbers, logarithmic where they differ much."""
+    some = [number for number in numbers if number > 1e-4]
     if column.scale == 100.0:
         panel.set_xlim(0, 100)
-    elif numbers and min(numbers) > 0 and max(numbers) > _LOGARITHMIC * min(numbers):
-        panel.set_xscale("log")
+    elif some and max(some) > _LOGARITHMIC * min(some):
+        if len(some) == len(numbers):
+            panel.set_xscale("log")
+        else:
+            panel.set_xscale("symlog", linthresh=min(some))

@@ -62,7 +62,7 @@ class TablesConfig:
         count: samples of each prior that are measured, and real scenes to compare with; null takes the size's.
         num_steps: denoising steps per sample; null takes the size's.
         guidance: w of classifier-free guidance where prompts are followed, 0 for none.
-        pretraining: further keys of pretrain for every row, such as {learning_rate: 5e-4}.
+        pretraining: further keys of pretrain for every row, such as {learning_rate: 5e-4}; null for none.
         seed: of weights, batches, noise and samples.
         device: torch device.
         workers: physics worker processes; 0 computes in this one.
@@ -81,7 +81,7 @@ class TablesConfig:
     count: int | None = None
     num_steps: int | None = None
     guidance: float = 1.0
-    pretraining: dict[str, Any] = field(default_factory=dict)
+    pretraining: Any = None
     seed: int = 0
     device: str = "cpu"
     workers: int = 2
@@ -95,6 +95,8 @@ class TablesConfig:
                 raise unknown_name("table", name, ALL_TABLES)
         if not self.tables:
             raise InvalidInputError(f"tables=[] asks for nothing; name some of {', '.join(ALL_TABLES)}")
+        if self.pretraining is not None and not isinstance(self.pretraining, Mapping):
+            raise InvalidInputError(f"pretraining={self.pretraining!r} is no mapping; write it like {{hidden: 64}}")
         for name in ("iterations", "batch_size", "parameters", "count", "num_steps"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -138,5 +140,5 @@ class TablesConfig:
             "evaluate_every": max(1, iterations // 2),
             "checkpoint_every": max(1, min(250, iterations // 5)),
             **preset.pretraining,
-            **self.pretraining,
+            **(self.pretraining or {}),
         }

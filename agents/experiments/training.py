@@ -78,7 +78,7 @@ class Sizes:
         if before is not None:
             return run_config(row, self.settings, int(before["config"]["hidden"]))
         config = run_config(row, self.settings)
-        if "hidden" in self.settings.pretraining:
+        if "hidden" in self.settings.common():
             return config
         width = match_width(
             target_parameters(row, self.settings),

@@ -58,7 +58,8 @@ def test_every_precision_row_changes_one_thing_of_the_first_of_its_part() -> Non
         if entry.row.capacity != 1:
             assert not changed
         else:
-            assert len(changed) == 1 or changed in ({"prediction", "loss_weighting"}, {"kernel", "category_loss"})
+            together = ({"prediction", "loss_weighting"}, {"kernel", "category_loss", "empty_slots"})
+            assert len(changed) == 1 or any(changed <= keys for keys in together), changed
 
 
 def test_every_factor_is_asked() -> None:
@@ -103,6 +104,7 @@ def test_keys_of_a_row_win_over_those_of_all_rows(tmp_path: Path) -> None:
         ({"tables": []}, "asks for nothing"),
         ({"iterations": 0}, "iterations=0 must be at least 1"),
         ({"count": 1}, "measure at least 2"),
+        ({"pretraining": "hidden"}, "is no mapping"),
     ],
 )
 def test_wrong_settings_are_refused(keys: dict[str, object], message: str) -> None:
