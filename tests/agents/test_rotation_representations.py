@@ -204,7 +204,7 @@ def test_older_files_hold_matrices(scenes: SceneBatch, tmp_path: Path) -> None:
     prior = _prior("matrix", scenes)
     directory = prior.save(tmp_path)
     state = json.loads((directory / "config.json").read_text())
-    for key in ("rotation", "timesteps", "loss_weighting", "noise_floor", "clip"):
+    for key in ("rotation", "timesteps", "loss_weighting", "noise_floor", "noise_ceiling", "clip"):
         del state["prior"][key]
     del state["prior"]["network"]["kind"]
     (directory / "config.json").write_text(json.dumps(state))
