@@ -34,11 +34,16 @@ def _predictions(weighting: str, note: str, *names: str) -> list[Setting]:
     return [(f"prediction {name}{note}", {"prediction": name, "loss_weighting": weighting}) for name in names]
 
 
+def _categories(kernel: str, empty_slots: str, loss: str) -> dict[str, Any]:
+    return {"kernel": kernel, "empty_slots": empty_slots, "category_loss": loss}
+
+
 FACTORS: tuple[Setting, ...] = (
     *_predictions("none", "", "karras", "epsilon", "v", "x0"),
     *_predictions("min_snr", ", min-SNR", "epsilon", "v", "x0"),
     *_each("schedule", "schedule", "karras", "cosine", "linear"),
     *_each("noise floor", "noise_floor", 0.01, 0.002, 0.0005),
+    *_each("noise ceiling", "noise_ceiling", 20.0, 80.0),
     *_each("timesteps", "timesteps", "lognormal", "uniform"),
     *_each("moments per", "moments", "scene", "feature", "category"),
     *_each("translation weight", "translation_weight", 1.0, 3.0),
@@ -46,13 +51,18 @@ FACTORS: tuple[Setting, ...] = (
     *_each("Fourier octaves", "frequencies", 0, 8),
     ("no learning-rate decay", {"final_learning_rate": 1.0}),
     ("learning rate decays to 0.01", {"final_learning_rate": 0.01}),
-    ("categories: mask and replace, cross-entropy", {"kernel": "mask_and_replace", "category_loss": "cross_entropy"}),
-    ("categories: absorbing, bound", {"kernel": "absorbing", "category_loss": "bound"}),
+    *_each("optimizer", "optimizer", "muon", "adamw"),
+    *_each("empty slots", "empty_slots", "dropped", "attended"),
+    ("categories: early absorbing, dropped, cross-entropy", _categories("early_absorbing", "dropped", "cross_entropy")),
+    ("categories: absorbing, dropped, cross-entropy", _categories("absorbing", "dropped", "cross_entropy")),
+    ("categories: mask and replace, cross-entropy", _categories("mask_and_replace", "attended", "cross_entropy")),
+    ("categories: absorbing, bound", _categories("absorbing", "attended", "bound")),
 )
 """What the precision table changes, one at a time."""
 
 _NEEDS = {
     "noise_floor": ("schedule", "karras"),
+    "noise_ceiling": ("schedule", "karras"),
     "moments": ("prediction", "karras"),
 }
 """Keys that are read only where another key has a value."""
@@ -66,6 +76,8 @@ def one_factor_at_a_time(prefix: str, base: Mapping[str, Any], title: str) -> tu
     for label, keys in FACTORS:
         changed = {key: value for key, value in keys.items() if here[key] != value}
         if not changed or any(here[_NEEDS[key][0]] != _NEEDS[key][1] for key in keys if key in _NEEDS):
+            continue
+        if changed == {"empty_slots": "dropped"} and here["kernel"] == "mask_and_replace":
             continue
         name = "_".join([prefix, *(f"{key}_{value}" for key, value in changed.items())])
         entries.append(Entry(label, Row(name, {**base, **changed}), group=group))

@@ -143,7 +143,8 @@ def test_a_batch_that_cannot_be_parted_is_refused(config: PretrainConfig, raw: t
 def test_autocast_is_of_the_network_only(config: PretrainConfig, raw: torch.Tensor) -> None:
     run = make_run(replace(config, precision="bfloat16"), raw)
     x = run.prior.initial(2, 34)
-    assert run.prior.denoiser(x, torch.tensor([5, 900])).dtype == torch.float32
+    pose, logits = run.prior.denoiser(x, torch.tensor([5, 900]))
+    assert (pose.dtype, logits.dtype) == (torch.float32, torch.float32)
     assert run.run().denoiser.precision == torch.float32
 
 
