@@ -13,7 +13,7 @@ from agents.denoiser import PriorConfig
 from agents.diffusion import CategoryMoments, Preconditioning
 from agents.mixed_denoiser import MixedPriorConfig
 from agents.mixed_prior import MixedPrior
-from agents.networks import TextConfig, vocabulary
+from agents.networks import MixedFluxConfig, TextConfig, vocabulary
 from agents.networks.registry import NetworkConfig, network_config
 from agents.pretrain_config import PretrainConfig
 from agents.prior import PROCESSES, ScenePrior
@@ -84,6 +84,7 @@ def _continuous(config: PretrainConfig, raw: Tensor, normalizer: Normalizer) -> 
         loss_weighting=config.loss_weighting,
         noise_floor=config.noise_floor,
         noise_ceiling=config.noise_ceiling,
+        clip=config.denoised_clip,
     )
     torch.manual_seed(config.seed)
     moments = "feature" if config.moments == "category" else config.moments
@@ -107,6 +108,9 @@ def _mixed(config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts:
         config.kernel,
         translation_weight=config.translation_weight,
         category_loss=config.category_loss,
+        category_weight=config.category_weight,
+        given_share=config.given_share,
+        clip=config.denoised_clip,
         text=text,
         noise_floor=config.noise_floor,
         noise_ceiling=config.noise_ceiling,
@@ -120,11 +124,14 @@ def _mixed(config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts:
 
 
 def _network(config: PretrainConfig, features: int, normalizer: Normalizer, text_width: int = 0) -> NetworkConfig:
+    categories = get_scene_type(config.scene).num_assets + 1
+    if config.network == "paper" and config.process == "mixed":
+        return MixedFluxConfig.paper(categories, text_width)
     return network_config(
         config.network,
         config.process,
         features=features,
-        categories=get_scene_type(config.scene).num_assets + 1,
+        categories=categories,
         hidden=config.hidden,
         depth=config.depth,
         heads=config.heads,

@@ -31,7 +31,9 @@ class PretrainConfig:
         hidden: width of the network.
         depth: blocks of the network.
         heads: attention heads.
-        network: ``flux`` (ours), ``midiffusion`` or ``diffuscene``.
+        recipe: a named set of the other keys: ``ours``, or ``paper`` for the paper's setting; keys given beside it win.
+        network: ``flux`` (ours), ``midiffusion``, ``diffuscene``, or ``paper`` for the paper's flux network of 88.3 M
+            parameters, whatever hidden, depth, heads, attention and frequencies say.
         attention: of the mixed flux network: ``plain``, or ``distance`` for biases from distances between objects.
         frequencies: octaves of Fourier features of each translation (flux only); 0 for none.
         prediction: what the network predicts (``karras``, ``epsilon``, ``x0``, ``v``).
@@ -44,6 +46,10 @@ class PretrainConfig:
             the process is continuous), of each ``feature``, or of the ``scene`` as a whole.
         translation_weight: weight of x, y, z in the loss, rotations having 1.
         category_loss: of a mixed prior, ``cross_entropy`` of the clean category, or ``bound``, the paper's.
+        category_weight: weight of the loss of the categories beside that of the poses.
+        given_share: share of a mixed prior's training scenes in which some poses or categories are given, for
+            inpainting.
+        denoised_clip: bound on denoised scenes while sampling, normalised units; 0 for none.
         rotation: what a continuous prior diffuses as rotation: ``matrix``, ``quaternion`` or ``axis_angle``.
         matmul_precision: of float32 products on GPUs, ``highest``, ``high`` (TF32) or ``medium``.
         compile: compile the network with ``torch.compile`` (needs a C++ compiler on CPU).
@@ -82,6 +88,7 @@ class PretrainConfig:
     hidden: int = 128
     depth: int = 6
     heads: int = 4
+    recipe: str = "ours"
     network: str = "flux"
     attention: str = "distance"
     frequencies: int = 8
@@ -94,6 +101,9 @@ class PretrainConfig:
     moments: str = "category"
     translation_weight: float = 3.0
     category_loss: str = "cross_entropy"
+    category_weight: float = 0.3
+    given_share: float = 0.3
+    denoised_clip: float = 0.0
     rotation: str = "matrix"
     matmul_precision: str = "highest"
     process: str = "mixed"

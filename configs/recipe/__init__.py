@@ -1,0 +1,1 @@
+"""Named sets of the keys of ``scene-envs pretrain``."""

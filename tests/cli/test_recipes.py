@@ -1,0 +1,41 @@
+"""Named sets of pretraining keys."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from agents.cli_config import compose
+from agents.mixed_prior import MixedPrior
+from agents.networks.registry import parameter_count
+from agents.new_prior import build_prior
+from agents.pretrain_config import PretrainConfig
+from scene_envs.errors import InvalidInputError
+from scene_envs.grammars import get_grammar
+from scene_envs.normalizer import Normalizer
+
+
+def test_the_paper_s_recipe_is_its_setting() -> None:
+    config = compose("pretrain", PretrainConfig, ["recipe=paper", "text=true"])
+    raw = torch.from_numpy(get_grammar("dimsum_table").sample_array(np.random.default_rng(0), 40))
+    prior = build_prior(config, raw, Normalizer.fit(raw), [["A scene with 8 objects."]])
+    assert isinstance(prior, MixedPrior)
+    network = prior.mixed.network
+    assert (network.hidden, network.heads, network.double_blocks, network.single_blocks) == (512, 16, 5, 10)  # type: ignore[union-attr]
+    assert parameter_count(network) == pytest.approx(88.3e6, rel=0.05)  # of text 768 wide; ours is narrower
+    beta = 1 - prior.process.schedule.alpha_bar[1:] / prior.process.schedule.alpha_bar[:-1]
+    assert (float(beta[0]), float(beta[-1])) == pytest.approx((1e-4, 0.02))
+    assert prior.categories.schedule.keep[1] == pytest.approx(0.99999)
+    assert (prior.mixed.prediction, prior.mixed.category_loss, prior.mixed.clip) == ("epsilon", "bound", 1.0)
+
+
+def test_keys_given_beside_a_recipe_win() -> None:
+    config = compose("pretrain", PretrainConfig, ["learning_rate=0.5", "recipe=paper"])
+    assert (config.recipe, config.learning_rate, config.schedule) == ("paper", 0.5, "linear")
+    assert compose("pretrain", PretrainConfig, []) == PretrainConfig(output="")
+
+
+def test_an_unknown_recipe_is_refused() -> None:
+    with pytest.raises(InvalidInputError, match="recipe/papr"):
+        compose("pretrain", PretrainConfig, ["recipe=papr"])
