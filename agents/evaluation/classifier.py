@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 
 from agents.evaluation.judging import FEWEST, Accuracy, Forward, JudgeConfig, Split, check_classes, judge
-from agents.evaluation.scene_tokens import WAVE_FEATURES, SceneTokens, blurred, scene_tokens
+from agents.evaluation.scene_tokens import (
+    NEIGHBOUR_FEATURES,
+    POSE_FEATURES,
+    WAVE_FEATURES,
+    SceneTokens,
+    blurred,
+    scene_tokens,
+)
 from agents.evaluation.set_network import SetNetwork, SetNetworkConfig
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
@@ -20,8 +27,9 @@ MOST_OBJECTS = 50_000
 """Objects to train on, both classes together: scenes of many objects need fewer scenes, and cost more each."""
 
 _PRIOR_COUNT = 4.0
-"""Weight of the statistics over all categories in those of one category, in objects."""
+"""Weight of the variance over all groups in that of one group, in objects."""
 _CLIP = 8.0
+_LEAST_STD = 1e-4
 
 
 def classifier_accuracy(
@@ -35,8 +43,9 @@ def classifier_accuracy(
 ) -> Accuracy:
     """Accuracy, on held-out scenes, of a classifier trained to tell real scenes from samples.
 
-    A set transformer on the objects of a scene: categories, poses standardised per category by the real training
-    part, Fourier features of the translation, and the gaps to the nearest neighbours. Welded objects are objects
+    A set transformer on the objects of a scene: categories, poses standardised per asset, Fourier features of
+    the translation, and offsets and gaps to the nearest neighbours standardised per pair of assets; means and standard
+    deviations are those of the real training part. Welded objects are objects
     like any other; empty slots and the order of slots mean nothing.
 
     Samples carry noise that no grammar has, so that at full float precision every sampler is told apart by it and
@@ -68,21 +77,24 @@ def classifier_accuracy(
     both = SceneBatch(torch.cat([real.with_slots(slots).tensor, fake.with_slots(slots).tensor]).cpu(), real.scene_type)
     tokens = scene_tokens(blurred(both, *resolution, generator) if max(resolution) else both)
 
+    width = real.scene_type.num_assets + 1
+
     def prepare(split: Split) -> tuple[nn.Module, Forward]:
-        standardise = _Standardisation.fit(tokens[split.train[split.train < len(real)]], real.scene_type.num_assets)
-        network = SetNetwork(SetNetworkConfig(12 + WAVE_FEATURES, real.scene_type.num_assets + 1, outputs=1))
+        typical = _Typical.of(tokens[split.train[split.train < len(real)]], width)
+        features, pair_features = 2 * POSE_FEATURES + WAVE_FEATURES, 2 * NEIGHBOUR_FEATURES
+        network = SetNetwork(SetNetworkConfig(features, width, outputs=1, pair_features=pair_features))
 
         def forward(module: nn.Module, rows: Tensor) -> Tensor:
             part = tokens[rows]
-            own = torch.cat([standardise(part), part.waves], dim=-1)
-            logits: Tensor = module(own, part.categories, part.offsets, part.neighbours, part.present)
+            own, pairs = typical.deviations(part)
+            own = torch.cat([own, part.waves], dim=-1)
+            logits: Tensor = module(own, part.categories, pairs, part.neighbours, part.present)
             return logits[:, 0]
 
         return network, forward
 
-    return judge(
-        len(real), len(fake), prepare, seeds=seeds, seed=seed, config=_affordable(config or JudgeConfig(), tokens)
-    )
+    config = _affordable(config or JudgeConfig(), tokens)
+    return judge(len(real), len(fake), prepare, seeds=seeds, seed=seed, config=config)
 
 
 def _affordable(config: JudgeConfig, tokens: SceneTokens) -> JudgeConfig:
@@ -92,24 +104,54 @@ def _affordable(config: JudgeConfig, tokens: SceneTokens) -> JudgeConfig:
     return replace(config, most_train=min(config.most_train, most))
 
 
-class _Standardisation:
-    """Mean and standard deviation of poses per category, (C + 1, 12) each."""
+@dataclass(frozen=True)
+class _Moments:
+    """Mean and standard deviation (G, F) of each of G groups."""
 
-    def __init__(self, mean: Tensor, std: Tensor) -> None:
-        self.mean, self.std = mean, std
+    mean: Tensor
+    std: Tensor
 
     @classmethod
-    def fit(cls, tokens: SceneTokens, categories: int) -> _Standardisation:
-        """From the objects of real scenes; rare categories lean on the variance of all of them."""
-        poses, names = tokens.poses[tokens.present].double(), tokens.categories[tokens.present]
-        count = torch.bincount(names, minlength=categories + 1)[:, None].double()
-        mean = torch.zeros(categories + 1, 12, dtype=torch.float64).index_add(0, names, poses) / count.clamp(min=1.0)
-        squares = torch.zeros_like(mean).index_add(0, names, (poses - mean[names]) ** 2)
-        overall = squares.sum(dim=0) / count.sum().clamp(min=1.0)
-        variance = (squares + _PRIOR_COUNT * overall) / (count + _PRIOR_COUNT)
-        return cls(mean.float(), variance.sqrt().clamp(min=1e-4).float())
+    def of(cls, values: Tensor, groups: Tensor, count: int) -> _Moments:
+        """From ``values`` (M, F) of ``groups`` (M,); rare groups lean on the variance within all of them."""
+        values = values.double()
+        size = torch.bincount(groups, minlength=count)[:, None].double()
+        mean = torch.zeros(count, values.shape[-1], dtype=torch.float64).index_add(0, groups, values)
+        mean = mean / size.clamp(min=1.0)
+        squares = torch.zeros_like(mean).index_add(0, groups, (values - mean[groups]) ** 2)
+        overall = squares.sum(dim=0) / size.sum().clamp(min=1.0)
+        variance = (squares + _PRIOR_COUNT * overall) / (size + _PRIOR_COUNT)
+        return cls(mean.float(), variance.sqrt().clamp(min=_LEAST_STD).float())
 
-    def __call__(self, tokens: SceneTokens) -> Tensor:
-        """(B, N, 12) standardised poses."""
-        scaled = (tokens.poses - self.mean[tokens.categories]) / self.std[tokens.categories]
-        return scaled.clamp(-_CLIP, _CLIP)
+    def deviations(self, values: Tensor, groups: Tensor) -> Tensor:
+        """(..., 2 F): values in standard deviations from the mean of their group, and log(1 + their squares)."""
+        scaled = (values - self.mean[groups]) / self.std[groups]
+        return torch.cat([scaled.clamp(-_CLIP, _CLIP), scaled.square().log1p()], dim=-1)
+
+
+@dataclass(frozen=True)
+class _Typical:
+    """Where real objects are: poses per asset, offsets to neighbours per pair of assets."""
+
+    poses: _Moments
+    offsets: _Moments
+    width: int
+
+    @classmethod
+    def of(cls, real: SceneTokens, width: int) -> _Typical:
+        """From real scenes of ``width`` categories, empty included."""
+        there = real.neighbours != width - 1
+        pairs = _pairs(real, width)[there]
+        poses = _Moments.of(real.poses[real.present], real.categories[real.present], width)
+        return cls(poses, _Moments.of(real.offsets[there], pairs, width * width), width)
+
+    def deviations(self, tokens: SceneTokens) -> tuple[Tensor, Tensor]:
+        """Deviations of the poses (B, N, 24) and of the offsets (B, N, K, 14)."""
+        there = (tokens.neighbours != self.width - 1)[..., None]
+        pairs = self.offsets.deviations(tokens.offsets, _pairs(tokens, self.width)) * there
+        return self.poses.deviations(tokens.poses, tokens.categories), pairs
+
+
+def _pairs(tokens: SceneTokens, width: int) -> Tensor:
+    """(B, N, K) index of the ordered pair of assets."""
+    return tokens.categories[..., None] * width + tokens.neighbours

@@ -29,7 +29,7 @@ def frechet_scene_distance(a: SceneBatch, b: SceneBatch, *, encoder: SetEncoder 
         encoder: the features; None takes the shipped encoder.
 
     Returns:
-        The distance, at least 0, in units of the encoder's standardised features.
+        The distance, at least 0, in units of the encoder's whitened features.
 
     Raises:
         InvalidInputError: fewer than two scenes in one batch.

@@ -64,7 +64,7 @@ class JudgeConfig:
     most_train: int = 1000
     most_validation: int = 250
     epochs: int = 8
-    patience: int = 2
+    patience: int = 3
     batch_size: int = 64
     learning_rate: float = 4e-3
     weight_decay: float = 0.02

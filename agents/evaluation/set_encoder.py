@@ -51,9 +51,9 @@ class SetEncoder(nn.Module):
         )
         self.network = SetNetwork(self.config)
         self.mean: Tensor
-        self.std: Tensor
+        self.whitening: Tensor
         self.register_buffer("mean", torch.zeros(self.config.outputs))
-        self.register_buffer("std", torch.ones(self.config.outputs))
+        self.register_buffer("whitening", torch.eye(self.config.outputs))
 
     @property
     def unknown(self) -> int:
@@ -67,7 +67,7 @@ class SetEncoder(nn.Module):
         return torch.tensor([*tokens, self.unknown + 1])
 
     def forward(self, tokens: SceneTokens, names: Tensor) -> Tensor:
-        """Features (B, F) before standardisation; ``names`` (C + 1,) gives the token of each category."""
+        """Features (B, F) before whitening; ``names`` (C + 1,) gives the token of each category."""
         size = (tokens.extents.clamp(min=1e-3) / 0.1).log() * tokens.present[..., None]
         own = torch.cat([tokens.poses, tokens.waves, size], dim=-1)
         result: Tensor = self.network(
@@ -77,19 +77,19 @@ class SetEncoder(nn.Module):
 
     @torch.no_grad()
     def features(self, batch: SceneBatch) -> Tensor:
-        """(B, F) float32 standardised features, on the CPU."""
+        """(B, F) float32 whitened features, on the CPU."""
         was_training = self.training
         self.eval()
         names = self.names(batch)
         parts = [batch[start : start + _CHUNK].to("cpu") for start in range(0, len(batch), _CHUNK)]
         raw = torch.cat([self(scene_tokens(part), names) for part in parts]) if parts else torch.empty(0, FEATURES)
         self.train(was_training)
-        return (raw - self.mean) / self.std
+        return (raw - self.mean) @ self.whitening
 
     # -- files ----------------------------------------------------------------------------------
 
     def save(self, path: str | os.PathLike[str], note: str = "") -> Path:
-        """Write weights (float16), vocabulary and size to one ``.safetensors`` file.
+        """Write weights (float16; mean and whitening float32), vocabulary and size to one ``.safetensors`` file.
 
         Args:
             path: of the file.
@@ -99,7 +99,8 @@ class SetEncoder(nn.Module):
 
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        weights = {name: value.detach().half().contiguous() for name, value in self.state_dict().items()}
+        weights = {name: value.detach().contiguous() for name, value in self.state_dict().items()}
+        weights = {name: value.half() if name.startswith("network.") else value for name, value in weights.items()}
         metadata = {"vocabulary": json.dumps(self.vocabulary), "config": json.dumps(asdict(self.config)), "note": note}
         partial = path.with_name(path.name + ".partial")
         save_file(weights, partial, metadata)

@@ -34,6 +34,8 @@ DAMAGES = 5
 """Kinds of damage: position noise, rotation noise, swapped assets, moved objects, removed objects."""
 
 _UNKNOWN_SHARE = 0.1
+_LEAST_VARIANCE = 0.05
+"""Variance of a direction of the features, over the largest, below which it is not blown up to one."""
 _TEMPERATURE = 0.2
 
 
@@ -79,7 +81,7 @@ def train_set_encoder(
         scenes: real scenes by scene type, instead of drawing them from the grammars.
 
     Returns:
-        The encoder, with features standardised over clean and damaged scenes.
+        The encoder, with features whitened over clean and damaged scenes.
     """
     config = config or SetEncoderTraining()
     types = [get_scene_type(name) for name in scene_types]
@@ -90,7 +92,7 @@ def train_set_encoder(
         torch.manual_seed(seed)
         encoder = SetEncoder(sorted({asset for scene_type in types for asset in scene_type.assets}))
         _train(encoder, pools, config)
-        _standardise(encoder, pools)
+        whiten(encoder, pools)
     return encoder.eval().requires_grad_(False)
 
 
@@ -179,18 +181,26 @@ def _train(encoder: SetEncoder, pools: Sequence[SceneBatch], config: SetEncoderT
 
 
 @torch.no_grad()
-def _standardise(encoder: SetEncoder, pools: Sequence[SceneBatch]) -> None:
-    """Set mean and standard deviation of the features over clean and damaged scenes, all types weighing the same."""
+def whiten(encoder: SetEncoder, pools: Sequence[SceneBatch]) -> None:
+    """Whiten the features over clean and damaged scenes, within each type.
+
+    Without it, all features that tell the same damage would count it again, and one kind of damage would rule the
+    distance.
+
+    Args:
+        encoder: its mean and whitening are set.
+        pools: scenes of each type; all types weigh the same when they are of equal size.
+    """
     generator = torch.Generator().manual_seed(0)
     encoder.eval()
     parts = []
-    for pool in pools:
-        clean = pool[:200]
-        for batch in (clean, damage(clean, generator)[0]):
-            parts.append(encoder(scene_tokens(batch), encoder.names(batch)))
-    features = torch.cat(parts)
-    encoder.mean.copy_(features.mean(dim=0))
-    encoder.std.copy_(features.std(dim=0).clamp(min=1e-3))
+    for clean in pools:
+        both = SceneBatch.concatenate([clean, damage(clean, generator)[0]])
+        parts.append(encoder(scene_tokens(both), encoder.names(both)).double())
+    within = torch.cat([part - part.mean(dim=0) for part in parts])
+    values, vectors = torch.linalg.eigh(within.T @ within / (len(within) - len(parts)))
+    encoder.mean.copy_(torch.cat(parts).mean(dim=0))
+    encoder.whitening.copy_(vectors * values.clamp(min=_LEAST_VARIANCE * values.max()).rsqrt() @ vectors.T)
 
 
 def _some_unknown(encoder: SetEncoder, batch: SceneBatch, generator: torch.Generator) -> Tensor:

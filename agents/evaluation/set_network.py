@@ -25,6 +25,7 @@ class SetNetworkConfig:
         blocks: induced attention blocks.
         inducing: inducing points per block.
         dropout: share of the pooled features dropped in training.
+        pair_features: numbers per neighbour of an object.
     """
 
     features: int
@@ -35,6 +36,7 @@ class SetNetworkConfig:
     blocks: int = 1
     inducing: int = 8
     dropout: float = 0.1
+    pair_features: int = NEIGHBOUR_FEATURES
 
     def __post_init__(self) -> None:
         if self.hidden % self.heads:
@@ -98,7 +100,7 @@ class SetNetwork(nn.Module):
         hidden = config.hidden
         self.own = nn.Linear(config.features, hidden)
         self.category = nn.Embedding(config.categories, hidden)
-        self.pair = nn.Linear(NEIGHBOUR_FEATURES, hidden)
+        self.pair = nn.Linear(config.pair_features, hidden)
         self.pair_self = nn.Embedding(config.categories, hidden)
         self.pair_other = nn.Embedding(config.categories, hidden)
         self.enter = nn.Sequential(nn.Linear(3 * hidden, 2 * hidden), nn.GELU(), nn.Linear(2 * hidden, hidden))
@@ -121,7 +123,7 @@ class SetNetwork(nn.Module):
         Args:
             own: (B, N, F) numbers of each object.
             categories: (B, N) int64.
-            offsets: (B, N, K, 7) of :class:`~agents.evaluation.scene_tokens.SceneTokens`.
+            offsets: (B, N, K, P) numbers of each neighbour.
             neighbours: (B, N, K) int64 categories of the neighbours.
             present: (B, N) bool, False for padding.
 
