@@ -13,9 +13,11 @@ from agents.denoiser import autocast
 from agents.diffusion import CategoricalProcess, GaussianProcess
 from agents.diffusion.gaussian import Moments
 from agents.diffusion.reverse_steps import state_of
+from agents.networks.bert import BertEncoder
 from agents.networks.mixed_flux import POSE
 from agents.networks.registry import MixedNetworkConfig
-from agents.networks.text import TextConfig, TextEncoder
+from agents.networks.text import TextEncoder
+from agents.networks.text_encoders import AnyTextConfig
 from agents.packing import run_packed, take_slots
 from scene_envs.errors import InvalidInputError, unknown_name
 
@@ -48,7 +50,7 @@ class MixedPriorConfig:
         category_weight: weight of the category loss beside the pose loss.
         auxiliary: weight of the cross-entropy in the bound.
         given_share: share of training scenes in which some poses or categories are given, for inpainting.
-        text: size and vocabulary of the text encoder; None for a prior that reads no prompts.
+        text: kind and size of the text encoder; None for a prior that reads no prompts.
         noise_floor: lowest noise-to-signal ratio of the ``"karras"`` schedule, in normalised units.
         noise_ceiling: highest.
         timesteps: law of training timesteps, ``"lognormal"`` (of the noise-to-signal ratio) or ``"uniform"``.
@@ -72,7 +74,7 @@ class MixedPriorConfig:
     category_weight: float = 0.3
     auxiliary: float = 5e-4
     given_share: float = 0.3
-    text: TextConfig | None = None
+    text: AnyTextConfig | None = None
     noise_floor: float = 0.002
     noise_ceiling: float = 80.0
     timesteps: str = "lognormal"
@@ -123,7 +125,7 @@ class MixedDenoiser(nn.Module):
         network: nn.Module,
         poses: GaussianProcess,
         categories: CategoricalProcess,
-        text_encoder: TextEncoder | None = None,
+        text_encoder: TextEncoder | BertEncoder | None = None,
         empty_slots: str = "attended",
     ) -> None:
         super().__init__()

@@ -31,7 +31,8 @@ from agents.mixed_denoiser import Given, MixedDenoiser, MixedPriorConfig, Text
 from agents.mixed_training import mixed_loss
 from agents.networks.mixed_flux import POSE, MixedFluxConfig
 from agents.networks.registry import build_network, config_from_state, config_state
-from agents.networks.text import TextConfig, TextEncoder
+from agents.networks.text import TextConfig
+from agents.networks.text_encoders import text_config_from_state, text_encoder
 from agents.prior import ScenePrior
 from agents.prompt_reading import PromptReader, prompt_words
 from scene_envs.errors import InvalidInputError, unknown_name
@@ -91,7 +92,7 @@ class MixedPrior(PromptReader, ScenePrior):
         self.categories = CategoricalProcess(
             make_categorical_schedule(config.kernel, config.num_timesteps), config.network.categories
         )
-        encoder = None if config.text is None else TextEncoder(config.text)
+        encoder = None if config.text is None else text_encoder(config.text)
         self.denoiser = MixedDenoiser(
             build_network(config.network), self.process, self.categories, encoder, config.empty_slots
         )
@@ -107,9 +108,7 @@ class MixedPrior(PromptReader, ScenePrior):
         residual: ResidualVariance | None,
     ) -> MixedPrior:
         """From the ``prior`` entry of a configuration file."""
-        text = fields.get("text")
-        if text is not None:
-            text = TextConfig(**{**text, "words": tuple(text["words"])})
+        text = text_config_from_state(fields.get("text"))
         fields = {**fields, "network": config_from_state(fields["network"], "mixed"), "text": text}
         return cls(MixedPriorConfig(**fields), normalizer, preconditioning, card, residual)
 

@@ -13,8 +13,9 @@ from agents.denoiser import PriorConfig
 from agents.diffusion import CategoryMoments, Preconditioning
 from agents.mixed_denoiser import MixedPriorConfig
 from agents.mixed_prior import MixedPrior
-from agents.networks import MixedFluxConfig, TextConfig, vocabulary
+from agents.networks import MixedFluxConfig
 from agents.networks.registry import NetworkConfig, network_config
+from agents.networks.text_encoders import AnyTextConfig, text_config
 from agents.pretrain_config import PretrainConfig
 from agents.prior import PROCESSES, ScenePrior
 from agents.rotation_codes import SceneCode
@@ -97,7 +98,7 @@ def _mixed(config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts:
             f"rotation={config.rotation!r} needs process=continuous: mixed priors diffuse rotation matrices"
         )
     scene_type = get_scene_type(config.scene)
-    text = TextConfig(vocabulary(prompt for group in prompts for prompt in group)) if config.text else None
+    text = _text(config, prompts)
     network = _network(config, scene_type.features, normalizer, 0 if text is None else text.width)
     prior_config = MixedPriorConfig(
         config.scene,
@@ -121,6 +122,12 @@ def _mixed(config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts:
     torch.manual_seed(config.seed)
     free = raw[:_FITTED_ON, len(scene_type.fixed) :]
     return MixedPrior(prior_config, normalizer, _pose_moments(config.moments, free, normalizer))
+
+
+def _text(config: PretrainConfig, prompts: Sequence[Sequence[str]]) -> AnyTextConfig | None:
+    if not config.text:
+        return None
+    return text_config(config.text_encoder, (prompt for group in prompts for prompt in group))
 
 
 def _network(config: PretrainConfig, features: int, normalizer: Normalizer, text_width: int = 0) -> NetworkConfig:

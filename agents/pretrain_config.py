@@ -59,6 +59,8 @@ class PretrainConfig:
         empty_slots: whether slots known to be empty are ``attended`` (the paper's) or ``dropped`` from the network of a
             mixed prior, which needs an absorbing kernel and saves most of the work.
         text: whether a mixed prior reads prompts.
+        text_encoder: ``vocabulary`` for a small one with a closed vocabulary, trained with the prior; or the folder or
+            hub name of a BERT model, which stays as it is.
         prompt_dropout: share of training scenes whose prompt is withheld, for classifier-free guidance.
         seed: of weights, batches and noise.
         log_every: steps between log rows.
@@ -110,6 +112,7 @@ class PretrainConfig:
     kernel: str = "early_absorbing"
     empty_slots: str = "dropped"
     text: bool = False
+    text_encoder: str = "vocabulary"
     prompt_dropout: float = 0.1
     compile: bool = False
     seed: int = 0
