@@ -24,6 +24,7 @@ class SampleConfig:
         prompt: what the scenes should hold, for priors that read prompts; null for anything.
         guidance: weight of classifier-free guidance, 0 for none; needs a prompt.
         num_steps: denoising steps per scene.
+        eta: scale of the noise of the Gaussian steps, 1 for the ancestral chain, 0 for a deterministic one (DDIM).
         slots: slots per scene, more than trained is allowed; null means as trained.
         seed: of the noise.
         reward: scores the samples, for metrics.json; null for none.
@@ -43,6 +44,7 @@ class SampleConfig:
     prompt: str | None = None
     guidance: float = 0.0
     num_steps: int = 50
+    eta: float = 1.0
     slots: int | None = None
     seed: int = 0
     reward: Any = "feasible_objects"
@@ -80,6 +82,7 @@ def run(settings: SampleConfig, run: Run) -> None:
         prompt=settings.prompt,
         guidance=settings.guidance,
         num_steps=settings.num_steps,
+        eta=settings.eta,
         slots=settings.slots,
         seed=settings.seed,
         batch_size=settings.batch_size,
