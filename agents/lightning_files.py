@@ -11,7 +11,7 @@ import pickle
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import torch
 
@@ -85,5 +85,7 @@ class _Inert:
             """The class if it is harmless; else the placeholder."""
             return super().find_class(module, name) if (module, name) in _ALLOWED else _Placeholder
 
-    load = staticmethod(pickle.load)
-    loads = staticmethod(pickle.loads)
+    @classmethod
+    def load(cls, file: IO[bytes], **options: Any) -> Any:
+        """What :class:`Unpickler` makes of ``file``; files older than the zip format begin with such pickles."""
+        return cls.Unpickler(file, **options).load()

@@ -150,6 +150,20 @@ def test_objects_in_the_file_are_never_run(tmp_path: Path, monkeypatch: pytest.M
     assert not list(tmp_path.glob("*.trap"))
 
 
+def test_nothing_is_run_in_files_older_than_the_zip_format(tmp_path: Path) -> None:
+    class Trap:
+        def __reduce__(self) -> tuple[object, ...]:
+            return (Path.touch, (tmp_path / "sprung",))
+
+    (tmp_path / "bare.ckpt").write_bytes(pickle.dumps(Trap(), protocol=2))
+    with pytest.raises(CorruptFileError, match="not a checkpoint of PyTorch"):
+        read_lightning(tmp_path / "bare.ckpt")
+    content = {"state_dict": {"x": torch.arange(3.0)}, "trap": Trap()}
+    torch.save(content, tmp_path / "old.ckpt", _use_new_zipfile_serialization=False)
+    assert read_lightning(tmp_path / "old.ckpt")["state_dict"]["x"].tolist() == [0.0, 1.0, 2.0]
+    assert not (tmp_path / "sprung").exists()
+
+
 def test_what_does_not_fit_is_named(tmp_path: Path) -> None:
     state = random_state()
     del state["scene_in.bias"], state["double_blocks.0.x_qkv_linear.weight"]
