@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.prior_files import WEIGHTS_NAME, count_parameters, find_prior, read_config
+from agents.prior_files import WEIGHTS_NAME, count_parameters, find_prior, read_config, write_config
 from scene_envs.errors import CorruptFileError, InvalidInputError
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ HEADLINES = {
     "novelty": "novelty",
 }
 """The figures of :mod:`agents.evaluation` that a listing shows, and what it calls them."""
+_OPTIMIZERS = {"adamw": "AdamW", "muon": "Muon and AdamW"}
 _RATIOS = ("novelty",)
 _FLOOR = "floor_"
 
@@ -151,6 +152,7 @@ def ship_prior(
         prior.card["measures"] = measures
     try:
         folder = prior.save(output, precision=precision)
+        write_config(folder, _without_folders(read_config(folder)))
         (folder / README).write_text(card_page(folder.name, prior, PriorFacts.of(folder)), encoding="utf-8")
     finally:
         prior.card = kept
@@ -252,7 +254,8 @@ def _training(card: Mapping[str, Any]) -> str:
         f"{card['trained_steps']:,} steps" + (f" of {card['batch_size']} scenes" if card.get("batch_size") else "")
         if "trained_steps" in card
         else "",
-        f"AdamW, peak learning rate {run['learning_rate']:g}, EMA {run['ema']:g}" if "learning_rate" in run else "",
+        _OPTIMIZERS.get(run.get("optimizer", ""), ""),
+        f"peak learning rate {run['learning_rate']:g}, EMA {run['ema']:g}" if "learning_rate" in run else "",
         f"{card['seconds'] / 60:.0f} minutes" if card.get("seconds") else "",
         str(card.get("machine") or ""),
         f"held-out loss {card['heldout_loss']:.4g}" if card.get("heldout_loss") else "",
@@ -267,8 +270,16 @@ def _training_of(source: Path) -> dict[str, Any]:
     if not (folder / "metrics.json").is_file():
         return {}
     config = _read_json(folder / "metrics.json").get("config")
-    wanted = ("learning_rate", "ema", "warmup", "weight_decay", "data", "seed", "precision")
+    wanted = ("optimizer", "learning_rate", "ema", "warmup", "weight_decay", "seed", "precision")
     return {"training": {key: config[key] for key in wanted if key in config}} if isinstance(config, dict) else {}
+
+
+def _without_folders(state: dict[str, Any]) -> dict[str, Any]:
+    """A configuration in which no folder of this machine is named: of that of a BERT model the last part stays."""
+    text = state["prior"].get("text")
+    if not text or not os.path.isabs(text.get("model", "")):
+        return state
+    return {**state, "prior": {**state["prior"], "text": {**text, "model": os.path.basename(text["model"])}}}
 
 
 def _read_json(file: Path) -> dict[str, Any]:

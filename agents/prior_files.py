@@ -76,10 +76,15 @@ def write_prior(directory: str | os.PathLike[str], config: Mapping[str, Any], te
     save_file({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, weights)
     weights.chmod(0o644)
     os.replace(weights, directory / WEIGHTS_NAME)
+    write_config(directory, config)
+    return directory
+
+
+def write_config(directory: Path, config: Mapping[str, Any]) -> None:
+    """Replace a prior's configuration atomically."""
     partial = directory / (CONFIG_NAME + ".partial")
     partial.write_text(json.dumps(config, indent=1) + "\n")
     os.replace(partial, directory / CONFIG_NAME)
-    return directory
 
 
 def read_config(name: str | os.PathLike[str]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import torch
 
 from agents.checkpoint_import import import_checkpoint
 from agents.mixed_prior import MixedPrior
-from agents.model_card import PriorFacts
+from agents.model_card import PriorFacts, ship_prior
 from agents.networks.bert_files import FOLDER_VARIABLE, load_bert
 from agents.new_prior import build_prior
 from agents.pretrain_config import PretrainConfig
@@ -144,3 +144,15 @@ def test_the_configuration_names_the_model_and_its_digest(prior: MixedPrior, ber
     assert text["kind"] == "bert"
     assert text["model"] == str(bert)
     assert text["digest"] == load_bert(str(bert)).digest
+
+
+def test_a_shipped_prior_names_no_folder_and_finds_its_bert_all_the_same(
+    prior: MixedPrior, bert: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = ship_prior(prior, tmp_path / "given")
+    assert str(bert.parent) not in (folder / "config.json").read_text() + (folder / "README.md").read_text()
+    shipped = ScenePrior.load(folder)
+    with pytest.raises(InvalidInputError, match=FOLDER_VARIABLE):
+        shipped.sample(1, prompt=PROMPTS[0], num_steps=1)
+    monkeypatch.setenv(FOLDER_VARIABLE, str(bert))
+    assert len(shipped.sample(1, prompt=PROMPTS[0], num_steps=1)) == 1

@@ -27,6 +27,9 @@ FIGURES = {
 }
 
 
+CONFIG = {"optimizer": "muon", "learning_rate": 2e-3, "ema": 0.99, "hidden": 32, "data": "/somewhere/of/mine"}
+
+
 @pytest.fixture
 def run_folder(tmp_path: Path) -> Path:
     """A run as pretraining leaves it."""
@@ -34,7 +37,7 @@ def run_folder(tmp_path: Path) -> Path:
     prior = tiny_prior(process="mixed")
     prior.card = {"trained_steps": 1200, "batch_size": 96, "seconds": 600, "training_scenes": 131000}
     prior.save(folder / "prior")
-    (folder / "metrics.json").write_text(json.dumps({"config": {"learning_rate": 2e-3, "ema": 0.99, "hidden": 32}}))
+    (folder / "metrics.json").write_text(json.dumps({"config": CONFIG}))
     (folder / "evaluation").mkdir()
     (folder / "evaluation" / "metrics.json").write_text(json.dumps(FIGURES))
     return folder
@@ -59,7 +62,7 @@ def test_a_shipped_folder_is_a_prior_with_a_card(run_folder: Path, tmp_path: Pat
         "# Prior `small_mixed`",
         "| scene type | dimsum_table: 7 assets, 34 slots |",
         "Scenes of the dimsum grammar; 131,000 training scenes",
-        "1,200 steps of 96 scenes, AdamW, peak learning rate 0.002, EMA 0.99, 10 minutes, one NVIDIA H200",
+        "1,200 steps of 96 scenes, Muon and AdamW, peak learning rate 0.002, EMA 0.99, 10 minutes, one NVIDIA H200",
         "200 raw samples at 50 steps",
         "| feasible_fraction | 0.812 | 0.995 |",
         "Feasts of more than thirty objects.",
@@ -68,6 +71,7 @@ def test_a_shipped_folder_is_a_prior_with_a_card(run_folder: Path, tmp_path: Pat
     ):
         assert expected in page
     assert page.count("prompt=") == 0
+    assert not any("/somewhere" in path.read_text() for path in (folder / "README.md", folder / "config.json"))
 
 
 def test_facts_are_those_of_the_weights(run_folder: Path) -> None:
