@@ -34,7 +34,7 @@ class PretrainConfig:
         recipe: a named set of the other keys: ``ours``, or ``paper`` for the paper's setting; keys given beside it win.
         network: ``flux`` (ours), ``midiffusion``, ``diffuscene``, or ``paper`` for the paper's flux network of 88.3 M
             parameters, whatever hidden, depth, heads, attention and frequencies say.
-        attention: of the mixed flux network: ``plain``, or ``distance`` for biases from distances between objects.
+        attention: of the mixed flux network: ``plain``, or ``relative``, which sees where other objects stand.
         frequencies: octaves of Fourier features of each translation (flux only); 0 for none.
         prediction: what the network predicts (``karras``, ``epsilon``, ``x0``, ``v``).
         schedule: noise schedule (``karras``, ``linear``, ``cosine``).
@@ -92,7 +92,7 @@ class PretrainConfig:
     heads: int = 4
     recipe: str = "ours"
     network: str = "flux"
-    attention: str = "distance"
+    attention: str = "relative"
     frequencies: int = 8
     prediction: str = "karras"
     schedule: str = "karras"

@@ -47,7 +47,7 @@ FACTORS: tuple[Setting, ...] = (
     *_each("timesteps", "timesteps", "lognormal", "uniform"),
     *_each("moments per", "moments", "scene", "feature", "category"),
     *_each("translation weight", "translation_weight", 1.0, 3.0),
-    *_each("attention", "attention", "plain", "distance"),
+    *_each("attention", "attention", "plain", "relative"),
     *_each("Fourier octaves", "frequencies", 0, 8),
     ("no learning-rate decay", {"final_learning_rate": 1.0}),
     ("learning rate decays to 0.01", {"final_learning_rate": 0.01}),

@@ -6,21 +6,23 @@ stream, and join them in single-stream blocks (Flux; Esser et al. 2024; Pfaff et
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from agents.networks.distance_bias import DistanceBias
 from agents.networks.flux import SingleStreamBlock, timestep_embedding
+from agents.networks.relations import FEATURES, Relations, joint_attention
 from scene_envs.errors import InvalidInputError, unknown_name
 
 POSE = 12
 """Numbers of a pose: translation and rotation matrix."""
-ATTENTIONS = ("plain", "distance")
-"""How slots attend to each other: by content alone, or by their distances as well."""
+ATTENTIONS = ("plain", "relative")
+"""How slots attend to each other: by content alone, or seeing where the others stand as well."""
 _TIME_WIDTH = 256
 
 
@@ -41,8 +43,8 @@ class MixedFluxConfig:
         frequencies: octaves of Fourier features of each translation, damped by the noise (0: none, as the paper).
         time_scale: what timesteps are multiplied by before they are embedded.
         flags: 1 to tell the network which poses and categories are given (inpainting), 0 as the paper.
-        attention: ``"plain"``, or ``"distance"`` for biases from the distances between slots.
-        unit: metres per normalised unit along x, y, z, which the distances need.
+        attention: ``"plain"``, or ``"relative"`` for attention that sees where other slots stand.
+        unit: metres per normalised unit along x, y, z, which ``"relative"`` needs.
     """
 
     categories: int
@@ -76,18 +78,21 @@ class MixedFluxConfig:
 class DoubleStreamBlock(nn.Module):
     """Joint attention of two streams with their own projections, norms and MLPs, gated by the condition."""
 
-    def __init__(self, hidden: int, heads: int, mlp_ratio: float) -> None:
+    def __init__(self, hidden: int, heads: int, mlp_ratio: float, relations: int = 0) -> None:
         super().__init__()
         self.text = _Stream(hidden, heads, mlp_ratio)
         self.scene = _Stream(hidden, heads, mlp_ratio)
+        self.gathered = nn.Linear(heads * relations, hidden, bias=False) if relations else None
 
-    def forward(self, scene: Tensor, text: Tensor, condition: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Slots (B, N, H) and text (B, L, H) to the same; ``mask`` (B, 1, 1, L + N) is True where to attend."""
+    def forward(
+        self, scene: Tensor, text: Tensor, condition: Tensor, mask: Tensor | None, relations: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Slots (B, N, H) and text (B, L, H) to the same; ``mask`` and ``relations`` as of single-stream blocks."""
         scene, text = scene + self.scene.modality, text + self.text.modality
         rates = [stream.rates(condition) for stream in (self.text, self.scene)]
         parts = [s.heads_of(x, r) for s, x, r in zip((self.text, self.scene), (text, scene), rates, strict=True)]
         query, key, value = (torch.cat(pair, dim=2) for pair in zip(*parts, strict=True))
-        attended = F.scaled_dot_product_attention(query, key, value, attn_mask=mask).transpose(1, 2).flatten(-2)
+        attended = joint_attention(query, key, value, mask, relations, self.gathered)
         count = text.shape[1]
         return (
             self.scene.finish(scene, attended[:, count:], rates[1]),
@@ -157,14 +162,15 @@ class MixedFlux(nn.Module):
         self.time_in = nn.Sequential(nn.Linear(_TIME_WIDTH, hidden), nn.SiLU(), nn.Linear(hidden, hidden))
         self.text_in = nn.Linear(config.text_width, hidden) if config.text_width else None
         doubles = config.double_blocks if config.text_width else 0
+        features = FEATURES if config.attention == "relative" else 0
         self.double_blocks = nn.ModuleList(
-            DoubleStreamBlock(hidden, config.heads, config.mlp_ratio) for _ in range(doubles)
+            DoubleStreamBlock(hidden, config.heads, config.mlp_ratio, features) for _ in range(doubles)
         )
         self.single_blocks = nn.ModuleList(
-            SingleStreamBlock(hidden, config.heads, config.mlp_ratio) for _ in range(config.single_blocks)
+            SingleStreamBlock(hidden, config.heads, config.mlp_ratio, features) for _ in range(config.single_blocks)
         )
         blocks = doubles + config.single_blocks
-        self.bias = DistanceBias(blocks, config.heads, config.unit) if config.attention == "distance" else None
+        self.relations = Relations(blocks, config.heads, config.unit) if features else None
         self.final_modulation = nn.Linear(hidden, 2 * hidden)
         self.final = nn.Linear(hidden, width)
         self.pose_out = nn.Sequential(nn.Linear(width, config.pose_head), nn.SiLU(), nn.Linear(config.pose_head, POSE))
@@ -212,13 +218,14 @@ class MixedFlux(nn.Module):
         scene = self.scene_in(features)
         words = self._words(text, pose)
         count = 0 if words is None else words.shape[1]
-        masks = iter(self._masks(text_mask, slot_mask, count, position, noise_level, pose))
+        mask = _where_to_attend(text_mask, slot_mask, count, pose)
+        masks, relations = self._related(mask, count, position, noise_level)
         if words is not None:
             for block in self.double_blocks:
-                scene, words = block(scene, words, condition, next(masks))
+                scene, words = block(scene, words, condition, next(masks), relations)
             scene = torch.cat([words, scene], dim=1)
         for block in self.single_blocks:
-            scene = block(scene, condition, next(masks))
+            scene = block(scene, condition, next(masks), relations)
         scene = scene[:, count:]
         shift, scale = self.final_modulation(F.silu(condition)).unsqueeze(1).chunk(2, dim=-1)
         features = self.final((1 + scale) * F.layer_norm(scene, (self.config.hidden,), eps=1e-6) + shift)
@@ -230,27 +237,17 @@ class MixedFlux(nn.Module):
         result: Tensor = self.text_in(pose.new_zeros(len(pose), 1, self.config.text_width) if text is None else text)
         return result
 
-    def _masks(
-        self,
-        text_mask: Tensor | None,
-        slot_mask: Tensor | None,
-        count: int,
-        position: Tensor | None,
-        noise_level: Tensor | None,
-        pose: Tensor,
-    ) -> list[Tensor] | list[None]:
-        """What each block adds to its attention logits, or where it may attend; ``count`` tokens are text."""
-        mask = None
-        if text_mask is not None or slot_mask is not None:
-            everywhere = torch.ones(len(pose), count + pose.shape[1], dtype=torch.bool, device=pose.device)
-            words = everywhere[:, :count] if text_mask is None or not count else text_mask
-            mask = torch.cat([words, everywhere[:, count:] if slot_mask is None else slot_mask], dim=1)[:, None, None]
-        if self.bias is None:
-            return [mask] * (len(self.double_blocks) + len(self.single_blocks))  # type: ignore[return-value]
+    def _related(
+        self, mask: Tensor | None, count: int, position: Tensor | None, noise_level: Tensor | None
+    ) -> tuple[Iterator[Tensor | None], Tensor | None]:
+        """What every block adds to its attention logits (or where it may attend), and features of pairs of slots."""
+        if self.relations is None:
+            return itertools.repeat(mask), None
         if position is None or noise_level is None:
-            raise InvalidInputError("a network with attention='distance' needs position= and noise_level=")
-        biases = F.pad(self.bias(position, noise_level), (count, 0, count, 0))
-        return list(biases if mask is None else biases.masked_fill(~mask, -torch.inf))
+            raise InvalidInputError("a network with attention='relative' needs position= and noise_level=")
+        bias, features = self.relations(position, noise_level)
+        bias = F.pad(bias, (count, 0, count, 0))
+        return iter(bias if mask is None else bias.masked_fill(~mask, -torch.inf)), features
 
     def _pose_features(self, pose: Tensor, position: Tensor | None, noise_level: Tensor | None) -> Tensor:
         if not self.config.frequencies:
@@ -260,6 +257,16 @@ class MixedFlux(nn.Module):
         angle = position[..., None] * self.octaves  # (B, N, 3, F)
         damping = torch.exp(-0.5 * (self.octaves * noise_level[..., None]) ** 2).unsqueeze(-2)  # (B, N, 1, F)
         return torch.cat([pose, (angle.sin() * damping).flatten(-2), (angle.cos() * damping).flatten(-2)], dim=-1)
+
+
+def _where_to_attend(text_mask: Tensor | None, slot_mask: Tensor | None, count: int, pose: Tensor) -> Tensor | None:
+    """(B, 1, 1, L + N) bool of ``count`` = L text tokens before N slots; None where nothing is masked."""
+    if text_mask is None and slot_mask is None:
+        return None
+    everywhere = torch.ones(len(pose), count + pose.shape[1], dtype=torch.bool, device=pose.device)
+    words = everywhere[:, :count] if text_mask is None or not count else text_mask
+    slots = everywhere[:, count:] if slot_mask is None else slot_mask
+    return torch.cat([words, slots], dim=1)[:, None, None]
 
 
 def _embed(time: Tensor, dtype: torch.dtype) -> Tensor:

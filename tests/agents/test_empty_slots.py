@@ -15,7 +15,7 @@ from agents.prior import tiny_prior
 from scene_envs.errors import InvalidInputError
 
 
-def _prior(attention: str = "distance", kernel: str = "early_absorbing") -> MixedPrior:
+def _prior(attention: str = "relative", kernel: str = "early_absorbing") -> MixedPrior:
     tiny = tiny_prior("dimsum_table", process="mixed")
     assert isinstance(tiny, MixedPrior)
     assert isinstance(tiny.mixed.network, MixedFluxConfig)
@@ -51,7 +51,7 @@ def test_pack_keeps_every_scene_once_and_its_active_slots_first() -> None:
     assert sorted(seen) == list(range(37))
 
 
-@pytest.mark.parametrize("attention", ["plain", "distance"])
+@pytest.mark.parametrize("attention", ["plain", "relative"])
 def test_known_empty_slots_change_nothing(attention: str) -> None:
     """With every category known, a scene and the same scene with more empty slots are denoised alike."""
     prior = _prior(attention)

@@ -110,7 +110,7 @@ def test_transformers_do_not_care_about_the_order_of_slots(name: str, process: s
 
 
 def test_distances_do_not_care_about_the_order_of_slots() -> None:
-    assert order_error("flux", "mixed", attention="distance", unit=(0.5, 0.4, 0.1)) < 1e-9
+    assert order_error("flux", "mixed", attention="relative", unit=(0.5, 0.4, 0.1)) < 1e-9
 
 
 @pytest.mark.parametrize("process", PROCESSES)
@@ -190,7 +190,7 @@ def test_flags_and_time_are_read(name: str) -> None:
 @pytest.mark.parametrize("name", BASELINES)
 def test_fourier_features_are_off_as_published_and_need_positions(name: str) -> None:
     keys: dict[str, Any] = {"features": FEATURES, "categories": CATEGORIES, "hidden": 16, "depth": 2, "heads": 2}
-    config = network_config(name, "mixed", frequencies=8, attention="distance", **keys)
+    config = network_config(name, "mixed", frequencies=8, attention="relative", **keys)
     assert config.frequencies == 0
     arguments = {key: inputs("mixed", 6, text=False)[key].to(kind) for key, kind in _PLAIN.items()}
     assert build_network(config)(**arguments)[0].shape == (2, 6, 12)
@@ -240,7 +240,7 @@ def test_sizes_with_equal_parameters(name: str, process: str) -> None:
 
 def test_counts_agree_with_the_papers_size_and_with_a_sum_by_hand() -> None:
     assert parameter_count(MixedFluxConfig.paper(categories=21)) == pytest.approx(88.3e6, rel=2e-3)
-    distance = MixedFluxConfig(categories=8, hidden=16, heads=2, single_blocks=3, attention="distance")
+    distance = MixedFluxConfig(categories=8, hidden=16, heads=2, single_blocks=3, attention="relative")
     plain = MixedFluxConfig(categories=8, hidden=16, heads=2, single_blocks=3)
     assert parameter_count(distance) > parameter_count(plain)
     h, inner = 16, 24

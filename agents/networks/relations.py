@@ -1,0 +1,110 @@
+"""What slots see of where the others stand: biases of attention, and messages that attention gathers.
+
+A transformer that sees positions slot by slot has to find distances by itself. Here they are features of pairs. They
+bias the attention logits, and the attention weights that gather values gather them as well, so that a head learns at
+what offset its neighbours stand (as with the edges of graph transformers, Dwivedi and Bresson 2021, and in the
+structure module of AlphaFold, Jumper et al. 2021).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+_SCALES, _DIRECTED = 8, 8
+FEATURES = 2 * _SCALES + 3 * _DIRECTED
+"""Numbers per pair of slots."""
+
+
+def pair_features(metres: Tensor, noise: Tensor, scales: Tensor) -> Tensor:
+    """What stands between any two slots, (B, N, N, :data:`FEATURES`), from slot i to j.
+
+    Horizontal distance and difference in height as Gaussians at every scale, then the offset along z, x and y, which
+    saturates beyond each scale. All are blurred by the noise that is on the two positions: E exp(-d^2 / 2 l^2) under
+    Gaussian noise is a wider Gaussian.
+
+    Args:
+        metres: (B, N, 3) positions.
+        noise: (B, N) standard deviation of the noise on them, metres.
+        scales: (8,) lengths, metres.
+    """
+    variance = noise.square()
+    offset = metres.unsqueeze(2) - metres.unsqueeze(1)  # (B, N, N, 3)
+    spread = (variance.unsqueeze(2) + variance.unsqueeze(1)).unsqueeze(-1) + scales.square()
+    across, height = offset[..., :2], offset[..., 2:]
+    squared = across.square().sum(dim=-1, keepdim=True)
+    coarse = spread[..., :: _SCALES // _DIRECTED]
+    level = height / (height.square() + coarse).sqrt()
+    direction = (across.unsqueeze(-1) / (squared + coarse).sqrt().unsqueeze(-2)).flatten(-2)
+    gaussians = [torch.exp(-0.5 * squared / spread), torch.exp(-0.5 * height.square() / spread)]
+    return torch.cat([*gaussians, level, direction], dim=-1)
+
+
+class Relations(nn.Module):
+    """Features of pairs of slots, and the biases that every attention block makes of them.
+
+    Permutation-equivariant. Positions come in normalised units; features are of metres.
+
+    Args:
+        blocks: attention blocks.
+        heads: heads per block.
+        unit: metres per normalised unit along x, y, z; 0 along an axis that never varies.
+        width: hidden width.
+
+    >>> relations = Relations(blocks=2, heads=4, unit=(0.5, 0.5, 0.5))
+    >>> bias, features = relations(torch.zeros(3, 5, 3), torch.ones(3, 5))
+    >>> bias.shape, features.shape
+    (torch.Size([2, 3, 4, 5, 5]), torch.Size([3, 5, 5, 40]))
+    """
+
+    def __init__(self, blocks: int, heads: int, unit: tuple[float, float, float], width: int = 32) -> None:
+        super().__init__()
+        self.blocks, self.heads = blocks, heads
+        largest = torch.tensor(max(*unit, 0.1))
+        self.unit: Tensor
+        self.scales: Tensor
+        self.register_buffer("unit", torch.tensor(unit), persistent=False)
+        self.register_buffer("scales", torch.logspace(-2, float(largest.log10()), _SCALES), persistent=False)
+        self.hidden = nn.Linear(2 * _SCALES + _DIRECTED, width)
+        self.out = nn.Linear(width, blocks * heads)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, position: Tensor, noise_level: Tensor) -> tuple[Tensor, Tensor]:
+        """Biases (blocks, B, heads, N, N) and features (B, N, N, :data:`FEATURES`).
+
+        Args:
+            position: (B, N, 3), normalised.
+            noise_level: (B, N) noise on them, in the same units.
+        """
+        unit = self.unit.to(position)
+        features = pair_features(position * unit, noise_level * unit.max(), self.scales.to(position))
+        bias: Tensor = self.out(F.silu(self.hidden(features[..., : 2 * _SCALES + _DIRECTED])))
+        return bias.unflatten(-1, (self.blocks, self.heads)).permute(3, 0, 4, 1, 2), features
+
+
+def joint_attention(
+    query: Tensor,
+    key: Tensor,
+    value: Tensor,
+    mask: Tensor | None = None,
+    relations: Tensor | None = None,
+    gathered: nn.Linear | None = None,
+) -> Tensor:
+    """Attention over T tokens, (B, T, H), to which what slots gather of their relations is added.
+
+    Args:
+        query, key, value: (B, heads, T, H / heads).
+        mask: as of :func:`torch.nn.functional.scaled_dot_product_attention`; with ``relations`` one that is added.
+        relations: (B, N, N, F) features of pairs of the last N tokens, the slots; None for none.
+        gathered: from heads * F to H.
+    """
+    if relations is None or gathered is None or mask is None:
+        return F.scaled_dot_product_attention(query, key, value, attn_mask=mask).transpose(1, 2).flatten(-2)
+    weights = (query @ key.transpose(-1, -2) / query.shape[-1] ** 0.5 + mask).softmax(dim=-1)
+    slots = relations.shape[1]
+    among = weights[:, :, -slots:, -slots:].transpose(1, 2)  # (B, N, heads, N)
+    message = gathered((among @ relations).flatten(-2))
+    attended = (weights @ value).transpose(1, 2).flatten(-2)
+    return attended + F.pad(message, (0, 0, attended.shape[1] - slots, 0))
