@@ -215,7 +215,8 @@ class MixedDenoiser(nn.Module):
 
         def run(rows: Tensor, index: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
             words = None if text is None else (text[0][rows], text[1][rows])
-            return self._run([take_slots(x, rows, index) for x in inputs], time[rows], words, mask)
+            attended = mask | ~mask.any(dim=1, keepdim=True)  # a scene of filling alone attends to it, for no use
+            return self._run([take_slots(x, rows, index) for x in inputs], time[rows], words, attended)
 
         return run_packed(present, run, (POSE, self.categories.categories))
 

@@ -27,7 +27,7 @@ from scene_envs.scene_types import get_scene_type
 MOMENTS = ("category", "feature", "scene")
 """Whose mean and standard deviation precondition a network."""
 
-_FITTED_ON = 20_000
+FITTED_ON = 20_000
 """Scenes to which moments are fitted."""
 
 
@@ -43,7 +43,7 @@ def build_prior(
         prompts: prompts of every scene, from which a prior that reads them takes its vocabulary.
     """
     if config.prior:
-        return _started(config, raw.shape[1])
+        return _started(config, raw)
     if config.moments not in MOMENTS:
         raise unknown_name("moments", config.moments, MOMENTS)
     if config.process == "continuous":
@@ -53,12 +53,14 @@ def build_prior(
     raise unknown_name("process", config.process, PROCESSES)
 
 
-def _started(config: PretrainConfig, slots: int) -> ScenePrior:
-    """The prior that ``config`` names, for scenes of its type.
+def _started(config: PretrainConfig, raw: Tensor) -> ScenePrior:
+    """The prior that ``config`` names, for raw scenes (M, N, D) of its type, which keep its normalizer.
 
     Raises:
-        InvalidInputError: its scene type, its slots or its reading of prompts are not those of the run.
+        InvalidInputError: its scene type, its slots or its reading of prompts are not those of the run, or what it
+            takes as constant varies in the scenes.
     """
+    slots = raw.shape[1]
     prior = ScenePrior.load(config.prior)
     found = (prior.scene_type.name, prior.config.slots, prior.conditional)
     asked = (config.scene, slots, config.text)
@@ -66,7 +68,23 @@ def _started(config: PretrainConfig, slots: int) -> ScenePrior:
         names = ("scene type", "slots", "text")
         wrong = ", ".join(f"{n} {f!r}, not {a!r}" for n, f, a in zip(names, found, asked, strict=True) if f != a)
         raise InvalidInputError(f"the prior {config.prior!r} cannot be trained further on this data: it has {wrong}")
+    _check_constants(prior, raw[:FITTED_ON, len(prior.scene_type.fixed) :], config.prior)
     return prior
+
+
+def _check_constants(prior: ScenePrior, free: Tensor, name: str) -> None:
+    """Refuse scenes in which something varies that the prior would overwrite with a constant."""
+    normalizer = prior.normalizer
+    constant = normalizer.is_constant.cpu().clone()
+    if prior.process_name == "mixed":
+        constant[POSE.stop :] = False  # categories are states there
+    objects = free[free[..., -1] == 0]
+    off = ((objects - normalizer.input_min.cpu()).abs() > 1e-4).any(dim=0) & constant
+    if bool(off.any()):
+        raise InvalidInputError(
+            f"the prior {name!r} cannot be trained further on this data: of a slot, features "
+            f"{torch.nonzero(off)[:, 0].tolist()} never varied where it was trained, and do here; train a fresh prior"
+        )
 
 
 def _continuous(config: PretrainConfig, raw: Tensor, normalizer: Normalizer) -> ContinuousPrior:
@@ -89,7 +107,7 @@ def _continuous(config: PretrainConfig, raw: Tensor, normalizer: Normalizer) -> 
     )
     torch.manual_seed(config.seed)
     moments = "feature" if config.moments == "category" else config.moments
-    return ContinuousPrior.fitted(prior_config, normalizer, raw[:_FITTED_ON], moments)
+    return ContinuousPrior.fitted(prior_config, normalizer, raw[:FITTED_ON], moments)
 
 
 def _mixed(config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts: Sequence[Sequence[str]]) -> MixedPrior:
@@ -120,7 +138,7 @@ def _mixed(config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts:
         empty_slots=config.empty_slots,
     )
     torch.manual_seed(config.seed)
-    free = raw[:_FITTED_ON, len(scene_type.fixed) :]
+    free = raw[:FITTED_ON, len(scene_type.fixed) :]
     return MixedPrior(prior_config, normalizer, _pose_moments(config.moments, free, normalizer))
 
 
@@ -132,7 +150,9 @@ def _text(config: PretrainConfig, prompts: Sequence[Sequence[str]]) -> AnyTextCo
 
 def _network(config: PretrainConfig, features: int, normalizer: Normalizer, text_width: int = 0) -> NetworkConfig:
     categories = get_scene_type(config.scene).num_assets + 1
-    if config.network == "paper" and config.process == "mixed":
+    if config.network == "paper":
+        if config.process != "mixed":
+            raise InvalidInputError("network='paper' is mixed; with process=continuous take network=flux")
         return MixedFluxConfig.paper(categories, text_width)
     return network_config(
         config.network,

@@ -19,7 +19,7 @@ from torch import Generator, Tensor, nn
 from agents.averaging import Averaged, WeightAverage
 from agents.checkpoints import load_checkpoint, save_checkpoint
 from agents.mixed_prior import MixedPrior
-from agents.new_prior import build_prior
+from agents.new_prior import FITTED_ON, build_prior
 from agents.optimizers import build_optimizer
 from agents.parallel import World
 from agents.pretrain_config import PretrainConfig
@@ -227,13 +227,25 @@ class Pretrainer:
 
     def _load(self) -> None:
         state = load_checkpoint(self.checkpoint_path)
-        self.network.load_state_dict(state["network"])
+        try:
+            self.network.load_state_dict(state["network"])
+            self.optimizer.load_state_dict(state["optimizer"])
+        except (RuntimeError, ValueError, KeyError) as error:
+            raise InvalidInputError(
+                f"the run in {str(self.directory)!r} cannot go on: it was started with {self._started_with(state)}; "
+                "give the same keys again, or another output"
+            ) from error
         self.average.tensors = state["average"]
         self.average.updates = state["average_updates"]
-        self.optimizer.load_state_dict(state["optimizer"])
         self.step, self.seconds = state["step"], state["seconds"]
         self.evaluations = state["evaluations"]
         logger.info("resumed at step %d", self.step)
+
+    def _started_with(self, state: dict[str, Any]) -> str:
+        """The keys of the run in a checkpoint that are not those of this one."""
+        now = asdict(self.config)
+        keys = [f"{key}={value}" for key, value in state["config"].items() if value != now.get(key)]
+        return ", ".join(keys) or "another network or optimiser"
 
     def save_prior(self) -> ScenePrior:
         """Write the averaged prior to ``output/prior`` and return the prior holding the averaged weights."""
@@ -311,7 +323,8 @@ def _prepare_union(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Te
     whole = [SceneDataset.load(folder.strip()) for folder in config.data.split(",")]
     union = register_scene_type(union_scene_type([dataset.scene_type for dataset in whole]))
     parts = [dataset.stable_split((0.98, 0.02), seed=0) for dataset in whole]
-    some = torch.cat([to_union(dataset.batch(slice(5000)), union).tensor for dataset, _ in parts])
+    share = slice(min(5000, FITTED_ON // len(whole)))  # moments see scenes of every type
+    some = torch.cat([to_union(dataset.batch(share), union).tensor for dataset, _ in parts])
     normalizer = union_normalizer([dataset.normalizer for dataset in whole], union)
     prompts = [prompt for dataset in whole for prompt in dataset.prompt_sets]
     prior = build_prior(replace(config, scene=union.name), some, normalizer, prompts)

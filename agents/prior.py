@@ -6,7 +6,6 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -21,18 +20,16 @@ from agents.diffusion import (
     StepTable,
 )
 from agents.inpainting import inpaint
-from agents.prior_files import read_prior, to_precision, write_prior
+from agents.prior_storage import PROCESSES, load_prior, save_prior
 from agents.prompt_room import check_prompts
-from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError, unknown_name
+from agents.tiny_prior import tiny_prior
+from scene_envs.errors import InvalidInputError
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
 from scene_envs.scene import TRANSLATION, SceneBatch
-from scene_envs.scene_types import SceneType, get_scene_type, register_scene_type
+from scene_envs.scene_types import SceneType, get_scene_type
 
-PROCESSES = ("continuous", "mixed")
-"""Diffusion processes: categories as numbers, or as discrete states."""
-
-_LEVELS, _RESIDUAL = "residual.timesteps", "residual.variance"
+__all__ = ["PROCESSES", "ScenePrior", "tiny_prior"]
 
 
 class ScenePrior(nn.Module, ABC):
@@ -111,22 +108,7 @@ class ScenePrior(nn.Module, ABC):
         """A shipped prior by name, or one from a prior or run directory; in evaluation mode."""
         if isinstance(name, ScenePrior):
             return name
-        state, tensors = read_prior(name)
-        try:
-            moments = Preconditioning.from_state(state["preconditioning"])
-            normalizer = Normalizer.from_state(state["normalizer_state"])
-            residual = ResidualVariance(tensors.pop(_LEVELS), tensors.pop(_RESIDUAL)) if _LEVELS in tensors else None
-            _know_scene_type(state)
-            kind = _prior_class(state.get("process", "continuous"))
-            prior = kind.from_state(state["prior"], normalizer, moments, state.get("card"), residual)
-            prior.load_weights(tensors)
-        except (KeyError, TypeError) as error:
-            raise CorruptFileError(
-                f"the configuration of the prior {str(name)!r} is not one of ours: {error}"
-            ) from error
-        except RuntimeError as error:
-            raise CorruptFileError(f"the weights of the prior {str(name)!r} do not fit its network: {error}") from error
-        return prior.eval()
+        return load_prior(name)
 
     def save(self, directory: str | os.PathLike[str], precision: str = "float32") -> Path:
         """Write ``config.json`` and ``model.safetensors`` into ``directory``.
@@ -135,18 +117,7 @@ class ScenePrior(nn.Module, ABC):
             directory: folder, made if need be.
             precision: of the weights in the file, ``"float32"`` or ``"float16"``; loaded weights are float32 again.
         """
-        state = {
-            "process": self.process_name,
-            "prior": self.config_state(),
-            "scene_type": asdict(self.scene_type),
-            "preconditioning": self.preconditioning.state(),
-            "normalizer_state": self.normalizer.state(),
-            "card": self.card,
-        }
-        tensors = to_precision(self.weights(), precision)
-        if self.residual is not None:
-            tensors |= {_LEVELS: self.residual.timesteps, _RESIDUAL: self.residual.variance}
-        return write_prior(directory, state, tensors)
+        return save_prior(self, directory, precision)
 
     def weights(self) -> dict[str, Tensor]:
         """Trained tensors by name, as a prior's file holds them."""
@@ -400,60 +371,7 @@ class ScenePrior(nn.Module, ABC):
         return weight
 
 
-def _know_scene_type(state: dict[str, Any]) -> None:
-    """Register the scene type that a prior was saved with, unless one of that name is known."""
-    try:
-        get_scene_type(state["prior"]["scene_type"])
-    except UnknownNameError:
-        if "scene_type" not in state:
-            raise
-        register_scene_type(SceneType.from_dict(state["scene_type"]))
-
-
-def _prior_class(process: str) -> type[ScenePrior]:
-    if process not in PROCESSES:
-        raise unknown_name("process", process, PROCESSES)
-    kind: type[ScenePrior] = getattr(import_module(f"agents.{process}_prior"), f"{process.capitalize()}Prior")
-    return kind
-
-
 def _chunk_sizes(total: int, size: int) -> Iterator[int]:
     while total > 0:
         yield min(size, total)
         total -= size
-
-
-def _workspace_normalizer(scene_type: SceneType) -> Normalizer:
-    """A normalizer made from the scene type alone: workspace, yaw-only rotations, one-hot categories."""
-    low, high = (torch.tensor(corner) for corner in scene_type.workspace)
-    yaw_low = torch.tensor([-1.0, -1, 0, -1, -1, 0, 0, 0, 0])
-    yaw_high = torch.tensor([1.0, 1, 0, 1, 1, 0, 0, 0, 1])
-    flags = torch.ones(scene_type.num_assets + 1)
-    return Normalizer.from_range(torch.cat([low, yaw_low, 0 * flags]), torch.cat([high, yaw_high, flags]))
-
-
-def tiny_prior(
-    scene_type: str | SceneType = "dimsum_table",
-    seed: int = 0,
-    slots: int | None = None,
-    process: str = "continuous",
-    text: bool = False,
-) -> ScenePrior:
-    """An untrained prior with a very small network and random weights, for tests and examples.
-
-    Args:
-        scene_type: scene type or its name.
-        seed: of the weights.
-        slots: slots per scene; the scene type's when None.
-        process: ``"continuous"`` or ``"mixed"``.
-        text: whether it reads prompts, with a vocabulary of what can be said of scenes of this type; mixed only.
-    """
-    scene_type = get_scene_type(scene_type)
-    normalizer = _workspace_normalizer(scene_type)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        prior = _prior_class(process).tiny(scene_type, scene_type.slots if slots is None else slots, normalizer, text)
-        for parameter in prior.parameters():
-            if not bool(parameter.any()):
-                nn.init.normal_(parameter, std=0.02)
-    return prior.eval()

@@ -10,6 +10,9 @@ from torch import Tensor
 
 from agents.diffusion.categorical import CategoricalProcess
 
+_MET = 20
+"""Slots from which the moments of a category are taken."""
+
 
 @dataclass(frozen=True)
 class CategoryMoments:
@@ -29,7 +32,8 @@ class CategoryMoments:
     def fit(cls, poses: Tensor, categories: Tensor, count: int, floor: float = 1e-3) -> CategoryMoments:
         """Moments of poses (M, D) whose categories are (M,) in 0..``count`` - 1.
 
-        A category that never occurs takes the moments of all objects; *empty* stands still at their mean.
+        A category met fewer than 20 times takes the moments of all objects: a spread guessed too small would blow up
+        the targets of what it leaves out. *Empty* stands still at the mean of all objects.
         """
         poses = poses.double()
         object_poses = poses[categories != count - 1]
@@ -37,7 +41,7 @@ class CategoryMoments:
         std[-1] = 0.0
         for category in range(count - 1):
             own = poses[categories == category]
-            if len(own) > 1:
+            if len(own) >= _MET:
                 mean[category], std[category] = own.mean(dim=0), own.std(dim=0)
         share = torch.bincount(categories, minlength=count).double() + 1e-3
         return cls((share / share.sum()).float(), mean.float(), std.clamp(min=floor).float())

@@ -10,6 +10,7 @@ from torch import nn
 
 from agents.mixed_prior import MixedPrior
 from agents.networks import MixedFluxConfig
+from agents.networks.mixed_flux import ATTENTIONS
 from agents.packing import pack
 from agents.prior import tiny_prior
 from scene_envs.errors import InvalidInputError
@@ -100,3 +101,18 @@ def test_the_loss_is_finite_and_reaches_every_parameter_but_that_of_certain_thin
 def test_a_kernel_that_replaces_categories_is_refused() -> None:
     with pytest.raises(InvalidInputError, match="early_absorbing"):
         _prior(kernel="mask_and_replace")
+
+
+@pytest.mark.parametrize("attention", ATTENTIONS)
+def test_a_scene_that_is_known_to_be_empty_leaves_others_and_gradients_alone(attention: str) -> None:
+    prior = _prior(attention)
+    x = _noised(prior, 3, 200)
+    blank = torch.zeros_like(x[:1])
+    blank[..., -1] = 1.0
+    t = torch.full((4,), 200)
+    pose, logits = prior.denoiser.output(torch.cat([x, blank]), t)
+    alone, _ = prior.denoiser.output(x, t[:3])
+    torch.testing.assert_close(pose[:3], alone, atol=2e-6, rtol=0)
+    assert not bool(pose[3].any())
+    (pose.square().sum() + logits.square().sum()).backward()  # type: ignore[no-untyped-call]
+    assert all(bool(p.grad.isfinite().all()) for p in prior.denoiser.network.parameters() if p.grad is not None)

@@ -52,3 +52,14 @@ def test_preconditioning_survives_json() -> None:
     assert whole.by_category is not None
     torch.testing.assert_close(again.by_category.std, whole.by_category.std)
     torch.testing.assert_close(again.mean, whole.mean)
+
+
+def test_a_category_that_is_hardly_met_takes_the_moments_of_all_objects() -> None:
+    """Two slots that happen to be alike say nothing of how far a third may be."""
+    poses, categories = _data(2_000)
+    rare = torch.cat([categories[categories != 2], torch.tensor([2, 2])])
+    stood = torch.cat([poses[categories != 2], torch.tensor([[1.0, 1.0], [1.0, 1.0]])])
+    moments = CategoryMoments.fit(stood, rare, 4)
+    objects = stood[rare != 3]
+    torch.testing.assert_close(moments.std[2], objects.std(dim=0), atol=1e-5, rtol=0)
+    torch.testing.assert_close(moments.mean[2], objects.mean(dim=0), atol=1e-5, rtol=0)
