@@ -52,6 +52,7 @@ def measure_prior(
     pool: PhysicsPool | None = None,
     prompts: Sequence[str] | None = None,
     guidance: float = 0.0,
+    slots: int | None = None,
 ) -> Measured:
     """Sample ``count`` scenes and measure all of them; none is chosen, none is dropped.
 
@@ -63,11 +64,12 @@ def measure_prior(
         pool: physics workers.
         prompts: one per scene, which the samples are then compared with; None for none.
         guidance: weight of classifier-free guidance.
+        slots: per sample; None means as trained.
     """
     from agents.post_training.guard import realism
     from scene_envs.physics import feasibility, make_ready
 
-    raw = prior.sample(count, prompt=prompts, guidance=guidance, num_steps=num_steps, seed=seed)
+    raw = prior.sample(count, prompt=prompts, guidance=guidance, num_steps=num_steps, slots=slots, seed=seed)
     feasible = feasibility(raw, pool=pool)
     ready = make_ready(raw, pool=pool)
     counts = raw.counts.double()

@@ -48,6 +48,8 @@ class DenoisingPolicy(TensorDictModuleBase):
         self.prior = prior
         self.chunk = chunk
         self.guidance = guidance
+        if prior.conditional:
+            self.in_keys = [*self.in_keys, "prompt"]
         self.table: StepTableLike = prior.step_table(num_steps)
         self._step_of = {int(t): step for step, t in enumerate(self.table.timesteps.tolist())}
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import Generator
 
-from agents.post_training.comparison import measure_prior, write_comparison
+from agents.post_training.comparison import Measured, measure_prior, write_comparison
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.prompts import PromptDeck, prompts_beside
 from agents.post_training.rollouts import stream_seed
@@ -54,14 +54,17 @@ def steer(
     seed = config.seed + SAMPLE_SEED
     asked = _measured_prompts(config, base, scenes)
     with PhysicsPool(workers=config.workers, timeout=_PHYSICS_TIMEOUT) as pool:
+
+        def measure(prior: ScenePrior) -> Measured:
+            return measure_prior(
+                prior, scenes, num_steps=num_steps, seed=seed, pool=pool, prompts=asked, guidance=config.guidance,
+                slots=config.slots,
+            )  # fmt: skip
+
         _say(config, f"measuring {scenes} samples of the base prior")
-        before = measure_prior(
-            base, scenes, num_steps=num_steps, seed=seed, pool=pool, prompts=asked, guidance=config.guidance
-        )
+        before = measure(base)
         _say(config, f"measuring {scenes} samples of the post-trained prior")
-        after = measure_prior(
-            result.prior, scenes, num_steps=num_steps, seed=seed, pool=pool, prompts=asked, guidance=config.guidance
-        )
+        after = measure(result.prior)
     seconds = {"training": round(trained - started, 1), "measuring": round(time.perf_counter() - trained, 1)}
     _say(config, "drawing the report")
     title = f"Steering {base.scene_type.name.replace('_', ' ')} toward {reward_name(config.reward).replace('_', ' ')}"
@@ -76,7 +79,8 @@ def _measured_prompts(config: PostTrainConfig, prior: ScenePrior, count: int) ->
     directory = Path(config.output)
     batch = SceneBatch.load(directory / SCENES_NAME)
     real = prompts_beside(directory, batch, stream_seed(config.seed, "bank"))
-    deck = PromptDeck.of(prior, config.prompt, 1, prior.config.slots, real, len(batch))
+    slots = prior.config.slots if config.slots is None else config.slots
+    deck = PromptDeck.of(prior, config.prompt, 1, slots, real, len(batch))
     return deck.deal(count, Generator().manual_seed(config.seed + SAMPLE_SEED))
 
 

@@ -139,6 +139,7 @@ class PostTrainer:
             slots = self.learner.slots
             batch, found = real_scenes(self.prior, config.real_scenes, config.bank_size, seed=seed, slots=slots)
             _writing(f"the real scenes {str(path)!r}", lambda: batch.save(path))
+            texts.unlink(missing_ok=True)  # of other scenes, by a run that never reached a checkpoint
             if found is not None and self.prior.conditional:
                 _writing(f"their prompts {str(texts)!r}", lambda: save_prompts(texts, found))
         prompts: PromptSets | None = None

@@ -17,6 +17,7 @@ from agents.post_training.rollouts import collect
 from agents.prior import ScenePrior, tiny_prior
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.datasets import SceneDataset, generate
+from scene_envs.datasets.prompts import parse_prompt, scene_facts
 from scene_envs.denoising_torchrl import DenoisingTorchRLEnv
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
@@ -98,6 +99,7 @@ def test_the_torchrl_policy_reads_the_prompt_of_the_environment() -> None:
     prior = reader()
     env = DenoisingTorchRLEnv(2, prior=prior, num_steps=3, prompt=TWO[1])
     env.set_seed(0)
+    assert DenoisingPolicy(prior, 3).in_keys == ["scene", "timestep", "prompt"]
     rollout = env.rollout(3, DenoisingPolicy(prior, 3))
     transitions = rollout[:, 0].exclude("next").set("advantage", torch.tensor([1.0, -1.0]))
     policy = DenoisingPolicy(prior, 3)
@@ -152,6 +154,26 @@ def test_real_scenes_bring_their_own_prompts(tmp_path: Path) -> None:
     trainer.close()
 
 
+def test_prompts_of_a_run_that_never_saved_are_not_taken_for_those_of_other_scenes(tmp_path: Path) -> None:
+    generate("dimsum_table", 24, tmp_path / "data", seed=0, workers=0)
+    trainer = PostTrainer(
+        small_config(tmp_path / "run", real_scenes=str(tmp_path / "data"), bank_size=20, prompt="data"), prior=reader()
+    )
+    trainer.prepare()
+    trainer.close()
+    known = [set(trainer.scenes.prompts(i)) for i in range(20)]  # type: ignore[misc]
+    other = PostTrainer(small_config(tmp_path / "run", prompt="data"), prior=reader())
+    other.prepare()
+    other.close()
+    assert other.scenes.prompts is not None
+    assert any(not set(other.scenes.prompts(i)) <= known[i] for i in range(20))
+    batch = SceneBatch.load(tmp_path / "run" / "real_scenes.safetensors")
+    for i in range(20):
+        facts = scene_facts(batch[i])
+        for text in other.scenes.prompts(i):
+            assert all(check.holds for check in parse_prompt(text, "dimsum_table").check(facts[0])), text
+
+
 def test_the_doctor_examines_a_prompted_run(tmp_path: Path) -> None:
     report = diagnose(small_config(tmp_path, prompt=TWO, scenes_per_prompt=3), prior=reader())
     assert report.log_ratio == 0.0
@@ -164,7 +186,10 @@ def test_the_report_compares_samples_with_their_prompts(tmp_path: Path) -> None:
     pytest.importorskip("pybullet")
     prior = tiny_prior(process="mixed", text=True, slots=SLOTS)
     metrics = steer(
-        small_config(tmp_path, iterations=1, prompt=TWO[:1], slots=SLOTS), scenes=2, num_steps=2, prior=prior
+        small_config(tmp_path, iterations=1, prompt="A scene with 14 objects.", slots=SLOTS + 2),
+        scenes=2,
+        num_steps=2,
+        prior=prior,
     )
     assert 0.0 <= metrics["before"]["prompt_match"] <= 1.0
     assert "match of prompt and scene" in (tmp_path / "report.html").read_text()
