@@ -84,7 +84,8 @@ def _draw_panel(panel: Axes, column: Column, lines: Sequence[Line], real: Line) 
     _scale(panel, column, [number for number in (*numbers, floor) if number is not None])
     for height, (line, number) in enumerate(zip(lines, numbers, strict=True)):
         if number is None:
-            panel.text(0.02, height, "failed" if line.failure else "no data", fontsize=7, va="center", color=SOFT,
+            why = "failed" if line.failure else "not run yet" if line.pending else "no data"
+            panel.text(0.02, height, why, fontsize=7, va="center", color=SOFT,
                        transform=panel.get_yaxis_transform())  # fmt: skip
             continue
         spread = columns_.error(column, line.figures)

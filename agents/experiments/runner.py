@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +17,7 @@ from agents.experiments.rows import Row, Table
 from agents.experiments.settings import TablesConfig
 from agents.experiments.tables import REAL, FilledTable, Line, csv_text, markdown
 from agents.experiments.training import Sizes, check_runs, read_json, target_parameters, train, write_json
-from scene_envs.errors import SceneEnvsError, TrainingError
+from scene_envs.errors import InvalidInputError, SceneEnvsError, TrainingError
 
 if TYPE_CHECKING:
     from scene_envs.physics import PhysicsPool
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 REAL_NAME = "real.json"
-_PENDING = "not run yet"
+LOCK_NAME = "tables.lock"
 
 Say = Callable[[str], None]
 
@@ -36,10 +37,12 @@ class RowResult:
     Attributes:
         figures: of samples without prompts, or with prompts (True).
         failure: why it failed, empty where it did not.
+        pending: whether it has not been tried yet.
     """
 
     figures: dict[bool, dict[str, float]]
     failure: str = ""
+    pending: bool = False
 
 
 def run_tables(settings: TablesConfig, say: Say) -> dict[str, Any]:
@@ -59,6 +62,11 @@ def run_tables(settings: TablesConfig, say: Say) -> dict[str, Any]:
         InvalidInputError: what was asked for cannot be; no row was begun.
         TrainingError: some rows failed; the tables say which and why, and have the others.
     """
+    with _alone_in(Path(settings.output)):
+        return _run_tables(settings, say)
+
+
+def _run_tables(settings: TablesConfig, say: Say) -> dict[str, Any]:
     from scene_envs.physics import PhysicsPool
 
     tables = make_tables(settings.tables, settings.rows)
@@ -67,7 +75,7 @@ def run_tables(settings: TablesConfig, say: Say) -> dict[str, Any]:
     check_runs(rows, settings)
     data = RowData.load(settings)
     real, sizes = RealScenes.of(data, settings), Sizes(settings, data)
-    results = {row.name: RowResult({}, _PENDING) for row in rows}
+    results = {row.name: RowResult({}, pending=True) for row in rows}
     with PhysicsPool(workers=settings.workers) as pool:
         floor = _measured_once(
             Path(settings.output) / REAL_NAME, _evaluation(settings, real), lambda: measure_real(real, settings, pool)
@@ -95,6 +103,26 @@ def run_tables(settings: TablesConfig, say: Say) -> dict[str, Any]:
             "tries them again"
         )
     return summary
+
+
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Refuse a folder in which another command makes tables; the lock goes with the process that holds it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / LOCK_NAME).open("w") as file:
+        try:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except ImportError:  # no such locks on this system
+            pass
+        except BlockingIOError:
+            raise InvalidInputError(
+                f"another command is making tables in {str(folder)!r}; wait for it, or give another output"
+            ) from None
+        except OSError as error:
+            logger.debug("%s cannot be locked: %s", folder, error)
+        yield
 
 
 def write_tables(
@@ -185,7 +213,8 @@ def _fill(table: Table, results: dict[str, RowResult], floor: dict[str, float], 
     for entry in table.entries:
         result = results[entry.row.name]
         figures = result.figures.get(entry.prompted, {})
-        lines.append(Line(entry.label, entry.row.name, entry.group, {} if result.failure else figures, result.failure))
+        shown = {} if result.failure else figures
+        lines.append(Line(entry.label, entry.row.name, entry.group, shown, result.failure, result.pending))
     lines.append(Line(REAL, "", "real scenes" if any(line.group for line in lines) else "", floor))
     note = table.note
     if any(entry.prompted for entry in table.entries):

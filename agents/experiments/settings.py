@@ -42,6 +42,15 @@ SIZES: dict[str, Size] = {
 }  # fmt: skip
 """``tiny`` is for tests, ``small`` for a CPU, ``paper`` has the size of the paper's network and wants a GPU."""
 
+_OWN = "a key of tables itself"
+_NOT_OF_PRETRAINING = {
+    **dict.fromkeys(("scene", "data", "heldout", "seed", "device", "iterations", "batch_size"), _OWN),
+    "output": "each row has its own folder",
+    "prior": "rows start from fresh weights",
+    "recipe": "it is a set of keys; give those",
+}
+"""Keys of ``pretrain`` that are not the user's to give in ``pretraining``, and why."""
+
 ALL_TABLES = ("unconditional", "conditional", "objective", "rotation", "precision")
 
 
@@ -97,6 +106,9 @@ class TablesConfig:
             raise InvalidInputError(f"tables=[] asks for nothing; name some of {', '.join(ALL_TABLES)}")
         if self.pretraining is not None and not isinstance(self.pretraining, Mapping):
             raise InvalidInputError(f"pretraining={self.pretraining!r} is no mapping; write it like {{hidden: 64}}")
+        taken = [f"{key} ({why})" for key, why in _NOT_OF_PRETRAINING.items() if key in (self.pretraining or {})]
+        if taken:
+            raise InvalidInputError(f"pretraining cannot set {', '.join(taken)}")
         for name in ("iterations", "batch_size", "parameters", "count", "num_steps"):
             value = getattr(self, name)
             if value is not None and value < 1:

@@ -25,6 +25,7 @@ class Line:
         group: heading under which it stands.
         figures: by name; empty where the run failed.
         failure: why it failed, empty where it did not.
+        pending: whether the run has not been tried yet.
     """
 
     label: str
@@ -32,6 +33,7 @@ class Line:
     group: str
     figures: Figures
     failure: str = ""
+    pending: bool = False
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,8 @@ def _record(table: str, line: Line, shown: Mapping[str, Column]) -> dict[str, st
 
 
 def _cells(line: Line, shown: Sequence[Column]) -> list[str]:
+    if line.pending:
+        return ["not run yet", *([""] * (len(shown) - 1))] if shown else []
     if line.failure:
         return [f"failed: {line.failure}", *([""] * (len(shown) - 1))] if shown else []
     return [columns_.text(column, line.figures) for column in shown]

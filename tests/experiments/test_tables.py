@@ -72,7 +72,7 @@ def test_every_factor_is_asked() -> None:
     assert {("moments", name) for name in ("scene", "feature", "category")} <= asked
     assert {("noise_floor", value) for value in (0.01, 0.002, 0.0005)} <= asked
     assert {("translation_weight", 1.0), ("translation_weight", 3.0), ("final_learning_rate", 1.0)} <= asked
-    assert {("attention", "plain"), ("attention", "distance"), ("frequencies", 0), ("frequencies", 8)} <= asked
+    assert {("attention", "plain"), ("attention", "relative"), ("frequencies", 0), ("frequencies", 8)} <= asked
     assert {row.capacity for row in ours} == {0.5, 1.0, 2.0}
     assert [entry.row.overrides for entry in make_tables(["precision"], ["paper"])[0].entries] == [PAPER]
 
@@ -105,6 +105,8 @@ def test_keys_of_a_row_win_over_those_of_all_rows(tmp_path: Path) -> None:
         ({"iterations": 0}, "iterations=0 must be at least 1"),
         ({"count": 1}, "measure at least 2"),
         ({"pretraining": "hidden"}, "is no mapping"),
+        ({"pretraining": {"recipe": "paper", "hidden": 8}}, r"cannot set recipe \(it is a set of keys"),
+        ({"pretraining": {"iterations": 5}}, r"cannot set iterations \(a key of tables itself"),
     ],
 )
 def test_wrong_settings_are_refused(keys: dict[str, object], message: str) -> None:
