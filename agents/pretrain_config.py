@@ -13,7 +13,8 @@ class PretrainConfig:
         scene: scene type; with several datasets it is their union, and this key is not read.
         data: dataset directory of training scenes; several, joined by commas, train one prior on all their scene
             types with equal chances; ``grammar`` stands for fresh scenes of the grammar without end.
-        heldout: dataset directory of held-out scenes; empty takes the last 2 % of ``data``, or 512 of the grammar.
+        heldout: dataset directory of held-out scenes; empty takes the last 2 % of ``data``, or 512 of the grammar;
+            with several datasets it must be empty.
         prior: shipped name, or folder of a prior or a run, that training starts from, whatever the keys of its size
             and kind say; empty for a fresh one.
         output: run directory; an interrupted run in it goes on where it stopped.

@@ -244,6 +244,7 @@ class Pretrainer:
     def _started_with(self, state: dict[str, Any]) -> str:
         """The keys of the run in a checkpoint that are not those of this one."""
         now = asdict(self.config)
+        now |= {"iterations": state["config"]["iterations"], "output": state["config"]["output"]}  # may differ
         keys = [f"{key}={value}" for key, value in state["config"].items() if value != now.get(key)]
         return ", ".join(keys) or "another network or optimiser"
 
@@ -298,7 +299,10 @@ def prepare(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
             describe_all(sample, np.random.default_rng(config.seed), count=PROMPTS_PER_SCENE) if config.text else []
         )
         prior = build_prior(config, sample.tensor, fixed_normalizer(grammar), prompts)
-        held_out = grammar.sample(np.random.default_rng([config.seed, _SAMPLE, 1]), _HELD_OUT)
+        if config.heldout:
+            held_out = SceneBatch(SceneDataset.load(config.heldout).tensor[:2048], prior.scene_type)
+        else:
+            held_out = grammar.sample(np.random.default_rng([config.seed, _SAMPLE, 1]), _HELD_OUT)
         return prior, GrammarStream(grammar, prior), prior.encode(held_out)
     if "," in config.data:
         return _prepare_union(config)
@@ -320,6 +324,10 @@ def prepare(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
 def _prepare_union(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
     from scene_envs.datasets import SceneDataset, to_union, union_normalizer, union_scene_type
 
+    if config.heldout:
+        raise InvalidInputError(
+            f"heldout={config.heldout!r} is not read with several datasets: 2 % of each are held out; leave it out"
+        )
     whole = [SceneDataset.load(folder.strip()) for folder in config.data.split(",")]
     union = register_scene_type(union_scene_type([dataset.scene_type for dataset in whole]))
     parts = [dataset.stable_split((0.98, 0.02), seed=0) for dataset in whole]

@@ -92,6 +92,25 @@ def test_nan_stops_the_run_and_keeps_the_last_checkpoint(config: PretrainConfig,
     assert make_run(config, raw).run().card["trained_steps"] == 6
 
 
+def test_a_run_does_not_go_on_with_keys_that_do_not_fit_it(config: PretrainConfig, raw: torch.Tensor) -> None:
+    make_run(config, raw).run()
+    for other, was in (({"optimizer": "adamw"}, "optimizer=muon"), ({"hidden": 32}, "hidden=16")):
+        with pytest.raises(InvalidInputError, match=f"started with {was}"):
+            make_run(replace(config, iterations=8, **other), raw).run()  # type: ignore[arg-type]
+
+
+def test_what_an_older_prior_takes_as_constant_may_not_vary_where_it_is_trained_further(
+    config: PretrainConfig, raw: torch.Tensor
+) -> None:
+    make_run(config, raw).run()
+    further = replace(config, prior=config.output)
+    assert build_prior(further, raw, Normalizer.fit(raw)).config.slots == raw.shape[1]
+    turned = raw.clone()
+    turned[:, 1:, 3:12] = torch.tensor([0.0, -1, 0, 1, 0, 0, 0, 0, 1]) * (turned[:, 1:, -1:] == 0)
+    with pytest.raises(InvalidInputError, match=r"never varied"):
+        build_prior(further, turned, Normalizer.fit(turned))
+
+
 def test_a_truncated_checkpoint_is_named(config: PretrainConfig, raw: torch.Tensor) -> None:
     run = make_run(config, raw)
     run.run()
