@@ -13,7 +13,7 @@ from agents.denoiser import PriorConfig
 from agents.diffusion import CategoryMoments, Preconditioning
 from agents.mixed_denoiser import MixedPriorConfig
 from agents.mixed_prior import MixedPrior
-from agents.networks import MixedFluxConfig
+from agents.networks import MixedFluxConfig, TextConfig
 from agents.networks.registry import NetworkConfig, network_config
 from agents.networks.text_encoders import AnyTextConfig, text_config
 from agents.pretrain_config import PretrainConfig
@@ -145,7 +145,10 @@ def _mixed(config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts:
 def _text(config: PretrainConfig, prompts: Sequence[Sequence[str]]) -> AnyTextConfig | None:
     if not config.text:
         return None
-    return text_config(config.text_encoder, (prompt for group in prompts for prompt in group))
+    encoder = text_config(config.text_encoder, (prompt for group in prompts for prompt in group))
+    if isinstance(encoder, TextConfig):
+        return replace(encoder, depth=config.text_depth, latents=config.text_latents)
+    return encoder
 
 
 def _network(config: PretrainConfig, features: int, normalizer: Normalizer, text_width: int = 0) -> NetworkConfig:
@@ -166,6 +169,7 @@ def _network(config: PretrainConfig, features: int, normalizer: Normalizer, text
         attention=config.attention,
         frequencies=config.frequencies,
         unit=_unit(normalizer),
+        text_reach=config.text_reach,
     )
 
 

@@ -62,6 +62,10 @@ class PretrainConfig:
         text: whether a mixed prior reads prompts.
         text_encoder: ``vocabulary`` for a small one with a closed vocabulary, trained with the prior; or the folder or
             hub name of a BERT model, which stays as it is.
+        text_depth: blocks of the small text encoder.
+        text_latents: tokens that it condenses a prompt to; 0 for one per word.
+        text_reach: of the mixed flux network: text meets slots in its ``double``-stream blocks alone, which is quicker,
+            or in ``all``, as in the paper's.
         prompt_dropout: share of training scenes whose prompt is withheld, for classifier-free guidance.
         seed: of weights, batches and noise.
         log_every: steps between log rows.
@@ -114,6 +118,9 @@ class PretrainConfig:
     empty_slots: str = "dropped"
     text: bool = False
     text_encoder: str = "vocabulary"
+    text_depth: int = 2
+    text_latents: int = 16
+    text_reach: str = "double"
     prompt_dropout: float = 0.1
     compile: bool = False
     seed: int = 0

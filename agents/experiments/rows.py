@@ -69,8 +69,12 @@ PAPER: dict[str, Any] = {
     "schedule": "linear",
     "timesteps": "uniform",
     "loss_weighting": "none",
+    "moments": "feature",
     "translation_weight": 1.0,
     "category_loss": "bound",
+    "category_weight": 1.0,
+    "given_share": 0.0,
+    "denoised_clip": 1.0,
     "kernel": "mask_and_replace",
     "empty_slots": "attended",
     "attention": "plain",
@@ -78,7 +82,7 @@ PAPER: dict[str, Any] = {
     "optimizer": "adamw",
 }
 """The paper's setting: noise prediction under a linear schedule, the variational bound of masked and replaced
-categories, AdamW, and a network without features or biases made from distances."""
+categories, AdamW, and a network without features or relations between slots."""
 
 NETWORKS: dict[str, dict[str, Any]] = {
     "flux": {"network": "flux"},

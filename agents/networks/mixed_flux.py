@@ -23,6 +23,8 @@ POSE = 12
 """Numbers of a pose: translation and rotation matrix."""
 ATTENTIONS = ("plain", "relative")
 """How slots attend to each other: by content alone, or seeing where the others stand as well."""
+TEXT_REACHES = ("all", "double")
+"""Blocks in which slots meet text."""
 _TIME_WIDTH = 256
 
 
@@ -45,6 +47,7 @@ class MixedFluxConfig:
         flags: 1 to tell the network which poses and categories are given (inpainting), 0 as the paper.
         attention: ``"plain"``, or ``"relative"`` for attention that sees where other slots stand.
         unit: metres per normalised unit along x, y, z, which ``"relative"`` needs.
+        text_reach: how far text goes: to the ``"double"``-stream blocks, or through ``"all"`` blocks, as the paper's.
     """
 
     categories: int
@@ -61,8 +64,11 @@ class MixedFluxConfig:
     flags: int = 1
     attention: str = "plain"
     unit: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    text_reach: str = "all"
 
     def __post_init__(self) -> None:
+        if self.text_reach not in TEXT_REACHES:
+            raise unknown_name("reach of text", self.text_reach, TEXT_REACHES)
         object.__setattr__(self, "unit", tuple(self.unit))  # a list, when it comes from JSON
         if self.attention not in ATTENTIONS:
             raise unknown_name("attention", self.attention, ATTENTIONS)
@@ -76,11 +82,16 @@ class MixedFluxConfig:
 
 
 class DoubleStreamBlock(nn.Module):
-    """Joint attention of two streams with their own projections, norms and MLPs, gated by the condition."""
+    """Joint attention of two streams with their own projections, norms and MLPs, gated by the condition.
 
-    def __init__(self, hidden: int, heads: int, mlp_ratio: float, relations: int = 0) -> None:
+    Args:
+        hidden, heads, mlp_ratio, relations: as of :class:`~agents.networks.flux.SingleStreamBlock`.
+        text_ends: whether text is read here for the last time, so that it need not be changed.
+    """
+
+    def __init__(self, hidden: int, heads: int, mlp_ratio: float, relations: int = 0, text_ends: bool = False) -> None:
         super().__init__()
-        self.text = _Stream(hidden, heads, mlp_ratio)
+        self.text = _Stream(hidden, heads, mlp_ratio, finishes=not text_ends)
         self.scene = _Stream(hidden, heads, mlp_ratio)
         self.gathered = nn.Linear(heads * relations, hidden, bias=False) if relations else None
 
@@ -96,30 +107,31 @@ class DoubleStreamBlock(nn.Module):
         count = text.shape[1]
         return (
             self.scene.finish(scene, attended[:, count:], rates[1]),
-            self.text.finish(text, attended[:, :count], rates[0]),
+            self.text.finish(text, attended[:, :count], rates[0]) if self.text.finishes else text,
         )
 
 
 class _Stream(nn.Module):
     """One side of a double-stream block."""
 
-    def __init__(self, hidden: int, heads: int, mlp_ratio: float) -> None:
+    def __init__(self, hidden: int, heads: int, mlp_ratio: float, finishes: bool = True) -> None:
         super().__init__()
-        self.hidden, self.heads = hidden, heads
+        self.hidden, self.heads, self.finishes = hidden, heads, finishes
         self.modality = nn.Parameter(torch.zeros(1, 1, hidden))
-        self.modulation = nn.Linear(hidden, 6 * hidden)
+        self.modulation = nn.Linear(hidden, (6 if finishes else 2) * hidden)
         self.qkv = nn.Linear(hidden, 3 * hidden)
-        self.query_norm = nn.RMSNorm(hidden // heads, eps=1e-6)
+        self.query_norm = nn.RMSNorm(hidden // heads, eps=1e-6) if finishes else nn.Identity()
         self.key_norm = nn.RMSNorm(hidden // heads, eps=1e-6)
-        self.out = nn.Linear(hidden, hidden)
-        wide = int(hidden * mlp_ratio)
-        self.mlp = nn.Sequential(nn.Linear(hidden, wide), nn.GELU(approximate="tanh"), nn.Linear(wide, hidden))
+        if finishes:
+            self.out = nn.Linear(hidden, hidden)
+            wide = int(hidden * mlp_ratio)
+            self.mlp = nn.Sequential(nn.Linear(hidden, wide), nn.GELU(approximate="tanh"), nn.Linear(wide, hidden))
         nn.init.zeros_(self.modulation.weight)
         nn.init.zeros_(self.modulation.bias)
 
     def rates(self, condition: Tensor) -> tuple[Tensor, ...]:
-        """Shift, scale and gate of the attention, then of the MLP, (B, 1, H) each."""
-        return self.modulation(F.silu(condition)).unsqueeze(1).chunk(6, dim=-1)  # type: ignore[no-any-return]
+        """Shift, scale and gate of the attention, then of the MLP, (B, 1, H) each; only two where text ends."""
+        return self.modulation(F.silu(condition)).unsqueeze(1).chunk(6 if self.finishes else 2, dim=-1)  # type: ignore[no-any-return]
 
     def heads_of(self, x: Tensor, rates: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, Tensor]:
         """Query, key and value (B, heads, N, width)."""
@@ -164,7 +176,10 @@ class MixedFlux(nn.Module):
         doubles = config.double_blocks if config.text_width else 0
         features = FEATURES if config.attention == "relative" else 0
         self.double_blocks = nn.ModuleList(
-            DoubleStreamBlock(hidden, config.heads, config.mlp_ratio, features) for _ in range(doubles)
+            DoubleStreamBlock(
+                hidden, config.heads, config.mlp_ratio, features, config.text_reach == "double" and last == doubles
+            )
+            for last in range(1, doubles + 1)
         )
         self.single_blocks = nn.ModuleList(
             SingleStreamBlock(hidden, config.heads, config.mlp_ratio, features) for _ in range(config.single_blocks)
@@ -219,13 +234,16 @@ class MixedFlux(nn.Module):
         words = self._words(text, pose)
         count = 0 if words is None else words.shape[1]
         mask = _where_to_attend(text_mask, slot_mask, count, pose)
-        masks, relations = self._related(mask, count, position, noise_level)
+        biases, relations = self._related(position, noise_level)
         if words is not None:
             for block in self.double_blocks:
-                scene, words = block(scene, words, condition, next(masks), relations)
-            scene = torch.cat([words, scene], dim=1)
+                scene, words = block(scene, words, condition, _add_bias(next(biases), mask, count), relations)
+            if self.config.text_reach == "all":
+                scene = torch.cat([words, scene], dim=1)
+            else:
+                mask, count = None if mask is None else mask[..., count:], 0
         for block in self.single_blocks:
-            scene = block(scene, condition, next(masks), relations)
+            scene = block(scene, condition, _add_bias(next(biases), mask, count), relations)
         scene = scene[:, count:]
         shift, scale = self.final_modulation(F.silu(condition)).unsqueeze(1).chunk(2, dim=-1)
         features = self.final((1 + scale) * F.layer_norm(scene, (self.config.hidden,), eps=1e-6) + shift)
@@ -238,16 +256,15 @@ class MixedFlux(nn.Module):
         return result
 
     def _related(
-        self, mask: Tensor | None, count: int, position: Tensor | None, noise_level: Tensor | None
+        self, position: Tensor | None, noise_level: Tensor | None
     ) -> tuple[Iterator[Tensor | None], Tensor | None]:
-        """What every block adds to its attention logits (or where it may attend), and features of pairs of slots."""
+        """Biases (B, heads, N, N) of block after block, and features of pairs of slots; None where there are none."""
         if self.relations is None:
-            return itertools.repeat(mask), None
+            return itertools.repeat(None), None
         if position is None or noise_level is None:
             raise InvalidInputError("a network with attention='relative' needs position= and noise_level=")
         bias, features = self.relations(position, noise_level)
-        bias = F.pad(bias, (count, 0, count, 0))
-        return iter(bias if mask is None else bias.masked_fill(~mask, -torch.inf)), features
+        return iter(bias), features
 
     def _pose_features(self, pose: Tensor, position: Tensor | None, noise_level: Tensor | None) -> Tensor:
         if not self.config.frequencies:
@@ -267,6 +284,14 @@ def _where_to_attend(text_mask: Tensor | None, slot_mask: Tensor | None, count: 
     words = everywhere[:, :count] if text_mask is None or not count else text_mask
     slots = everywhere[:, count:] if slot_mask is None else slot_mask
     return torch.cat([words, slots], dim=1)[:, None, None]
+
+
+def _add_bias(bias: Tensor | None, mask: Tensor | None, count: int) -> Tensor | None:
+    """What is added to attention logits: ``bias`` on the slots, which follow ``count`` tokens, and the mask."""
+    if bias is None:
+        return mask
+    bias = F.pad(bias, (count, 0, count, 0))
+    return bias if mask is None else bias.masked_fill(~mask, -torch.inf)
 
 
 def _embed(time: Tensor, dtype: torch.dtype) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -199,6 +200,20 @@ def test_fourier_features_are_off_as_published_and_need_positions(name: str) -> 
 
 
 _PLAIN = {"pose": torch.float32, "states": torch.int64, "time": torch.float32}
+
+
+@pytest.mark.parametrize("attention", ["plain", "relative"])
+def test_text_that_ends_in_double_blocks_is_read_and_its_padding_is_not(attention: str) -> None:
+    network = make("flux", "mixed", text_reach="double", attention=attention)
+    arguments = inputs("mixed", 7)
+    said = run(network, "mixed", arguments)
+    said.square().sum().backward()
+    assert [name for name, p in network.named_parameters() if p.grad is None or not p.grad.any()] == []
+    padded = torch.where(arguments["text_mask"][..., None], arguments["text"], 7.0)
+    torch.testing.assert_close(run(network, "mixed", {**arguments, "text": padded}), said, atol=1e-12, rtol=0)
+    assert (run(network, "mixed", {**arguments, "text": arguments["text"] + 0.5}) - said).abs().max() > 1e-3
+    everywhere = MixedFluxConfig(categories=8, hidden=32, text_width=16)
+    assert parameter_count(replace(everywhere, text_reach="double")) < parameter_count(everywhere)
 
 
 @pytest.mark.parametrize("process", PROCESSES)
