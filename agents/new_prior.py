@@ -147,7 +147,7 @@ def _text(config: PretrainConfig, prompts: Sequence[Sequence[str]]) -> AnyTextCo
         return None
     encoder = text_config(config.text_encoder, (prompt for group in prompts for prompt in group))
     if isinstance(encoder, TextConfig):
-        return replace(encoder, depth=config.text_depth, latents=config.text_latents)
+        return replace(encoder, width=config.text_width, depth=config.text_depth, latents=config.text_latents)
     return encoder
 
 

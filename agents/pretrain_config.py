@@ -62,7 +62,8 @@ class PretrainConfig:
         text: whether a mixed prior reads prompts.
         text_encoder: ``vocabulary`` for a small one with a closed vocabulary, trained with the prior; or the folder or
             hub name of a BERT model, which stays as it is.
-        text_depth: blocks of the small text encoder.
+        text_width: width of the small text encoder.
+        text_depth: its blocks.
         text_latents: tokens that it condenses a prompt to; 0 for one per word.
         text_reach: of the mixed flux network: text meets slots in its ``double``-stream blocks alone, which is quicker,
             or in ``all``, as in the paper's.
@@ -118,6 +119,7 @@ class PretrainConfig:
     empty_slots: str = "dropped"
     text: bool = False
     text_encoder: str = "vocabulary"
+    text_width: int = 128
     text_depth: int = 2
     text_latents: int = 16
     text_reach: str = "double"
