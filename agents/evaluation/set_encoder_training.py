@@ -53,7 +53,7 @@ class SetEncoderTraining:
     """
 
     scenes: int = 160
-    steps: int = 700
+    steps: int = 1050
     batch_size: int = 16
     learning_rate: float = 2e-3
     contrast_weight: float = 0.2

@@ -79,6 +79,15 @@ def test_tokens_hold_what_is_there_and_how_near_it_is() -> None:
     assert float(first[1, 3].sinh() * 5e-3) == pytest.approx(0.2 - width, abs=1e-5)
 
 
+def test_tokens_do_not_depend_on_the_order_of_the_slots(scenes: SceneBatch) -> None:
+    batch = scenes[:20]
+    order = torch.randperm(batch.tensor.shape[1], generator=torch.Generator().manual_seed(0))
+    ours, theirs = scene_tokens(batch), scene_tokens(SceneBatch(batch.tensor[:, order], batch.scene_type))
+    for name in ("poses", "offsets", "neighbours", "extents"):
+        sums = [getattr(tokens, name).double().square().flatten(1).sum(dim=1) for tokens in (ours, theirs)]
+        assert torch.allclose(*sums, rtol=1e-9), name
+
+
 def test_overlapping_boxes_have_a_negative_gap() -> None:
     batch = two_cups(0.02)
     width = float(np.ptp(batch.scene_type.library["teacup"].bounds[:, 0]))

@@ -103,9 +103,10 @@ def test_scene_distance_grows_with_position_noise(real: SceneBatch) -> None:
 
 def test_scene_distance_grows_with_swapped_assets(real: SceneBatch) -> None:
     a, b = real[:80], real[80:]
-    distances = [frechet_scene_distance(a, swapped(b, share)) for share in (0.0, 0.1, 0.3, 0.6)]
+    distances = [frechet_scene_distance(a, swapped(b, share)) for share in (0.0, 0.2, 0.4, 0.8)]
     assert distances == sorted(distances)
     assert distances[1] > 1.1 * distances[0]
+    assert distances[3] > 5 * distances[0]
 
 
 def test_features_do_not_depend_on_slots_their_order_or_the_batch(real: SceneBatch) -> None:
