@@ -1,5 +1,9 @@
 """How good scenes are, in numbers."""
 
+from agents.evaluation.classifier import classifier_accuracy
+from agents.evaluation.frechet import frechet_scene_distance
+from agents.evaluation.inception import frechet_inception_distance
+from agents.evaluation.judging import Accuracy, JudgeConfig
 from agents.evaluation.measure import evaluate_prior, grammar_scenes, layout_figures, measure_samples
 from agents.evaluation.metrics import (
     category_distribution,
@@ -18,22 +22,28 @@ from agents.evaluation.physics_figures import (
     stable_fraction,
 )
 from agents.evaluation.prompt_following import own_prompts, prompt_chance, prompt_following
+from agents.evaluation.render_classifier import render_classifier_accuracy
 from agents.evaluation.report import figure_table, how_to_read
 from agents.evaluation.supports import CONTAINERS, SUPPORTS, Container, Support
 
 __all__ = [
     "CONTAINERS",
     "SUPPORTS",
+    "Accuracy",
     "Container",
+    "JudgeConfig",
     "Neighbors",
     "Support",
     "category_distribution",
     "category_kl",
+    "classifier_accuracy",
     "collision_rate",
     "count_wasserstein",
     "duplicates",
     "evaluate_prior",
     "figure_table",
+    "frechet_inception_distance",
+    "frechet_scene_distance",
     "grammar_scenes",
     "height_errors",
     "how_to_read",
@@ -48,6 +58,7 @@ __all__ = [
     "prompt_chance",
     "prompt_following",
     "ready_figures",
+    "render_classifier_accuracy",
     "scene_distances",
     "stable_fraction",
     "workspace_fraction",
