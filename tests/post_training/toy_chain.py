@@ -11,6 +11,8 @@ from agents.diffusion import GaussianStep, StepTable
 class LinearChain(nn.Module):
     """x_{t-1} ~ N(theta x_t, sigma^2) in one slot of one feature; a last, deterministic step follows."""
 
+    conditional = False
+
     def __init__(self, theta: float, sigmas: tuple[float, ...]) -> None:
         super().__init__()
         self.theta = nn.Parameter(torch.tensor(theta, dtype=torch.float64))
