@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -95,15 +96,8 @@ def _continuous(config: PretrainConfig, raw: Tensor, normalizer: Normalizer) -> 
         config.scene,
         raw.shape[1],
         _network(config, code.features, normalizer),  # type: ignore[arg-type]
-        config.schedule,
-        config.prediction,
-        translation_weight=config.translation_weight,
         rotation=config.rotation,
-        timesteps=config.timesteps,
-        loss_weighting=config.loss_weighting,
-        noise_floor=config.noise_floor,
-        noise_ceiling=config.noise_ceiling,
-        clip=config.denoised_clip,
+        **_chain(config),
     )
     torch.manual_seed(config.seed)
     moments = "feature" if config.moments == "category" else config.moments
@@ -122,24 +116,24 @@ def _mixed(config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts:
         config.scene,
         raw.shape[1],
         network,  # type: ignore[arg-type]
-        config.schedule,
-        config.prediction,
-        config.kernel,
-        translation_weight=config.translation_weight,
+        kernel=config.kernel,
         category_loss=config.category_loss,
         category_weight=config.category_weight,
         given_share=config.given_share,
-        clip=config.denoised_clip,
         text=text,
-        noise_floor=config.noise_floor,
-        noise_ceiling=config.noise_ceiling,
-        timesteps=config.timesteps,
-        loss_weighting=config.loss_weighting,
         empty_slots=config.empty_slots,
+        **_chain(config),
     )
     torch.manual_seed(config.seed)
     free = raw[:FITTED_ON, len(scene_type.fixed) :]
     return MixedPrior(prior_config, normalizer, _pose_moments(config.moments, free, normalizer))
+
+
+def _chain(config: PretrainConfig) -> dict[str, Any]:
+    """What both kinds of prior are told of noise and loss."""
+    same = ("schedule", "prediction", "translation_weight", "timesteps", "loss_weighting")
+    noise = ("noise_floor", "noise_ceiling", "noise_mean", "noise_std")
+    return {key: getattr(config, key) for key in same + noise} | {"clip": config.denoised_clip}
 
 
 def _text(config: PretrainConfig, prompts: Sequence[Sequence[str]]) -> AnyTextConfig | None:

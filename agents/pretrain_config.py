@@ -41,6 +41,9 @@ class PretrainConfig:
         schedule: noise schedule (``karras``, ``linear``, ``cosine``).
         noise_floor: lowest noise-to-signal ratio of the karras schedule, in normalised units.
         noise_ceiling: highest noise-to-signal ratio of the karras schedule.
+        noise_mean: mean of ln(noise-to-signal) over training timesteps. Rooms, whose normalised unit is metres, need
+            less noise than tables: about -2.6, with a floor of 0.0004.
+        noise_std: its standard deviation.
         timesteps: law of training timesteps, ``lognormal`` (of the noise-to-signal ratio) or ``uniform``.
         loss_weighting: of the loss by timestep, ``none`` or ``min_snr``.
         moments: whose mean and spread scale what the network says: those of each ``category`` (of each feature, where
@@ -104,6 +107,8 @@ class PretrainConfig:
     schedule: str = "karras"
     noise_floor: float = 0.002
     noise_ceiling: float = 20.0
+    noise_mean: float = -1.8
+    noise_std: float = 2.1
     timesteps: str = "lognormal"
     loss_weighting: str = "none"
     moments: str = "category"
