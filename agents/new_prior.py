@@ -16,6 +16,7 @@ from agents.mixed_denoiser import MixedPriorConfig
 from agents.mixed_prior import MixedPrior
 from agents.networks import MixedFluxConfig, TextConfig
 from agents.networks.registry import NetworkConfig, network_config
+from agents.networks.text import TextEncoder, warn_unknown
 from agents.networks.text_encoders import AnyTextConfig, text_config
 from agents.pretrain_config import PretrainConfig
 from agents.prior import PROCESSES, ScenePrior
@@ -44,7 +45,7 @@ def build_prior(
         prompts: prompts of every scene, from which a prior that reads them takes its vocabulary.
     """
     if config.prior:
-        return _started(config, raw)
+        return _started(config, raw, prompts)
     if config.moments not in MOMENTS:
         raise unknown_name("moments", config.moments, MOMENTS)
     if config.process == "continuous":
@@ -54,8 +55,10 @@ def build_prior(
     raise unknown_name("process", config.process, PROCESSES)
 
 
-def _started(config: PretrainConfig, raw: Tensor) -> ScenePrior:
+def _started(config: PretrainConfig, raw: Tensor, prompts: Sequence[Sequence[str]]) -> ScenePrior:
     """The prior that ``config`` names, for raw scenes (M, N, D) of its type, which keep its normalizer.
+
+    Its vocabulary stays as it is; words of ``prompts`` that it lacks are listed in a warning.
 
     Raises:
         InvalidInputError: its scene type, its slots or its reading of prompts are not those of the run, or what it
@@ -70,6 +73,9 @@ def _started(config: PretrainConfig, raw: Tensor) -> ScenePrior:
         wrong = ", ".join(f"{n} {f!r}, not {a!r}" for n, f, a in zip(names, found, asked, strict=True) if f != a)
         raise InvalidInputError(f"the prior {config.prior!r} cannot be trained further on this data: it has {wrong}")
     _check_constants(prior, raw[:FITTED_ON, len(prior.scene_type.fixed) :], config.prior)
+    encoder = prior.denoiser.text_encoder if isinstance(prior, MixedPrior) else None
+    if isinstance(encoder, TextEncoder):
+        warn_unknown(encoder.unknown_words(prompt for group in prompts for prompt in group))
     return prior
 
 

@@ -8,7 +8,7 @@ import math
 import os
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,27 +19,19 @@ from torch import Generator, Tensor, nn
 from agents.averaging import Averaged, WeightAverage
 from agents.checkpoints import load_checkpoint, save_checkpoint
 from agents.mixed_prior import MixedPrior
-from agents.new_prior import FITTED_ON, build_prior
 from agents.optimizers import build_optimizer
 from agents.parallel import World
 from agents.pretrain_config import PretrainConfig
 from agents.prior import ScenePrior
-from agents.training_data import PROMPTS_PER_SCENE, GrammarStream, SceneTable, TrainingData, UnionTable
+from agents.training_data import TrainingData
 from agents.training_log import TrainingLog
-from scene_envs.datasets.prompts import describe_all
+from agents.training_setup import prepare
 from scene_envs.errors import InvalidInputError, MissingDependencyError, TrainingError, unknown_name
-from scene_envs.grammars import get_grammar
-from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import register_scene_type
 
 logger = logging.getLogger(__name__)
 
 _PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 _MATMUL_PRECISIONS = ("highest", "high", "medium")
-_SAMPLE = 1024
-"""Scenes of a grammar to which the moments and the vocabulary are fitted."""
-_HELD_OUT = 512
-"""Held-out scenes of a grammar."""
 
 
 def learning_rate_at(step: int, config: PretrainConfig) -> float:
@@ -286,56 +278,3 @@ def pretrain(config: PretrainConfig) -> dict[str, Any]:
     partial.write_text(json.dumps(metrics, indent=1))
     os.replace(partial, trainer.directory / "metrics.json")
     return metrics
-
-
-def prepare(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
-    """A fresh prior, its training scenes, and held-out scenes (K, N, D)."""
-    from scene_envs.datasets import SceneDataset, fixed_normalizer
-
-    if config.data == "grammar":
-        grammar = get_grammar(config.scene)
-        sample = grammar.sample(np.random.default_rng([config.seed, _SAMPLE]), _SAMPLE)
-        prompts = (
-            describe_all(sample, np.random.default_rng(config.seed), count=PROMPTS_PER_SCENE) if config.text else []
-        )
-        prior = build_prior(config, sample.tensor, fixed_normalizer(grammar), prompts)
-        if config.heldout:
-            held_out = SceneBatch(SceneDataset.load(config.heldout).tensor[:2048], prior.scene_type)
-        else:
-            held_out = grammar.sample(np.random.default_rng([config.seed, _SAMPLE, 1]), _HELD_OUT)
-        return prior, GrammarStream(grammar, prior), prior.encode(held_out)
-    if "," in config.data:
-        return _prepare_union(config)
-    dataset = SceneDataset.load(config.data)
-    raw, prompt_sets = dataset.tensor, dataset.prompt_sets
-    if config.heldout:
-        heldout_raw = SceneDataset.load(config.heldout).tensor
-    else:
-        split = max(1, len(raw) // 50)
-        raw, heldout_raw, prompt_sets = raw[:-split], raw[-split:], prompt_sets[:-split]
-    prior = build_prior(config, raw, dataset.normalizer, prompt_sets)
-
-    def encode(scenes: Tensor) -> Tensor:
-        return torch.cat([prior.encode(SceneBatch(part, prior.scene_type)) for part in scenes.split(10_000)])
-
-    return prior, SceneTable(encode(raw), prompt_sets), encode(heldout_raw[:2048])
-
-
-def _prepare_union(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
-    from scene_envs.datasets import SceneDataset, to_union, union_normalizer, union_scene_type
-
-    if config.heldout:
-        raise InvalidInputError(
-            f"heldout={config.heldout!r} is not read with several datasets: 2 % of each are held out; leave it out"
-        )
-    whole = [SceneDataset.load(folder.strip()) for folder in config.data.split(",")]
-    union = register_scene_type(union_scene_type([dataset.scene_type for dataset in whole]))
-    parts = [dataset.stable_split((0.98, 0.02), seed=0) for dataset in whole]
-    share = slice(min(5000, FITTED_ON // len(whole)))  # moments see scenes of every type
-    some = torch.cat([to_union(dataset.batch(share), union).tensor for dataset, _ in parts])
-    normalizer = union_normalizer([dataset.normalizer for dataset in whole], union)
-    prompts = [prompt for dataset in whole for prompt in dataset.prompt_sets]
-    prior = build_prior(replace(config, scene=union.name), some, normalizer, prompts)
-    data = UnionTable([train for train, _ in parts], prior)
-    heldout = torch.cat([data.encode(held.batch(slice(2048 // len(whole)))) for _, held in parts])
-    return prior, data, heldout

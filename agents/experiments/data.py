@@ -44,6 +44,8 @@ class RowData:
         Raises:
             InvalidInputError: several folders, or scenes of another type.
         """
+        from agents.training_setup import split_heldout
+
         if settings.data == "grammar":
             return cls(None, None)
         if "," in settings.data:
@@ -53,27 +55,15 @@ class RowData:
         whole = _read(settings.data, settings.scene)
         if settings.heldout:
             return cls(whole, _read(settings.heldout, settings.scene))
-        split = max(1, len(whole) // 50)
-        return cls(whole[: len(whole) - split], whole[len(whole) - split :])
+        return cls(*split_heldout(whole))
 
     def prepare(self, config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
         """A fresh prior, its training scenes, and held-out scenes (K, N, D), both as it encodes them."""
-        import torch
-
-        from agents.new_prior import build_prior
-        from agents.pretraining import prepare
-        from agents.training_data import SceneTable
-        from scene_envs.scene import SceneBatch
+        from agents.training_setup import prepare, prepare_from
 
         if self.training is None or self.heldout is None:
             return prepare(config)
-        prior = build_prior(config, self.training.tensor, self.training.normalizer, self.training.prompt_sets)
-
-        def encode(scenes: Tensor) -> Tensor:
-            return torch.cat([prior.encode(SceneBatch(part, prior.scene_type)) for part in scenes.split(10_000)])
-
-        table = SceneTable(encode(self.training.tensor), self.training.prompt_sets)
-        return prior, table, encode(self.heldout.tensor[:2048])
+        return prepare_from(config, self.training, self.heldout)
 
     def count_parameters(self, config: PretrainConfig) -> int:
         """Trained numbers of the prior that ``config`` asks for."""

@@ -111,6 +111,14 @@ class TextEncoder(nn.Module):
         longest = max(len(row) for row in rows)
         return torch.tensor([row + [PADDING] * (longest - len(row)) for row in rows]), unknown
 
+    def unknown_words(self, prompts: Iterable[str]) -> list[str]:
+        """Words of ``prompts`` that the vocabulary lacks, sorted.
+
+        >>> TextEncoder(TextConfig(words=("a", "cup"), width=8, heads=2)).unknown_words(["A cup.", "a jug"])
+        ['.', 'jug']
+        """
+        return sorted({word for prompt in prompts for word in split_words(prompt)} - self._index.keys())
+
     def forward(self, prompts: Sequence[str]) -> tuple[Tensor, Tensor]:
         """Tokens (B, L, W) and their mask (B, L), True for real ones; ``""`` stands for no prompt.
 

@@ -118,6 +118,17 @@ def test_vocabulary_and_encoder_survive_a_file(prior: MixedPrior, tmp_path: obje
     assert torch.equal(first.tensor, second.tensor)
 
 
+def test_training_further_lists_the_words_that_the_prior_lacks(
+    prior: MixedPrior, tmp_path: object, caplog: pytest.LogCaptureFixture
+) -> None:
+    prior.save(str(tmp_path))
+    scenes = get_grammar("dimsum_table").sample(np.random.default_rng(0), 8)
+    config = PretrainConfig(prior=str(tmp_path), process="mixed", text=True)
+    with caplog.at_level(logging.WARNING):
+        build_prior(config, scenes.tensor, Normalizer.fit(scenes.tensor), [("A zeppelin over 12 cups.",)] * 8)
+    assert "over, zeppelin" in caplog.text
+
+
 def test_a_vocabulary_holds_the_words_of_prompts_and_all_counts() -> None:
     words = vocabulary(PROMPTS)
     assert {"a", "scene", "cups", "12", "125", "."} <= set(words)
