@@ -170,6 +170,7 @@ def _network(config: PretrainConfig, features: int, normalizer: Normalizer, text
         frequencies=config.frequencies,
         unit=_unit(normalizer),
         text_reach=config.text_reach,
+        pooled_text=int(config.pooled_text),
     )
 
 

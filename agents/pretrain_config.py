@@ -70,6 +70,7 @@ class PretrainConfig:
         text_latents: tokens that it condenses a prompt to; 0 for one per word.
         text_reach: of the mixed flux network: text meets slots in its ``double``-stream blocks alone, which is quicker,
             or in ``all``, as in the paper's.
+        pooled_text: whether the mean of the text tokens also modulates every block of the mixed flux network.
         prompt_dropout: share of training scenes whose prompt is withheld, for classifier-free guidance.
         seed: of weights, batches and noise.
         log_every: steps between log rows.
@@ -114,7 +115,7 @@ class PretrainConfig:
     moments: str = "category"
     translation_weight: float = 3.0
     category_loss: str = "cross_entropy"
-    category_weight: float = 0.3
+    category_weight: float = 2.0
     given_share: float = 0.3
     denoised_clip: float = 0.0
     rotation: str = "matrix"
@@ -128,6 +129,7 @@ class PretrainConfig:
     text_depth: int = 2
     text_latents: int = 16
     text_reach: str = "double"
+    pooled_text: bool = True
     prompt_dropout: float = 0.1
     compile: bool = False
     seed: int = 0

@@ -48,6 +48,8 @@ class MixedFluxConfig:
         attention: ``"plain"``, or ``"relative"`` for attention that sees where other slots stand.
         unit: metres per normalised unit along x, y, z, which ``"relative"`` needs.
         text_reach: how far text goes: to the ``"double"``-stream blocks, or through ``"all"`` blocks, as the paper's.
+        pooled_text: 1 to add the mean of the text tokens to the embedded time, which modulates every block (as Flux
+            does with a pooled embedding), 0 as the paper.
     """
 
     categories: int
@@ -65,6 +67,7 @@ class MixedFluxConfig:
     attention: str = "plain"
     unit: tuple[float, float, float] = (1.0, 1.0, 1.0)
     text_reach: str = "all"
+    pooled_text: int = 0
 
     def __post_init__(self) -> None:
         if self.text_reach not in TEXT_REACHES:
@@ -173,6 +176,8 @@ class MixedFlux(nn.Module):
         self.scene_in = nn.Linear(width, hidden)
         self.time_in = nn.Sequential(nn.Linear(_TIME_WIDTH, hidden), nn.SiLU(), nn.Linear(hidden, hidden))
         self.text_in = nn.Linear(config.text_width, hidden) if config.text_width else None
+        pooled = config.text_width and config.pooled_text
+        self.pooled_in = nn.Linear(config.text_width, hidden, bias=False) if pooled else None
         doubles = config.double_blocks if config.text_width else 0
         features = FEATURES if config.attention == "relative" else 0
         self.double_blocks = nn.ModuleList(
@@ -227,6 +232,8 @@ class MixedFlux(nn.Module):
             pose output (B, N, 12) and logits (B, N, K) of the clean category.
         """
         condition = self.time_in(_embed(time * self.config.time_scale, pose.dtype))
+        if self.pooled_in is not None and text is not None:
+            condition = condition + self.pooled_in(_mean_token(text, text_mask))
         features = self.pose_in(self._pose_features(pose, position, noise_level)) + self.category_in(states)
         if self.given_in is not None and given is not None:
             features = features + self.given_in(given)
@@ -274,6 +281,14 @@ class MixedFlux(nn.Module):
         angle = position[..., None] * self.octaves  # (B, N, 3, F)
         damping = torch.exp(-0.5 * (self.octaves * noise_level[..., None]) ** 2).unsqueeze(-2)  # (B, N, 1, F)
         return torch.cat([pose, (angle.sin() * damping).flatten(-2), (angle.cos() * damping).flatten(-2)], dim=-1)
+
+
+def _mean_token(text: Tensor, mask: Tensor | None) -> Tensor:
+    """(B, W) mean of the real ones of tokens (B, L, W)."""
+    if mask is None:
+        return text.mean(dim=1)
+    real = mask[..., None].to(text)
+    return (text * real).sum(dim=1) / real.sum(dim=1).clamp(min=1.0)
 
 
 def _where_to_attend(text_mask: Tensor | None, slot_mask: Tensor | None, count: int, pose: Tensor) -> Tensor | None:

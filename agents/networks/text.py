@@ -84,8 +84,9 @@ class TextEncoder(nn.Module):
         )
         self.layers = nn.TransformerEncoder(layer, config.depth, enable_nested_tensor=False)
         self.norm = nn.LayerNorm(config.width)
-        self.questions = nn.Parameter(torch.randn(config.latents, config.width)) if config.latents else None
+        self.questions = nn.Parameter(0.2 * torch.randn(config.latents, config.width)) if config.latents else None
         self.condense = nn.MultiheadAttention(config.width, config.heads, batch_first=True) if config.latents else None
+        self.answer_norm = nn.LayerNorm(config.width) if config.latents else None
 
     @property
     def token_space(self) -> tuple[int, int]:
@@ -134,11 +135,11 @@ class TextEncoder(nn.Module):
         mask = indices != PADDING
         x = self.embedding(indices) + self.position[: indices.shape[1]]
         x = self.norm(self.layers(x, src_key_padding_mask=~mask))
-        if self.condense is None or self.questions is None:
+        if self.condense is None or self.questions is None or self.answer_norm is None:
             return x, mask
         asked = self.questions.expand(len(indices), -1, -1)
         answers, _ = self.condense(asked, x, x, key_padding_mask=~mask, need_weights=False)
-        return answers + asked, mask.new_ones(answers.shape[:2])
+        return self.answer_norm(answers + asked), mask.new_ones(answers.shape[:2])
 
 
 def warn_unknown(words: Sequence[str]) -> None:
