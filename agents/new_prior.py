@@ -147,7 +147,13 @@ def _text(config: PretrainConfig, prompts: Sequence[Sequence[str]]) -> AnyTextCo
         return None
     encoder = text_config(config.text_encoder, (prompt for group in prompts for prompt in group))
     if isinstance(encoder, TextConfig):
-        return replace(encoder, width=config.text_width, depth=config.text_depth, latents=config.text_latents)
+        return replace(
+            encoder,
+            width=config.text_width,
+            depth=config.text_depth,
+            latents=config.text_latents,
+            window=config.text_window,
+        )
     return encoder
 
 
@@ -171,6 +177,7 @@ def _network(config: PretrainConfig, features: int, normalizer: Normalizer, text
         unit=_unit(normalizer),
         text_reach=config.text_reach,
         pooled_text=int(config.pooled_text),
+        tally=int(config.tally),
     )
 
 

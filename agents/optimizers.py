@@ -20,22 +20,35 @@ _COEFFICIENTS = (3.4445, -4.7750, 2.0315)
 """Of the quintic Newton-Schulz iteration (Jordan et al. 2024)."""
 
 
-def build_optimizer(name: str, network: nn.Module, weight_decay: float) -> torch.optim.Optimizer:
-    """An optimiser of all parameters of ``network``; every group's ``lr`` is the rate of AdamW.
+def build_optimizer(
+    name: str, network: nn.Module, weight_decay: float, text_rate: float = 1.0
+) -> torch.optim.Optimizer:
+    """An optimiser of ``network``, whose groups say under ``rate`` what share of the learning rate is theirs.
 
     Args:
         name: ``"adamw"``, or ``"muon"`` for Muon on the matrices inside ``blocks`` and AdamW on the rest.
         network: what is trained.
         weight_decay: decoupled.
+        text_rate: of the parameters under ``text_encoder``. A few percent of the loss depend on prompts at first, and
+            steps as long as elsewhere blur all words to one before any is read.
     """
     if name not in OPTIMIZERS:
         raise unknown_name("optimizer", name, OPTIMIZERS)
+    named = [(key, parameter) for key, parameter in network.named_parameters() if parameter.requires_grad]
+    text = [p for key, p in named if key.startswith("text_encoder.")]
+    matrices = [p for key, p in named if p.ndim == 2 and "blocks." in key and name == "muon"]
+    taken = {id(p) for p in (*text, *matrices)}
+    others = [p for _, p in named if id(p) not in taken]
+    optimizer: torch.optim.Optimizer
     if name == "adamw":
-        return torch.optim.AdamW(network.parameters(), betas=_BETAS, weight_decay=weight_decay)
-    matrices = [p for key, p in network.named_parameters() if p.ndim == 2 and "blocks." in key]
-    inside = {id(p) for p in matrices}
-    others = [p for p in network.parameters() if id(p) not in inside]
-    return MuonAdamW(matrices, others, weight_decay=weight_decay)
+        optimizer = torch.optim.AdamW(others, betas=_BETAS, weight_decay=weight_decay)
+    else:
+        optimizer = MuonAdamW(matrices, others, weight_decay=weight_decay)
+    if text:
+        optimizer.add_param_group({"params": text, "kind": "adamw", "rate": text_rate})
+    for group in optimizer.param_groups:
+        group.setdefault("rate", 1.0)
+    return optimizer
 
 
 class MuonAdamW(torch.optim.Optimizer):

@@ -68,9 +68,13 @@ class PretrainConfig:
         text_width: width of the small text encoder.
         text_depth: its blocks.
         text_latents: tokens that it condenses a prompt to; 0 for one per word.
+        text_learning_rate: of the small text encoder, as a fraction of learning_rate.
         text_reach: of the mixed flux network: text meets slots in its ``double``-stream blocks alone, which is quicker,
             or in ``all``, as in the paper's.
         pooled_text: whether the mean of the text tokens also modulates every block of the mixed flux network.
+        tally: whether the mixed flux network is told how many slots it sees of each category, and how many are masked.
+        text_window: of the small text encoder: words that are read together before they attend to each other, odd; 1
+            reads each by itself.
         prompt_dropout: share of training scenes whose prompt is withheld, for classifier-free guidance.
         seed: of weights, batches and noise.
         log_every: steps between log rows.
@@ -128,8 +132,11 @@ class PretrainConfig:
     text_width: int = 128
     text_depth: int = 2
     text_latents: int = 16
+    text_learning_rate: float = 0.1
     text_reach: str = "double"
     pooled_text: bool = True
+    tally: bool = True
+    text_window: int = 3
     prompt_dropout: float = 0.1
     compile: bool = False
     seed: int = 0

@@ -80,7 +80,7 @@ class Pretrainer:
             raise unknown_name("precision", config.precision, _PRECISIONS)
         prior.denoiser.precision = _PRECISIONS[config.precision]
         self.average = WeightAverage(self.network, config.ema)
-        self.optimizer = build_optimizer(config.optimizer, self.network, config.weight_decay)
+        self.optimizer = build_optimizer(config.optimizer, self.network, config.weight_decay, config.text_learning_rate)
         if config.matmul_precision not in _MATMUL_PRECISIONS:
             raise unknown_name("matmul_precision", config.matmul_precision, _MATMUL_PRECISIONS)
         torch.set_float32_matmul_precision(config.matmul_precision)
@@ -149,7 +149,7 @@ class Pretrainer:
         self.world.sum_gradients(self.network.parameters())
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), config.clip)
         for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate_at(self.step, config)
+            group["lr"] = learning_rate_at(self.step, config) * group["rate"]
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.average.update(self.network)

@@ -17,6 +17,7 @@ from torch.nn import functional as F
 
 from agents.networks.flux import SingleStreamBlock, timestep_embedding
 from agents.networks.relations import FEATURES, Relations, joint_attention
+from agents.networks.tally import Tally
 from scene_envs.errors import InvalidInputError, unknown_name
 
 POSE = 12
@@ -50,6 +51,7 @@ class MixedFluxConfig:
         text_reach: how far text goes: to the ``"double"``-stream blocks, or through ``"all"`` blocks, as the paper's.
         pooled_text: 1 to add the mean of the text tokens to the embedded time, which modulates every block (as Flux
             does with a pooled embedding), 0 as the paper.
+        tally: 1 to add what is counted in the scene as well (:class:`~agents.networks.tally.Tally`), 0 as the paper.
     """
 
     categories: int
@@ -68,6 +70,7 @@ class MixedFluxConfig:
     unit: tuple[float, float, float] = (1.0, 1.0, 1.0)
     text_reach: str = "all"
     pooled_text: int = 0
+    tally: int = 0
 
     def __post_init__(self) -> None:
         if self.text_reach not in TEXT_REACHES:
@@ -178,6 +181,7 @@ class MixedFlux(nn.Module):
         self.text_in = nn.Linear(config.text_width, hidden) if config.text_width else None
         pooled = config.text_width and config.pooled_text
         self.pooled_in = nn.Linear(config.text_width, hidden, bias=False) if pooled else None
+        self.tally = Tally(config.categories, config.text_width, hidden) if config.tally else None
         doubles = config.double_blocks if config.text_width else 0
         features = FEATURES if config.attention == "relative" else 0
         self.double_blocks = nn.ModuleList(
@@ -232,8 +236,11 @@ class MixedFlux(nn.Module):
             pose output (B, N, 12) and logits (B, N, K) of the clean category.
         """
         condition = self.time_in(_embed(time * self.config.time_scale, pose.dtype))
-        if self.pooled_in is not None and text is not None:
-            condition = condition + self.pooled_in(_mean_token(text, text_mask))
+        pooled = None if text is None else _mean_token(text, text_mask)
+        if self.pooled_in is not None and pooled is not None:
+            condition = condition + self.pooled_in(pooled)
+        if self.tally is not None:
+            condition = condition + self.tally(states, pooled, slot_mask)
         features = self.pose_in(self._pose_features(pose, position, noise_level)) + self.category_in(states)
         if self.given_in is not None and given is not None:
             features = features + self.given_in(given)

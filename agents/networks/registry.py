@@ -78,6 +78,7 @@ def network_config(
     unit: tuple[float, float, float] = (1.0, 1.0, 1.0),
     text_reach: str = "all",
     pooled_text: int = 0,
+    tally: int = 0,
 ) -> NetworkConfig:
     """The size of a network from the keys that all networks share.
 
@@ -94,7 +95,7 @@ def network_config(
         attention: read by the mixed ``flux`` alone, see :class:`~agents.networks.MixedFluxConfig`.
         frequencies: read by ``flux`` alone: the others are as published, unless their configuration is made by hand.
         unit: read by the mixed ``flux`` alone.
-        text_reach, pooled_text: read by the mixed ``flux`` alone.
+        text_reach, pooled_text, tally: read by the mixed ``flux`` alone.
 
     Raises:
         UnknownNameError: no network or no process has that name.
@@ -117,7 +118,7 @@ def network_config(
     else:
         sizes |= {"double_blocks": max(1, depth // 3), "single_blocks": depth, "embedding": hidden}
         sizes |= {"text_width": text_width, "attention": attention, "frequencies": frequencies, "unit": unit}
-        sizes |= {"text_reach": text_reach, "pooled_text": pooled_text}
+        sizes |= {"text_reach": text_reach, "pooled_text": pooled_text, "tally": tally}
     config: NetworkConfig = entry.config(**sizes)
     return config
 

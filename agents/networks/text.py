@@ -40,6 +40,7 @@ class TextConfig:
         heads: attention heads.
         max_tokens: longest prompt, its start token included.
         latents: tokens that a prompt is condensed to, so that long ones cost no more than short ones; 0 for none.
+        window: neighbouring words that are read together before attention ("two tea bottles"), an odd number.
     """
 
     words: tuple[str, ...]
@@ -48,6 +49,11 @@ class TextConfig:
     heads: int = 4
     max_tokens: int = 128
     latents: int = 16
+    window: int = 1
+
+    def __post_init__(self) -> None:
+        if self.window < 1 or self.window % 2 == 0:
+            raise InvalidInputError(f"a text window of {self.window} words: give an odd number, 1 for single words")
 
 
 def vocabulary(prompts: Iterable[str]) -> tuple[str, ...]:
@@ -73,6 +79,9 @@ class TextEncoder(nn.Module):
         self._index = {word: index + _SPECIAL for index, word in enumerate(config.words)}
         self.embedding = nn.Embedding(len(config.words) + _SPECIAL, config.width)
         self.position = nn.Parameter(0.02 * torch.randn(config.max_tokens, config.width))
+        self.phrases = (
+            nn.Conv1d(config.width, config.width, config.window, padding="same") if config.window > 1 else None
+        )
         layer = nn.TransformerEncoderLayer(
             config.width,
             config.heads,
@@ -133,7 +142,11 @@ class TextEncoder(nn.Module):
         """The same from token indices (B, L) int64 as :meth:`tokenize` gives them."""
         indices = indices.to(self.position.device)
         mask = indices != PADDING
-        x = self.embedding(indices) + self.position[: indices.shape[1]]
+        x = self.embedding(indices)
+        if self.phrases is not None:
+            words = (x * mask[..., None]).transpose(1, 2)
+            x = x + self.phrases(words).transpose(1, 2)
+        x = x + self.position[: indices.shape[1]]
         x = self.norm(self.layers(x, src_key_padding_mask=~mask))
         if self.condense is None or self.questions is None or self.answer_norm is None:
             return x, mask

@@ -27,6 +27,7 @@ from agents.networks import (
     network_config,
     parameter_count,
 )
+from agents.networks.tally import count_states
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 FEATURES, CATEGORIES, TEXT = 20, 8, 12
@@ -48,6 +49,8 @@ def make(name: str, process: str, text_width: int = TEXT, zero: bool = False, **
         heads=2,
         text_width=text_width,
         frequencies=2,
+        pooled_text=1,
+        tally=1,
     )
     torch.manual_seed(0)
     network = build_network(type(config)(**{**vars(config), **fields})).double()
@@ -176,6 +179,13 @@ def test_gradients_reach_every_parameter(name: str, process: str, text: bool) ->
     run(network, process, inputs(process, 9, text)).square().sum().backward()
     dead = [name for name, value in network.named_parameters() if value.grad is None or not value.grad.any()]
     assert dead == []
+
+
+def test_a_tally_counts_what_is_seen_and_no_filling() -> None:
+    states = torch.tensor([[0, 3, 3, 7, 8, 8], [8, 8, 1, 1, 1, 2]])  # 7 is empty, 8 the mask
+    mask = torch.tensor([[True] * 6, [False, True, False, True, True, True]])
+    expected = [[1, 0, 0, 2, 0, 0, 0, 2], [0, 2, 1, 0, 0, 0, 0, 1]]
+    assert count_states(states, CATEGORIES, mask).tolist() == expected
 
 
 @pytest.mark.parametrize("name", BASELINES)

@@ -80,6 +80,19 @@ def test_its_state_resumes_exactly() -> None:
         assert torch.equal(a, b)
 
 
+@pytest.mark.parametrize("name", ["muon", "adamw"])
+def test_a_text_encoder_has_a_share_of_the_learning_rate(name: str) -> None:
+    network = nn.ModuleDict({"blocks": nn.Linear(4, 4), "text_encoder": nn.Linear(4, 4), "out": nn.Linear(4, 4)})
+    optimizer = build_optimizer(name, network, 0.0, text_rate=0.1)
+    rates = {id(p): group["rate"] for group in optimizer.param_groups for p in group["params"]}
+    assert {key: rates[id(p)] for key, p in network.named_parameters() if key.endswith("bias")} == {
+        "blocks.bias": 1.0,
+        "text_encoder.bias": 0.1,
+        "out.bias": 1.0,
+    }
+    assert len(rates) == 6
+
+
 def test_an_unknown_optimizer_is_named() -> None:
     with pytest.raises(UnknownNameError, match="muon"):
         build_optimizer("mion", nn.Linear(2, 2), 0.0)

@@ -37,9 +37,9 @@ def prior() -> MixedPrior:
     return made.eval()
 
 
-@pytest.mark.parametrize("latents", [0, 4])
-def test_padding_changes_nothing_in_the_encoder(latents: int) -> None:
-    encoder = TextEncoder(TextConfig(vocabulary(PROMPTS), width=16, heads=2, latents=latents)).eval()
+@pytest.mark.parametrize(("latents", "window"), [(0, 1), (4, 1), (0, 3), (4, 5)])
+def test_padding_changes_nothing_in_the_encoder(latents: int, window: int) -> None:
+    encoder = TextEncoder(TextConfig(vocabulary(PROMPTS), width=16, heads=2, latents=latents, window=window)).eval()
     alone, _ = encoder(PROMPTS[:1])
     tokens, mask = encoder([PROMPTS[0], PROMPTS[1] + " " + PROMPTS[1]])
     assert tokens.shape[1] == (latents or 19)
@@ -165,6 +165,11 @@ def test_a_vocabulary_holds_the_words_of_prompts_and_all_counts() -> None:
     indices, unknown = encoder.tokenize(PROMPTS)
     assert indices.shape[0] == 2
     assert unknown == []
+
+
+def test_a_window_of_words_is_odd() -> None:
+    with pytest.raises(InvalidInputError, match="window of 2 words: give an odd number"):
+        TextConfig(words=("cup",), window=2)
 
 
 def test_a_network_with_text_has_double_blocks_and_one_without_has_none() -> None:
