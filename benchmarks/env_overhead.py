@@ -145,7 +145,7 @@ def compare(bare: Callable[[], None], faces: Sequence[tuple[str, Callable[[], No
 def main() -> None:
     """Parse the arguments, run, print a Markdown table."""
     parser = argparse.ArgumentParser(description="Overhead of the environment faces over a bare sampling loop.")
-    parser.add_argument("--prior", default="dimsum_table", help="name or path; 'tiny' for an untrained one")
+    parser.add_argument("--prior", default="dimsum_table_continuous", help="name or path; 'tiny' for an untrained one")
     parser.add_argument("--batch", type=int, default=128)
     parser.add_argument("--steps", type=int, default=10)
     parser.add_argument("--rounds", type=int, default=3)

@@ -135,7 +135,7 @@ def measure(run: Callable[[], None], ignored: list[Tensor]) -> int:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--prior", default="dimsum_table", help="name, directory, or 'tiny'")
+    parser.add_argument("--prior", default="dimsum_table_continuous", help="name, directory, or 'tiny'")
     parser.add_argument("--batch-size", type=int, default=8)
     parser.add_argument("--steps", type=int, nargs="+", default=[10, 25, 50, 100])
     arguments = parser.parse_args()

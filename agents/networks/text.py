@@ -18,6 +18,8 @@ _TOKEN = re.compile(r"[a-z]+|\d+|[^\sa-z\d]")
 PADDING, UNKNOWN, START = 0, 1, 2
 """The first tokens: padding, a word outside the vocabulary, and the start of every prompt."""
 _SPECIAL = 3
+_CHUNKS = 4
+"""Parts of a batch of prompts on the CPU, each as wide as its longest prompt."""
 
 
 def split_words(prompt: str) -> list[str]:
@@ -141,6 +143,16 @@ class TextEncoder(nn.Module):
     def encode(self, indices: Tensor) -> tuple[Tensor, Tensor]:
         """The same from token indices (B, L) int64 as :meth:`tokenize` gives them."""
         indices = indices.to(self.position.device)
+        if self.condense is None or len(indices) < 4 * _CHUNKS or indices.device.type != "cpu":
+            return self._encode(indices)
+        lengths = (indices != PADDING).sum(dim=1)  # in parts of similar length: few prompts are as long as the longest
+        order = torch.argsort(lengths, stable=True)
+        parts = [self._encode(indices[rows, : int(lengths[rows].max())]) for rows in order.tensor_split(_CHUNKS)]
+        back = torch.argsort(order)
+        tokens, mask = (torch.cat(side)[back] for side in zip(*parts, strict=True))
+        return tokens, mask
+
+    def _encode(self, indices: Tensor) -> tuple[Tensor, Tensor]:
         mask = indices != PADDING
         x = self.embedding(indices)
         if self.phrases is not None:

@@ -73,7 +73,7 @@ class PostTrainConfig:
         progress: ``"bar"``, ``"lines"`` or ``"none"``.
     """
 
-    prior: str = "dimsum_table"
+    prior: str = "dimsum_table_continuous"
     reward: Any = "object_count"
     output: str = "runs/post-train"
     seed: int = 0

@@ -11,7 +11,7 @@ from agents.post_training.steering import steer
 from agents.prior import ScenePrior
 
 RECIPE = PostTrainConfig(
-    prior="dimsum_table",
+    prior="dimsum_table_continuous",
     reward="object_count",
     iterations=24,
     batch_size=32,

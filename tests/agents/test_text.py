@@ -47,6 +47,13 @@ def test_padding_changes_nothing_in_the_encoder(latents: int, window: int) -> No
     assert bool(mask[0].all()) == bool(latents)
 
 
+def test_prompts_of_many_lengths_are_read_as_one_by_one() -> None:
+    prompts = [" ".join(["two cups and"] * (1 + number % 7)) for number in range(24)]
+    encoder = TextEncoder(TextConfig(vocabulary(prompts), width=16, heads=2, latents=4, window=3)).eval()
+    alone = torch.cat([encoder([prompt])[0] for prompt in prompts])
+    torch.testing.assert_close(encoder(prompts)[0], alone, atol=1e-5, rtol=1e-4)
+
+
 def test_padding_changes_nothing_in_the_network(prior: MixedPrior) -> None:
     x, t = prior.initial(1, 34, torch.Generator().manual_seed(0)), torch.tensor([500])
     tokens, mask = prior.encode_prompts(PROMPTS[:1])
