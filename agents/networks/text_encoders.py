@@ -44,8 +44,8 @@ def text_config(key: str, prompts: Iterable[str]) -> AnyTextConfig:
 def text_config_from_state(fields: Mapping[str, Any] | None) -> AnyTextConfig | None:
     """Inverse of :func:`dataclasses.asdict`, also after a trip through JSON; None stays None.
 
-    >>> text_config_from_state({"words": ["cup"], "width": 8})
-    TextConfig(words=('cup',), width=8, depth=2, heads=4, max_tokens=128, latents=16)
+    >>> text_config_from_state({"words": ["cup"], "width": 8}).width
+    8
     """
     if fields is None:
         return None
