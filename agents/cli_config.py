@@ -22,6 +22,7 @@ _WANTED = {
     float | None: "a number or null",
     bool: "true or false",
 }
+_OPENING = "[{('\""
 _FIELD = re.compile(r"(\w+): (.*)")
 
 
@@ -71,7 +72,8 @@ def format_rows(rows: Sequence[tuple[str, str]]) -> str:
 def compose(command: str, config: type, words: Sequence[str]) -> Any:
     """An instance of ``config`` from ``key=value`` words over the packaged configuration of ``command``.
 
-    Values are written as in Hydra: numbers, ``true``, ``null``, ``[1, 2]``, ``{name: clip, high: 20}``.
+    Values are written as in Hydra: numbers, ``true``, ``null``, ``[1, 2]``, ``{name: clip, high: 20}``; the brackets of
+    a list may be left out.
 
     Raises:
         UnknownNameError: no such key; the nearest one is offered.
@@ -109,6 +111,8 @@ def _override(command: str, word: str, hints: dict[str, Any]) -> str:
         raise unknown_name(f"{command} key", key, hints)
     if hints[key] is str or (hints[key] == (str | None) and value != "null"):
         value = _quoted(value)
+    elif "," in value and value[0] not in _OPENING:
+        value = f"[{value}]"  # a,b is a list, where Hydra would see a sweep
     return f"{key}={value}"
 
 

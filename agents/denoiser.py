@@ -26,8 +26,9 @@ class PriorConfig:
         noise_std: its standard deviation.
         translation_weight: weight of x, y, z in the pretraining loss, other features having 1.
         rotation: what is diffused as rotation, ``"matrix"``, ``"quaternion"`` or ``"axis_angle"``.
-        timesteps: law of training timesteps, ``"lognormal"`` (of the noise-to-signal ratio) or ``"uniform"``; None is
-            what was published with the prediction, lognormal for ``"karras"`` and uniform for the others.
+        timesteps: law of training timesteps, ``"lognormal"`` (of the noise-to-signal ratio), ``"uniform"`` or
+            ``"both"`` in equal parts; None is what was published with the prediction, lognormal for ``"karras"`` and
+            uniform for the others.
         loss_weighting: of the loss by timestep, ``"none"`` or ``"min_snr"``.
         noise_floor: lowest noise-to-signal ratio of the ``"karras"`` schedule, in normalised units.
         noise_ceiling: highest.

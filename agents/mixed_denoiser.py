@@ -53,7 +53,8 @@ class MixedPriorConfig:
         text: kind and size of the text encoder; None for a prior that reads no prompts.
         noise_floor: lowest noise-to-signal ratio of the ``"karras"`` schedule, in normalised units.
         noise_ceiling: highest.
-        timesteps: law of training timesteps, ``"lognormal"`` (of the noise-to-signal ratio) or ``"uniform"``.
+        timesteps: law of training timesteps, ``"lognormal"`` (of the noise-to-signal ratio), ``"uniform"`` or
+            ``"both"`` in equal parts.
         loss_weighting: of the pose loss by timestep, ``"none"`` or ``"min_snr"``.
         empty_slots: ``"dropped"`` leaves slots that are known to be empty out of the network, which saves most of the
             work at low noise and needs an absorbing kernel; ``"attended"`` is the paper's.

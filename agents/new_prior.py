@@ -17,7 +17,7 @@ from agents.mixed_prior import MixedPrior
 from agents.networks import MixedFluxConfig, TextConfig
 from agents.networks.registry import NetworkConfig, network_config
 from agents.networks.text import TextEncoder, warn_unknown
-from agents.networks.text_encoders import AnyTextConfig, text_config
+from agents.networks.text_encoders import VOCABULARY, AnyTextConfig, text_config
 from agents.pretrain_config import PretrainConfig
 from agents.prior import PROCESSES, ScenePrior
 from agents.rotation_codes import SceneCode
@@ -153,6 +153,8 @@ def _text(config: PretrainConfig, prompts: Sequence[Sequence[str]]) -> AnyTextCo
             depth=config.text_depth,
             latents=config.text_latents,
             window=config.text_window,
+            numbers=config.text_numbers,
+            categories=get_scene_type(config.scene).num_assets + 1 if _requests(config) else 0,
         )
     return encoder
 
@@ -178,6 +180,17 @@ def _network(config: PretrainConfig, features: int, normalizer: Normalizer, text
         text_reach=config.text_reach,
         pooled_text=int(config.pooled_text),
         tally=int(config.tally),
+        requests=int(_requests(config)),
+    )
+
+
+def _requests(config: PretrainConfig) -> bool:
+    """Whether the network is told what a prompt asks of each category."""
+    return (
+        config.text_requests
+        and config.network == "flux"
+        and config.text_encoder == VOCABULARY
+        and config.text_latents > 0
     )
 
 

@@ -44,7 +44,8 @@ class PretrainConfig:
         noise_mean: mean of ln(noise-to-signal) over training timesteps. Rooms, whose normalised unit is metres, need
             less noise than tables: about -2.6, with a floor of 0.0004.
         noise_std: its standard deviation.
-        timesteps: law of training timesteps, ``lognormal`` (of the noise-to-signal ratio) or ``uniform``.
+        timesteps: law of training timesteps, ``lognormal`` (of the noise-to-signal ratio), ``uniform``, or ``both`` in
+            equal parts: categories are decided at high noise, which the first rarely draws.
         loss_weighting: of the loss by timestep, ``none`` or ``min_snr``.
         moments: whose mean and spread scale what the network says: those of each ``category`` (of each feature, where
             the process is continuous), of each ``feature``, or of the ``scene`` as a whole.
@@ -75,6 +76,10 @@ class PretrainConfig:
         tally: whether the mixed flux network is told how many slots it sees of each category, and how many are masked.
         text_window: of the small text encoder: words that are read together before they attend to each other, odd; 1
             reads each by itself.
+        text_requests: whether the small text encoder also says what is asked of each category, which joins the logits
+            of the mixed flux network beside what it sees; needs text_latents.
+        text_numbers: of the small text encoder: whether words that are numbers say how many they are, so that counts
+            need not be learned number by number.
         prompt_dropout: share of training scenes whose prompt is withheld, for classifier-free guidance.
         seed: of weights, batches and noise.
         log_every: steps between log rows.
@@ -132,11 +137,13 @@ class PretrainConfig:
     text_width: int = 128
     text_depth: int = 2
     text_latents: int = 16
-    text_learning_rate: float = 0.1
+    text_learning_rate: float = 0.5
     text_reach: str = "double"
     pooled_text: bool = True
     tally: bool = True
     text_window: int = 3
+    text_requests: bool = True
+    text_numbers: bool = True
     prompt_dropout: float = 0.1
     compile: bool = False
     seed: int = 0

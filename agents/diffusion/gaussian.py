@@ -152,8 +152,8 @@ class GaussianProcess:
         return self.preconditioning.mean.to(like), self.preconditioning.std.to(like)
 
 
-TIMESTEP_LAWS = ("lognormal", "uniform")
-"""How training timesteps are drawn: the logarithm of the noise-to-signal ratio being normal, or all alike."""
+TIMESTEP_LAWS = ("lognormal", "uniform", "both")
+"""How training timesteps are drawn: a normal logarithm of the noise-to-signal ratio, all alike, or half each."""
 
 
 def timestep_weights(law: str, schedule: NoiseSchedule, mean: float, std: float) -> Tensor:
@@ -164,7 +164,7 @@ def timestep_weights(law: str, schedule: NoiseSchedule, mean: float, std: float)
         return lognormal_timesteps(schedule, mean, std)
     weight = torch.full((schedule.num_timesteps + 1,), 1.0 / schedule.num_timesteps, dtype=torch.float64)
     weight[0] = 0.0
-    return weight
+    return weight if law == "uniform" else 0.5 * (weight + lognormal_timesteps(schedule, mean, std))
 
 
 def lognormal_timesteps(schedule: NoiseSchedule, mean: float, std: float) -> Tensor:

@@ -44,7 +44,7 @@ FACTORS: tuple[Setting, ...] = (
     *_each("schedule", "schedule", "karras", "cosine", "linear"),
     *_each("noise floor", "noise_floor", 0.01, 0.002, 0.0005),
     *_each("noise ceiling", "noise_ceiling", 20.0, 80.0),
-    *_each("timesteps", "timesteps", "lognormal", "uniform"),
+    *_each("timesteps", "timesteps", "lognormal", "uniform", "both"),
     *_each("moments per", "moments", "scene", "feature", "category"),
     *_each("translation weight", "translation_weight", 1.0, 3.0),
     *_each("attention", "attention", "plain", "relative"),

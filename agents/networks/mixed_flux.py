@@ -17,6 +17,7 @@ from torch.nn import functional as F
 
 from agents.networks.flux import SingleStreamBlock, timestep_embedding
 from agents.networks.relations import FEATURES, Relations, joint_attention
+from agents.networks.requests import Requests
 from agents.networks.tally import Tally
 from scene_envs.errors import InvalidInputError, unknown_name
 
@@ -52,6 +53,8 @@ class MixedFluxConfig:
         pooled_text: 1 to add the mean of the text tokens to the embedded time, which modulates every block (as Flux
             does with a pooled embedding), 0 as the paper.
         tally: 1 to add what is counted in the scene as well (:class:`~agents.networks.tally.Tally`), 0 as the paper.
+        requests: 1 where the first K text tokens say what is asked of each category, in order, which then joins the
+            logits (:class:`~agents.networks.requests.Requests`); 0 as the paper.
     """
 
     categories: int
@@ -71,6 +74,7 @@ class MixedFluxConfig:
     text_reach: str = "all"
     pooled_text: int = 0
     tally: int = 0
+    requests: int = 0
 
     def __post_init__(self) -> None:
         if self.text_reach not in TEXT_REACHES:
@@ -182,6 +186,8 @@ class MixedFlux(nn.Module):
         pooled = config.text_width and config.pooled_text
         self.pooled_in = nn.Linear(config.text_width, hidden, bias=False) if pooled else None
         self.tally = Tally(config.categories, config.text_width, hidden) if config.tally else None
+        requests = config.requests and config.text_width
+        self.requests = Requests(config.categories, config.text_width, hidden) if requests else None
         doubles = config.double_blocks if config.text_width else 0
         features = FEATURES if config.attention == "relative" else 0
         self.double_blocks = nn.ModuleList(
@@ -225,7 +231,7 @@ class MixedFlux(nn.Module):
             pose: (B, N, 12) noisy poses, as the process scales them.
             states: (B, N) int64 in 0..K, K being the mask token.
             time: (B,) what is embedded, times ``time_scale``: a timestep or a log noise level.
-            text: (B, L, W) text tokens; None for no text, which needs no double-stream blocks.
+            text: (B, L, W) text tokens; None for no text. With ``requests`` the first K of them are of the categories.
             text_mask: (B, L) bool, True for real tokens.
             position: (B, N, 3) translations in signal units, for the Fourier features.
             noise_level: (B, N) noise-to-signal ratio of ``position``.
@@ -235,6 +241,10 @@ class MixedFlux(nn.Module):
         Returns:
             pose output (B, N, 12) and logits (B, N, K) of the clean category.
         """
+        asked = None
+        if self.requests is not None and text is not None:
+            asked, text = text[:, : self.config.categories], text[:, self.config.categories :]
+            text_mask = None if text_mask is None else text_mask[:, self.config.categories :]
         condition = self.time_in(_embed(time * self.config.time_scale, pose.dtype))
         pooled = None if text is None else _mean_token(text, text_mask)
         if self.pooled_in is not None and pooled is not None:
@@ -261,7 +271,10 @@ class MixedFlux(nn.Module):
         scene = scene[:, count:]
         shift, scale = self.final_modulation(F.silu(condition)).unsqueeze(1).chunk(2, dim=-1)
         features = self.final((1 + scale) * F.layer_norm(scene, (self.config.hidden,), eps=1e-6) + shift)
-        return self.pose_out(features), self.logits_out(features)
+        logits = self.logits_out(features)
+        if self.requests is not None:
+            logits = logits + self.requests(states, asked, slot_mask)[:, None]
+        return self.pose_out(features), logits
 
     def _words(self, text: Tensor | None, pose: Tensor) -> Tensor | None:
         if self.text_in is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from scene_envs.datasets.prompts.language import NUMBERS
 from scene_envs.errors import InvalidInputError
 
 _LOGGER = logging.getLogger(__name__)
@@ -18,6 +20,7 @@ _TOKEN = re.compile(r"[a-z]+|\d+|[^\sa-z\d]")
 PADDING, UNKNOWN, START = 0, 1, 2
 """The first tokens: padding, a word outside the vocabulary, and the start of every prompt."""
 _SPECIAL = 3
+_PERIODS = (4, 16, 64)
 _CHUNKS = 4
 """Parts of a batch of prompts on the CPU, each as wide as its longest prompt."""
 
@@ -29,6 +32,28 @@ def split_words(prompt: str) -> list[str]:
     ['a', 'scene', 'with', '12', 'cups', ',', 'and', 'a', 'lid', '.']
     """
     return _TOKEN.findall(prompt.lower())
+
+
+def number_features(word: str) -> list[float]:
+    """What a word says of numbers: 1, n/16, log(1 + n), and sines and cosines of n; zeros where it is no number.
+
+    Embeddings alone would have to learn for each number by itself how many it is. Articles stand for 1.
+
+    >>> number_features("three")[:3] == number_features("3")[:3] == [1.0, 3 / 16, math.log(4)]
+    True
+    >>> sum(map(abs, number_features("cups")))
+    0.0
+    """
+    if word.isdigit():
+        number = int(word)
+    elif word in ("a", "an"):
+        number = 1
+    elif word in NUMBERS:
+        number = NUMBERS.index(word)
+    else:
+        return [0.0] * (3 + 2 * len(_PERIODS))
+    angles = [2 * math.pi * number / period for period in _PERIODS]
+    return [1.0, number / 16, math.log1p(number), *map(math.sin, angles), *map(math.cos, angles)]
 
 
 @dataclass(frozen=True)
@@ -43,6 +68,9 @@ class TextConfig:
         max_tokens: longest prompt, its start token included.
         latents: tokens that a prompt is condensed to, so that long ones cost no more than short ones; 0 for none.
         window: neighbouring words that are read together before attention ("two tea bottles"), an odd number.
+        categories: of how many categories it says as well what is asked of them, a token each before the latents; needs
+            latents.
+        numbers: whether words that are numbers say how many they are (:func:`number_features`).
     """
 
     words: tuple[str, ...]
@@ -52,8 +80,12 @@ class TextConfig:
     max_tokens: int = 128
     latents: int = 16
     window: int = 1
+    categories: int = 0
+    numbers: bool = False
 
     def __post_init__(self) -> None:
+        if self.categories and not self.latents:
+            raise InvalidInputError("a text encoder without latents answers for no categories; give latents")
         if self.window < 1 or self.window % 2 == 0:
             raise InvalidInputError(f"a text window of {self.window} words: give an odd number, 1 for single words")
 
@@ -80,6 +112,10 @@ class TextEncoder(nn.Module):
         self.config = config
         self._index = {word: index + _SPECIAL for index, word in enumerate(config.words)}
         self.embedding = nn.Embedding(len(config.words) + _SPECIAL, config.width)
+        features = torch.tensor([number_features(word) for word in [""] * _SPECIAL + [*config.words]])
+        self.number_table: Tensor
+        self.register_buffer("number_table", features, persistent=False)
+        self.number_in = nn.Linear(features.shape[1], config.width, bias=False) if config.numbers else None
         self.position = nn.Parameter(0.02 * torch.randn(config.max_tokens, config.width))
         self.phrases = (
             nn.Conv1d(config.width, config.width, config.window, padding="same") if config.window > 1 else None
@@ -95,7 +131,8 @@ class TextEncoder(nn.Module):
         )
         self.layers = nn.TransformerEncoder(layer, config.depth, enable_nested_tensor=False)
         self.norm = nn.LayerNorm(config.width)
-        self.questions = nn.Parameter(0.2 * torch.randn(config.latents, config.width)) if config.latents else None
+        questions = config.categories + config.latents
+        self.questions = nn.Parameter(0.2 * torch.randn(questions, config.width)) if questions else None
         self.condense = nn.MultiheadAttention(config.width, config.heads, batch_first=True) if config.latents else None
         self.answer_norm = nn.LayerNorm(config.width) if config.latents else None
 
@@ -155,6 +192,8 @@ class TextEncoder(nn.Module):
     def _encode(self, indices: Tensor) -> tuple[Tensor, Tensor]:
         mask = indices != PADDING
         x = self.embedding(indices)
+        if self.number_in is not None:
+            x = x + self.number_in(self.number_table[indices])
         if self.phrases is not None:
             words = (x * mask[..., None]).transpose(1, 2)
             x = x + self.phrases(words).transpose(1, 2)

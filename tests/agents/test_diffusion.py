@@ -6,7 +6,14 @@ import pytest
 import torch
 from diffusers import DDPMScheduler
 
-from agents.diffusion import GaussianProcess, Preconditioning, StepTable, lognormal_timesteps, make_schedule
+from agents.diffusion import (
+    GaussianProcess,
+    Preconditioning,
+    StepTable,
+    lognormal_timesteps,
+    make_schedule,
+    timestep_weights,
+)
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 D = 20
@@ -121,6 +128,13 @@ def test_broken_step_tables_are_refused() -> None:
 def test_unknown_schedule_names_the_nearest() -> None:
     with pytest.raises(UnknownNameError, match="karras"):
         make_schedule("karas")
+
+
+def test_half_of_both_laws_of_timesteps_is_uniform() -> None:
+    schedule = make_schedule("karras", num_timesteps=100)
+    laws = [timestep_weights(law, schedule, -1.2, 1.0) for law in ("both", "lognormal", "uniform")]
+    torch.testing.assert_close(laws[0], (laws[1] + laws[2]) / 2)
+    assert float(laws[0].sum()) == pytest.approx(1.0)
 
 
 def test_training_timesteps_follow_the_lognormal_law() -> None:

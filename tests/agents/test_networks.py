@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from agents.networks import (
     NETWORKS,
@@ -27,6 +28,7 @@ from agents.networks import (
     network_config,
     parameter_count,
 )
+from agents.networks.requests import Requests
 from agents.networks.tally import count_states
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
@@ -51,6 +53,7 @@ def make(name: str, process: str, text_width: int = TEXT, zero: bool = False, **
         frequencies=2,
         pooled_text=1,
         tally=1,
+        requests=1,
     )
     torch.manual_seed(0)
     network = build_network(type(config)(**{**vars(config), **fields})).double()
@@ -88,6 +91,11 @@ def run(network: nn.Module, process: str, arguments: dict[str, Any]) -> Tensor:
     """What a network says, (B, N, numbers)."""
     if type(network).__name__ == "FluxDenoiser":
         arguments = {key: value for key, value in arguments.items() if not key.startswith("text")}
+    if getattr(network, "requests", None) is not None and arguments["text"] is not None:
+        generator = torch.Generator().manual_seed(2)
+        asked = torch.randn((len(arguments["text"]), CATEGORIES, TEXT), generator=generator, dtype=torch.float64)
+        arguments = {**arguments, "text": torch.cat([asked, arguments["text"]], dim=1)}
+        arguments["text_mask"] = F.pad(arguments["text_mask"], (CATEGORIES, 0), value=True)
     result = network(**arguments)
     return torch.cat(result, dim=-1) if process == "mixed" else result
 
@@ -186,6 +194,23 @@ def test_a_tally_counts_what_is_seen_and_no_filling() -> None:
     mask = torch.tensor([[True] * 6, [False, True, False, True, True, True]])
     expected = [[1, 0, 0, 2, 0, 0, 0, 2], [0, 2, 1, 0, 0, 0, 0, 1]]
     assert count_states(states, CATEGORIES, mask).tolist() == expected
+
+
+def test_what_is_asked_of_a_category_moves_the_logits_of_all_slots_alike_and_filling_does_not() -> None:
+    torch.manual_seed(0)
+    requests = Requests(CATEGORIES, TEXT, 16).double()
+    nn.init.normal_(requests.out.weight)
+    states = torch.tensor([[0, 3, 3, 7, 8, 8], [8, 8, 1, 1, 1, 2]])
+    asked = torch.randn(2, CATEGORIES, TEXT, dtype=torch.float64)
+    wanted = requests(states, asked)
+    other = asked.clone()
+    other[:, 3] += 1.0
+    changed = (requests(states, other) - wanted).abs() > 1e-6
+    assert changed.nonzero()[:, 1].tolist() == [3, 3]
+    filled = torch.cat([states, torch.full((2, 4), 3)], dim=1)
+    mask = torch.arange(10).expand(2, -1) < 6
+    torch.testing.assert_close(requests(filled, asked, mask), wanted)
+    torch.testing.assert_close(requests(states.flip(1), asked), wanted)
 
 
 @pytest.mark.parametrize("name", BASELINES)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import torch
 from agents.mixed_denoiser import MixedPriorConfig
 from agents.mixed_prior import MixedPrior
 from agents.networks import MixedFluxConfig, TextConfig, TextEncoder, vocabulary
+from agents.networks.text import number_features
 from agents.new_prior import build_prior
 from agents.pretrain_config import PretrainConfig
 from agents.prior import ScenePrior, tiny_prior
@@ -37,12 +39,13 @@ def prior() -> MixedPrior:
     return made.eval()
 
 
-@pytest.mark.parametrize(("latents", "window"), [(0, 1), (4, 1), (0, 3), (4, 5)])
-def test_padding_changes_nothing_in_the_encoder(latents: int, window: int) -> None:
-    encoder = TextEncoder(TextConfig(vocabulary(PROMPTS), width=16, heads=2, latents=latents, window=window)).eval()
+@pytest.mark.parametrize(("latents", "window", "categories"), [(0, 1, 0), (4, 1, 8), (0, 3, 0), (4, 5, 0)])
+def test_padding_changes_nothing_in_the_encoder(latents: int, window: int, categories: int) -> None:
+    size: dict[str, Any] = {"latents": latents, "window": window, "categories": categories, "numbers": bool(categories)}
+    encoder = TextEncoder(TextConfig(vocabulary(PROMPTS), width=16, heads=2, **size)).eval()
     alone, _ = encoder(PROMPTS[:1])
     tokens, mask = encoder([PROMPTS[0], PROMPTS[1] + " " + PROMPTS[1]])
-    assert tokens.shape[1] == (latents or 19)
+    assert tokens.shape[1] == (latents + categories or 19)
     torch.testing.assert_close(tokens[:1, : alone.shape[1]], alone, atol=1e-5, rtol=1e-4)
     assert bool(mask[0].all()) == bool(latents)
 
@@ -172,6 +175,19 @@ def test_a_vocabulary_holds_the_words_of_prompts_and_all_counts() -> None:
     indices, unknown = encoder.tokenize(PROMPTS)
     assert indices.shape[0] == 2
     assert unknown == []
+
+
+def test_numbers_say_how_many_they_are_however_they_are_written() -> None:
+    for words in (("a", "an", "one", "1"), ("three", "3"), ("twenty", "20")):
+        assert len({tuple(number_features(word)) for word in words}) == 1
+    sizes = [number_features(str(number))[1] for number in (0, 1, 2, 33)]
+    assert sizes == [0.0, 1 / 16, 2 / 16, 33 / 16]
+    assert not any(number_features("cup"))
+
+
+def test_categories_are_asked_of_latents_only() -> None:
+    with pytest.raises(InvalidInputError, match="give latents"):
+        TextConfig(words=("cup",), latents=0, categories=8)
 
 
 def test_a_window_of_words_is_odd() -> None:

@@ -138,6 +138,8 @@ def echo(monkeypatch):
         ("number=1e-3", "number", 1e-3),
         ("number=null", "number", None),
         ("items=[1, 2]", "items", [1, 2]),
+        ("items=1,2", "items", [1, 2]),
+        ("anything=layout, physics", "anything", ["layout", "physics"]),
         ("anything=object_count", "anything", "object_count"),
         ("anything={name: clip, high: 2.5}", "anything", {"name": "clip", "high": 2.5}),
     ],
