@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 _EMPTY_WEIGHT = 0.1
 """Weight of the pose of an empty slot in the loss: it means nothing, but chains should not drift on it."""
 
+_COUNT_WEIGHT = 0.5
+"""Weight of the numbers that a prompt asks for, read from the text alone, where the network subtracts from them."""
+
 
 def mixed_loss(
     prior: MixedPrior, x0: Tensor, generator: Generator | None, t: Tensor | None, text: Text | None
@@ -34,7 +37,8 @@ def mixed_loss(
     given = draw_given(prior, x0, generator) if config.given_share > 0 else None
     x_t = prior.add_noise(x0, t, noise)
     x_t = x_t if given is None else given.write(x_t)
-    output, logits = prior.denoiser.output(x_t, t, given, prior.unconditional(len(x0)) if text is None else text)
+    text = prior.unconditional(len(x0)) if text is None else text
+    output, logits = prior.denoiser.output(x_t, t, given, text)
     pose0, category0 = x0[..., :POSE], x0[..., POSE:].argmax(dim=-1)
     moments = prior.denoiser.moments(state_of(x_t[..., POSE:]), t)
     error = output - prior.process.target(pose0, x_t[..., :POSE], t, noise[..., :POSE], moments)
@@ -56,7 +60,11 @@ def mixed_loss(
     else:
         losses = F.cross_entropy(logits.flatten(0, 1), category0.flatten(), reduction="none").view_as(drawn)
     category_loss = (losses * drawn).sum(dim=1) / drawn.sum(dim=1).clamp(min=1.0)
-    return pose_loss + config.category_weight * category_loss
+    loss = pose_loss + config.category_weight * category_loss
+    requests = getattr(prior.denoiser.network, "requests", None)
+    if requests is not None and text is not None:
+        loss = loss + _COUNT_WEIGHT * requests.count_loss(text[0][:, : requests.things], category0)
+    return loss
 
 
 def draw_given(prior: MixedPrior, x0: Tensor, generator: Generator | None) -> Given:

@@ -101,7 +101,7 @@ def _continuous(config: PretrainConfig, raw: Tensor, normalizer: Normalizer) -> 
     prior_config = PriorConfig(
         config.scene,
         raw.shape[1],
-        _network(config, code.features, normalizer),  # type: ignore[arg-type]
+        _network(config, code.features, normalizer, raw.shape[1]),  # type: ignore[arg-type]
         rotation=config.rotation,
         **_chain(config),
     )
@@ -117,7 +117,7 @@ def _mixed(config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts:
         )
     scene_type = get_scene_type(config.scene)
     text = _text(config, prompts)
-    network = _network(config, scene_type.features, normalizer, 0 if text is None else text.width)
+    network = _network(config, scene_type.features, normalizer, raw.shape[1], 0 if text is None else text.width)
     prior_config = MixedPriorConfig(
         config.scene,
         raw.shape[1],
@@ -154,12 +154,14 @@ def _text(config: PretrainConfig, prompts: Sequence[Sequence[str]]) -> AnyTextCo
             latents=config.text_latents,
             window=config.text_window,
             numbers=config.text_numbers,
-            categories=get_scene_type(config.scene).num_assets + 1 if _requests(config) else 0,
+            asked=max(_kinds(config.scene)) + 2 if _requests(config) else 0,
         )
     return encoder
 
 
-def _network(config: PretrainConfig, features: int, normalizer: Normalizer, text_width: int = 0) -> NetworkConfig:
+def _network(
+    config: PretrainConfig, features: int, normalizer: Normalizer, slots: int, text_width: int = 0
+) -> NetworkConfig:
     categories = get_scene_type(config.scene).num_assets + 1
     if config.network == "paper":
         if config.process != "mixed":
@@ -180,12 +182,20 @@ def _network(config: PretrainConfig, features: int, normalizer: Normalizer, text
         text_reach=config.text_reach,
         pooled_text=int(config.pooled_text),
         tally=int(config.tally),
-        requests=int(_requests(config)),
+        requests=slots if _requests(config) else 0,
+        kinds=_kinds(config.scene) if _requests(config) else (),
     )
 
 
+def _kinds(scene: str) -> tuple[int, ...]:
+    """The kind of each asset: assets of one display name are one kind to a prompt."""
+    names = [asset.display_name for asset in get_scene_type(scene).library]
+    order = {name: number for number, name in enumerate(dict.fromkeys(names))}
+    return tuple(order[name] for name in names)
+
+
 def _requests(config: PretrainConfig) -> bool:
-    """Whether the network is told what a prompt asks of each category."""
+    """Whether the network is told what a prompt asks of each kind of object."""
     return (
         config.text_requests
         and config.network == "flux"

@@ -55,6 +55,12 @@ class World:
         for gradient, total in zip(gradients, flat.split([g.numel() for g in gradients]), strict=True):
             gradient.copy_(total.view_as(gradient))
 
+    def share(self, parameters: Iterable[nn.Parameter]) -> None:
+        """Replace the values of every process by those of the first."""
+        if self.size > 1:
+            for parameter in parameters:
+                torch.distributed.broadcast(parameter.data, src=0)
+
     def wait(self) -> None:
         """Go on when all processes are here."""
         if self.size > 1:

@@ -60,7 +60,7 @@ class PretrainConfig:
         compile: compile the network with ``torch.compile`` (needs a C++ compiler on CPU).
         process: ``continuous`` (categories as numbers) or ``mixed`` (categories as discrete states).
         kernel: of the categories of a mixed prior (``mask_and_replace``, ``absorbing``, ``early_absorbing``,
-            ``uniform``).
+            ``squared_absorbing``, ``uniform``).
         empty_slots: whether slots known to be empty are ``attended`` (the paper's) or ``dropped`` from the network of a
             mixed prior, which needs an absorbing kernel and saves most of the work.
         text: whether a mixed prior reads prompts.
@@ -76,8 +76,10 @@ class PretrainConfig:
         tally: whether the mixed flux network is told how many slots it sees of each category, and how many are masked.
         text_window: of the small text encoder: words that are read together before they attend to each other, odd; 1
             reads each by itself.
-        text_requests: whether the small text encoder also says what is asked of each category, which joins the logits
-            of the mixed flux network beside what it sees; needs text_latents.
+        text_requests: whether the small text encoder also says what is asked of each kind of object, which joins the
+            logits of the mixed flux network beside what it sees; needs text_latents.
+        text_warmup: steps in which the text encoder learns how many of each kind its prompts ask for, before a fresh
+            prior takes the first of its own; at most iterations.
         text_numbers: of the small text encoder: whether words that are numbers say how many they are, so that counts
             need not be learned number by number.
         prompt_dropout: share of training scenes whose prompt is withheld, for classifier-free guidance.
@@ -143,6 +145,7 @@ class PretrainConfig:
     tally: bool = True
     text_window: int = 3
     text_requests: bool = True
+    text_warmup: int = 400
     text_numbers: bool = True
     prompt_dropout: float = 0.1
     compile: bool = False

@@ -23,6 +23,7 @@ from agents.optimizers import build_optimizer
 from agents.parallel import World
 from agents.pretrain_config import PretrainConfig
 from agents.prior import ScenePrior
+from agents.reading import learn_counts
 from agents.training_data import TrainingData
 from agents.training_log import TrainingLog
 from agents.training_setup import prepare
@@ -100,6 +101,8 @@ class Pretrainer:
         self.directory.mkdir(parents=True, exist_ok=True)
         if self.checkpoint_path.exists():
             self._load()
+        elif not self.config.prior and isinstance(self.prior, MixedPrior):
+            self._learn_to_read(self.prior)
         if self.config.compile:
             self.prior.denoiser.network.compile()
         for row in self._steps():
@@ -109,6 +112,13 @@ class Pretrainer:
             self.prior.fit_residual(self.heldout_data[:512].to(self.config.device))
         self.prior.denoiser.precision = torch.float32
         return self.save_prior()
+
+    def _learn_to_read(self, prior: MixedPrior) -> None:
+        """Every process learns the same, and begins with the weights of the first."""
+        steps = min(self.config.text_warmup, self.config.iterations)
+        if learn_counts(prior, self.data, steps, self.config.batch_size, self.config.seed) is not None:
+            self.world.share(self.network.parameters())
+            self.average = WeightAverage(self.network, self.config.ema)
 
     def _steps(self) -> Iterator[dict[str, float]]:
         config, started = self.config, time.perf_counter() - self.seconds

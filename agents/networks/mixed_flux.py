@@ -53,8 +53,10 @@ class MixedFluxConfig:
         pooled_text: 1 to add the mean of the text tokens to the embedded time, which modulates every block (as Flux
             does with a pooled embedding), 0 as the paper.
         tally: 1 to add what is counted in the scene as well (:class:`~agents.networks.tally.Tally`), 0 as the paper.
-        requests: 1 where the first K text tokens say what is asked of each category, in order, which then joins the
-            logits (:class:`~agents.networks.requests.Requests`); 0 as the paper.
+        requests: where the first text tokens say what is asked of each kind of object, and last of all objects, and
+            that joins the logits (:class:`~agents.networks.requests.Requests`): the largest number told apart; 0 where
+            not, as the paper.
+        kinds: (K - 1,) the kind of each category, as prompts call it; empty where each is one of its own.
     """
 
     categories: int
@@ -75,11 +77,13 @@ class MixedFluxConfig:
     pooled_text: int = 0
     tally: int = 0
     requests: int = 0
+    kinds: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if self.text_reach not in TEXT_REACHES:
             raise unknown_name("reach of text", self.text_reach, TEXT_REACHES)
-        object.__setattr__(self, "unit", tuple(self.unit))  # a list, when it comes from JSON
+        object.__setattr__(self, "unit", tuple(self.unit))  # lists, when they come from JSON
+        object.__setattr__(self, "kinds", tuple(self.kinds) or tuple(range(self.categories - 1)))
         if self.attention not in ATTENTIONS:
             raise unknown_name("attention", self.attention, ATTENTIONS)
         if self.hidden % self.heads:
@@ -186,8 +190,8 @@ class MixedFlux(nn.Module):
         pooled = config.text_width and config.pooled_text
         self.pooled_in = nn.Linear(config.text_width, hidden, bias=False) if pooled else None
         self.tally = Tally(config.categories, config.text_width, hidden) if config.tally else None
-        requests = config.requests and config.text_width
-        self.requests = Requests(config.categories, config.text_width, hidden) if requests else None
+        requests = config.requests if config.text_width else 0
+        self.requests = Requests(config.kinds, config.text_width, hidden, requests) if requests else None
         doubles = config.double_blocks if config.text_width else 0
         features = FEATURES if config.attention == "relative" else 0
         self.double_blocks = nn.ModuleList(
@@ -231,7 +235,7 @@ class MixedFlux(nn.Module):
             pose: (B, N, 12) noisy poses, as the process scales them.
             states: (B, N) int64 in 0..K, K being the mask token.
             time: (B,) what is embedded, times ``time_scale``: a timestep or a log noise level.
-            text: (B, L, W) text tokens; None for no text. With ``requests`` the first K of them are of the categories.
+            text: (B, L, W) text tokens; None for no text. With ``requests`` the first are of the kinds of objects.
             text_mask: (B, L) bool, True for real tokens.
             position: (B, N, 3) translations in signal units, for the Fourier features.
             noise_level: (B, N) noise-to-signal ratio of ``position``.
@@ -243,8 +247,8 @@ class MixedFlux(nn.Module):
         """
         asked = None
         if self.requests is not None and text is not None:
-            asked, text = text[:, : self.config.categories], text[:, self.config.categories :]
-            text_mask = None if text_mask is None else text_mask[:, self.config.categories :]
+            asked, text = text[:, : self.requests.things], text[:, self.requests.things :]
+            text_mask = None if text_mask is None else text_mask[:, self.requests.things :]
         condition = self.time_in(_embed(time * self.config.time_scale, pose.dtype))
         pooled = None if text is None else _mean_token(text, text_mask)
         if self.pooled_in is not None and pooled is not None:
@@ -272,7 +276,7 @@ class MixedFlux(nn.Module):
         shift, scale = self.final_modulation(F.silu(condition)).unsqueeze(1).chunk(2, dim=-1)
         features = self.final((1 + scale) * F.layer_norm(scene, (self.config.hidden,), eps=1e-6) + shift)
         logits = self.logits_out(features)
-        if self.requests is not None:
+        if self.requests is not None and asked is not None:
             logits = logits + self.requests(states, asked, slot_mask)[:, None]
         return self.pose_out(features), logits
 

@@ -80,6 +80,7 @@ def network_config(
     pooled_text: int = 0,
     tally: int = 0,
     requests: int = 0,
+    kinds: tuple[int, ...] = (),
 ) -> NetworkConfig:
     """The size of a network from the keys that all networks share.
 
@@ -96,7 +97,7 @@ def network_config(
         attention: read by the mixed ``flux`` alone, see :class:`~agents.networks.MixedFluxConfig`.
         frequencies: read by ``flux`` alone: the others are as published, unless their configuration is made by hand.
         unit: read by the mixed ``flux`` alone.
-        text_reach, pooled_text, tally, requests: read by the mixed ``flux`` alone.
+        text_reach, pooled_text, tally, requests, kinds: read by the mixed ``flux`` alone.
 
     Raises:
         UnknownNameError: no network or no process has that name.
@@ -120,7 +121,7 @@ def network_config(
         sizes |= {"double_blocks": max(1, depth // 3), "single_blocks": depth, "embedding": hidden}
         sizes |= {"text_width": text_width, "attention": attention, "frequencies": frequencies, "unit": unit}
         sizes |= {"text_reach": text_reach, "pooled_text": pooled_text, "tally": tally}
-        sizes |= {"requests": requests if text_width else 0}
+        sizes |= {"requests": requests if text_width else 0, "kinds": kinds}
     config: NetworkConfig = entry.config(**sizes)
     return config
 

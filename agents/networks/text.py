@@ -68,8 +68,8 @@ class TextConfig:
         max_tokens: longest prompt, its start token included.
         latents: tokens that a prompt is condensed to, so that long ones cost no more than short ones; 0 for none.
         window: neighbouring words that are read together before attention ("two tea bottles"), an odd number.
-        categories: of how many categories it says as well what is asked of them, a token each before the latents; needs
-            latents.
+        asked: of how many things (kinds of objects, and objects at all) it says as well what is asked of them, a token
+            each before the latents; needs latents.
         numbers: whether words that are numbers say how many they are (:func:`number_features`).
     """
 
@@ -80,12 +80,12 @@ class TextConfig:
     max_tokens: int = 128
     latents: int = 16
     window: int = 1
-    categories: int = 0
+    asked: int = 0
     numbers: bool = False
 
     def __post_init__(self) -> None:
-        if self.categories and not self.latents:
-            raise InvalidInputError("a text encoder without latents answers for no categories; give latents")
+        if self.asked and not self.latents:
+            raise InvalidInputError("a text encoder without latents does not say what is asked of things; give latents")
         if self.window < 1 or self.window % 2 == 0:
             raise InvalidInputError(f"a text window of {self.window} words: give an odd number, 1 for single words")
 
@@ -131,7 +131,7 @@ class TextEncoder(nn.Module):
         )
         self.layers = nn.TransformerEncoder(layer, config.depth, enable_nested_tensor=False)
         self.norm = nn.LayerNorm(config.width)
-        questions = config.categories + config.latents
+        questions = config.asked + config.latents
         self.questions = nn.Parameter(0.2 * torch.randn(questions, config.width)) if questions else None
         self.condense = nn.MultiheadAttention(config.width, config.heads, batch_first=True) if config.latents else None
         self.answer_norm = nn.LayerNorm(config.width) if config.latents else None
