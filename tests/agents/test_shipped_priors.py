@@ -1,0 +1,36 @@
+"""What ships with the package: priors that load, fit their scene types, and do what a prompt says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import agents
+from agents.model_card import PriorFacts
+from agents.prior import ScenePrior
+from agents.prior_files import list_priors
+
+FOLDER = Path(agents.__file__).parent / "priors"
+READERS = [name for name in list_priors() if PriorFacts.of(name).text]
+
+
+def test_weights_of_all_priors_fit_into_64_mib() -> None:
+    assert sum(file.stat().st_size for file in FOLDER.rglob("*.safetensors")) <= 64 * 2**20
+
+
+@pytest.mark.parametrize("name", list_priors())
+def test_every_prior_has_a_card_with_figures_beside_those_of_real_scenes(name: str) -> None:
+    card = (FOLDER / name / "README.md").read_text()
+    assert f"# Prior `{name}`" in card
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_the_number_of_objects_follows_the_prompt(name: str) -> None:
+    """Numbers that are common in the data, far enough apart: a prior that ignores prompts misses both by several."""
+    prior = ScenePrior.load(name)
+    free = prior.sample(8, num_steps=20, seed=0).counts.float()
+    for asked in (round(float(free.mean() - free.std())), round(float(free.mean() + free.std()))):
+        counts = prior.sample(6, prompt=f"A scene with {asked} objects.", guidance=1.0, num_steps=20, seed=1).counts
+        assert float((counts - asked).abs().to(torch.float32).mean()) < max(1.0, 0.4 * float(free.std()))
