@@ -175,11 +175,11 @@ class MixedDenoiser(nn.Module):
         ratio = (self.poses.sigma[t.cpu()] / self.poses.alpha[t.cpu()]).to(x_t.device)
         level = ratio[:, None].expand(pose.shape[:2])
         scaled = self.poses.network_input(pose, t)
-        position = pose[..., :3] / alpha
+        position = pose / alpha
         if given is not None:
             exact = given.pose[..., None]
             scaled = torch.where(exact, self.poses.network_input(pose, torch.zeros_like(t)), scaled)
-            position = torch.where(exact, pose[..., :3], position)
+            position = torch.where(exact, pose, position)
             level = torch.where(given.pose, torch.zeros_like(level), level)
         octaves: int = self.network.config.frequencies  # type: ignore[union-attr, assignment]
         time = 250.0 * ratio.log() if octaves else (t - 1).to(pose.dtype)

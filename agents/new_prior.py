@@ -178,7 +178,9 @@ def _network(
         text_width=text_width,
         attention=config.attention,
         frequencies=config.frequencies,
+        rotation_features=int(config.rotation_features),
         unit=_unit(normalizer),
+        rotations=_rotations(normalizer),
         text_reach=config.text_reach,
         pooled_text=int(config.pooled_text),
         tally=int(config.tally),
@@ -222,3 +224,9 @@ def _unit(normalizer: Normalizer) -> tuple[float, float, float]:
     scale = normalizer.scale[:3]
     x, y, z = torch.where(scale == 0, torch.zeros_like(scale), 1.0 / scale.clamp(min=1e-9)).tolist()
     return x, y, z
+
+
+def _rotations(normalizer: Normalizer) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """What nine normalised numbers are multiplied by, and what is then added, to be a rotation matrix."""
+    low, high = normalizer.input_min[3 : POSE.stop], normalizer.input_max[3 : POSE.stop]
+    return tuple(((high - low) / 2).tolist()), tuple(((high + low) / 2).tolist())

@@ -24,7 +24,8 @@ class PretrainConfig:
         precision: number format of the network in training, ``float32`` or ``bfloat16`` (autocast).
         optimizer: ``adamw``, or ``muon`` for Muon on the matrices inside blocks and AdamW on the rest.
         learning_rate: peak learning rate.
-        final_learning_rate: where the cosine ends, as a fraction of the peak.
+        final_learning_rate: where the cosine after the warm-up ends, as a fraction of the peak; 1 for none. The weights
+            that are kept are averages (ema), which makes a decay dispensable.
         warmup: steps of linear warm-up.
         weight_decay: decoupled weight decay.
         clip: largest gradient norm.
@@ -37,6 +38,8 @@ class PretrainConfig:
             parameters, whatever hidden, depth, heads, attention and frequencies say.
         attention: of the mixed flux network: ``plain``, or ``relative``, which sees where other objects stand.
         frequencies: octaves of Fourier features of each translation (flux only); 0 for none.
+        rotation_features: the mixed flux network is told how far each rotation is off SO(3), and off upright, in units
+            of the noise.
         prediction: what the network predicts (``karras``, ``epsilon``, ``x0``, ``v``).
         schedule: noise schedule (``karras``, ``linear``, ``cosine``).
         noise_floor: lowest noise-to-signal ratio of the karras schedule, in normalised units.
@@ -103,7 +106,7 @@ class PretrainConfig:
     precision: str = "float32"
     optimizer: str = "muon"
     learning_rate: float = 1e-3
-    final_learning_rate: float = 0.01
+    final_learning_rate: float = 1.0
     warmup: int = 100
     weight_decay: float = 0.01
     clip: float = 1.0
@@ -115,6 +118,7 @@ class PretrainConfig:
     network: str = "flux"
     attention: str = "relative"
     frequencies: int = 8
+    rotation_features: bool = True
     prediction: str = "karras"
     schedule: str = "karras"
     noise_floor: float = 0.002

@@ -79,6 +79,7 @@ PAPER: dict[str, Any] = {
     "empty_slots": "attended",
     "attention": "plain",
     "frequencies": 0,
+    "rotation_features": False,
     "optimizer": "adamw",
 }
 """The paper's setting: noise prediction under a linear schedule, the variational bound of masked and replaced

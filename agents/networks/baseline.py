@@ -111,12 +111,12 @@ class _Baseline(nn.Module):
         return result
 
     def _with_octaves(self, features: Tensor, position: Tensor | None, noise_level: Tensor | None) -> Tensor:
-        """Features (B, N, D) and, where asked for, those of ``position`` (B, N, 3) under noise (B, N)."""
+        """Features (B, N, D) and, where asked for, those of the translations, with which ``position`` begins."""
         if not len(self.octaves):
             return features
         if position is None or noise_level is None:
             raise InvalidInputError("a network with Fourier features needs position= and noise_level=")
-        angle = position[..., None] * self.octaves  # (B, N, 3, F)
+        angle = position[..., :3, None] * self.octaves  # (B, N, 3, F)
         damping = torch.exp(-0.5 * (self.octaves * noise_level[..., None]) ** 2).unsqueeze(-2)  # (B, N, 1, F)
         return torch.cat([features, (angle.sin() * damping).flatten(-2), (angle.cos() * damping).flatten(-2)], dim=-1)
 
@@ -148,7 +148,7 @@ class ContinuousBaseline(_Baseline):
             text_mask: (B, L) bool, True for real tokens.
         """
         levels = noise_level[:, None].expand(x.shape[:2])
-        tokens = self.scene_in(self._with_octaves(x, position[..., :3], levels))
+        tokens = self.scene_in(self._with_octaves(x, position, levels))
         result: Tensor = self.scene_out(self._tokens(tokens, 250.0 * noise_level.log(), text, text_mask))
         return result
 

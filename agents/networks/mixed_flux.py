@@ -18,6 +18,7 @@ from torch.nn import functional as F
 from agents.networks.flux import SingleStreamBlock, timestep_embedding
 from agents.networks.relations import FEATURES, Relations, joint_attention
 from agents.networks.requests import Requests
+from agents.networks.rotation_features import ROTATION_FEATURES, gated_rotation, rotation_features
 from agents.networks.tally import Tally
 from scene_envs.errors import InvalidInputError, unknown_name
 
@@ -53,6 +54,10 @@ class MixedFluxConfig:
         pooled_text: 1 to add the mean of the text tokens to the embedded time, which modulates every block (as Flux
             does with a pooled embedding), 0 as the paper.
         tally: 1 to add what is counted in the scene as well (:class:`~agents.networks.tally.Tally`), 0 as the paper.
+        rotation_features: 1 to tell how far each rotation is off SO(3) and off upright in units of the noise
+            (:func:`~agents.networks.rotation_features.rotation_features`), 0 as the paper.
+        rotations: what the nine normalised numbers of a rotation are multiplied by, and what is then added, to be that
+            of an object, which ``rotation_features`` needs.
         requests: where the first text tokens say what is asked of each kind of object, and last of all objects, and
             that joins the logits (:class:`~agents.networks.requests.Requests`): the largest number told apart; 0 where
             not, as the paper.
@@ -78,11 +83,14 @@ class MixedFluxConfig:
     tally: int = 0
     requests: int = 0
     kinds: tuple[int, ...] = ()
+    rotation_features: int = 0
+    rotations: tuple[tuple[float, ...], tuple[float, ...]] = ((1.0,) * 9, (0.0,) * 9)
 
     def __post_init__(self) -> None:
         if self.text_reach not in TEXT_REACHES:
             raise unknown_name("reach of text", self.text_reach, TEXT_REACHES)
         object.__setattr__(self, "unit", tuple(self.unit))  # lists, when they come from JSON
+        object.__setattr__(self, "rotations", tuple(tuple(numbers) for numbers in self.rotations))
         object.__setattr__(self, "kinds", tuple(self.kinds) or tuple(range(self.categories - 1)))
         if self.attention not in ATTENTIONS:
             raise unknown_name("attention", self.attention, ATTENTIONS)
@@ -178,7 +186,9 @@ class MixedFlux(nn.Module):
         self.config = config
         hidden, width = config.hidden, config.embedding
         self.pose_in = nn.Sequential(
-            nn.Linear(POSE + 6 * config.frequencies, width), nn.SiLU(), nn.Linear(width, width)
+            nn.Linear(POSE + 6 * config.frequencies + ROTATION_FEATURES * config.rotation_features, width),
+            nn.SiLU(),
+            nn.Linear(width, width),
         )
         self.category_in = nn.Embedding(config.categories + 1, width)
         self.given_in = nn.Embedding(4, width) if config.flags else None
@@ -209,12 +219,16 @@ class MixedFlux(nn.Module):
         self.final = nn.Linear(hidden, width)
         self.pose_out = nn.Sequential(nn.Linear(width, config.pose_head), nn.SiLU(), nn.Linear(config.pose_head, POSE))
         self.logits_out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, config.categories))
-        for layer in (self.final_modulation, self.pose_out[-1], self.logits_out[-1]):
+        self.rotation_gates = nn.Linear(width, ROTATION_FEATURES) if config.rotation_features else None
+        gates = [] if self.rotation_gates is None else [self.rotation_gates]
+        for layer in (self.final_modulation, self.pose_out[-1], self.logits_out[-1], *gates):
             for parameter in layer.parameters():
                 nn.init.zeros_(parameter)
-        octaves = math.pi * 2.0 ** torch.arange(config.frequencies, dtype=torch.float32)
         self.octaves: Tensor
+        self.rotations: Tensor
+        octaves = math.pi * 2.0 ** torch.arange(config.frequencies, dtype=torch.float32)
         self.register_buffer("octaves", octaves, persistent=False)
+        self.register_buffer("rotations", torch.tensor(config.rotations), persistent=False)
 
     def forward(
         self,
@@ -237,7 +251,8 @@ class MixedFlux(nn.Module):
             time: (B,) what is embedded, times ``time_scale``: a timestep or a log noise level.
             text: (B, L, W) text tokens; None for no text. With ``requests`` the first are of the kinds of objects.
             text_mask: (B, L) bool, True for real tokens.
-            position: (B, N, 3) translations in signal units, for the Fourier features.
+            position: (B, N, 12) poses in signal units, for the features that are made of them; translations alone,
+                (B, N, 3), will do without ``rotation_features``.
             noise_level: (B, N) noise-to-signal ratio of ``position``.
             given: (B, N) int64, 1 where the pose is given, plus 2 where the category is; None for nowhere.
             slot_mask: (B, N) bool, False for filling that nothing may attend to; None where there is none.
@@ -255,7 +270,8 @@ class MixedFlux(nn.Module):
             condition = condition + self.pooled_in(pooled)
         if self.tally is not None:
             condition = condition + self.tally(states, pooled, slot_mask)
-        features = self.pose_in(self._pose_features(pose, position, noise_level)) + self.category_in(states)
+        turns = self._turns(pose, position, noise_level)
+        features = self.pose_in(self._pose_features(pose, position, noise_level, turns)) + self.category_in(states)
         if self.given_in is not None and given is not None:
             features = features + self.given_in(given)
         scene = self.scene_in(features)
@@ -278,7 +294,10 @@ class MixedFlux(nn.Module):
         logits = self.logits_out(features)
         if self.requests is not None and asked is not None:
             logits = logits + self.requests(states, asked, slot_mask)[:, None]
-        return self.pose_out(features), logits
+        output = self.pose_out(features)
+        if self.rotation_gates is not None and turns is not None:
+            output = output + F.pad(gated_rotation(turns, self.rotation_gates(features)), (3, 0))
+        return output, logits
 
     def _words(self, text: Tensor | None, pose: Tensor) -> Tensor | None:
         if self.text_in is None:
@@ -294,17 +313,30 @@ class MixedFlux(nn.Module):
             return itertools.repeat(None), None
         if position is None or noise_level is None:
             raise InvalidInputError("a network with attention='relative' needs position= and noise_level=")
-        bias, features = self.relations(position, noise_level)
+        bias, features = self.relations(position[..., :3], noise_level)
         return iter(bias), features
 
-    def _pose_features(self, pose: Tensor, position: Tensor | None, noise_level: Tensor | None) -> Tensor:
-        if not self.config.frequencies:
-            return pose
+    def _turns(self, pose: Tensor, position: Tensor | None, noise_level: Tensor | None) -> Tensor | None:
+        """Features of the rotations, (B, N, :data:`ROTATION_FEATURES`); None where the network has none."""
+        if not self.config.rotation_features:
+            return None
         if position is None or noise_level is None:
-            raise InvalidInputError("a network with Fourier features needs position= and noise_level=")
-        angle = position[..., None] * self.octaves  # (B, N, 3, F)
-        damping = torch.exp(-0.5 * (self.octaves * noise_level[..., None]) ** 2).unsqueeze(-2)  # (B, N, 1, F)
-        return torch.cat([pose, (angle.sin() * damping).flatten(-2), (angle.cos() * damping).flatten(-2)], dim=-1)
+            raise InvalidInputError("a network with features of rotations needs position= and noise_level=")
+        scale, offset = self.rotations.to(position)
+        rotation = (position[..., 3:POSE] * scale + offset).unflatten(-1, (3, 3))
+        return rotation_features(rotation, noise_level * scale.max()).to(pose)
+
+    def _pose_features(
+        self, pose: Tensor, position: Tensor | None, noise_level: Tensor | None, turns: Tensor | None
+    ) -> Tensor:
+        features = [pose]
+        if self.config.frequencies:
+            if position is None or noise_level is None:
+                raise InvalidInputError("a network with Fourier features needs position= and noise_level=")
+            angle = position[..., :3, None] * self.octaves  # (B, N, 3, F)
+            damping = torch.exp(-0.5 * (self.octaves * noise_level[..., None]) ** 2).unsqueeze(-2)  # (B, N, 1, F)
+            features += [(angle.sin() * damping).flatten(-2), (angle.cos() * damping).flatten(-2)]
+        return torch.cat(features if turns is None else [*features, turns], dim=-1)
 
 
 def _mean_token(text: Tensor, mask: Tensor | None) -> Tensor:

@@ -1,0 +1,57 @@
+"""What noisy rotation matrices say of themselves, in units of the noise on them.
+
+A denoiser of nine numbers has to find out that they are those of a rotation, and that most things stand upright. Both
+are differences as small as the noise, which a network that sees the numbers alone learns last: what lies flat in one
+place and leans in another then lies flat to ten degrees only.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from scene_envs.rotations import project_to_so3
+
+ROTATION_FEATURES = 9 + 4
+"""Numbers per rotation."""
+_TILTS = (6, 7, 2, 5)
+"""Entries R_20, R_21, R_02 and R_12 of a row-major matrix."""
+_LEAST_NOISE = 1e-4
+_REACH = 4.0
+"""Standard deviations at which the distance from upright saturates."""
+
+
+@torch.no_grad()
+def rotation_features(rotation: Tensor, noise: Tensor) -> Tensor:
+    """How far rotations are off SO(3), and how far the nearest ones are off upright, (B, N, :data:`ROTATION_FEATURES`).
+
+    Args:
+        rotation: (B, N, 3, 3) noisy rotation matrices.
+        noise: (B, N) standard deviation of the noise on their entries.
+
+    Returns:
+        The residual of the projection onto SO(3), row-major, over the noise: three of the nine numbers of the noise
+        are not in it. Then R_20, R_21, R_02 and R_12 of the projection, which are 0 where the z-axes of object and
+        world are parallel, over the noise and saturating. No gradient passes.
+
+    >>> upright = torch.eye(3).expand(1, 2, 3, 3)
+    >>> rotation_features(upright, torch.full((1, 2), 0.1)).abs().max() < 1e-5
+    tensor(True)
+    """
+    with torch.autocast(rotation.device.type, enabled=False):
+        wide = rotation if rotation.dtype == torch.float64 else rotation.float()
+        level = noise.to(wide).clamp(min=_LEAST_NOISE)[..., None]
+        nearest = project_to_so3(wide.nan_to_num())
+        off = (wide - nearest).flatten(-2) / level
+        tilt = nearest.flatten(-2)[..., list(_TILTS)]
+        return torch.cat([off, tilt / (level.square() + (tilt / _REACH).square()).sqrt()], dim=-1)
+
+
+def gated_rotation(features: Tensor, gates: Tensor) -> Tensor:
+    """What features (B, N, F) add to the nine outputs of a rotation, each with a gate (B, N, F) of its own.
+
+    Carried through the blocks they would be thirteen numbers of noise to keep for every object. So the network only has
+    to say which of them count, which is a matter of the category and of where the object lies.
+    """
+    off, tilt = (features * gates).split([9, 4], dim=-1)
+    return off.index_add(-1, torch.tensor(_TILTS, device=off.device), tilt)
