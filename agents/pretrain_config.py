@@ -24,8 +24,8 @@ class PretrainConfig:
         precision: number format of the network in training, ``float32`` or ``bfloat16`` (autocast).
         optimizer: ``adamw``, or ``muon`` for Muon on the matrices inside blocks and AdamW on the rest.
         learning_rate: peak learning rate.
-        final_learning_rate: where the cosine after the warm-up ends, as a fraction of the peak; 1 for none. The weights
-            that are kept are averages (ema), which makes a decay dispensable.
+        final_learning_rate: where the learning rate ends, as a fraction of the peak; 1 for no decay.
+        decay_share: share of the steps, the last ones, over which it goes there along a cosine; 1 from the warm-up on.
         warmup: steps of linear warm-up.
         weight_decay: decoupled weight decay.
         clip: largest gradient norm.
@@ -106,7 +106,8 @@ class PretrainConfig:
     precision: str = "float32"
     optimizer: str = "muon"
     learning_rate: float = 1e-3
-    final_learning_rate: float = 1.0
+    final_learning_rate: float = 0.01
+    decay_share: float = 0.3
     warmup: int = 100
     weight_decay: float = 0.01
     clip: float = 1.0

@@ -36,11 +36,12 @@ _MATMUL_PRECISIONS = ("highest", "high", "medium")
 
 
 def learning_rate_at(step: int, config: PretrainConfig) -> float:
-    """Linear warm-up, then a cosine to ``final_learning_rate`` of the peak."""
+    """Linear warm-up, the peak, and in the last ``decay_share`` of the steps a cosine to ``final_learning_rate``."""
     if step < config.warmup:
         return config.learning_rate * (step + 1) / config.warmup
-    progress = (step - config.warmup) / max(1, config.iterations - config.warmup)
-    cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
+    start = max(config.warmup, config.iterations * (1.0 - config.decay_share))
+    progress = (step - start) / max(1.0, config.iterations - start)
+    cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, max(0.0, progress))))
     return config.learning_rate * (config.final_learning_rate + (1 - config.final_learning_rate) * cosine)
 
 
@@ -75,6 +76,8 @@ class Pretrainer:
                 f"batch_size={config.batch_size} is not a multiple of {self.parts}, "
                 f"the {self.world.size} process(es) times accumulate={config.accumulate}"
             )
+        if not 0.0 <= config.decay_share <= 1.0:
+            raise InvalidInputError(f"decay_share={config.decay_share} is outside 0..1: it is a share of the steps")
         self.prior = prior.to(config.device).train()
         self.network: nn.Module = prior.denoiser
         if config.precision not in _PRECISIONS:

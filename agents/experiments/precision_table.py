@@ -51,7 +51,7 @@ FACTORS: tuple[Setting, ...] = (
     *_each("Fourier octaves", "frequencies", 0, 8),
     *_each("features of rotations", "rotation_features", False, True),
     ("no learning-rate decay", {"final_learning_rate": 1.0}),
-    ("learning rate decays to 0.01", {"final_learning_rate": 0.01}),
+    ("learning rate decays from the warm-up on", {"decay_share": 1.0}),
     *_each("optimizer", "optimizer", "muon", "adamw"),
     *_each("empty slots", "empty_slots", "dropped", "attended"),
     ("categories: early absorbing, dropped, cross-entropy", _categories("early_absorbing", "dropped", "cross_entropy")),

@@ -121,11 +121,27 @@ def test_a_truncated_checkpoint_is_named(config: PretrainConfig, raw: torch.Tens
 
 
 def test_learning_rate_warms_up_and_ends_at_its_floor() -> None:
-    config = PretrainConfig(iterations=1000, warmup=10, learning_rate=1.0, final_learning_rate=0.1)
+    config = PretrainConfig(iterations=1000, warmup=10, learning_rate=1.0, final_learning_rate=0.1, decay_share=1.0)
     assert learning_rate_at(0, config) == pytest.approx(0.1)
     assert learning_rate_at(9, config) == pytest.approx(1.0)
     assert learning_rate_at(505, config) == pytest.approx(0.55)
     assert learning_rate_at(1000, config) == pytest.approx(0.1)
+
+
+def test_learning_rate_stays_at_its_peak_until_the_decay_begins() -> None:
+    config = PretrainConfig(iterations=1000, warmup=10, learning_rate=1.0, final_learning_rate=0.1, decay_share=0.2)
+    assert {learning_rate_at(step, config) for step in range(9, 801)} == {1.0}
+    assert learning_rate_at(900, config) == pytest.approx(0.55)  # half way along the cosine
+    assert learning_rate_at(1000, config) == pytest.approx(0.1)
+    assert learning_rate_at(900, replace(config, final_learning_rate=1.0)) == 1.0
+    late = replace(config, warmup=900)  # a decay never begins in the warm-up
+    assert learning_rate_at(899, late) == 1.0
+    assert learning_rate_at(950, late) == pytest.approx(0.55)
+
+
+def test_a_decay_share_that_is_none_is_refused(config: PretrainConfig, raw: torch.Tensor) -> None:
+    with pytest.raises(InvalidInputError, match=r"decay_share=1\.5 is outside 0\.\.1"):
+        make_run(replace(config, decay_share=1.5), raw)
 
 
 def test_the_weight_average_follows_its_closed_form() -> None:

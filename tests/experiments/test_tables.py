@@ -72,7 +72,7 @@ def test_every_factor_is_asked() -> None:
     assert {("moments", name) for name in ("scene", "feature", "category")} <= asked
     assert {("noise_floor", value) for value in (0.01, 0.002, 0.0005)} <= asked
     assert {("translation_weight", 1.0), ("translation_weight", 3.0)} <= asked
-    assert {("final_learning_rate", 1.0), ("final_learning_rate", 0.01)} <= asked
+    assert {("final_learning_rate", 1.0), ("decay_share", 1.0)} <= asked
     assert {("rotation_features", True), ("rotation_features", False)} <= asked
     assert {("attention", "plain"), ("attention", "relative"), ("frequencies", 0), ("frequencies", 8)} <= asked
     assert {row.capacity for row in ours} == {0.5, 1.0, 2.0}
