@@ -19,8 +19,16 @@ CONFIG_NAME, METRICS_NAME = "row.json", "metrics.json"
 _RUN_ONLY = ("output", "device", "log_every", "evaluate_every", "checkpoint_every", "pictures_every", "tensorboard")
 """Keys that may change between the parts of a resumed run."""
 _SHAPING = (
-    *("network", "process", "text", "rotation", "attention", "frequencies", "rotation_features"),
-    *("hidden", "depth", "heads"),
+    "network",
+    "process",
+    "text",
+    "rotation",
+    "attention",
+    "frequencies",
+    "rotation_features",
+    "hidden",
+    "depth",
+    "heads",
 )
 """Keys that the number of parameters depends on."""
 
