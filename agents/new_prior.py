@@ -179,6 +179,7 @@ def _network(
         attention=config.attention,
         frequencies=config.frequencies,
         rotation_features=int(config.rotation_features),
+        contacts=int(config.contacts),
         unit=_unit(normalizer),
         rotations=_rotations(normalizer),
         text_reach=config.text_reach,

@@ -40,6 +40,8 @@ class PretrainConfig:
         frequencies: octaves of Fourier features of each translation (flux only); 0 for none.
         rotation_features: the mixed flux network is told how far each rotation is off SO(3), and off upright, in units
             of the noise.
+        contacts: with attention=relative: the network learns at what distance two objects touch, and is told the gap
+            that is left in units of the noise.
         prediction: what the network predicts (``karras``, ``epsilon``, ``x0``, ``v``).
         schedule: noise schedule (``karras``, ``linear``, ``cosine``).
         noise_floor: lowest noise-to-signal ratio of the karras schedule, in normalised units.
@@ -120,6 +122,7 @@ class PretrainConfig:
     attention: str = "relative"
     frequencies: int = 8
     rotation_features: bool = True
+    contacts: bool = True
     prediction: str = "karras"
     schedule: str = "karras"
     noise_floor: float = 0.002

@@ -50,6 +50,7 @@ FACTORS: tuple[Setting, ...] = (
     *_each("attention", "attention", "plain", "relative"),
     *_each("Fourier octaves", "frequencies", 0, 8),
     *_each("features of rotations", "rotation_features", False, True),
+    *_each("contacts", "contacts", False, True),
     ("no learning-rate decay", {"final_learning_rate": 1.0}),
     ("learning rate decays from the warm-up on", {"decay_share": 1.0}),
     *_each("optimizer", "optimizer", "muon", "adamw"),
@@ -66,6 +67,7 @@ _NEEDS = {
     "noise_floor": ("schedule", "karras"),
     "noise_ceiling": ("schedule", "karras"),
     "moments": ("prediction", "karras"),
+    "contacts": ("attention", "relative"),
 }
 """Keys that are read only where another key has a value."""
 

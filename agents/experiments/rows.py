@@ -80,6 +80,7 @@ PAPER: dict[str, Any] = {
     "attention": "plain",
     "frequencies": 0,
     "rotation_features": False,
+    "contacts": False,
     "optimizer": "adamw",
 }
 """The paper's setting: noise prediction under a linear schedule, the variational bound of masked and replaced

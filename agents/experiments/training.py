@@ -26,6 +26,7 @@ _SHAPING = (
     "attention",
     "frequencies",
     "rotation_features",
+    "contacts",
     "hidden",
     "depth",
     "heads",

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from agents.networks.relations import joint_attention
+from agents.networks.flux_blocks import SingleStreamBlock
 from scene_envs.errors import InvalidInputError
 
 
@@ -45,49 +45,6 @@ def timestep_embedding(value: Tensor, width: int, max_period: float = 10_000.0) 
     frequency = torch.exp(-math.log(max_period) * torch.arange(half, device=value.device, dtype=value.dtype) / half)
     angle = value[:, None] * frequency[None]
     return torch.cat([angle.cos(), angle.sin()], dim=-1)
-
-
-class SingleStreamBlock(nn.Module):
-    """Attention and MLP in parallel on a modulated LayerNorm, gated (Flux; Dehghani et al. 2023).
-
-    Args:
-        hidden: width of the tokens.
-        heads: attention heads.
-        mlp_ratio: width of the MLP over ``hidden``.
-        relations: numbers per pair of slots that attention gathers; 0 for none.
-    """
-
-    def __init__(self, hidden: int, heads: int, mlp_ratio: float, relations: int = 0) -> None:
-        super().__init__()
-        self.heads = heads
-        self.hidden = hidden
-        self.mlp_hidden = int(hidden * mlp_ratio)
-        self.modulation = nn.Linear(hidden, 3 * hidden)
-        self.linear1 = nn.Linear(hidden, 3 * hidden + self.mlp_hidden)
-        self.linear2 = nn.Linear(hidden + self.mlp_hidden, hidden)
-        self.query_norm = nn.RMSNorm(hidden // heads, eps=1e-6)
-        self.key_norm = nn.RMSNorm(hidden // heads, eps=1e-6)
-        self.gathered = nn.Linear(heads * relations, hidden, bias=False) if relations else None
-        nn.init.zeros_(self.modulation.weight)
-        nn.init.zeros_(self.modulation.bias)
-
-    def forward(
-        self, tokens: Tensor, condition: Tensor, mask: Tensor | None = None, relations: Tensor | None = None
-    ) -> Tensor:
-        """Tokens (B, T, H) and condition (B, H) to tokens (B, T, H).
-
-        Args:
-            tokens: (B, T, H).
-            condition: (B, H).
-            mask: (B, 1 or heads, 1 or T, T), True where to attend, or what is added to the attention logits.
-            relations: (B, N, N, F) features of pairs of the last N tokens; needs a mask that is added.
-        """
-        shift, scale, gate = self.modulation(F.silu(condition)).unsqueeze(1).chunk(3, dim=-1)
-        x = (1 + scale) * F.layer_norm(tokens, (self.hidden,), eps=1e-6) + shift
-        qkv, mlp = self.linear1(x).split([3 * self.hidden, self.mlp_hidden], dim=-1)
-        query, key, value = qkv.unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        attended = joint_attention(self.query_norm(query), self.key_norm(key), value, mask, relations, self.gathered)
-        return tokens + gate * self.linear2(torch.cat([attended, F.gelu(mlp, approximate="tanh")], dim=-1))
 
 
 class FluxDenoiser(nn.Module):

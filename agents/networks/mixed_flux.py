@@ -15,8 +15,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from agents.networks.flux import SingleStreamBlock, timestep_embedding
-from agents.networks.relations import FEATURES, Relations, joint_attention
+from agents.networks.contacts import CHANNELS, Contacts, gated_displacement
+from agents.networks.flux import timestep_embedding
+from agents.networks.flux_blocks import DoubleStreamBlock, SingleStreamBlock
+from agents.networks.relations import FEATURES, Relations
 from agents.networks.requests import Requests
 from agents.networks.rotation_features import ROTATION_FEATURES, gated_rotation, rotation_features
 from agents.networks.tally import Tally
@@ -56,8 +58,10 @@ class MixedFluxConfig:
         tally: 1 to add what is counted in the scene as well (:class:`~agents.networks.tally.Tally`), 0 as the paper.
         rotation_features: 1 to tell how far each rotation is off SO(3) and off upright in units of the noise
             (:func:`~agents.networks.rotation_features.rotation_features`), 0 as the paper.
+        contacts: 1 for displacements along the gaps between objects (:class:`~agents.networks.contacts.Contacts`),
+            0 as the paper; without relative attention there are none.
         rotations: what the nine normalised numbers of a rotation are multiplied by, and what is then added, to be that
-            of an object, which ``rotation_features`` needs.
+            of an object, which ``rotation_features`` and ``contacts`` need.
         requests: where the first text tokens say what is asked of each kind of object, and last of all objects, and
             that joins the logits (:class:`~agents.networks.requests.Requests`): the largest number told apart; 0 where
             not, as the paper.
@@ -84,6 +88,7 @@ class MixedFluxConfig:
     requests: int = 0
     kinds: tuple[int, ...] = ()
     rotation_features: int = 0
+    contacts: int = 0
     rotations: tuple[tuple[float, ...], tuple[float, ...]] = ((1.0,) * 9, (0.0,) * 9)
 
     def __post_init__(self) -> None:
@@ -101,72 +106,6 @@ class MixedFluxConfig:
     def paper(cls, categories: int, text_width: int = 768) -> MixedFluxConfig:
         """The size and the details of the paper: 88.3 M parameters with text."""
         return cls(categories, 512, 5, 10, 16, 4.0, 256, POSE, text_width, 0, 1000.0, 0)
-
-
-class DoubleStreamBlock(nn.Module):
-    """Joint attention of two streams with their own projections, norms and MLPs, gated by the condition.
-
-    Args:
-        hidden, heads, mlp_ratio, relations: as of :class:`~agents.networks.flux.SingleStreamBlock`.
-        text_ends: whether text is read here for the last time, so that it need not be changed.
-    """
-
-    def __init__(self, hidden: int, heads: int, mlp_ratio: float, relations: int = 0, text_ends: bool = False) -> None:
-        super().__init__()
-        self.text = _Stream(hidden, heads, mlp_ratio, finishes=not text_ends)
-        self.scene = _Stream(hidden, heads, mlp_ratio)
-        self.gathered = nn.Linear(heads * relations, hidden, bias=False) if relations else None
-
-    def forward(
-        self, scene: Tensor, text: Tensor, condition: Tensor, mask: Tensor | None, relations: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Slots (B, N, H) and text (B, L, H) to the same; ``mask`` and ``relations`` as of single-stream blocks."""
-        scene, text = scene + self.scene.modality, text + self.text.modality
-        rates = [stream.rates(condition) for stream in (self.text, self.scene)]
-        parts = [s.heads_of(x, r) for s, x, r in zip((self.text, self.scene), (text, scene), rates, strict=True)]
-        query, key, value = (torch.cat(pair, dim=2) for pair in zip(*parts, strict=True))
-        attended = joint_attention(query, key, value, mask, relations, self.gathered)
-        count = text.shape[1]
-        return (
-            self.scene.finish(scene, attended[:, count:], rates[1]),
-            self.text.finish(text, attended[:, :count], rates[0]) if self.text.finishes else text,
-        )
-
-
-class _Stream(nn.Module):
-    """One side of a double-stream block."""
-
-    def __init__(self, hidden: int, heads: int, mlp_ratio: float, finishes: bool = True) -> None:
-        super().__init__()
-        self.hidden, self.heads, self.finishes = hidden, heads, finishes
-        self.modality = nn.Parameter(torch.zeros(1, 1, hidden))
-        self.modulation = nn.Linear(hidden, (6 if finishes else 2) * hidden)
-        self.qkv = nn.Linear(hidden, 3 * hidden)
-        self.query_norm = nn.RMSNorm(hidden // heads, eps=1e-6) if finishes else nn.Identity()
-        self.key_norm = nn.RMSNorm(hidden // heads, eps=1e-6)
-        if finishes:
-            self.out = nn.Linear(hidden, hidden)
-            wide = int(hidden * mlp_ratio)
-            self.mlp = nn.Sequential(nn.Linear(hidden, wide), nn.GELU(approximate="tanh"), nn.Linear(wide, hidden))
-        nn.init.zeros_(self.modulation.weight)
-        nn.init.zeros_(self.modulation.bias)
-
-    def rates(self, condition: Tensor) -> tuple[Tensor, ...]:
-        """Shift, scale and gate of the attention, then of the MLP, (B, 1, H) each; only two where text ends."""
-        return self.modulation(F.silu(condition)).unsqueeze(1).chunk(6 if self.finishes else 2, dim=-1)  # type: ignore[no-any-return]
-
-    def heads_of(self, x: Tensor, rates: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, Tensor]:
-        """Query, key and value (B, heads, N, width)."""
-        x = (1 + rates[1]) * F.layer_norm(x, (self.hidden,), eps=1e-6) + rates[0]
-        query, key, value = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        return self.query_norm(query), self.key_norm(key), value
-
-    def finish(self, x: Tensor, attended: Tensor, rates: tuple[Tensor, ...]) -> Tensor:
-        """The two gated residuals."""
-        x = x + rates[2] * self.out(attended)
-        inner = (1 + rates[4]) * F.layer_norm(x, (self.hidden,), eps=1e-6) + rates[3]
-        result: Tensor = x + rates[5] * self.mlp(inner)
-        return result
 
 
 class MixedFlux(nn.Module):
@@ -220,7 +159,10 @@ class MixedFlux(nn.Module):
         self.pose_out = nn.Sequential(nn.Linear(width, config.pose_head), nn.SiLU(), nn.Linear(config.pose_head, POSE))
         self.logits_out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, config.categories))
         self.rotation_gates = nn.Linear(width, ROTATION_FEATURES) if config.rotation_features else None
-        gates = [] if self.rotation_gates is None else [self.rotation_gates]
+        contacts = config.contacts and features
+        self.contacts = Contacts(config.categories, features, hidden) if contacts else None
+        self.contact_gates = nn.Linear(width, 3 * CHANNELS) if contacts else None
+        gates = [layer for layer in (self.rotation_gates, self.contact_gates) if layer is not None]
         for layer in (self.final_modulation, self.pose_out[-1], self.logits_out[-1], *gates):
             for parameter in layer.parameters():
                 nn.init.zeros_(parameter)
@@ -252,7 +194,7 @@ class MixedFlux(nn.Module):
             text: (B, L, W) text tokens; None for no text. With ``requests`` the first are of the kinds of objects.
             text_mask: (B, L) bool, True for real tokens.
             position: (B, N, 12) poses in signal units, for the features that are made of them; translations alone,
-                (B, N, 3), will do without ``rotation_features``.
+                (B, N, 3), will do without ``rotation_features`` and ``contacts``.
             noise_level: (B, N) noise-to-signal ratio of ``position``.
             given: (B, N) int64, 1 where the pose is given, plus 2 where the category is; None for nowhere.
             slot_mask: (B, N) bool, False for filling that nothing may attend to; None where there is none.
@@ -279,6 +221,8 @@ class MixedFlux(nn.Module):
         count = 0 if words is None else words.shape[1]
         mask = _where_to_attend(text_mask, slot_mask, count, pose)
         biases, relations = self._related(position, noise_level)
+        messages, moves = self._touching(position, states, noise_level, relations, slot_mask)
+        scene = scene if messages is None else scene + messages
         if words is not None:
             for block in self.double_blocks:
                 scene, words = block(scene, words, condition, _add_bias(next(biases), mask, count), relations)
@@ -297,6 +241,8 @@ class MixedFlux(nn.Module):
         output = self.pose_out(features)
         if self.rotation_gates is not None and turns is not None:
             output = output + F.pad(gated_rotation(turns, self.rotation_gates(features)), (3, 0))
+        if self.contact_gates is not None and moves is not None:
+            output = output + F.pad(gated_displacement(moves, self.contact_gates(features)), (0, 9))
         return output, logits
 
     def _words(self, text: Tensor | None, pose: Tensor) -> Tensor | None:
@@ -322,9 +268,29 @@ class MixedFlux(nn.Module):
             return None
         if position is None or noise_level is None:
             raise InvalidInputError("a network with features of rotations needs position= and noise_level=")
+        return rotation_features(self._matrices(position), noise_level * self.rotations[0].max().to(position)).to(pose)
+
+    def _matrices(self, position: Tensor) -> Tensor:
+        """Noisy rotation matrices (B, N, 3, 3) from poses in signal units."""
         scale, offset = self.rotations.to(position)
-        rotation = (position[..., 3:POSE] * scale + offset).unflatten(-1, (3, 3))
-        return rotation_features(rotation, noise_level * scale.max()).to(pose)
+        return (position[..., 3:POSE] * scale + offset).unflatten(-1, (3, 3))
+
+    def _touching(
+        self,
+        position: Tensor | None,
+        states: Tensor,
+        noise_level: Tensor | None,
+        relations: Tensor | None,
+        slot_mask: Tensor | None,
+    ) -> tuple[Tensor | None, Tensor | None]:
+        """What :class:`~agents.networks.contacts.Contacts` say; None twice where the network has none."""
+        if self.contacts is None or self.relations is None or relations is None or position is None:
+            return None, None
+        assert noise_level is not None  # where there are relations it was asked for
+        unit = self.relations.unit.to(position)
+        metres, noise = position[..., :3] * unit, noise_level * unit.max()
+        messages, moves = self.contacts(metres, self._matrices(position), states, noise, relations, slot_mask)
+        return messages, moves
 
     def _pose_features(
         self, pose: Tensor, position: Tensor | None, noise_level: Tensor | None, turns: Tensor | None

@@ -82,6 +82,7 @@ def network_config(
     requests: int = 0,
     kinds: tuple[int, ...] = (),
     rotation_features: int = 0,
+    contacts: int = 0,
     rotations: tuple[tuple[float, ...], tuple[float, ...]] = ((1.0,) * 9, (0.0,) * 9),
 ) -> NetworkConfig:
     """The size of a network from the keys that all networks share.
@@ -100,7 +101,7 @@ def network_config(
         frequencies: read by ``flux`` alone: the others are as published, unless their configuration is made by hand.
         unit: read by the mixed ``flux`` alone.
         text_reach, pooled_text, tally, requests, kinds: read by the mixed ``flux`` alone.
-        rotation_features, rotations: read by the mixed ``flux`` alone.
+        rotation_features, contacts, rotations: read by the mixed ``flux`` alone.
 
     Raises:
         UnknownNameError: no network or no process has that name.
@@ -125,7 +126,7 @@ def network_config(
         sizes |= {"text_width": text_width, "attention": attention, "frequencies": frequencies, "unit": unit}
         sizes |= {"text_reach": text_reach, "pooled_text": pooled_text, "tally": tally}
         sizes |= {"requests": requests if text_width else 0, "kinds": kinds}
-        sizes |= {"rotation_features": rotation_features, "rotations": rotations}
+        sizes |= {"rotation_features": rotation_features, "contacts": contacts, "rotations": rotations}
     config: NetworkConfig = entry.config(**sizes)
     return config
 

@@ -53,6 +53,8 @@ def make(name: str, process: str, text_width: int = TEXT, zero: bool = False, **
         text_width=text_width,
         frequencies=2,
         rotation_features=1,
+        contacts=1,
+        attention="relative",
         pooled_text=1,
         tally=1,
         requests=9,

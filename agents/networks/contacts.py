@@ -1,0 +1,134 @@
+"""At what distance two objects touch, and what follows for where each of them has to go.
+
+Objects exclude each other and stand on each other to within a fraction of a millimetre, and how far apart their centres
+then are is a matter of both categories and of the direction, hardly of anything else. A transformer that sees positions
+has to find that by itself, for every pair of categories. Here a small network on pairs of slots learns that distance,
+and what the rest sees is the gap that it leaves, in units of the noise, which is the only scale on which a denoiser can
+move anything.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+CHANNELS = 4
+"""Displacements that are offered for every slot."""
+_GAPS = 8  # sideways, in height, along the three axes of either object
+_DIRECTIONS = 6
+_BASIS = 3  # of each gap
+_REACH = 4.0
+_GAP_OF = (0, 0, 1, 2, 3, 4, 5, 5, 5, 6, 6, 6, 7, 7, 7)
+"""Which gap each of the ways is along: x, y, z of the world, the axes of i, and those of j in the world."""
+_TYPICAL = 0.1  # metres between the centres of objects that touch
+_LEAST_NOISE = 2e-4  # metres
+
+
+class Contacts(nn.Module):
+    """Messages between slots about the gaps between them, and displacements along those.
+
+    Permutation-equivariant. For slots i and j a network on features of the pair, the direction to each other as each
+    sees it, and both categories gives the distances at which they would touch: sideways, in height, and along the axes
+    of each. The gaps are what is left of the actual distances, over the noise on both. A second network weighs them.
+
+    Args:
+        categories: K = C + 1; the mask token is one more.
+        features: numbers per pair of slots, from :class:`~agents.networks.relations.Relations`.
+        hidden: width of the messages.
+        width: of the networks on pairs.
+        kind: width of what stands for a category.
+
+    >>> contacts = Contacts(categories=3, features=40, hidden=16)
+    >>> metres, rotation = torch.randn(2, 5, 3), torch.eye(3).expand(2, 5, 3, 3)
+    >>> states, noise, features = torch.zeros(2, 5).long(), torch.full((2, 5), 0.1), torch.zeros(2, 5, 5, 40)
+    >>> messages, displacements = contacts(metres, rotation, states, noise, features)
+    >>> messages.shape, displacements.shape
+    (torch.Size([2, 5, 16]), torch.Size([2, 5, 4, 3]))
+    """
+
+    def __init__(self, categories: int, features: int, hidden: int, width: int = 32, kind: int = 16) -> None:
+        super().__init__()
+        self.kind = nn.Embedding(categories + 1, kind)
+        self.seen = nn.Linear(features + 2 * _DIRECTIONS, width)
+        self.own, self.other = (nn.Linear(kind, 2 * width, bias=False) for _ in range(2))
+        self.touch = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, _GAPS))
+        self.weigh = nn.Linear(width + _BASIS * _GAPS + 1, width)
+        self.second = nn.Linear(width, width)
+        self.amplitudes = nn.Linear(width, CHANNELS * 2 * _GAPS)
+        self.out = nn.Linear(width, hidden)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(
+        self,
+        metres: Tensor,
+        rotation: Tensor,
+        states: Tensor,
+        noise: Tensor,
+        features: Tensor,
+        slot_mask: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Messages (B, N, H) to every slot, and displacements (B, N, :data:`CHANNELS`, 3) in units of the noise.
+
+        Args:
+            metres: (B, N, 3) noisy positions.
+            rotation: (B, N, 3, 3) rotations, as near SO(3) as they are.
+            states: (B, N) int64 categories, mask tokens among them.
+            noise: (B, N) standard deviation of the noise on positions, metres.
+            features: (B, N, N, F) of pairs of slots.
+            slot_mask: (B, N) bool, False for filling that nothing may see; None where there is none.
+        """
+        offset = metres.unsqueeze(2) - metres.unsqueeze(1)  # (B, N, N, 3) from j to i
+        both = ((noise.square().unsqueeze(2) + noise.square().unsqueeze(1)).sqrt() + _LEAST_NOISE).unsqueeze(-1)
+        sideways = offset[..., :2].square().sum(dim=-1, keepdim=True).add(1e-12).sqrt()
+        aside = offset[..., :2] / (sideways.square() + both.square()).sqrt()
+        own = offset @ rotation  # the axes of i
+        others = torch.einsum("bijw,bjwk->bijk", offset, rotation)
+        along = torch.cat([sideways, offset[..., 2:], own, others], dim=-1)  # (B, N, N, GAPS)
+        kinds = self.kind(states)
+        early, late = (self.own(kinds).unsqueeze(2) + self.other(kinds).unsqueeze(1)).chunk(2, dim=-1)
+        seen = F.silu(self.seen(torch.cat([features, *_as_seen(aside, rotation)], dim=-1)) + early)
+        gaps = (along.abs() - _TYPICAL * (1.0 + self.touch(seen))) / both
+        bounded = gaps / (1.0 + (gaps / _REACH).square()).sqrt()
+        basis = [bounded, torch.sigmoid(-2.0 * gaps), torch.exp(-0.5 * gaps.square()), both.log()]
+        weighed = F.silu(self.weigh(torch.cat([seen, *basis], dim=-1)) + late)
+        weighed = F.silu(self.second(weighed))
+        there = (~torch.eye(states.shape[1], dtype=torch.bool, device=states.device))[None].to(weighed)
+        there = (there if slot_mask is None else there * slot_mask.unsqueeze(1)).unsqueeze(-1)
+        weighed = torch.cat([weighed * there, there.expand(*weighed.shape[:-1], 1)], dim=-1)  # (B, N, N, W + 1)
+        sign = along / (along.square() + both.square()).sqrt()
+        ways = [aside, sign[..., 1:5], (sign[..., 5:, None] * rotation.mT.unsqueeze(1)).flatten(-2)]
+        moves = self._displacements(weighed, torch.cat(ways, dim=-1), bounded, rotation)
+        return self.out(weighed[..., :-1].sum(dim=2)), moves
+
+    def _displacements(self, weighed: Tensor, ways: Tensor, bounded: Tensor, rotation: Tensor) -> Tensor:
+        """(B, N, CHANNELS, 3): along every gap an amplitude, and another times the gap, summed over the others.
+
+        Amplitudes are linear in ``weighed`` (B, N, N, W + 1), so the sum is taken first: what a pair takes is not
+        CHANNELS times as much.
+        """
+        ways = torch.cat([ways, ways * bounded[..., _GAP_OF]], dim=-1)
+        gathered = weighed.mT @ ways  # (B, N, W + 1, 2 * 15)
+        amplitudes = torch.cat([self.amplitudes.weight, self.amplitudes.bias[:, None]], dim=1)
+        amplitudes = amplitudes.unflatten(0, (2, CHANNELS, _GAPS))[:, :, _GAP_OF]  # (2, CHANNELS, 15, W + 1)
+        moves = torch.einsum("biusq,scqu->bicq", gathered.unflatten(-1, (2, -1)), amplitudes)
+        level, own, others = moves.split([3, 3, 9], dim=-1)
+        return level + own @ rotation.mT + others.unflatten(-1, (3, 3)).sum(dim=-2)
+
+
+def gated_displacement(displacements: Tensor, gates: Tensor) -> Tensor:
+    """What displacements (B, N, :data:`CHANNELS`, 3) add to the output of translations, (B, N, 3).
+
+    Args:
+        displacements: as :class:`Contacts` make them.
+        gates: (B, N, CHANNELS * 3), one for each.
+    """
+    return (displacements * gates.unflatten(-1, (CHANNELS, 3))).sum(dim=-2)
+
+
+def _as_seen(aside: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
+    """Level directions (B, N, N, 2) from j to i in the frames of i and of j, with their squares, (B, N, N, 6) each."""
+    first = aside @ rotation[..., :2, :]
+    second = -torch.einsum("bijw,bjwk->bijk", aside, rotation[..., :2, :])
+    return torch.cat([first, first.square()], dim=-1), torch.cat([second, second.square()], dim=-1)
