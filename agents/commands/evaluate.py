@@ -31,6 +31,7 @@ class EvaluateConfig:
             empty compares with fresh scenes of the grammar, without novelty.
         heldout: dataset folder of held-out scenes; empty takes the last scenes of data.
         training_scenes: scenes of data among which novelty looks for the nearest, drawn at random.
+        prompt_count: samples with prompts, each of a held-out scene, at most count; null takes count.
         num_steps: denoising steps per sample.
         guidance: weight of classifier-free guidance for the samples with prompts, 0 for none.
         seed: of the samples, the real scenes and the classifiers.
@@ -51,6 +52,7 @@ class EvaluateConfig:
     data: str = ""
     heldout: str = ""
     training_scenes: int = 20_000
+    prompt_count: int | None = None
     num_steps: int = 50
     guidance: float = 0.0
     seed: int = 0
@@ -78,6 +80,11 @@ def run(settings: EvaluateConfig, run: Run) -> None:
     from scene_envs.physics import PhysicsPool
 
     groups = choose_groups(settings.measures, project=settings.project)
+    if settings.prompt_count is not None and not 2 <= settings.prompt_count <= settings.count:
+        raise InvalidInputError(
+            f"prompt_count={settings.prompt_count} must be from 2 to count={settings.count}, whose scenes the prompts "
+            "are of; null takes all of them"
+        )
     prior = ScenePrior.load(settings.prior).to(settings.device)
     results = _Results.of(run, _identity(settings, prior))
     missing = [name for name in groups if name not in results.groups]
@@ -102,6 +109,7 @@ def run(settings: EvaluateConfig, run: Run) -> None:
             pool,
             settings.seed,
             settings.fid_weights,
+            settings.prompt_count,
         )
         for name in missing:
             started = time.perf_counter()

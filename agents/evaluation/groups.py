@@ -31,6 +31,7 @@ class Material:
         pool: physics workers; None computes in this process.
         seed: of classifiers and prompts.
         fid_weights: path of the weights of an Inception-v3; empty for none.
+        prompts: real scenes whose prompts are followed; None for all of them.
 
     >>> empty = SceneBatch.empty("dimsum_table", 2)
     >>> measure_group("layout", Material(empty, RealScenes(empty, empty)))["floor_objects_mean"]
@@ -43,6 +44,7 @@ class Material:
     pool: PhysicsPool | None = None
     seed: int = 0
     fid_weights: str = ""
+    prompts: int | None = None
 
 
 def measure_group(name: str, material: Material) -> Figures:
@@ -142,7 +144,7 @@ def _fid(material: Material) -> Figures:
 def _prompts(material: Material) -> Figures:
     if material.follow is None:
         raise InvalidInputError("prompt-following needs a prior that reads prompts, and this one was trained without")
-    scenes = material.real.floor
+    scenes = material.real.floor[: material.prompts]
     prompts = own_prompts(scenes, material.seed)
     figures = prompt_following(material.follow(prompts), prompts)
     real = {FLOOR_PREFIX + name: value for name, value in prompt_following(scenes, prompts).items()}

@@ -73,7 +73,7 @@ class Contacts(nn.Module):
 
         Args:
             metres: (B, N, 3) noisy positions.
-            rotation: (B, N, 3, 3) rotations, as near SO(3) as they are.
+            rotation: (B, N, 3, 3) rotation matrices; they must be no noisier than that, or the axes are no directions.
             states: (B, N) int64 categories, mask tokens among them.
             noise: (B, N) standard deviation of the noise on positions, metres.
             features: (B, N, N, F) of pairs of slots.

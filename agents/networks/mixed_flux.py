@@ -10,6 +10,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -20,7 +21,7 @@ from agents.networks.flux import timestep_embedding
 from agents.networks.flux_blocks import DoubleStreamBlock, SingleStreamBlock
 from agents.networks.relations import FEATURES, Relations
 from agents.networks.requests import Requests
-from agents.networks.rotation_features import ROTATION_FEATURES, gated_rotation, rotation_features
+from agents.networks.rotation_features import ROTATION_FEATURES, gated_rotation, nearest_rotations, rotation_features
 from agents.networks.tally import Tally
 from scene_envs.errors import InvalidInputError, unknown_name
 
@@ -212,16 +213,17 @@ class MixedFlux(nn.Module):
             condition = condition + self.pooled_in(pooled)
         if self.tally is not None:
             condition = condition + self.tally(states, pooled, slot_mask)
-        turns = self._turns(pose, position, noise_level)
-        features = self.pose_in(self._pose_features(pose, position, noise_level, turns)) + self.category_in(states)
+        geometry = self._geometry(position, noise_level)
+        turns = self._turns(geometry)
+        features = self.pose_in(self._pose_features(pose, geometry, turns)) + self.category_in(states)
         if self.given_in is not None and given is not None:
             features = features + self.given_in(given)
         scene = self.scene_in(features)
         words = self._words(text, pose)
         count = 0 if words is None else words.shape[1]
         mask = _where_to_attend(text_mask, slot_mask, count, pose)
-        biases, relations = self._related(position, noise_level)
-        messages, moves = self._touching(position, states, noise_level, relations, slot_mask)
+        biases, relations = self._related(geometry)
+        messages, moves = self._touching(geometry, states, relations, slot_mask)
         scene = scene if messages is None else scene + messages
         if words is not None:
             for block in self.double_blocks:
@@ -251,58 +253,67 @@ class MixedFlux(nn.Module):
         result: Tensor = self.text_in(pose.new_zeros(len(pose), 1, self.config.text_width) if text is None else text)
         return result
 
-    def _related(
-        self, position: Tensor | None, noise_level: Tensor | None
-    ) -> tuple[Iterator[Tensor | None], Tensor | None]:
-        """Biases (B, heads, N, N) of block after block, and features of pairs of slots; None where there are none."""
-        if self.relations is None:
-            return itertools.repeat(None), None
-        if position is None or noise_level is None:
-            raise InvalidInputError("a network with attention='relative' needs position= and noise_level=")
-        bias, features = self.relations(position[..., :3], noise_level)
-        return iter(bias), features
-
-    def _turns(self, pose: Tensor, position: Tensor | None, noise_level: Tensor | None) -> Tensor | None:
-        """Features of the rotations, (B, N, :data:`ROTATION_FEATURES`); None where the network has none."""
-        if not self.config.rotation_features:
+    def _geometry(self, position: Tensor | None, noise_level: Tensor | None) -> _Geometry | None:
+        config = self.config
+        turned = self.rotation_gates is not None or self.contacts is not None
+        if not (turned or config.frequencies or self.relations is not None):
             return None
         if position is None or noise_level is None:
-            raise InvalidInputError("a network with features of rotations needs position= and noise_level=")
-        return rotation_features(self._matrices(position), noise_level * self.rotations[0].max().to(position)).to(pose)
-
-    def _matrices(self, position: Tensor) -> Tensor:
-        """Noisy rotation matrices (B, N, 3, 3) from poses in signal units."""
+            raise InvalidInputError(
+                "a network with Fourier features, attention='relative', features of rotations or contacts needs "
+                "position= and noise_level="
+            )
+        if not turned:
+            return _Geometry(position, noise_level)
         scale, offset = self.rotations.to(position)
-        return (position[..., 3:POSE] * scale + offset).unflatten(-1, (3, 3))
+        noisy = (position[..., 3:POSE] * scale + offset).unflatten(-1, (3, 3))
+        return _Geometry(position, noise_level, noisy, nearest_rotations(noisy))
+
+    def _related(self, geometry: _Geometry | None) -> tuple[Iterator[Tensor | None], Tensor | None]:
+        """Biases (B, heads, N, N) of block after block, and features of pairs of slots; None where there are none."""
+        if self.relations is None or geometry is None:
+            return itertools.repeat(None), None
+        bias, features = self.relations(geometry.position[..., :3], geometry.noise_level)
+        return iter(bias), features
 
     def _touching(
-        self,
-        position: Tensor | None,
-        states: Tensor,
-        noise_level: Tensor | None,
-        relations: Tensor | None,
-        slot_mask: Tensor | None,
+        self, geometry: _Geometry | None, states: Tensor, relations: Tensor | None, slot_mask: Tensor | None
     ) -> tuple[Tensor | None, Tensor | None]:
         """What :class:`~agents.networks.contacts.Contacts` say; None twice where the network has none."""
-        if self.contacts is None or self.relations is None or relations is None or position is None:
+        if self.contacts is None or self.relations is None or relations is None or geometry is None:
             return None, None
-        assert noise_level is not None  # where there are relations it was asked for
-        unit = self.relations.unit.to(position)
-        metres, noise = position[..., :3] * unit, noise_level * unit.max()
-        messages, moves = self.contacts(metres, self._matrices(position), states, noise, relations, slot_mask)
+        unit = self.relations.unit.to(geometry.position)
+        metres, noise = geometry.position[..., :3] * unit, geometry.noise_level * unit.max()
+        rotation = geometry.nearest.to(metres)
+        messages, moves = self.contacts(metres, rotation, states, noise, relations, slot_mask)
         return messages, moves
 
-    def _pose_features(
-        self, pose: Tensor, position: Tensor | None, noise_level: Tensor | None, turns: Tensor | None
-    ) -> Tensor:
+    def _turns(self, geometry: _Geometry | None) -> Tensor | None:
+        """Features of the rotations, (B, N, :data:`ROTATION_FEATURES`); None where the network has none."""
+        if self.rotation_gates is None or geometry is None:
+            return None
+        level = geometry.noise_level * self.rotations[0].max().to(geometry.noise_level)
+        return rotation_features(geometry.noisy, geometry.nearest, level)
+
+    def _pose_features(self, pose: Tensor, geometry: _Geometry | None, turns: Tensor | None) -> Tensor:
         features = [pose]
-        if self.config.frequencies:
-            if position is None or noise_level is None:
-                raise InvalidInputError("a network with Fourier features needs position= and noise_level=")
-            angle = position[..., :3, None] * self.octaves  # (B, N, 3, F)
-            damping = torch.exp(-0.5 * (self.octaves * noise_level[..., None]) ** 2).unsqueeze(-2)  # (B, N, 1, F)
+        if self.config.frequencies and geometry is not None:
+            angle = geometry.position[..., :3, None] * self.octaves  # (B, N, 3, F)
+            squared = (self.octaves * geometry.noise_level[..., None]) ** 2
+            damping = torch.exp(-0.5 * squared).unsqueeze(-2)  # (B, N, 1, F)
             features += [(angle.sin() * damping).flatten(-2), (angle.cos() * damping).flatten(-2)]
-        return torch.cat(features if turns is None else [*features, turns], dim=-1)
+        return torch.cat(features if turns is None else [*features, turns.to(pose)], dim=-1)
+
+
+class _Geometry(NamedTuple):
+    """Noisy poses in signal units, (B, N, 12) or translations alone, and the noise on them, (B, N)."""
+
+    position: Tensor
+    noise_level: Tensor
+    noisy: Tensor = torch.empty(0)
+    """(B, N, 3, 3) rotation matrices with their noise, where rotations are read."""
+    nearest: Tensor = torch.empty(0)
+    """(B, N, 3, 3) the rotations nearest to them."""
 
 
 def _mean_token(text: Tensor, mask: Tensor | None) -> Tensor:

@@ -22,11 +22,20 @@ _REACH = 4.0
 
 
 @torch.no_grad()
-def rotation_features(rotation: Tensor, noise: Tensor) -> Tensor:
+def nearest_rotations(rotation: Tensor) -> Tensor:
+    """The rotations that are nearest to noisy matrices (B, N, 3, 3); the identity where there are no numbers."""
+    with torch.autocast(rotation.device.type, enabled=False):
+        wide = rotation if rotation.dtype == torch.float64 else rotation.float()
+        return project_to_so3(wide.nan_to_num())
+
+
+@torch.no_grad()
+def rotation_features(rotation: Tensor, nearest: Tensor, noise: Tensor) -> Tensor:
     """How far rotations are off SO(3), and how far the nearest ones are off upright, (B, N, :data:`ROTATION_FEATURES`).
 
     Args:
         rotation: (B, N, 3, 3) noisy rotation matrices.
+        nearest: (B, N, 3, 3) those of :func:`nearest_rotations`.
         noise: (B, N) standard deviation of the noise on their entries.
 
     Returns:
@@ -35,16 +44,13 @@ def rotation_features(rotation: Tensor, noise: Tensor) -> Tensor:
         world are parallel, over the noise and saturating. No gradient passes.
 
     >>> upright = torch.eye(3).expand(1, 2, 3, 3)
-    >>> rotation_features(upright, torch.full((1, 2), 0.1)).abs().max() < 1e-5
+    >>> rotation_features(upright, nearest_rotations(upright), torch.full((1, 2), 0.1)).abs().max() < 1e-5
     tensor(True)
     """
-    with torch.autocast(rotation.device.type, enabled=False):
-        wide = rotation if rotation.dtype == torch.float64 else rotation.float()
-        level = noise.to(wide).clamp(min=_LEAST_NOISE)[..., None]
-        nearest = project_to_so3(wide.nan_to_num())
-        off = (wide - nearest).flatten(-2) / level
-        tilt = nearest.flatten(-2)[..., list(_TILTS)]
-        return torch.cat([off, tilt / (level.square() + (tilt / _REACH).square()).sqrt()], dim=-1)
+    level = noise.to(nearest).clamp(min=_LEAST_NOISE)[..., None]
+    off = (rotation.to(nearest) - nearest).flatten(-2) / level
+    tilt = nearest.flatten(-2)[..., list(_TILTS)]
+    return torch.cat([off, tilt / (level.square() + (tilt / _REACH).square()).sqrt()], dim=-1)
 
 
 def gated_rotation(features: Tensor, gates: Tensor) -> Tensor:

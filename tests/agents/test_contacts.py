@@ -120,7 +120,8 @@ def test_a_network_with_contacts_starts_at_the_mean_like_any_other() -> None:
     output, logits = network(
         pose, torch.zeros(2, 4).long(), torch.zeros(2), position=pose, noise_level=torch.full((2, 4), 0.3)
     )
-    assert output.abs().max() == 0 and logits.abs().max() == 0
+    assert output.abs().max() == 0
+    assert logits.abs().max() == 0
     output.sum().backward()
     assert network.contact_gates.weight.grad.abs().max() > 0
 
@@ -132,4 +133,23 @@ def test_numbers_that_are_none_stay_with_their_scene() -> None:
     metres[1, 0, 0] = math.nan
     level, features = torch.full((2, 3), 0.1).double(), torch.zeros(2, 3, 3, 4).double()
     _, moves = contacts(metres, IDENTITY.expand(2, 3, 3, 3), torch.zeros(2, 3).long(), level, features)
-    assert not moves[0].isnan().any() and moves[1].isnan().any()
+    assert not moves[0].isnan().any()
+    assert moves[1].isnan().any()
+
+
+def test_noise_without_end_moves_nothing_without_end() -> None:
+    """Noisy matrices are no rotations: what is made of their axes would grow with the noise."""
+    torch.manual_seed(0)
+    config = MixedFluxConfig(categories=5, hidden=16, heads=2, embedding=16, attention="relative", contacts=1)
+    network = build_network(config)
+    for parameter in network.parameters():
+        nn.init.normal_(parameter, std=0.2)
+    noise = torch.randn(8, 6, 12)
+    exact = torch.cat([0.1 * torch.randn(8, 6, 3), torch.eye(3).flatten().expand(8, 6, 9)], dim=-1)
+    sizes = []
+    for level in (0.1, 20.0, 1000.0):
+        position = exact + level * noise
+        told = {"position": position, "noise_level": torch.full((8, 6), level)}
+        output, _ = network(position / math.hypot(1, level), torch.zeros(8, 6).long(), torch.zeros(8), **told)
+        sizes.append(float(output.detach()[..., :3].abs().mean()))
+    assert max(sizes) < 3 * sizes[0]

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from agents.networks import MixedFlux, MixedFluxConfig
-from agents.networks.rotation_features import rotation_features
+from agents.networks.rotation_features import nearest_rotations, rotation_features
 from scene_envs.errors import InvalidInputError
 
 
@@ -66,7 +66,9 @@ def test_what_is_off_so3_is_the_noise_but_for_the_turn_that_it_makes(level: floa
     exact = turns(2000)
     noise = torch.randn(exact.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     noisy = exact + level * noise
-    off = rotation_features(noisy, torch.full(exact.shape[:2], level, dtype=torch.float64))[..., :9]
+    off = rotation_features(noisy, nearest_rotations(noisy), torch.full(exact.shape[:2], level, dtype=torch.float64))[
+        ..., :9
+    ]
     for number in range(5):
         nearest, _ = scipy.linalg.polar(noisy[0, number].numpy())
         wanted = (noisy[0, number] - torch.from_numpy(nearest)) / level
@@ -79,7 +81,9 @@ def test_tilt_is_told_in_units_of_the_noise_and_yaw_is_not() -> None:
     yaw = Rotation.from_euler("z", [[0.3], [2.0], [-1.0]])
     for degrees in (0.0, 0.05, 0.5, 90.0):
         tilted = torch.from_numpy((Rotation.from_euler("x", degrees, degrees=True) * yaw).as_matrix())[None]
-        row = rotation_features(tilted, torch.full((1, 3), 0.01).double())[0, :, 9:11].norm(dim=-1)
+        row = rotation_features(tilted, nearest_rotations(tilted), torch.full((1, 3), 0.01).double())[0, :, 9:11].norm(
+            dim=-1
+        )
         sine = math.sin(math.radians(degrees)) / 0.01
         if degrees < 1:
             assert row.tolist() == pytest.approx([sine] * 3, rel=0.05, abs=1e-9)
@@ -119,6 +123,6 @@ def test_numbers_that_are_none_pass_through() -> None:
     """A network that diverged makes no number; the chain reports it, not a decomposition."""
     broken = turns(2).clone()
     broken[0, 1, 0, 0] = math.nan
-    features = rotation_features(broken, torch.full((1, 2), 0.1).double())
+    features = rotation_features(broken, nearest_rotations(broken), torch.full((1, 2), 0.1).double())
     assert not features[0, 0].isnan().any()
     assert features[0, 1].isnan().any()

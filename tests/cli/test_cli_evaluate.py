@@ -112,6 +112,8 @@ def test_all_leaves_out_what_cannot_be_measured_and_says_why(
         (["data=nowhere", "measures=layout"], "no dataset at 'nowhere'"),
         (["heldout=somewhere", "measures=layout"], "needs data="),
         (["count=1", "measures=layout"], "count >= 2"),
+        (["prompt_count=1"], "prompt_count=1 must be from 2 to count="),
+        (["count=4", "prompt_count=5"], "prompt_count=5 must be from 2 to count=4"),
     ],
 )
 def test_what_cannot_be_done_is_refused_in_words(

@@ -48,6 +48,14 @@ def test_samples_that_follow_every_prompt_score_as_real_scenes_do(scenes: SceneB
     assert figures["chance_prompt_following"] < 1.0
 
 
+def test_fewer_prompts_than_samples_can_be_followed(scenes: SceneBatch) -> None:
+    real = RealScenes(scenes[:12], scenes[12:24])
+    material = Material(scenes, real, follow=lambda prompts: real.floor[: len(prompts)], prompts=6)
+    figures = measure_group("prompts", material)
+    assert sum(figures[f"prompt_{kind}_number"] for kind in ("counts", "names", "relations")) == 6
+    assert figures["prompt_following"] == figures["floor_prompt_following"] == 1.0
+
+
 def test_samples_that_ignore_their_prompts_score_as_chance_does(scenes: SceneBatch) -> None:
     real = RealScenes(scenes[:20], scenes[20:])
     ignored = measure_group("prompts", Material(scenes, real, follow=lambda prompts: real.reference))
