@@ -18,7 +18,7 @@ from agents.mixed_denoiser import MixedPriorConfig
 from agents.mixed_prior import MixedPrior
 from agents.networks.bert import BertTextConfig
 from agents.networks.bert_files import BASE
-from agents.networks.mixed_flux import POSE, MixedFluxConfig
+from agents.networks.mixed_flux_config import POSE, MixedFluxConfig
 from scene_envs.datasets import DatasetInfo, read_metadata
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
 from scene_envs.normalizer import Normalizer

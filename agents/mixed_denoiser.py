@@ -14,7 +14,7 @@ from agents.diffusion import CategoricalProcess, GaussianProcess
 from agents.diffusion.gaussian import Moments
 from agents.diffusion.reverse_steps import state_of
 from agents.networks.bert import BertEncoder
-from agents.networks.mixed_flux import POSE
+from agents.networks.mixed_flux_config import POSE
 from agents.networks.registry import MixedNetworkConfig
 from agents.networks.text import TextEncoder
 from agents.networks.text_encoders import AnyTextConfig

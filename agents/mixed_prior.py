@@ -29,7 +29,7 @@ from agents.diffusion import (
 from agents.diffusion.reverse_steps import state_of
 from agents.mixed_denoiser import Given, MixedDenoiser, MixedPriorConfig, Text
 from agents.mixed_training import mixed_loss
-from agents.networks.mixed_flux import POSE, MixedFluxConfig
+from agents.networks.mixed_flux_config import POSE, MixedFluxConfig
 from agents.networks.registry import build_network, config_from_state, config_state
 from agents.networks.text import TextConfig
 from agents.networks.text_encoders import text_config_from_state, text_encoder

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from agents.diffusion import loss_weights
 from agents.diffusion.reverse_steps import state_of
 from agents.mixed_denoiser import Given, Text
-from agents.networks.mixed_flux import POSE
+from agents.networks.mixed_flux_config import POSE
 
 if TYPE_CHECKING:
     from agents.mixed_prior import MixedPrior

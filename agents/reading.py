@@ -10,7 +10,8 @@ import torch
 from torch import Generator, nn
 
 from agents.mixed_prior import MixedPrior
-from agents.networks.mixed_flux import POSE, MixedFlux
+from agents.networks.mixed_flux import MixedFlux
+from agents.networks.mixed_flux_config import POSE
 from agents.training_data import TrainingData
 
 logger = logging.getLogger(__name__)

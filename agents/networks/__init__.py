@@ -3,7 +3,8 @@
 from agents.networks.diffuscene import DiffuScene, DiffuSceneConfig, MixedDiffuScene, MixedDiffuSceneConfig
 from agents.networks.flux import FluxConfig, FluxDenoiser
 from agents.networks.midiffusion import MiDiffusion, MiDiffusionConfig, MixedMiDiffusion, MixedMiDiffusionConfig
-from agents.networks.mixed_flux import MixedFlux, MixedFluxConfig
+from agents.networks.mixed_flux import MixedFlux
+from agents.networks.mixed_flux_config import MixedFluxConfig
 from agents.networks.registry import (
     NETWORKS,
     build_network,

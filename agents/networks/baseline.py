@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from agents.networks.flux import timestep_embedding
-from agents.networks.mixed_flux import POSE
+from agents.networks.mixed_flux_config import POSE
 from scene_envs.errors import InvalidInputError
 
 _TIME_WIDTH = 256

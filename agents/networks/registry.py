@@ -13,7 +13,8 @@ from torch import nn
 from agents.networks.diffuscene import DiffuScene, DiffuSceneConfig, MixedDiffuScene, MixedDiffuSceneConfig
 from agents.networks.flux import FluxConfig, FluxDenoiser
 from agents.networks.midiffusion import MiDiffusion, MiDiffusionConfig, MixedMiDiffusion, MixedMiDiffusionConfig
-from agents.networks.mixed_flux import MixedFlux, MixedFluxConfig
+from agents.networks.mixed_flux import MixedFlux
+from agents.networks.mixed_flux_config import MixedFluxConfig
 from scene_envs.errors import InvalidInputError, unknown_name
 
 NETWORKS = ("flux", "midiffusion", "diffuscene")

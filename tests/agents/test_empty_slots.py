@@ -10,7 +10,7 @@ from torch import nn
 
 from agents.mixed_prior import MixedPrior
 from agents.networks import MixedFluxConfig
-from agents.networks.mixed_flux import ATTENTIONS
+from agents.networks.mixed_flux_config import ATTENTIONS
 from agents.packing import pack
 from agents.prior import tiny_prior
 from scene_envs.errors import InvalidInputError
