@@ -32,6 +32,9 @@ class Contacts(nn.Module):
     sees it, and both categories gives the distances at which they would touch: sideways, in height, and along the axes
     of each. The gaps are what is left of the actual distances, over the noise on both. A second network weighs them.
 
+    A slot whose category is masked gets no message: what stands in another would be taken for empty, which is so of
+    real scenes with noise on them, but of samples takes objects away that only stand a little wrong.
+
     Args:
         categories: K = C + 1; the mask token is one more.
         features: numbers per pair of slots, from :class:`~agents.networks.relations.Relations`.
@@ -69,7 +72,7 @@ class Contacts(nn.Module):
         features: Tensor,
         slot_mask: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Messages (B, N, H) to every slot, and displacements (B, N, :data:`CHANNELS`, 3) in units of the noise.
+        """Messages (B, N, H) to slots, 0 where the category is masked, and displacements (B, N, :data:`CHANNELS`, 3) in units of the noise.
 
         Args:
             metres: (B, N, 3) noisy positions.
@@ -100,7 +103,8 @@ class Contacts(nn.Module):
         sign = along / (along.square() + both.square()).sqrt()
         ways = [aside, sign[..., 1:5], (sign[..., 5:, None] * rotation.mT.unsqueeze(1)).flatten(-2)]
         moves = self._displacements(weighed, torch.cat(ways, dim=-1), bounded, rotation)
-        return self.out(weighed[..., :-1].sum(dim=2)), moves
+        known = (states < self.kind.num_embeddings - 1).unsqueeze(-1)
+        return self.out(weighed[..., :-1].sum(dim=2)) * known, moves
 
     def _displacements(self, weighed: Tensor, ways: Tensor, bounded: Tensor, rotation: Tensor) -> Tensor:
         """(B, N, CHANNELS, 3): along every gap an amplitude, and another times the gap, summed over the others.

@@ -103,6 +103,19 @@ def test_an_object_alone_and_filling_offer_nothing() -> None:
     torch.testing.assert_close(messages[0, 0], contacts.out.bias)
 
 
+def test_a_masked_slot_is_moved_but_told_nothing() -> None:
+    torch.manual_seed(1)
+    contacts = Contacts(categories=3, features=4, hidden=8).double()
+    nn.init.normal_(contacts.out.weight)
+    metres = torch.tensor([[[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]], dtype=torch.float64)
+    level, features = torch.full((1, 2), 0.1).double(), torch.zeros(1, 2, 2, 4).double()
+    states = torch.tensor([[0, 3]])  # 3 = K is the mask token
+    messages, moves = contacts(metres, IDENTITY.expand(1, 2, 3, 3), states, level, features)
+    assert messages[0, 1].abs().max() == 0
+    assert messages[0, 0].abs().max() > 0
+    assert moves[0, 1].abs().max() > 0
+
+
 def test_gates_weigh_every_displacement_by_itself() -> None:
     offered = torch.randn(2, 3, CHANNELS, 3, generator=torch.Generator().manual_seed(0))
     gates = torch.zeros(2, 3, 3 * CHANNELS)
