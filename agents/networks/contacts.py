@@ -72,7 +72,7 @@ class Contacts(nn.Module):
         features: Tensor,
         slot_mask: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Messages (B, N, H) to slots, 0 where the category is masked, and displacements (B, N, :data:`CHANNELS`, 3) in units of the noise.
+        """Messages (B, N, H) to slots, and displacements (B, N, :data:`CHANNELS`, 3) in units of the noise.
 
         Args:
             metres: (B, N, 3) noisy positions.
