@@ -113,5 +113,6 @@ def _scale(panel: Axes, column: Column, numbers: Sequence[float]) -> None:
     elif some and max(some) > _LOGARITHMIC * min(some):
         if len(some) == len(numbers):
             panel.set_xscale("log")
+            panel.xaxis.set_minor_formatter("")  # over less than two decades it labels every minor tick, on each other
         else:
             panel.set_xscale("symlog", linthresh=min(some))
