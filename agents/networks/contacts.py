@@ -9,6 +9,8 @@ move anything.
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -30,7 +32,9 @@ class Contacts(nn.Module):
 
     Permutation-equivariant. For slots i and j a network on features of the pair, the direction to each other as each
     sees it, and both categories gives the distances at which they would touch: sideways, in height, and along the axes
-    of each. The gaps are what is left of the actual distances, over the noise on both. A second network weighs them.
+    of each. The gaps are what is left of the actual distances, over the noise on both along the gap: normalised units
+    differ by axis, and so does the noise. A second network weighs them. Of a displacement along a gap every axis takes
+    the share that its noise has in the gap, as the posterior mean under such noise does.
 
     A slot whose category is masked gets no message: what stands in another would be taken for empty, which is so of
     real scenes with noise on them, but of samples takes objects away that only stand a little wrong.
@@ -44,7 +48,7 @@ class Contacts(nn.Module):
 
     >>> contacts = Contacts(categories=3, features=40, hidden=16)
     >>> metres, rotation = torch.randn(2, 5, 3), torch.eye(3).expand(2, 5, 3, 3)
-    >>> states, noise, features = torch.zeros(2, 5).long(), torch.full((2, 5), 0.1), torch.zeros(2, 5, 5, 40)
+    >>> states, noise, features = torch.zeros(2, 5).long(), torch.full((2, 5, 3), 0.1), torch.zeros(2, 5, 5, 40)
     >>> messages, displacements = contacts(metres, rotation, states, noise, features)
     >>> messages.shape, displacements.shape
     (torch.Size([2, 5, 16]), torch.Size([2, 5, 4, 3]))
@@ -78,31 +82,38 @@ class Contacts(nn.Module):
             metres: (B, N, 3) noisy positions.
             rotation: (B, N, 3, 3) rotation matrices; they must be no noisier than that, or the axes are no directions.
             states: (B, N) int64 categories, mask tokens among them.
-            noise: (B, N) standard deviation of the noise on positions, metres.
+            noise: (B, N, 3) standard deviation of the noise on positions along x, y, z, metres.
             features: (B, N, N, F) of pairs of slots.
             slot_mask: (B, N) bool, False for filling that nothing may see; None where there is none.
         """
         offset = metres.unsqueeze(2) - metres.unsqueeze(1)  # (B, N, N, 3) from j to i
-        both = ((noise.square().unsqueeze(2) + noise.square().unsqueeze(1)).sqrt() + _LEAST_NOISE).unsqueeze(-1)
+        variance = noise.square().unsqueeze(2) + noise.square().unsqueeze(1) + _LEAST_NOISE**2
         sideways = offset[..., :2].square().sum(dim=-1, keepdim=True).add(1e-12).sqrt()
-        aside = offset[..., :2] / (sideways.square() + both.square()).sqrt()
+        toward = offset[..., :2] / sideways
         own = offset @ rotation  # the axes of i
         others = torch.einsum("bijw,bjwk->bijk", offset, rotation)
         along = torch.cat([sideways, offset[..., 2:], own, others], dim=-1)  # (B, N, N, GAPS)
+        level = (toward.square() * variance[..., :2]).sum(dim=-1, keepdim=True)
+        squared = rotation.square()
+        spread = [level, variance[..., 2:], variance @ squared, torch.einsum("bijw,bjwk->bijk", variance, squared)]
+        both = torch.cat(spread, dim=-1).sqrt().clamp(min=_LEAST_NOISE)  # (B, N, N, GAPS) noise along each
+        sign = along / (along.square() + both.square()).sqrt()
+        aside = toward * sign[..., :1]
         kinds = self.kind(states)
         early, late = (self.own(kinds).unsqueeze(2) + self.other(kinds).unsqueeze(1)).chunk(2, dim=-1)
         seen = F.silu(self.seen(torch.cat([features, *_as_seen(aside, rotation)], dim=-1)) + early)
         gaps = (along.abs() - _TYPICAL * (1.0 + self.touch(seen))) / both
         bounded = gaps / (1.0 + (gaps / _REACH).square()).sqrt()
-        basis = [bounded, torch.sigmoid(-2.0 * gaps), torch.exp(-0.5 * gaps.square()), both.log()]
+        basis = [bounded, torch.sigmoid(-2.0 * gaps), torch.exp(-0.5 * gaps.square()), both[..., :1].log()]
         weighed = F.silu(self.weigh(torch.cat([seen, *basis], dim=-1)) + late)
         weighed = F.silu(self.second(weighed))
         there = (~torch.eye(states.shape[1], dtype=torch.bool, device=states.device))[None].to(weighed)
         there = (there if slot_mask is None else there * slot_mask.unsqueeze(1)).unsqueeze(-1)
         weighed = torch.cat([weighed * there, there.expand(*weighed.shape[:-1], 1)], dim=-1)  # (B, N, N, W + 1)
-        sign = along / (along.square() + both.square()).sqrt()
-        ways = [aside, sign[..., 1:5], (sign[..., 5:, None] * rotation.mT.unsqueeze(1)).flatten(-2)]
+        sign = sign / both
+        ways = [aside / both[..., :1], sign[..., 1:5], (sign[..., 5:, None] * rotation.mT.unsqueeze(1)).flatten(-2)]
         moves = self._displacements(weighed, torch.cat(ways, dim=-1), bounded, rotation)
+        moves = math.sqrt(2) * noise.unsqueeze(-2) * moves
         known = (states < self.kind.num_embeddings - 1).unsqueeze(-1)
         return self.out(weighed[..., :-1].sum(dim=2)) * known, moves
 

@@ -202,7 +202,7 @@ class MixedFlux(nn.Module):
         if self.contacts is None or self.relations is None or relations is None or geometry is None:
             return None, None
         unit = self.relations.unit.to(geometry.position)
-        metres, noise = geometry.position[..., :3] * unit, geometry.noise_level * unit.max()
+        metres, noise = geometry.position[..., :3] * unit, geometry.noise_level.unsqueeze(-1) * unit
         rotation = geometry.nearest.to(metres)
         messages, moves = self.contacts(metres, rotation, states, noise, relations, slot_mask)
         return messages, moves

@@ -30,17 +30,23 @@ def linear_along(*gaps: int | slice) -> Contacts:
     return contacts
 
 
-def displacement(contacts: Contacts, metres: Tensor, noise: float, rotation: Tensor | None = None) -> Tensor:
+def displacement(
+    contacts: Contacts, metres: Tensor, noise: float | list[float], rotation: Tensor | None = None
+) -> Tensor:
     """(N, 3) of the first channel, for objects at ``metres`` (N, 3)."""
     count = len(metres)
     turned = IDENTITY.expand(1, count, 3, 3) if rotation is None else rotation[None]
-    level = torch.full((1, count), noise, dtype=torch.float64)
+    level = torch.as_tensor(noise, dtype=torch.float64).expand(1, count, 3)
     features = torch.zeros(1, count, count, 4, dtype=torch.float64)
     return contacts(metres[None], turned, torch.zeros(1, count).long(), level, features)[1][0, :, 0].detach()
 
 
+def share(noise: float) -> float:
+    return math.sqrt(2) * noise / math.hypot(math.sqrt(2) * noise, 2e-4)
+
+
 def bounded(gap: float, noise: float) -> float:
-    gap /= math.sqrt(2) * noise + 2e-4
+    gap /= math.hypot(math.sqrt(2) * noise, 2e-4)
     return gap / math.sqrt(1 + (gap / REACH) ** 2)
 
 
@@ -50,7 +56,9 @@ def test_two_objects_part_by_their_gap_in_units_of_the_noise(noise: float, dista
     direction = torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64)
     first, second = displacement(linear_along(SIDEWAYS), torch.stack([0 * direction, distance * direction]), noise)
     torch.testing.assert_close(second, -first)
-    sharpness = distance / math.hypot(distance, math.sqrt(2) * noise + 2e-4)  # the direction itself is noisy
+    sharpness = (
+        share(noise) * distance / math.hypot(distance, math.sqrt(2) * noise, 2e-4)
+    )  # the direction itself is noisy
     wanted = -bounded(distance - TOUCH, noise) * sharpness * direction
     torch.testing.assert_close(second, wanted, atol=1e-4, rtol=1e-4)
 
@@ -59,7 +67,7 @@ def test_what_stands_on_something_is_moved_in_height_alone() -> None:
     metres = torch.tensor([[0.0, 0.0, 0.0], [0.01, 0.0, 0.103]], dtype=torch.float64)
     below, above = displacement(linear_along(HEIGHT), metres, 1e-3)
     assert above.tolist()[:2] == [0.0, 0.0]
-    assert float(above[2]) == pytest.approx(-bounded(0.003, 1e-3), rel=1e-3)
+    assert float(above[2]) == pytest.approx(-share(1e-3) * bounded(0.003, 1e-3), rel=1e-3)
     torch.testing.assert_close(below, -above)
 
 
@@ -71,10 +79,22 @@ def test_boxes_part_along_their_own_axes() -> None:
     rotation = torch.stack([turn, IDENTITY])
     contacts = linear_along(OWN.start)
     first, _ = displacement(contacts, metres, 1e-3, rotation)
-    away = -bounded(-0.001, 1e-3) * turn[:, 0]
+    away = -share(1e-3) * bounded(-0.001, 1e-3) * turn[:, 0]
     torch.testing.assert_close(first, -away, atol=1e-3, rtol=1e-3)
     _, second = displacement(linear_along(OTHERS.start), metres, 1e-3, rotation)
     torch.testing.assert_close(second, away, atol=1e-3, rtol=1e-3)
+
+
+def test_noise_that_differs_by_axis_moves_most_along_the_noisiest() -> None:
+    """Given that two objects touch, the mean of the noise along x is its covariance with the gap over its variance."""
+    direction, noise = torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64), [0.01, 0.002, 0.05]
+    covariance = torch.tensor(noise, dtype=torch.float64).square()
+    along = float(2 * (covariance * direction.square()).sum() + 4e-8)
+    distance, gap = 0.101, 0.001
+    second = displacement(linear_along(SIDEWAYS), torch.stack([0 * direction, distance * direction]), noise)[1]
+    shift = -2 * covariance * direction * gap / along / torch.tensor(noise)  # of both together, in units of the noise
+    sharpness = distance / math.hypot(distance, math.sqrt(along))
+    torch.testing.assert_close(second, shift * sharpness / math.sqrt(2), atol=1e-4, rtol=1e-2)
 
 
 def test_what_is_offered_turns_with_the_scene() -> None:
@@ -94,7 +114,7 @@ def test_an_object_alone_and_filling_offer_nothing() -> None:
     contacts = Contacts(categories=3, features=4, hidden=8).double()
     nn.init.normal_(contacts.out.weight)
     assert displacement(contacts, torch.zeros(1, 3, dtype=torch.float64), 0.1).tolist() == [[0.0, 0.0, 0.0]]
-    level, features = torch.full((1, 2), 0.1).double(), torch.zeros(1, 2, 2, 4).double()
+    level, features = torch.full((1, 2, 3), 0.1).double(), torch.zeros(1, 2, 2, 4).double()
     states, turned = torch.zeros(1, 2).long(), IDENTITY.expand(1, 2, 3, 3)
     metres = torch.tensor([[[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]], dtype=torch.float64)
     only_first = torch.tensor([[True, False]])
@@ -108,7 +128,7 @@ def test_a_masked_slot_is_moved_but_told_nothing() -> None:
     contacts = Contacts(categories=3, features=4, hidden=8).double()
     nn.init.normal_(contacts.out.weight)
     metres = torch.tensor([[[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]], dtype=torch.float64)
-    level, features = torch.full((1, 2), 0.1).double(), torch.zeros(1, 2, 2, 4).double()
+    level, features = torch.full((1, 2, 3), 0.1).double(), torch.zeros(1, 2, 2, 4).double()
     states = torch.tensor([[0, 3]])  # 3 = K is the mask token
     messages, moves = contacts(metres, IDENTITY.expand(1, 2, 3, 3), states, level, features)
     assert messages[0, 1].abs().max() == 0
@@ -144,7 +164,7 @@ def test_numbers_that_are_none_stay_with_their_scene() -> None:
     contacts = Contacts(categories=3, features=4, hidden=8).double()
     metres = torch.randn(2, 3, 3, dtype=torch.float64)
     metres[1, 0, 0] = math.nan
-    level, features = torch.full((2, 3), 0.1).double(), torch.zeros(2, 3, 3, 4).double()
+    level, features = torch.full((2, 3, 3), 0.1).double(), torch.zeros(2, 3, 3, 4).double()
     _, moves = contacts(metres, IDENTITY.expand(2, 3, 3, 3), torch.zeros(2, 3).long(), level, features)
     assert not moves[0].isnan().any()
     assert moves[1].isnan().any()
