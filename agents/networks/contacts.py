@@ -96,7 +96,7 @@ class Contacts(nn.Module):
         level = (toward.square() * variance[..., :2]).sum(dim=-1, keepdim=True)
         squared = rotation.square()
         spread = [level, variance[..., 2:], variance @ squared, torch.einsum("bijw,bjwk->bijk", variance, squared)]
-        both = torch.cat(spread, dim=-1).sqrt().clamp(min=_LEAST_NOISE)  # (B, N, N, GAPS) noise along each
+        both = torch.cat(spread, dim=-1).clamp(min=_LEAST_NOISE**2).sqrt()  # (B, N, N, GAPS) noise along each
         sign = along / (along.square() + both.square()).sqrt()
         aside = toward * sign[..., :1]
         kinds = self.kind(states)
