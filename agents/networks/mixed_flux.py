@@ -204,7 +204,8 @@ class MixedFlux(nn.Module):
         unit = self.relations.unit.to(geometry.position)
         metres, noise = geometry.position[..., :3] * unit, geometry.noise_level.unsqueeze(-1) * unit
         rotation = geometry.nearest.to(metres)
-        messages, moves = self.contacts(metres, rotation, states, noise, relations, slot_mask)
+        with torch.autocast(metres.device.type, enabled=False):  # half of a percent of a metre is too much
+            messages, moves = self.contacts(metres, rotation, states, noise, relations, slot_mask)
         return messages, moves
 
     def _turns(self, geometry: _Geometry | None) -> Tensor | None:

@@ -170,6 +170,21 @@ def test_numbers_that_are_none_stay_with_their_scene() -> None:
     assert moves[1].isnan().any()
 
 
+def test_half_precision_of_the_network_leaves_contacts_exact() -> None:
+    """bfloat16 knows a metre to four millimetres."""
+    torch.manual_seed(0)
+    config = MixedFluxConfig(categories=5, hidden=16, heads=2, embedding=16, attention="relative", contacts=1)
+    network = build_network(config)
+    told: list[Tensor] = []
+    network.contacts.register_forward_hook(lambda module, given, out: told.append(out[1].detach()))
+    position = torch.cat([torch.randn(2, 6, 3), torch.eye(3).flatten().expand(2, 6, 9)], dim=-1)
+    inputs = {"position": position, "noise_level": torch.full((2, 6), 1e-3)}
+    for precision in (torch.float32, torch.bfloat16):
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=precision == torch.bfloat16):
+            network(position, torch.zeros(2, 6).long(), torch.zeros(2), **inputs)
+    torch.testing.assert_close(told[1], told[0])
+
+
 def test_noise_without_end_moves_nothing_without_end() -> None:
     """Noisy matrices are no rotations: what is made of their axes would grow with the noise."""
     torch.manual_seed(0)
