@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from agents.checkpoints import save_checkpoint
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.curves import draw_curve
@@ -25,6 +27,7 @@ from agents.post_training.run_files import (
     write_metrics,
 )
 from agents.prior import ScenePrior
+from agents.prompt_room import check_room
 from rewards import reward_name
 from scene_envs.errors import TrainingError
 from scene_envs.scene import SceneBatch
@@ -145,6 +148,9 @@ class PostTrainer:
         prompts: PromptSets | None = None
         if self.prior.conditional:
             prompts = prompts_beside(self.directory, batch, seed)
+            if config.prompt == "data":
+                large = torch.nonzero(batch.counts > self.learner.slots)[:, 0].tolist()
+                check_room([text for i in large for text in prompts(i)], self.prior.scene_type, self.learner.slots)
         x0 = self.prior.encode(batch.to(config.device))
         self.scenes = RealScenes.split(x0, config.guard_scenes, prompts)
         asked = self.scenes.heldout_prompts()

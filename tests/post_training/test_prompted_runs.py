@@ -131,6 +131,13 @@ def test_stopped_and_resumed_run_equals_the_uninterrupted_one(tmp_path: Path) ->
     assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
 
 
+def test_prompts_of_real_scenes_that_do_not_fit_are_refused_at_the_start(tmp_path: Path) -> None:
+    trainer = PostTrainer(small_config(tmp_path, slots=4, prompt="data"), prior=reader())
+    with pytest.raises(InvalidInputError, match=r"asks for \d+ objects, a scene has 4 slots; give slots=\d+ or more"):
+        trainer.prepare()
+    trainer.close()
+
+
 def test_real_scenes_bring_their_own_prompts(tmp_path: Path) -> None:
     generate("dimsum_table", 24, tmp_path / "data", seed=0, workers=0)
     dataset = SceneDataset.load(tmp_path / "data")
