@@ -177,6 +177,7 @@ def _network(
         heads=config.heads,
         text_width=text_width,
         attention=config.attention,
+        relation_blur=config.relation_blur,
         frequencies=config.frequencies,
         rotation_features=int(config.rotation_features),
         contacts=int(config.contacts),

@@ -37,6 +37,8 @@ class PretrainConfig:
         network: ``flux`` (ours), ``midiffusion``, ``diffuscene``, or ``paper`` for the paper's flux network of 88.3 M
             parameters, whatever hidden, depth, heads, attention and frequencies say.
         attention: of the mixed flux network: ``plain``, or ``relative``, which sees where other objects stand.
+        relation_blur: with attention=relative: the noise that blurs what is seen along x, y and z, of the ``axis``
+            itself, or of the one where it is ``largest``.
         frequencies: octaves of Fourier features of each translation (flux only); 0 for none.
         rotation_features: the mixed flux network is told how far each rotation is off SO(3), and off upright, in units
             of the noise.
@@ -120,6 +122,7 @@ class PretrainConfig:
     recipe: str = "ours"
     network: str = "flux"
     attention: str = "relative"
+    relation_blur: str = "axis"
     frequencies: int = 8
     rotation_features: bool = True
     contacts: bool = True

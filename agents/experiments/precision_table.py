@@ -51,6 +51,7 @@ FACTORS: tuple[Setting, ...] = (
     *_each("Fourier octaves", "frequencies", 0, 8),
     *_each("features of rotations", "rotation_features", False, True),
     *_each("contacts", "contacts", False, True),
+    *_each("relations blurred by the noise of the", "relation_blur", "largest", "axis"),
     ("no learning-rate decay", {"final_learning_rate": 1.0}),
     ("learning rate decays from the warm-up on", {"decay_share": 1.0}),
     *_each("optimizer", "optimizer", "muon", "adamw"),
@@ -68,6 +69,7 @@ _NEEDS = {
     "noise_ceiling": ("schedule", "karras"),
     "moments": ("prediction", "karras"),
     "contacts": ("attention", "relative"),
+    "relation_blur": ("attention", "relative"),
 }
 """Keys that are read only where another key has a value."""
 

@@ -73,7 +73,7 @@ class MixedFlux(nn.Module):
             SingleStreamBlock(hidden, config.heads, config.mlp_ratio, features) for _ in range(config.single_blocks)
         )
         blocks = doubles + config.single_blocks
-        self.relations = Relations(blocks, config.heads, config.unit) if features else None
+        self.relations = Relations(blocks, config.heads, config.unit, blur=config.relation_blur) if features else None
         self.final_modulation = nn.Linear(hidden, 2 * hidden)
         self.final = nn.Linear(hidden, width)
         self.pose_out = nn.Sequential(nn.Linear(width, config.pose_head), nn.SiLU(), nn.Linear(config.pose_head, POSE))

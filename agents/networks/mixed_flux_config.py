@@ -33,6 +33,8 @@ class MixedFluxConfig:
         flags: 1 to tell the network which poses and categories are given (inpainting), 0 as the paper.
         attention: ``"plain"``, or ``"relative"`` for attention that sees where other slots stand.
         unit: metres per normalised unit along x, y, z, which ``"relative"`` needs.
+        relation_blur: the noise that blurs what ``"relative"`` sees along an axis: of the ``"axis"``, or the
+            ``"largest"`` of all (:class:`~agents.networks.relations.Relations`).
         text_reach: how far text goes: to the ``"double"``-stream blocks, or through ``"all"`` blocks, as the paper's.
         pooled_text: 1 to add the mean of the text tokens to the embedded time, which modulates every block (as Flux
             does with a pooled embedding), 0 as the paper.
@@ -63,6 +65,7 @@ class MixedFluxConfig:
     flags: int = 1
     attention: str = "plain"
     unit: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    relation_blur: str = "largest"
     text_reach: str = "all"
     pooled_text: int = 0
     tally: int = 0

@@ -75,6 +75,7 @@ def network_config(
     heads: int,
     text_width: int = 0,
     attention: str = "plain",
+    relation_blur: str = "axis",
     frequencies: int = 8,
     unit: tuple[float, float, float] = (1.0, 1.0, 1.0),
     text_reach: str = "all",
@@ -98,7 +99,7 @@ def network_config(
             ``diffuscene`` has a third as many residual blocks per level.
         heads: attention heads.
         text_width: width of the text tokens; 0 for none. The continuous ``flux`` reads none.
-        attention: read by the mixed ``flux`` alone, see :class:`~agents.networks.MixedFluxConfig`.
+        attention, relation_blur: read by the mixed ``flux`` alone, see :class:`~agents.networks.MixedFluxConfig`.
         frequencies: read by ``flux`` alone: the others are as published, unless their configuration is made by hand.
         unit: read by the mixed ``flux`` alone.
         text_reach, pooled_text, tally, requests, kinds: read by the mixed ``flux`` alone.
@@ -124,7 +125,8 @@ def network_config(
         sizes |= {"depth": depth, "frequencies": frequencies}
     else:
         sizes |= {"double_blocks": max(1, depth // 3), "single_blocks": depth, "embedding": hidden}
-        sizes |= {"text_width": text_width, "attention": attention, "frequencies": frequencies, "unit": unit}
+        sizes |= {"text_width": text_width, "frequencies": frequencies, "unit": unit}
+        sizes |= {"attention": attention, "relation_blur": relation_blur}
         sizes |= {"text_reach": text_reach, "pooled_text": pooled_text, "tally": tally}
         sizes |= {"requests": requests if text_width else 0, "kinds": kinds}
         sizes |= {"rotation_features": rotation_features, "contacts": contacts, "rotations": rotations}

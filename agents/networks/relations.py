@@ -12,9 +12,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from scene_envs.errors import unknown_name
+
 _SCALES, _DIRECTED = 8, 8
 FEATURES = 2 * _SCALES + 3 * _DIRECTED
 """Numbers per pair of slots."""
+BLURS = ("axis", "largest")
+"""Whose noise blurs the features of an axis."""
 
 
 def pair_features(metres: Tensor, noise: Tensor, scales: Tensor) -> Tensor:
@@ -26,18 +30,19 @@ def pair_features(metres: Tensor, noise: Tensor, scales: Tensor) -> Tensor:
 
     Args:
         metres: (B, N, 3) positions.
-        noise: (B, N) standard deviation of the noise on them, metres.
+        noise: (B, N, 3) standard deviation of the noise on them along x, y, z, metres.
         scales: (8,) lengths, metres.
     """
     variance = noise.square()
-    offset = metres.unsqueeze(2) - metres.unsqueeze(1)  # (B, N, N, 3)
-    spread = (variance.unsqueeze(2) + variance.unsqueeze(1)).unsqueeze(-1) + scales.square()
-    across, height = offset[..., :2], offset[..., 2:]
-    squared = across.square().sum(dim=-1, keepdim=True)
+    offset = (metres.unsqueeze(2) - metres.unsqueeze(1)).unsqueeze(-1)  # (B, N, N, 3, 1)
+    squared = offset.square()
+    spread = (variance.unsqueeze(2) + variance.unsqueeze(1)).unsqueeze(-1) + scales.square()  # (B, N, N, 3, 8)
+    across = (squared[..., :2, :] / spread[..., :2, :]).sum(dim=-2)
     coarse = spread[..., :: _SCALES // _DIRECTED]
-    level = height / (height.square() + coarse).sqrt()
-    direction = (across.unsqueeze(-1) / (squared + coarse).sqrt().unsqueeze(-2)).flatten(-2)
-    gaussians = [torch.exp(-0.5 * squared / spread), torch.exp(-0.5 * height.square() / spread)]
+    level = offset[..., 2, :] / (squared[..., 2, :] + coarse[..., 2, :]).sqrt()
+    horizontal = squared[..., :2, :].sum(dim=-2, keepdim=True)
+    direction = (offset[..., :2, :] / (horizontal + coarse[..., :2, :]).sqrt()).flatten(-2)
+    gaussians = [torch.exp(-0.5 * across), torch.exp(-0.5 * squared[..., 2, :] / spread[..., 2, :])]
     return torch.cat([*gaussians, level, direction], dim=-1)
 
 
@@ -51,6 +56,8 @@ class Relations(nn.Module):
         heads: heads per block.
         unit: metres per normalised unit along x, y, z; 0 along an axis that never varies.
         width: hidden width.
+        blur: the noise that blurs features of an axis: of the ``"axis"`` itself, or of the one where it is
+            ``"largest"`` for all, which is too much for heights in rooms.
 
     >>> relations = Relations(blocks=2, heads=4, unit=(0.5, 0.5, 0.5))
     >>> bias, features = relations(torch.zeros(3, 5, 3), torch.ones(3, 5))
@@ -58,9 +65,13 @@ class Relations(nn.Module):
     (torch.Size([2, 3, 4, 5, 5]), torch.Size([3, 5, 5, 40]))
     """
 
-    def __init__(self, blocks: int, heads: int, unit: tuple[float, float, float], width: int = 32) -> None:
+    def __init__(
+        self, blocks: int, heads: int, unit: tuple[float, float, float], width: int = 32, blur: str = "axis"
+    ) -> None:
         super().__init__()
-        self.blocks, self.heads = blocks, heads
+        if blur not in BLURS:
+            raise unknown_name("blur", blur, BLURS)
+        self.blocks, self.heads, self.blur = blocks, heads, blur
         largest = torch.tensor(max(*unit, 0.1))
         self.unit: Tensor
         self.scales: Tensor
@@ -79,7 +90,8 @@ class Relations(nn.Module):
             noise_level: (B, N) noise on them, in the same units.
         """
         unit = self.unit.to(position)
-        features = pair_features(position * unit, noise_level * unit.max(), self.scales.to(position))
+        blurred = unit if self.blur == "axis" else unit.max().expand(3)
+        features = pair_features(position * unit, noise_level.unsqueeze(-1) * blurred, self.scales.to(position))
         bias: Tensor = self.out(F.silu(self.hidden(features[..., : 2 * _SCALES + _DIRECTED])))
         return bias.unflatten(-1, (self.blocks, self.heads)).permute(3, 0, 4, 1, 2), features
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 
+import pytest
 import torch
 from torch import nn
 
 from agents.networks.relations import FEATURES, Relations, joint_attention, pair_features
+from scene_envs.errors import UnknownNameError
 
 SCALES = torch.logspace(-2, 0, 8, dtype=torch.float64)
 
@@ -15,7 +17,7 @@ SCALES = torch.logspace(-2, 0, 8, dtype=torch.float64)
 def _scene(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     metres = torch.rand(2, 6, 3, generator=generator, dtype=torch.float64)
-    return metres, 0.1 * torch.rand(2, 6, generator=generator, dtype=torch.float64)
+    return metres, 0.1 * torch.rand(2, 6, 1, generator=generator, dtype=torch.float64).expand(-1, -1, 3)
 
 
 def test_only_offsets_count_and_turning_the_scene_turns_the_directions() -> None:
@@ -33,16 +35,29 @@ def test_only_offsets_count_and_turning_the_scene_turns_the_directions() -> None
     )
 
 
-def test_blurred_distances_are_expectations_under_the_noise() -> None:
-    """E exp(-d^2 / 2 l^2) of a height difference under noise of variance s^2 is l / sqrt(l^2 + s^2) of the feature."""
+def test_blurred_distances_are_expectations_under_the_noise_of_their_axes() -> None:
+    """E exp(-d^2 / 2 l^2) of an offset under noise of variance s^2 is l / sqrt(l^2 + s^2) of the feature, per axis."""
     generator = torch.Generator().manual_seed(1)
-    metres = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, 0.3]]], dtype=torch.float64)
-    noise = torch.tensor([[0.1, 0.2]], dtype=torch.float64)
-    feature = pair_features(metres, noise, SCALES)[0, 0, 1, 8:16]
-    drawn = 0.3 + torch.randn(400_000, generator=generator, dtype=torch.float64) * math.hypot(0.1, 0.2)
-    expected = torch.exp(-0.5 * drawn[:, None] ** 2 / SCALES**2).mean(dim=0)
-    factor = SCALES / (SCALES**2 + 0.05).sqrt()
-    torch.testing.assert_close(feature * factor, expected, atol=2e-3, rtol=0)
+    metres = torch.tensor([[[0.0, 0.0, 0.0], [0.2, -0.1, 0.3]]], dtype=torch.float64)
+    noise = torch.tensor([[[0.3, 0.1, 0.1], [0.4, 0.1, 0.2]]], dtype=torch.float64)
+    variance = noise.square().sum(dim=1)[0]
+    features = pair_features(metres, noise, SCALES)[0, 0, 1]
+    drawn = metres[0, 1] + torch.randn(400_000, 3, generator=generator, dtype=torch.float64) * variance.sqrt()
+    factors = SCALES / (SCALES**2 + variance[:, None]).sqrt()  # (3, 8)
+    height = torch.exp(-0.5 * drawn[:, 2:] ** 2 / SCALES**2).mean(dim=0)
+    torch.testing.assert_close(features[8:16] * factors[2], height, atol=2e-3, rtol=0)
+    across = torch.exp(-0.5 * drawn[:, :2].square().sum(dim=-1, keepdim=True) / SCALES**2).mean(dim=0)
+    torch.testing.assert_close(features[:8] * factors[:2].prod(dim=0), across, atol=2e-3, rtol=0)
+
+
+def test_a_low_axis_is_blurred_by_its_own_noise() -> None:
+    """In a room of 5 m by 0.5 m noise of 0.02 is 1 cm in height, which leaves 2 cm visible; 10 cm would not."""
+    position, noise = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, 0.04]]]), torch.full((1, 2), 0.02)
+    for blur, metres in (("axis", 0.01), ("largest", 0.1)):
+        height = Relations(1, 2, (5.0, 5.0, 0.5), blur=blur)(position, noise)[1][0, 0, 1, 8]
+        assert float(height) == pytest.approx(math.exp(-0.5 * 0.02**2 / (2 * metres**2 + 0.01**2)), rel=1e-5)
+    with pytest.raises(UnknownNameError, match="axis"):
+        Relations(1, 2, (1.0, 1.0, 1.0), blur="axes")
 
 
 def test_messages_are_weighted_means_of_the_features() -> None:
