@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_envs.scene_types import SceneType
+from scene_envs.scene_types import FixedObject, SceneType
 
 Array = NDArray[np.float64]
 _SIDES = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -73,6 +73,41 @@ def frame_scene_type(scene_type: SceneType) -> Framing:
     base = upper if len(upper) else _footprint(low, high, 1.0, low[2])
     points = np.concatenate([base, filled])
     return Framing(points, _direction(azimuth, elevation), _direction(azimuth - 85.0, 57.0), ground)
+
+
+def scene_type_of_one(
+    scene_type: SceneType, translations: Array, rotations: Array, categories: NDArray[np.int64]
+) -> SceneType:
+    """The scene type as which to look at one scene: that of its only support, in types that hold tables and rooms.
+
+    A union of scene types has no fixed objects and the workspace of the largest, in which a table is a speck. A scene
+    with one welded object is framed as if that were fixed there; any other as ``scene_type``.
+
+    Args:
+        scene_type: of the scene.
+        translations: (N, 3) m.
+        rotations: (N, 3, 3).
+        categories: (N,) int64, empty ones being the number of assets.
+    """
+    names = np.array([*scene_type.assets, ""])[categories]
+    supports = np.flatnonzero(np.isin(names, scene_type.welded))
+    if scene_type.fixed or len(supports) != 1:
+        return scene_type
+
+    def fixed(slots: NDArray[np.int64]) -> SceneType:
+        poses = ((translations[slot].tolist(), rotations[slot].ravel().tolist()) for slot in slots)
+        objects = (FixedObject(str(names[slot]), *map(tuple, pose)) for slot, pose in zip(slots, poses, strict=True))
+        return replace(scene_type, fixed=tuple(objects))
+
+    support = fixed(supports)
+    vertices = _fixed_geometry(support)[1]
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    lost = np.abs(translations - 0.5 * (low + high)).max(axis=1) > (high - low).max()
+    objects = np.flatnonzero((names != "") & (np.arange(len(names)) != supports[0]) & ~lost)
+    low[2] = translations[objects, 2].min(initial=high[2])
+    tops = _fixed_geometry(fixed(objects))[1][:, 2]
+    high[2] = max(high[2], tops.max(initial=-np.inf), low[2] + 0.1 * (high - low)[:2].max())
+    return replace(support, workspace=(tuple(low.tolist()), tuple(high.tolist())))
 
 
 def fit_camera(points: Array, to_camera: Array, fov_y: float, aspect: float, margin: float) -> tuple[Array, Array]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.render.cameras import light_camera, picture_camera
-from scene_envs.render.framing import frame_scene_type
+from scene_envs.render.framing import frame_scene_type, scene_type_of_one
 from scene_envs.render.lighting import blur, contact_shade, soft_shadow, surface_normals
 from scene_envs.render.stage import Frame, Stage, get_stage
 from scene_envs.rotations import matrix_to_quaternion
@@ -43,8 +43,9 @@ def render(
 
     Args:
         batch: B scenes.
-        style: ``"picture"`` is a lit three-quarter view with soft shadows; ``"semantic"`` is one flat colour per
-            asset on white, seen by the camera of the scene type (the paper's: 640 x 480, 45 degrees).
+        style: ``"picture"`` is a lit three-quarter view with soft shadows, in types without fixed objects of the only
+            support where a scene has but one; ``"semantic"`` is one flat colour per asset on white, seen by the camera
+            of the scene type (the paper's: 640 x 480, 45 degrees).
         camera: replaces the camera of the style.
         width: image width, pixels; the camera's by default. The view of a picture is fitted to the image.
         height: image height, pixels; the camera's by default.
@@ -61,9 +62,8 @@ def render(
     scene_type = batch.scene_type
     if style not in _STYLES:
         raise unknown_name("render style", style, _STYLES)
-    if camera is None:
-        camera = scene_type.camera if style == "semantic" else _fitted_camera(scene_type, width, height)
-    width, height = camera.width if width is None else width, camera.height if height is None else height
+    default = camera or (scene_type.camera if style == "semantic" else _fitted_camera(scene_type, width, height))
+    width, height = default.width if width is None else width, default.height if height is None else height
     if width < 1 or height < 1:
         raise InvalidInputError(f"an image needs at least 1 x 1 pixels, got width={width}, height={height}")
     marked = _as_mask(highlight, batch)
@@ -73,12 +73,14 @@ def render(
     quaternions = matrix_to_quaternion(rotations.detach().cpu().double()).numpy()
     stage = get_stage(scene_type.assets, scene_type.asset_folders)
     images = np.empty((len(batch), height, width, 3), dtype=np.uint8)
-    for index in range(len(batch)):
+    for index, rotation in enumerate(rotations.detach().cpu().double().numpy()):
         stage.place(translations[index], quaternions[index], categories[index])
         if style == "semantic":
-            images[index] = _semantic(stage.look(camera, width, height), categories[index], scene_type)
+            images[index] = _semantic(stage.look(default, width, height), categories[index], scene_type)
         else:
-            images[index] = _picture(stage, camera, width, height, scene_type, marked[index])
+            seen = scene_type_of_one(scene_type, translations[index], rotation, categories[index])
+            view = camera or (default if seen is scene_type else picture_camera(seen, width, height))
+            images[index] = _picture(stage, view, width, height, seen, marked[index])
     return images
 
 

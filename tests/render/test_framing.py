@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from scene_envs.datasets import to_union, union_scene_type
 from scene_envs.errors import InvalidInputError, UnknownNameError
+from scene_envs.grammars import get_grammar
 from scene_envs.render import picture_camera
 from scene_envs.render.cameras import light_camera
-from scene_envs.render.framing import fit_camera, frame_scene_type
+from scene_envs.render.framing import fit_camera, frame_scene_type, scene_type_of_one
 from scene_envs.scene_types import Camera, FixedObject, SceneType, get_scene_type, list_scene_types
 
 BUILT_IN = list_scene_types()
@@ -109,3 +111,30 @@ def test_wrong_arguments_are_named():
         picture_camera("dimsum_tabel")
     with pytest.raises(InvalidInputError, match="height=0"):
         picture_camera("dimsum_table", 10, 0)
+
+
+@pytest.mark.parametrize("name", ["dimsum_table", "pantry_shelf", "breakfast_table_low_clutter"])
+def test_a_table_among_rooms_is_seen_from_near(name):
+    """In a union with a room its support fills the picture as it does in a type of its own, and is the whole of it."""
+    union = union_scene_type([name, "restaurant_low_clutter"])
+    scene = to_union(get_grammar(name).sample(np.random.default_rng(0), 1), union)
+    parts = (scene.translations[0].numpy(), scene.rotations[0].numpy(), scene.categories[0].numpy())
+    seen = scene_type_of_one(union, *parts)
+    camera = picture_camera(seen)
+    own = get_scene_type(name)
+    vertices = fixed_vertices(own)
+    top = vertices if "shelf" in name else vertices[vertices[:, 2] > vertices[:, 2].max() - 0.03]
+    places, depth = in_image(top, camera)
+    assert (depth > 0).all()
+    assert np.abs(places).max() <= 0.951
+    assert np.ptp(places, axis=0).max() > 1.2
+    objects = scene.translations[0][~scene.is_empty[0]].numpy()
+    assert np.abs(in_image(objects, camera)[0]).max() <= 1.0
+    assert np.dot(frame_scene_type(seen).to_camera, frame_scene_type(own).to_camera) > 0.9
+
+
+def test_rooms_and_types_with_a_support_of_their_own_keep_their_view():
+    for name in ("restaurant_low_clutter", "dimsum_table"):
+        scene = get_grammar(name).sample(np.random.default_rng(0), 1)
+        parts = (scene.translations[0].numpy(), scene.rotations[0].numpy(), scene.categories[0].numpy())
+        assert scene_type_of_one(scene.scene_type, *parts) is scene.scene_type
