@@ -27,9 +27,13 @@ def test_every_prior_has_a_card_with_figures_beside_those_of_real_scenes(name: s
 
 @pytest.mark.parametrize("name", READERS)
 def test_the_number_of_objects_follows_the_prompt(name: str) -> None:
-    """A small and a large number among those that it comes up with by itself; without reading it would miss both."""
+    """Of a small and a large number among those that it comes up with by itself, it misses by half of what it would
+    without reading, or by less."""
     prior = ScenePrior.load(name)
     free = prior.sample(8, num_steps=20, seed=0).counts.sort().values
+    missed, unread = [], []
     for asked in (int(free[1]), int(free[-2])):
         counts = prior.sample(6, prompt=f"A scene with {asked} objects.", guidance=1.0, num_steps=20, seed=1).counts
-        assert float((counts - asked).abs().float().mean()) < max(1.0, 0.4 * float(free.float().std()))
+        missed += (counts - asked).abs().tolist()
+        unread += (free - asked).abs().tolist()
+    assert sum(missed) / len(missed) < max(1.0, 0.5 * sum(unread) / len(unread))
