@@ -43,6 +43,8 @@ from scene_envs.scene_types import SceneType, get_scene_type
 
 CATEGORY_LOSSES = ("cross_entropy", "bound")
 _TEXT = "text_encoder."
+_AT_ONCE = 32
+"""Scenes whose residual is measured at once: features of all pairs of slots of 512 rooms would be gigabytes."""
 
 
 class MixedPrior(PromptReader, ScenePrior):
@@ -357,9 +359,11 @@ class MixedPrior(PromptReader, ScenePrior):
         for t in timesteps:
             noise = torch.randn(x0.shape, generator=generator).to(x0.device)
             level = t.to(x0.device).expand(len(x0))
-            x_t = self.add_noise(x0, level, noise)
-            pose, _ = self.denoiser(x_t, level, self.seen(x_t), self.unconditional(len(x0)))
-            error = (pose - x0[..., :POSE]).square() * present[..., None]
+            poses = [
+                self.denoiser(part, level[: len(part)], self.seen(part), self.unconditional(len(part)))[0]
+                for part in self.add_noise(x0, level, noise).split(_AT_ONCE)
+            ]
+            error = (torch.cat(poses) - x0[..., :POSE]).square() * present[..., None]
             rows.append((error.sum(dim=(0, 1)) / present.sum()).cpu())
         self.residual = ResidualVariance(timesteps, torch.stack(rows))
         return self.residual
