@@ -173,11 +173,22 @@ def register_scene_type(scene_type: SceneType) -> SceneType:
 
 
 def get_scene_type(name: str | SceneType) -> SceneType:
-    """The scene type called ``name``; raises UnknownNameError with the nearest known name."""
+    """The scene type called ``name``; names joined by ``+`` are their union.
+
+    Raises:
+        UnknownNameError: no scene type has that name; says which is nearest.
+
+    >>> get_scene_type("dimsum_table+pantry_shelf").slots
+    61
+    """
     if isinstance(name, SceneType):
         return name
     if name not in _REGISTRY:
         load_plugins()
+    if name not in _REGISTRY and "+" in name:
+        from scene_envs.unions import union_scene_type
+
+        return union_scene_type(name.split("+"), name)
     if name not in _REGISTRY:
         raise unknown_name("scene type", name, _REGISTRY)
     return _REGISTRY[name]

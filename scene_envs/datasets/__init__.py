@@ -9,8 +9,9 @@ from scene_envs.datasets.ranges import fixed_normalizer
 from scene_envs.datasets.splits import Part
 from scene_envs.datasets.store import StorageError
 from scene_envs.datasets.stream import SceneStream
-from scene_envs.datasets.union import from_union, to_union, union_normalizer, union_scene_type
+from scene_envs.datasets.union import from_union, to_union, union_normalizer
 from scene_envs.datasets.verification import judge_scenes, verify_scenes
+from scene_envs.unions import union_scene_type
 
 __all__ = [
     "DatasetInfo",

@@ -7,7 +7,7 @@ from importlib import import_module
 
 import pytest
 
-MODULES = ["dataset", "mixing", "splits", "stream", "union"]
+MODULES = ["dataset", "mixing", "splits", "stream"]
 MODULES += [f"prompts.{name}" for name in ("claims", "facts", "language", "parser")]
 
 

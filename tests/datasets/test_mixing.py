@@ -25,7 +25,7 @@ from scene_envs.datasets import (
     union_scene_type,
 )
 from scene_envs.datasets import files as files_module
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type
@@ -232,6 +232,13 @@ def test_a_state_of_another_mixture_is_refused() -> None:
 
 
 # -- unions -----------------------------------------------------------------------------------------
+
+
+def test_names_joined_by_plus_are_the_union_everywhere() -> None:
+    assert get_scene_type("dimsum_table+pantry_shelf") == union_scene_type(["dimsum_table", "pantry_shelf"])
+    with pytest.raises(UnknownNameError, match="did you mean 'pantry_shelf'"):
+        get_scene_type("dimsum_table+pantry_shlf")
+
 
 
 def test_a_union_holds_the_assets_slots_and_room_of_all() -> None:
