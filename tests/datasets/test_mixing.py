@@ -240,7 +240,6 @@ def test_names_joined_by_plus_are_the_union_everywhere() -> None:
         get_scene_type("dimsum_table+pantry_shlf")
 
 
-
 def test_a_union_holds_the_assets_slots_and_room_of_all() -> None:
     names = ["breakfast_table_high_clutter", "dimsum_table", "restaurant_high_clutter"]
     union = union_scene_type(names)
