@@ -27,13 +27,17 @@ def test_every_prior_has_a_card_with_figures_beside_those_of_real_scenes(name: s
 
 @pytest.mark.parametrize("name", READERS)
 def test_the_number_of_objects_follows_the_prompt(name: str) -> None:
-    """Of a small and a large number among those that it comes up with by itself, it misses by half of what it would
-    without reading, or by less."""
+    """A small and a large number among those that it comes up with by itself; without reading it would miss both.
+
+    A prior of all types has the wider spread of all, and misses by half of what it would without reading, or by less.
+    """
     prior = ScenePrior.load(name)
     free = prior.sample(8, num_steps=20, seed=0).counts.sort().values
     missed, unread = [], []
     for asked in (int(free[1]), int(free[-2])):
         counts = prior.sample(6, prompt=f"A scene with {asked} objects.", guidance=1.0, num_steps=20, seed=1).counts
-        missed += (counts - asked).abs().tolist()
-        unread += (free - asked).abs().tolist()
-    assert sum(missed) / len(missed) < max(1.0, 0.5 * sum(unread) / len(unread))
+        missed.append(float((counts - asked).abs().float().mean()))
+        unread.append(float((free - asked).abs().float().mean()))
+    if "+" not in prior.scene_type.name:
+        assert max(missed) < max(1.0, 0.4 * float(free.float().std()))
+    assert sum(missed) < max(2.0, 0.5 * sum(unread))
