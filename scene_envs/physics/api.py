@@ -135,16 +135,44 @@ def project(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> Projection
     )
 
 
-def make_ready(batch: SceneBatch, *, duration: float = 1.5, pool: PhysicsPool | None = None) -> ReadyResult:
+def make_ready(
+    batch: SceneBatch, *, duration: float = 1.5, rounds: int = 5, pool: PhysicsPool | None = None
+) -> ReadyResult:
     """Project, settle, then count what is feasible inside the workspace: the simulation-ready objects.
+
+    Where some object is not ready, the settled scene goes through it again, up to ``rounds`` times in all, and the
+    round with most ready objects is kept, the earliest of equal ones: thin things on the edges of others come to rest
+    a little more than 1 mm deep in them, and what fell has room elsewhere.
 
     Args:
         batch: B scenes of N slots.
-        duration: longest time to settle, s.
+        duration: longest time to settle in each round, s.
+        rounds: most rounds per scene, at least 1.
         pool: worker processes; None computes in this process.
 
-    Raises InvalidInputError and MissingDependencyError as :func:`feasibility` does.
+    Raises InvalidInputError, also for ``rounds`` below 1, and MissingDependencyError as :func:`feasibility` does.
     """
+    if rounds < 1:
+        raise InvalidInputError(f"rounds={rounds} must be at least 1: each projects and settles once")
+    best = last = _make_ready_once(batch, duration, pool)
+    tensor, ready, counts = best.batch.tensor.clone(), best.ready.clone(), best.counts.clone()
+    free = best.batch.is_free.sum(dim=-1)
+    scenes = torch.arange(len(batch))  # that went through the last round
+    for _ in range(rounds - 1):
+        again = (last.valid & (counts < free)[scenes]).nonzero()[:, 0]
+        if not len(again):
+            break
+        scenes = scenes[again]
+        last = _make_ready_once(last.batch[again], duration, pool)
+        better = last.counts > counts[scenes]
+        improved = scenes[better]
+        tensor[improved], ready[improved] = last.batch.tensor[better], last.ready[better]
+        counts[improved] = last.counts[better]
+    return ReadyResult(SceneBatch(tensor, best.batch.scene_type), ready, counts, best.valid)
+
+
+def _make_ready_once(batch: SceneBatch, duration: float, pool: PhysicsPool | None) -> ReadyResult:
+    """One round of :func:`make_ready`."""
     projected = project(batch, pool=pool)
     settled = settle(projected.batch, duration=duration, pool=pool)
     judged = feasibility(settled.batch, pool=pool)

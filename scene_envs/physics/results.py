@@ -122,10 +122,10 @@ class ReadyResult:
     """Scenes made ready for a simulator.
 
     Attributes:
-        batch: projected and settled scenes.
+        batch: projected and settled scenes, of the best round each.
         ready: (B, N) bool; free objects that are feasible there and inside the workspace.
         counts: (B,) int64, ready objects per scene.
-        valid: (B,) bool.
+        valid: (B,) bool, of the first round.
     """
 
     batch: SceneBatch

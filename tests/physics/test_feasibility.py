@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from simple_scenes import SIDE, TYPE, scene, turned
 
-from scene_envs.errors import MissingDependencyError
+from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import equilibrium, feasibility, make_ready, penetration, project, settle
 from scene_envs.physics.motion import Physics, physics_of
@@ -29,9 +29,9 @@ def dimsum(count: int, seed: int) -> SceneBatch:
     return get_grammar("dimsum_table").sample(np.random.default_rng(seed), count)
 
 
-def jittered(batch: SceneBatch, seed: int) -> SceneBatch:
+def jittered(batch: SceneBatch, seed: int, times: float = 1.0) -> SceneBatch:
     noise = torch.randn(batch.translations.shape, generator=torch.Generator().manual_seed(seed))
-    noise *= torch.tensor([0.01, 0.01, 0.002]) * batch.is_free.unsqueeze(-1)
+    noise *= times * torch.tensor([0.01, 0.01, 0.002]) * batch.is_free.unsqueeze(-1)
     return batch.with_poses(batch.translations + noise, batch.rotations)
 
 
@@ -177,6 +177,26 @@ def test_jittered_scenes_become_ready() -> None:
     free = int(batch.is_free.sum())
     assert int(raw.counts.sum()) < 0.6 * free
     assert int(ready.counts.sum()) >= 0.95 * free
+
+
+def test_what_is_not_ready_gets_more_rounds_and_the_rest_stays() -> None:
+    breakfast = get_grammar("breakfast_table_high_clutter").sample(np.random.default_rng(3), 8)
+    batch = jittered(breakfast, 5, times=6.0)
+    once, more = make_ready(batch, rounds=1), make_ready(batch)
+    free = batch.is_free.sum(dim=-1)
+    done = once.counts == free
+    assert 0 < int(done.sum()) < len(batch)
+    torch.testing.assert_close(more.batch.tensor[done], once.batch.tensor[done], atol=1e-3, rtol=0.0)
+    assert bool((more.counts >= once.counts).all())
+    assert int(more.counts.sum()) > int(once.counts.sum())
+    judged = feasibility(more.batch)
+    assert torch.equal(judged.feasible & more.batch.in_workspace, more.ready)
+    assert torch.equal(more.ready.sum(dim=-1), more.counts)
+
+
+def test_at_least_one_round_is_needed_to_be_ready() -> None:
+    with pytest.raises(InvalidInputError, match="rounds=0 must be at least 1"):
+        make_ready(scene(("cube", 0.0, 0.0, 0.0)), rounds=0)
 
 
 def test_without_pybullet_only_settling_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
