@@ -23,6 +23,7 @@ class Run:
     """Context in which a command works: its folder exists, and what the packages log goes to stderr and ``log.txt``.
 
     ``config.yaml`` is written when the command starts, unless an earlier run left one, and again when it is done.
+    Of the processes that ``torchrun`` starts, the first alone writes and speaks; the others log what fails.
 
     Args:
         command: the command's name.
@@ -36,6 +37,7 @@ class Run:
         self.command = command
         self.settings = settings
         self.directory = Path(settings.output)
+        self._leads = int(os.environ.get("RANK", "0")) == 0
         self._handlers: list[logging.Handler] = []
 
     def __enter__(self) -> Run:
@@ -43,6 +45,8 @@ class Run:
             self.directory.mkdir(parents=True, exist_ok=True)
         except (FileExistsError, NotADirectoryError):
             raise InvalidInputError(f"output={str(self.directory)!r} is a file, not a folder; give another") from None
+        if not self._leads:
+            return self
         if not (self.directory / "config.yaml").exists():
             self._write_config()
         self._start_logging()
@@ -55,7 +59,7 @@ class Run:
         if error is None:
             self._write_config()
         else:
-            self.log(f"failed: {error or kind}")
+            self._append(f"failed: {error or kind}")
         for handler in self._handlers:
             handler.close()
             for package in _PACKAGES:
@@ -63,11 +67,16 @@ class Run:
 
     def say(self, text: str) -> None:
         """Tell the user on stdout, and keep it in the log."""
-        print(text, flush=True)
+        if self._leads:
+            print(text, flush=True)
         self.log(text)
 
     def log(self, text: str) -> None:
         """One line into ``log.txt`` alone."""
+        if self._leads:
+            self._append(text)
+
+    def _append(self, text: str) -> None:
         with (self.directory / "log.txt").open("a", encoding="utf-8") as file:
             file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {text}\n")
 
@@ -81,6 +90,8 @@ class Run:
         self._replace("config.yaml", yaml.safe_dump(dataclasses.asdict(self.settings), sort_keys=False))
 
     def _replace(self, name: str, text: str) -> None:
+        if not self._leads:
+            return
         partial = self.directory / (name + ".partial")
         partial.write_text(text, encoding="utf-8")
         os.replace(partial, self.directory / name)

@@ -111,6 +111,8 @@ class Pretrainer:
         for row in self._steps():
             if self.world.leads:
                 self.log.write(row, self.config.iterations)
+        if self.world.leads:
+            logger.info("measuring the error that is left at 40 noise levels, for the samplers")
         with self._averaged():
             self.prior.fit_residual(self.heldout_data[:512].to(self.config.device))
         self.prior.denoiser.precision = torch.float32

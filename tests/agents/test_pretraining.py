@@ -201,36 +201,18 @@ def test_a_grammar_without_end_trains_a_prior_that_reads_prompts(tmp_path: Path)
     assert (tmp_path / "samples-0000002.png").stat().st_size > 1000
 
 
-_TWO = """
-import sys
-import torch
-from agents.new_prior import build_prior
-from agents.pretraining import Pretrainer
-from agents.pretrain_config import PretrainConfig
-from agents.training_data import SceneTable
-from scene_envs.normalizer import Normalizer
-from scene_envs.scene import SceneBatch
-torch.set_num_threads(1)
-output, accumulate, scenes = sys.argv[1:]
-config = PretrainConfig(output=output, iterations=4, batch_size=8, hidden=16, depth=1, heads=2, warmup=2, log_every=1,
-                        evaluate_every=4, checkpoint_every=4, accumulate=int(accumulate))
-raw = torch.load(scenes)
-prior = build_prior(config, raw, Normalizer.fit(raw))
-x0 = prior.encode(SceneBatch(raw, prior.scene_type))
-Pretrainer(config, SceneTable(x0), x0[:32], prior).run()
-"""
-
-
-def test_two_processes_take_the_steps_of_one_with_twice_the_parts(tmp_path: Path, raw: torch.Tensor) -> None:
-    script, scenes = tmp_path / "two.py", tmp_path / "raw.pt"
-    script.write_text(_TWO)
-    torch.save(raw, scenes)
+def test_two_processes_take_the_steps_of_one_with_twice_the_parts(tmp_path: Path) -> None:
+    generate("dimsum_table", 64, tmp_path / "data", workers=0, verify=False, progress=False)
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
+    keys = ["iterations=4", "batch_size=8", "hidden=16", "depth=1", "heads=2", "warmup=2", "log_every=1", "seed=3"]
     for start, name, accumulate in ((launcher, "two", "1"), ([sys.executable], "one", "2")):
-        command = [*start, str(script), str(tmp_path / name), accumulate, str(scenes)]
+        folders = [f"data={tmp_path / 'data'}", f"heldout={tmp_path / 'data'}", f"output={tmp_path / name}"]
+        command = [*start, "-m", "agents.cli", "pretrain", *folders, *keys, f"accumulate={accumulate}"]
         done = subprocess.run(command, env=environment, capture_output=True, timeout=240, text=True)
         assert done.returncode == 0, done.stderr[-3000:]
+        assert done.stdout.count("held-out loss") == 1  # the first process alone speaks
+        assert {"config.yaml", "metrics.json", "prior"} <= {path.name for path in (tmp_path / name).iterdir()}
     two, one = (list(csv.DictReader((tmp_path / name / "log.csv").open())) for name in ("two", "one"))
     assert len(two) == len(one) == 4
     for first, second in zip(two, one, strict=True):
