@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 _SAMPLES, _PROMPTED = "scenes.safetensors", "prompted.safetensors"
 _NOT_PART = ("measures", "project", "fid_weights", "pictures", "workers", "device", "output")
 """Keys that change no figure of a group."""
+_OF_PROMPTS = {"prompt_count", "guidance"}
+"""Keys that change the figures of the group ``prompts`` alone."""
 
 
 @dataclass
@@ -142,20 +144,27 @@ class _Results:
 
     @classmethod
     def of(cls, run: Run, identity: dict[str, Any]) -> _Results:
-        """Go on with the results in the folder when they depend on the same; else start afresh."""
+        """Go on with what the folder holds, as far as it depends on the same."""
         path = run.directory / "metrics.json"
         try:
             found = json.loads(path.read_text(encoding="utf-8"))["evaluation"]
-            known, groups = found["identity"], found["groups"]
+            known, groups = dict(found["identity"]), dict(found["groups"])
         except (OSError, ValueError, KeyError, TypeError):
-            known, groups = None, {}
-        if known == identity:
+            known, groups = {}, {}
+        changed = {key for key in {*known, *identity} if known.get(key) != identity.get(key)}
+        if known and not changed:
             return cls(run, identity, groups)
-        if known is not None:
-            run.say(f"{path} is of other settings or of another prior: measuring anew")
-        for name in (_SAMPLES, _PROMPTED):
+        stale = [_PROMPTED]
+        if known and changed <= _OF_PROMPTS:
+            if groups.pop("prompts", None) is not None:
+                run.say(f"{path} has other {' and '.join(sorted(changed))}: measuring the prompts anew")
+        else:
+            groups, stale = {}, [_SAMPLES, _PROMPTED]
+            if known:
+                run.say(f"{path} is of other settings or of another prior: measuring anew")
+        for name in stale:
             (run.directory / name).unlink(missing_ok=True)
-        results = cls(run, identity, {})
+        results = cls(run, identity, groups)
         results.write()
         return results
 

@@ -90,6 +90,16 @@ def test_other_settings_or_another_prior_are_measured_anew(
     assert log(tmp_path / "out").count("layout measured in") == 4
 
 
+def test_other_guidance_measures_the_prompts_alone_anew(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    reads = tiny_prior(process="mixed", text=True).save(tmp_path / "reads")
+    words = ["evaluate", f"prior={reads}", *QUICK, "measures=[layout,prompts]", f"output={tmp_path / 'out'}"]
+    for guidance, again in ((0, False), (2, True), (2, False)):
+        assert main([*words, f"guidance={guidance}"]) == 0
+        assert ("has other guidance: measuring the prompts anew" in capsys.readouterr().out) == again
+    assert log(tmp_path / "out").count("layout measured in") == 1
+    assert log(tmp_path / "out").count("prompts measured in") == 2
+
+
 def test_all_leaves_out_what_cannot_be_measured_and_says_why(
     prior: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
