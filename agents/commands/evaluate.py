@@ -122,7 +122,7 @@ def run(settings: EvaluateConfig, run: Run) -> None:
                     raise
                 results.skip(name, str(error))
             else:
-                results.add(name, figures)
+                results.add(name, {"prompt_guidance": settings.guidance, **figures} if name == "prompts" else figures)
                 run.log(f"{name} measured in {time.perf_counter() - started:.1f} s")
     report = results.report(groups)
     (run.directory / "metrics.md").write_text(report + "\n", encoding="utf-8")
@@ -141,6 +141,7 @@ class _Results:
     def __init__(self, run: Run, identity: dict[str, Any], groups: dict[str, dict[str, float]]) -> None:
         self.run_, self.identity, self.groups = run, identity, groups
         self.skipped: dict[str, str] = {}
+        self._steps = {"num_steps": float(identity["num_steps"])}
 
     @classmethod
     def of(cls, run: Run, identity: dict[str, Any]) -> _Results:
@@ -193,7 +194,7 @@ class _Results:
         """``metrics.json``: all figures by name, then the same by group."""
         flat = {name: value for figures in self.groups.values() for name, value in figures.items()}
         self.run_.write_metrics(
-            {**flat, "evaluation": {"identity": self.identity, "groups": self.groups, "skipped": self.skipped}}
+            {**self._steps, **flat, "evaluation": {"identity": self.identity, "groups": self.groups, "skipped": self.skipped}}
         )
 
     def report(self, groups: list[str]) -> str:
@@ -201,7 +202,8 @@ class _Results:
         from agents.evaluation.report import figure_table
 
         self.write()
-        figures = {k: v for name in groups for k, v in self.groups.get(name, {}).items() if v is not None}
+        measured = {k: v for name in groups for k, v in self.groups.get(name, {}).items() if v is not None}
+        figures = {**self._steps, **measured}
         notes = [f"- {name} not measured: {reason}" for name, reason in self.skipped.items()]
         return "\n".join([figure_table(figures), *(["", *notes] if notes else [])])
 

@@ -47,6 +47,7 @@ READING: dict[str, str] = {
     "render_accuracy_std": "its spread over the seeds",
     "frechet_scene_distance": "FSD, on features of a frozen set encoder (no FID); lower is better",
     "frechet_inception_distance": "FID of semantic renders; lower is better",
+    "prompt_guidance": "weight of classifier-free guidance of the samples with prompts; 0 for none",
     "prompt_following": "samples of which every claim of their prompt is true; higher is better",
     r"prompt_(counts|names|relations)": "the same among prompts on {}",
     r"prompt_(counts|names|relations)_number": "how many prompts on {} there are",
