@@ -193,9 +193,8 @@ class _Results:
     def write(self) -> None:
         """``metrics.json``: all figures by name, then the same by group."""
         flat = {name: value for figures in self.groups.values() for name, value in figures.items()}
-        self.run_.write_metrics(
-            {**self._steps, **flat, "evaluation": {"identity": self.identity, "groups": self.groups, "skipped": self.skipped}}
-        )
+        evaluation = {"identity": self.identity, "groups": self.groups, "skipped": self.skipped}
+        self.run_.write_metrics({**self._steps, **flat, "evaluation": evaluation})
 
     def report(self, groups: list[str]) -> str:
         """The figures of ``groups`` as Markdown, and what was not measured."""

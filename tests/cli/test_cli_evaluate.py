@@ -99,7 +99,7 @@ def test_other_guidance_measures_the_prompts_alone_anew(tmp_path: Path, capsys: 
     assert log(tmp_path / "out").count("layout measured in") == 1
     assert log(tmp_path / "out").count("prompts measured in") == 2
     assert metrics(tmp_path / "out")["prompt_guidance"] == 2
-    assert "| num_steps | 2 |" in (tmp_path / "out" / "metrics.md").read_text()
+    assert "| num_steps | 1 |" in (tmp_path / "out" / "metrics.md").read_text()
 
 
 def test_all_leaves_out_what_cannot_be_measured_and_says_why(
