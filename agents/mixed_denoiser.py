@@ -59,6 +59,8 @@ class MixedPriorConfig:
         empty_slots: ``"dropped"`` leaves slots that are known to be empty out of the network, which saves most of the
             work at low noise and needs an absorbing kernel; ``"attended"`` is the paper's.
         clip: bound on denoised poses while sampling, normalised units; 0 for none (1 is the paper's).
+        unmasking: which masked slots a step of an absorbing kernel unmasks: ``"even"``, as near to the expected number
+            as can be, or ``"independent"``, each by its own chance. Other kernels know the second alone.
     """
 
     scene_type: str
@@ -82,6 +84,7 @@ class MixedPriorConfig:
     loss_weighting: str = "none"
     empty_slots: str = "attended"
     clip: float = 0.0
+    unmasking: str = "even"
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ from agents.diffusion import (
     timestep_weights,
 )
 from agents.diffusion.reverse_steps import state_of
+from agents.diffusion.unmasking import UNMASKINGS
 from agents.mixed_denoiser import Given, MixedDenoiser, MixedPriorConfig, Text
 from agents.mixed_training import mixed_loss
 from agents.networks.mixed_flux_config import POSE, MixedFluxConfig
@@ -84,6 +85,8 @@ class MixedPrior(PromptReader, ScenePrior):
             )
         if config.category_loss not in CATEGORY_LOSSES:
             raise unknown_name("category loss", config.category_loss, CATEGORY_LOSSES)
+        if config.unmasking not in UNMASKINGS:
+            raise unknown_name("unmasking", config.unmasking, UNMASKINGS)
         check_weighting(config.loss_weighting, config.prediction)
         if config.empty_slots == "dropped" and not isinstance(config.network, MixedFluxConfig):
             raise InvalidInputError("empty_slots='dropped' needs network='flux'; others take empty_slots='attended'")
@@ -94,6 +97,7 @@ class MixedPrior(PromptReader, ScenePrior):
         self.categories = CategoricalProcess(
             make_categorical_schedule(config.kernel, config.num_timesteps), config.network.categories
         )
+        self._together = config.unmasking == "even" and self.categories.only_absorbs
         encoder = None if config.text is None else text_encoder(config.text)
         self.denoiser = MixedDenoiser(
             build_network(config.network), self.process, self.categories, encoder, config.empty_slots
@@ -257,7 +261,8 @@ class MixedPrior(PromptReader, ScenePrior):
         residual = None if self.residual is None else self.residual.at(t)
         mean, std = self.process.posterior(x_t[..., :POSE], pose, t, previous, residual, eta)
         states = x_t[..., POSE:]
-        probs = self.categories.posterior(state_of(states), logits.softmax(dim=-1), t, previous)
+        state = state_of(states)
+        probs = self.categories.posterior(state, logits.softmax(dim=-1), t, previous)
         slots, fixed = x_t.shape[1], len(self.scene_type.fixed)
         random = torch.full((slots,), previous > 0, device=x_t.device)
         random[:fixed] = False
@@ -267,7 +272,8 @@ class MixedPrior(PromptReader, ScenePrior):
         if fixed:
             certain = F.one_hot(self._fixed[:fixed, POSE:].argmax(dim=-1), self.num_categories + 1).to(probs)
             probs = torch.cat([certain.expand(len(probs), -1, -1), probs[:, fixed:]], dim=1)
-        return MixedStep(clamped[..., :POSE], std * (~known).to(mean.dtype), probs, random)
+        masked = (state == self.num_categories) & random if self._together else None
+        return MixedStep(clamped[..., :POSE], std * (~known).to(mean.dtype), probs, random, masked)
 
     def regenerate(
         self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int,

@@ -128,6 +128,7 @@ def _mixed(config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts:
         given_share=config.given_share,
         text=text,
         empty_slots=config.empty_slots,
+        unmasking=config.unmasking,
         **_chain(config),
     )
     torch.manual_seed(config.seed)

@@ -70,6 +70,8 @@ class PretrainConfig:
             ``squared_absorbing``, ``uniform``).
         empty_slots: whether slots known to be empty are ``attended`` (the paper's) or ``dropped`` from the network of a
             mixed prior, which needs an absorbing kernel and saves most of the work.
+        unmasking: which masked slots a sampling step of an absorbing kernel unmasks: ``even``, as near to the expected
+            number as can be, so that few categories are decided at once, or ``independent``.
         text: whether a mixed prior reads prompts.
         text_encoder: ``vocabulary`` for a small one with a closed vocabulary, trained with the prior; or the folder or
             hub name of a BERT model, which stays as it is.
@@ -145,6 +147,7 @@ class PretrainConfig:
     process: str = "mixed"
     kernel: str = "early_absorbing"
     empty_slots: str = "dropped"
+    unmasking: str = "even"
     text: bool = False
     text_encoder: str = "vocabulary"
     text_width: int = 128

@@ -208,15 +208,15 @@ class _Results:
 
 
 def _identity(settings: EvaluateConfig, prior: ScenePrior) -> dict[str, Any]:
-    """The keys that figures depend on, and a digest of the prior's weights."""
+    """The keys that figures depend on, and a digest of what the prior is made of and of its weights."""
     import hashlib
 
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(json.dumps(prior.config_state(), sort_keys=True).encode())
     for name, tensor in sorted(prior.weights().items()):
         digest.update(name.encode())
         digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
     keys = {key: value for key, value in vars(settings).items() if key not in _NOT_PART}
-    return {**keys, "weights": digest.hexdigest()[:16]}
+    return {**keys, "digest": digest.hexdigest()[:16]}
 
 
 def _sample(prior: ScenePrior, settings: EvaluateConfig, prompts: list[str] | None) -> SceneBatch:

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from agents.diffusion.unmasking import draw_unmasked, unmasking_log_prob
+
 _TINY = 1e-30
 
 
@@ -87,7 +89,7 @@ class GaussianStep(NamedTuple):
 
 
 class MixedStep(NamedTuple):
-    """Normal poses and a categorical state per slot, independent given x_t.
+    """Normal poses and a categorical state per slot, independent given x_t and which slots are unmasked.
 
     A state stands in the last K features of a slot as a one-hot vector; the mask token is all zeros.
 
@@ -96,6 +98,8 @@ class MixedStep(NamedTuple):
         pose_std: (N, P); 0 marks a certain entry.
         probs: (B, N, K + 1) of the state, the mask token last.
         random: (N,) bool, slots whose state is drawn; in the others the likeliest one is taken.
+        masked: (B, N) bool, slots of which as many as expected are unmasked together
+            (:mod:`agents.diffusion.unmasking`); None unmasks each by its own chance.
 
     >>> probs = torch.tensor([[[0.25, 0.75, 0.0]]])
     >>> step = MixedStep(torch.zeros(1, 1, 1), torch.ones(1, 1), probs, torch.tensor([True]))
@@ -107,6 +111,7 @@ class MixedStep(NamedTuple):
     pose_std: Tensor
     probs: Tensor
     random: Tensor
+    masked: Tensor | None = None
 
     @property
     def std(self) -> Tensor:
@@ -119,21 +124,47 @@ class MixedStep(NamedTuple):
         return int((self.pose_std > 0).sum() + self.random.sum())
 
     def from_noise(self, noise: Tensor) -> Tensor:
-        """Poses shifted and scaled; states by inverting their distribution function at Phi of one noise entry."""
+        """Poses shifted and scaled; states by inverting their distribution function at Phi of one noise entry.
+
+        Phi of the next entry says which masked slots are unmasked, where they are unmasked together.
+        """
         pose = self.mean.shape[-1]
-        uniform = torch.special.ndtr(noise[..., pose : pose + 1].double())
-        cumulative = self.probs.double().cumsum(dim=-1)
-        drawn = (cumulative < uniform * cumulative[..., -1:]).sum(dim=-1).clamp(max=self.probs.shape[-1] - 1)
+        uniform = torch.special.ndtr(noise[..., pose : pose + 2].double())
+        drawn = self._draw_states(uniform[..., 0], uniform[..., 1])
         state = torch.where(self.random, drawn, self.probs.argmax(dim=-1))
         return torch.cat([self.mean + self.pose_std * noise[..., :pose], one_hot_state(state, self.probs)], dim=-1)
 
+    def _draw_states(self, uniform: Tensor, order: Tensor) -> Tensor:
+        mask = self.probs.shape[-1] - 1
+        cumulative = self.probs.double().cumsum(dim=-1)
+        if self.masked is None:
+            return _invert(cumulative, uniform)
+        unmasked = draw_unmasked(self.masked, 1 - self.probs[..., -1], order)
+        chosen = _invert(cumulative[..., :-1], uniform)
+        seen = torch.where(unmasked, chosen, torch.full_like(chosen, mask))
+        return torch.where(self.masked, seen, self.probs.argmax(dim=-1))
+
     def log_prob(self, x: Tensor) -> Tensor:
-        """(B, N) nats: the log-density of the pose plus the log-probability of the state."""
+        """(B, N) nats: the log-density of the pose plus the log-probability of the state.
+
+        Which slots are unmasked together has one log-probability per scene; the masked slots have equal shares of it.
+        """
         pose = self.mean.shape[-1]
         continuous = gaussian_log_prob(x[..., :pose], self.mean, self.pose_std)
         state = state_of(x[..., pose:])
         discrete = self.probs.gather(-1, state.unsqueeze(-1)).squeeze(-1).clamp(min=_TINY).log()
+        if self.masked is not None:
+            chance, still = 1 - self.probs[..., -1], state == self.probs.shape[-1] - 1
+            chosen = torch.where(still, torch.zeros_like(discrete), discrete - chance.clamp(min=_TINY).log())
+            together = unmasking_log_prob(self.masked, chance.detach(), ~still)
+            discrete = torch.where(self.masked, chosen + together, discrete)
         return continuous + torch.where(self.random, discrete, torch.zeros_like(discrete))
+
+
+def _invert(cumulative: Tensor, uniform: Tensor) -> Tensor:
+    """(...) int64: where ``uniform`` (...) falls among the running sums (..., S) of weights."""
+    below = cumulative < uniform.unsqueeze(-1) * cumulative[..., -1:]
+    return below.sum(dim=-1).clamp(max=cumulative.shape[-1] - 1)
 
 
 def one_hot_state(state: Tensor, probs: Tensor) -> Tensor:
@@ -157,5 +188,6 @@ def concatenate_steps(parts: Sequence[ReverseStep]) -> ReverseStep:
     if isinstance(first, MixedStep):
         mixed = [part for part in parts if isinstance(part, MixedStep)]
         mean, probs = (torch.cat([getattr(part, name) for part in mixed]) for name in ("mean", "probs"))
-        return MixedStep(mean, first.pose_std, probs, first.random)
+        masked = None if first.masked is None else torch.cat([part.masked for part in mixed if part.masked is not None])
+        return MixedStep(mean, first.pose_std, probs, first.random, masked)
     raise TypeError(f"cannot concatenate steps of type {type(first).__name__}")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from itertools import product
+
+import pytest
 import torch
 from torch.distributions import Categorical, Normal
 
@@ -18,7 +21,7 @@ def _mixed(batch: int = 1, slots: int = 2) -> MixedStep:
 
 def test_normal_noise_draws_the_stated_distribution() -> None:
     step = _mixed()
-    wide = MixedStep(*(part.expand(20_000, -1, -1) if part.ndim == 3 else part for part in step))
+    wide = step._replace(mean=step.mean.expand(20_000, -1, -1), probs=step.probs.expand(20_000, -1, -1))
     x = wide.from_noise(torch.randn(20_000, 2, 6, generator=torch.Generator().manual_seed(1)))
     torch.testing.assert_close(x[..., :3].mean(dim=0), step.mean[0], atol=0.03, rtol=0)
     torch.testing.assert_close(x[..., :3].std(dim=0), step.pose_std, atol=0.02, rtol=0.02)
@@ -49,6 +52,39 @@ def test_the_mask_token_is_all_zeros_and_comes_back() -> None:
     one_hot = one_hot_state(states, torch.zeros(2, 2, 4))
     assert one_hot[0, 1].tolist() == [0.0, 0.0, 0.0]
     assert (state_of(one_hot) == states).all()
+
+
+def _masked(chance: float, batch: int = 1) -> MixedStep:
+    """Four masked slots among five, of three categories each; the third slot is seen. All scenes are alike."""
+    chosen = torch.rand(1, 5, 3, generator=torch.Generator().manual_seed(0)).softmax(dim=-1)
+    probs = torch.cat([chance * chosen, torch.full((1, 5, 1), 1 - chance)], dim=-1)
+    probs[:, 2] = torch.tensor([0.0, 1.0, 0.0, 0.0])
+    masked = torch.tensor([[True, True, False, True, True]]).expand(batch, -1)
+    random = torch.ones(5, dtype=torch.bool)
+    return MixedStep(torch.zeros(batch, 5, 1), torch.zeros(5, 1), probs.expand(batch, -1, -1), random, masked)
+
+
+@pytest.mark.parametrize("chance", [0.1, 0.3, 0.5, 0.9])
+def test_slots_unmasked_together_are_as_many_as_expected(chance: float) -> None:
+    step = _masked(chance, 40_000)
+    state = state_of(step.from_noise(torch.randn(40_000, 5, 4, generator=torch.Generator().manual_seed(1)))[..., 1:])
+    number = (state[:, [0, 1, 3, 4]] < 3).sum(dim=1)
+    assert set(number.unique().tolist()) <= {int(4 * chance), int(4 * chance) + 1}
+    assert (state[:, 2] == 1).all()
+    shares = torch.stack([(state == value).float().mean(dim=0) for value in range(4)], dim=-1)
+    torch.testing.assert_close(shares, step.probs[0], atol=0.012, rtol=0)  # each slot as if it were alone
+
+
+@pytest.mark.parametrize("chance", [0.1, 0.3, 0.5, 0.9])
+def test_the_probabilities_of_all_outcomes_of_unmasking_sum_to_one(chance: float) -> None:
+    states = torch.tensor(list(product(range(4), range(4), [1], range(4), range(4))))
+    step = _masked(chance, len(states))
+    x = torch.cat([torch.zeros(len(states), 5, 1), one_hot_state(states, step.probs)], dim=-1)
+    probability = step.log_prob(x).double().sum(dim=1).exp()
+    assert float(probability.sum()) == pytest.approx(1.0, abs=1e-5)
+    number = (states[:, [0, 1, 3, 4]] < 3).sum(dim=1)
+    of_number = torch.stack([probability[number == value].sum() for value in range(5)])
+    assert float((of_number * torch.arange(5)).sum()) == pytest.approx(4 * chance, abs=1e-5)
 
 
 def test_steps_of_parts_are_the_step_of_the_whole() -> None:

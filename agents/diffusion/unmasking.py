@@ -1,0 +1,65 @@
+"""Which masked slots a step of an absorbing chain unmasks: as near to the expected number as can be.
+
+Where every slot is unmasked by its own chance, slots that are unmasked in the same step do not know of each other's
+categories, and a scene of few steps gets one cup too many. The chance of each slot stays what the chain says it is;
+that their number is never more than one off its expectation lets most steps of a small scene decide one category alone.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+UNMASKINGS = ("even", "independent")
+"""Laws of which masked slots a step unmasks."""
+_TINY = 1e-30
+
+
+def draw_unmasked(masked: Tensor, chance: Tensor, uniform: Tensor) -> Tensor:
+    """(B, N) bool: of the ``masked`` slots of each scene, those that are unmasked now, drawn without replacement.
+
+    Of M masked slots with chance p, M p rounded down or up are unmasked, up with the probability that makes M p the
+    mean. Ranks of independent numbers say nothing of their minimum, so that one number per slot decides both.
+
+    Args:
+        masked: (B, N) bool.
+        chance: (B, N) of a masked slot to be unmasked, the same for all of a scene.
+        uniform: (B, N) independent numbers, uniform on [0, 1).
+
+    >>> masked = torch.tensor([[True, True, False, True, True]])
+    >>> draw_unmasked(masked, torch.full((1, 5), 0.5), torch.tensor([[0.4, 0.9, 0.0, 0.2, 0.6]])).tolist()
+    [[True, False, False, True, False]]
+    """
+    total, expected = _expected(masked, chance)
+    order = torch.where(masked, uniform.double(), torch.full_like(uniform, torch.inf, dtype=torch.float64))
+    least = order.amin(dim=-1).clamp(max=1.0)
+    rounding = (1 - (1 - least) ** total).clamp(max=1 - 1e-12)
+    number = (expected + rounding).floor()
+    return masked & (order.argsort(dim=-1).argsort(dim=-1) < number.unsqueeze(-1))
+
+
+def unmasking_log_prob(masked: Tensor, chance: Tensor, unmasked: Tensor) -> Tensor:
+    """(B, N) nats, whose sum over the slots of a scene is the log-probability that just ``unmasked`` are unmasked.
+
+    It depends on no parameter of a network; the masked slots of a scene have equal shares of it.
+
+    Args:
+        masked, chance: as of :func:`draw_unmasked`.
+        unmasked: (B, N) bool, some of the masked.
+
+    >>> masked, chance = torch.ones(1, 4, dtype=torch.bool), torch.full((1, 4), 0.5)
+    >>> two = torch.tensor([[True, False, True, False]])
+    >>> round(float(unmasking_log_prob(masked, chance, two).sum().exp()), 4)  # one of six pairs
+    0.1667
+    """
+    total, expected = _expected(masked, chance)
+    number = (unmasked & masked).sum(dim=-1).double()
+    probability = (1 - (number - expected).abs()).clamp(min=_TINY)  # of rounding to this number
+    subsets = torch.lgamma(total + 1) - torch.lgamma(number + 1) - torch.lgamma(total - number + 1)
+    share = (probability.log() - subsets) / total.clamp(min=1)
+    return torch.where(masked, share.unsqueeze(-1), torch.zeros_like(share).unsqueeze(-1)).to(chance.dtype)
+
+
+def _expected(masked: Tensor, chance: Tensor) -> tuple[Tensor, Tensor]:
+    """(B,) masked slots, and how many of them are to be unmasked on average, float64."""
+    return masked.sum(dim=-1).double(), torch.where(masked, chance.double(), 0.0).sum(dim=-1)
