@@ -14,12 +14,11 @@ from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.export.asset_files import AssetFiles
 from scene_envs.export.formats import get_format, resolve_formats
 from scene_envs.export.placed import identifier, place
+from scene_envs.physics.constants import FRICTION
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
 
 MANIFEST = "export.json"
-FRICTION = 0.6
-"""That of the project's own physics."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ def export(
         output: folder; made where there is none. Other files in it are left alone.
         formats: a name, several, or ``"all"`` that can be written here; see
             :func:`scene_envs.export.list_formats`.
-        friction: coefficient of friction of all surfaces.
+        friction: Coulomb friction coefficient between any two surfaces; that of :mod:`scene_envs.physics` unless given.
 
     Raises:
         UnknownNameError: no such format.

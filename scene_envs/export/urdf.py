@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -82,8 +83,8 @@ def _write(asset: Asset, files: AssetFiles, parts: list[Path], path: Path) -> Pa
     name = files.name(asset)
     root = ET.Element("robot", {"name": name, "xmlns:drake": DRAKE})
     link = ET.SubElement(root, "link", name=name)
-    contact = ET.SubElement(link, "contact")  # read by PyBullet
-    ET.SubElement(contact, "lateral_friction", value=number(files.friction))
+    contact = ET.SubElement(link, "contact")  # read by PyBullet, which multiplies the coefficients of the two bodies
+    ET.SubElement(contact, "lateral_friction", value=number(math.sqrt(files.friction)))
     inertial = ET.SubElement(link, "inertial")
     ET.SubElement(inertial, "origin", xyz=numbers(asset.center_of_mass), rpy="0 0 0")
     ET.SubElement(inertial, "mass", value=number(asset.mass))

@@ -24,6 +24,12 @@ from scene_envs.physics.results import (
 from scene_envs.rotations import geodesic_angle, project_to_so3
 from scene_envs.scene import SceneBatch
 
+TIME_STEP = 1.0 / 480.0
+"""Longest integration step while settling, s."""
+_SHORT_STEP = 1.0 / 960.0
+"""The same in further rounds of making ready."""
+_READY_DEPTH, _READY_DURATION = 1e-4, 2.0
+"""What a ready object may overlap (m), and how long it stays where it is (s)."""
 _CHUNK = 8
 """Scenes per message to a worker."""
 _ORTHOGONAL = 1e-3
@@ -103,15 +109,27 @@ def equilibrium(batch: SceneBatch, *, duration: float = 0.1, pool: PhysicsPool |
     return EquilibriumResult(_stack(rows, batch, "displacement"), _stack(rows, batch, "rotation"), _valid(rows))
 
 
-def settle(batch: SceneBatch, *, duration: float = 1.0, pool: PhysicsPool | None = None) -> SettleResult:
+def settle(
+    batch: SceneBatch, *, duration: float = 1.0, time_step: float = TIME_STEP, pool: PhysicsPool | None = None
+) -> SettleResult:
     """Let every scene come to rest under gravity, with slight damping.
 
     Simulates up to ``duration`` seconds, and stops earlier when nothing moves any more. Objects that fall off
     their support are where they fell to; they are outside the workspace.
 
-    Raises InvalidInputError and MissingDependencyError as :func:`feasibility` does.
+    Args:
+        batch: B scenes of N slots.
+        duration: s.
+        time_step: longest integration step, s; tall stacks get shorter ones. Shorter steps leave smaller overlaps.
+        pool: worker processes; None computes in this process.
+
+    Raises InvalidInputError, also for times that are not positive, and MissingDependencyError as
+    :func:`feasibility` does.
     """
-    rows = _run("settle", batch, {"duration": duration}, pool)
+    for name, value in (("duration", duration), ("time_step", time_step)):
+        if not 0.0 < value < float("inf"):
+            raise InvalidInputError(f"{name}={value} must be a positive number of seconds")
+    rows = _run("settle", batch, {"duration": duration, "time_step": time_step}, pool)
     settled, displacement, rotation = _moved(rows, batch)
     return SettleResult(settled, displacement, rotation, _valid(rows))
 
@@ -138,11 +156,12 @@ def project(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> Projection
 def make_ready(
     batch: SceneBatch, *, duration: float = 1.5, rounds: int = 5, pool: PhysicsPool | None = None
 ) -> ReadyResult:
-    """Project, settle, then count what is feasible inside the workspace: the simulation-ready objects.
+    """Project, settle, then count the simulation-ready objects.
 
-    Where some object is not ready, the settled scene goes through it again, up to ``rounds`` times in all, and the
-    round with most ready objects is kept, the earliest of equal ones: thin things on the edges of others come to rest
-    a little more than 1 mm deep in them, and what fell has room elsewhere.
+    A free object is ready when it is inside the workspace, overlaps nothing deeper than 0.1 mm, and stays within 1 mm
+    and 0.01 rad of where it is for 2 s of simulation. Scenes with objects that are not ready go through projection and
+    settling again, with shorter time steps, up to ``rounds`` times in all. The round with most ready objects is kept,
+    the earliest of equal ones.
 
     Args:
         batch: B scenes of N slots.
@@ -154,7 +173,7 @@ def make_ready(
     """
     if rounds < 1:
         raise InvalidInputError(f"rounds={rounds} must be at least 1: each projects and settles once")
-    best = last = _make_ready_once(batch, duration, pool)
+    best = last = _make_ready_once(batch, duration, TIME_STEP, pool)
     tensor, ready, counts = best.batch.tensor.clone(), best.ready.clone(), best.counts.clone()
     free = best.batch.is_free.sum(dim=-1)
     scenes = torch.arange(len(batch))  # that went through the last round
@@ -163,7 +182,7 @@ def make_ready(
         if not len(again):
             break
         scenes = scenes[again]
-        last = _make_ready_once(last.batch[again], duration, pool)
+        last = _make_ready_once(last.batch[again], duration, _SHORT_STEP, pool)
         better = last.counts > counts[scenes]
         improved = scenes[better]
         tensor[improved], ready[improved] = last.batch.tensor[better], last.ready[better]
@@ -171,11 +190,11 @@ def make_ready(
     return ReadyResult(SceneBatch(tensor, best.batch.scene_type), ready, counts, best.valid)
 
 
-def _make_ready_once(batch: SceneBatch, duration: float, pool: PhysicsPool | None) -> ReadyResult:
+def _make_ready_once(batch: SceneBatch, duration: float, time_step: float, pool: PhysicsPool | None) -> ReadyResult:
     """One round of :func:`make_ready`."""
     projected = project(batch, pool=pool)
-    settled = settle(projected.batch, duration=duration, pool=pool)
-    judged = feasibility(settled.batch, pool=pool)
+    settled = settle(projected.batch, duration=duration, time_step=time_step, pool=pool)
+    judged = feasibility(settled.batch, max_penetration=_READY_DEPTH, duration=_READY_DURATION, pool=pool)
     valid = projected.valid & settled.valid & judged.valid
     ready = judged.feasible & settled.batch.in_workspace & valid[:, None]
     return ReadyResult(settled.batch, ready, ready.sum(dim=-1), valid)

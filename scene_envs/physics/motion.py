@@ -131,7 +131,13 @@ def motion(physics: Physics, objects: Objects, pairs: ObjectPairs, duration: flo
 
 
 def advance(
-    physics: Physics, objects: Objects, pairs: ObjectPairs, rest: Rest, duration: float, *, settling: bool = False
+    physics: Physics,
+    objects: Objects,
+    pairs: ObjectPairs,
+    rest: Rest,
+    duration: float,
+    *,
+    settling: float | None = None,
 ) -> Moved:
     """The objects of one scene ``duration`` seconds later.
 
@@ -145,7 +151,7 @@ def advance(
         pairs: their near pairs.
         rest: which of them have a closed form.
         duration: s.
-        settling: damp the motion, and integrate once only.
+        settling: longest time step (s) of a damped motion that is integrated once; None looks again where in doubt.
     """
     translation = objects.translation.copy()
     translation[:, 2] += rest.rise
@@ -175,7 +181,7 @@ def _simulate(
     duration: float,
     moved: Moved,
     *,
-    settling: bool,
+    settling: float | None,
 ) -> Mask:
     """Simulate the objects ``due`` (n,), write where they get into ``moved``, and say which left early (n,)."""
     left = np.zeros(len(objects), dtype=bool)
@@ -187,8 +193,9 @@ def _simulate(
     np.maximum.at(tallest, group[due], height[due])
 
     def run(members: Mask, settings: SolverSettings) -> None:
-        if settling:
-            settings = replace(settings, linear_damping=_DAMPING, angular_damping=_DAMPING)
+        if settling is not None:
+            step = min(settling, settings.time_step)
+            settings = replace(settings, time_step=step, linear_damping=_DAMPING, angular_damping=_DAMPING)
         rows = np.flatnonzero(objects.fixed | members)
         end = physics.world.simulate(objects[rows], fine[rows], group[rows], duration, settings)
         free = ~objects.fixed[rows]
@@ -197,7 +204,7 @@ def _simulate(
 
     for settings in dict.fromkeys(settings_for(int(carriers)) for carriers in tallest[group[due]]):
         run(due & np.array([label >= 0 and settings_for(int(tallest[label])) == settings for label in group]), settings)
-    if settling:
+    if settling is not None:
         return left
     displacement = np.linalg.norm(moved.translation - objects.translation, axis=1)
     doubtful = due & (height >= _TALL) & (displacement > _DOUBT[0]) & (displacement < _DOUBT[1])
@@ -244,8 +251,15 @@ def _merge(objects: Objects, pairs: ObjectPairs, group: Index, first: Index, sec
     return due
 
 
-def settle_scene(physics: Physics, objects: Objects, duration: float) -> tuple[Array, Array, bool]:
-    """Let one scene come to rest: rotation (n, 3, 3), translation (n, 3) m, and whether it stayed finite."""
+def settle_scene(physics: Physics, objects: Objects, duration: float, time_step: float) -> tuple[Array, Array, bool]:
+    """Let one scene come to rest: rotation (n, 3, 3), translation (n, 3) m, and whether it stayed finite.
+
+    Args:
+        physics: of the scene's assets.
+        objects: of one scene.
+        duration: s, the longest time to simulate.
+        time_step: s, the longest step; tall stacks get shorter ones.
+    """
     current = objects
     calm = np.zeros(len(objects), dtype=bool)  # was simulated, and did not move
     remaining = duration
@@ -259,7 +273,7 @@ def settle_scene(physics: Physics, objects: Objects, duration: float) -> tuple[A
         rest = Rest(rest.still | done, rest.rise, rest.tilt)
         if not (active & ~done).any() and (np.abs(rest.rise) < _STILL).all():
             break
-        moved = advance(physics, current, pairs, rest, span, settling=True)
+        moved = advance(physics, current, pairs, rest, span, settling=time_step)
         if not moved.is_finite:
             return objects.rotation, objects.translation, False
         far = np.linalg.norm(moved.translation - current.translation, axis=1)

@@ -15,15 +15,13 @@ from scipy.spatial import ConvexHull, QhullError
 
 from scene_envs.physics import rigid
 from scene_envs.physics.collision import NEAR, Contacts, ObjectPairs, scene_pairs
+from scene_envs.physics.constants import GRAVITY
 from scene_envs.physics.geometry import AssetGeometry, LibraryGeometry, PartGeometry
 from scene_envs.physics.placement import Objects
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-
-GRAVITY = 9.81
-"""m/s^2."""
 
 _FLAT = 3e-4
 """Tilt (rad) up to which an object counts as upright."""

@@ -123,7 +123,7 @@ class ReadyResult:
 
     Attributes:
         batch: projected and settled scenes, of the best round each.
-        ready: (B, N) bool; free objects that are feasible there and inside the workspace.
+        ready: (B, N) bool; free objects that are simulation-ready there (see :func:`make_ready`).
         counts: (B,) int64, ready objects per scene.
         valid: (B,) bool, of the first round.
     """

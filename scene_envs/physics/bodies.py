@@ -1,0 +1,247 @@
+"""Body pool: the PyBullet bodies of one asset library, built once and parked between scenes."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from scene_envs.errors import MissingDependencyError, PhysicsError
+from scene_envs.physics.constants import FRICTION, GRAVITY
+from scene_envs.physics.geometry import LevelGeometry, LibraryGeometry, inset_hull
+
+Array = NDArray[np.float64]
+BodyKey = tuple[int, str]
+"""Asset category and level of detail ("fine" or "coarse") of a body."""
+
+SCALE = 20.0
+"""Bullet length units per metre. Bullet grows each convex mesh by 0.001 units and rounds its edges by as much: 1 mm if
+a unit were a metre, 0.05 mm like this. Times and masses are as they are; gravity and inertia are scaled to match."""
+MARGIN = 1e-3 / SCALE
+"""What Bullet adds to each convex mesh (m). Hulls go in smaller by as much, so that they act at their true size."""
+
+_PARKING = 1000.0
+"""Height (Bullet units) of the first parked body; the next ones are above it."""
+_PARKING_STEP = 10.0 * SCALE
+_SPARE_BODIES = 64
+_SPARE_FACTOR = 3
+"""A pool with more bodies than this many times what a scene needs, and the spare ones, is built anew: Bullet compares
+the boxes of all bodies in every step, the parked ones too."""
+_ZERO = (0.0, 0.0, 0.0)
+_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+
+
+class BodyPool:
+    """Bodies of one asset library in a PyBullet client of their own.
+
+    Two properties keep the motion of a scene independent of the scenes before it. The broadphase is Bullet's simple
+    one: it keeps no tree, and lists pairs in the order of the bodies. And a body that is placed or parked gets a
+    fresh broadphase proxy, which drops its pairs, contacts and warm starts.
+
+    Args:
+        library: geometry of the assets.
+
+    Raises:
+        MissingDependencyError: pybullet is not installed.
+        PhysicsError: PyBullet has no free client slot.
+    """
+
+    def __init__(self, library: LibraryGeometry) -> None:
+        self.bullet = _import_bullet()
+        self.client: int = self.bullet.connect(self.bullet.DIRECT)
+        if self.client < 0:
+            raise PhysicsError("PyBullet has no free client slot; close clients that are no longer used")
+        self._library = library
+        self._bodies: dict[BodyKey, list[int]] = {}
+        self._parking: dict[int, tuple[float, float, float]] = {}
+        self._frames: dict[int, tuple[Array, Array]] = {}  # category -> principal axes, moments
+        self._wavefronts: dict[BodyKey, str] = {}
+
+    def principal(self, category: int) -> tuple[Array, Array]:
+        """Principal axes (3, 3, columns) and moments (3,) kg m^2 of an asset's inertia."""
+        if category not in self._frames:
+            moments, axes = np.linalg.eigh(np.asarray(self._library.assets[category].asset.inertia))
+            if np.linalg.det(axes) < 0:
+                axes[:, 0] *= -1.0
+            self._frames[category] = axes, moments
+        return self._frames[category]
+
+    def take(self, needed: Mapping[BodyKey, int]) -> dict[BodyKey, list[int]]:
+        """Parked bodies, ``needed[key]`` of each key; the same ones in the same order whatever was taken before.
+
+        Raises:
+            PhysicsError: PyBullet refuses a shape or a body.
+        """
+        have = sum(len(bodies) for bodies in self._bodies.values())
+        missing = any(len(self._bodies.get(key, ())) < count for key, count in needed.items())
+        if missing or have > _SPARE_FACTOR * sum(needed.values()) + _SPARE_BODIES:
+            sizes = {key: len(bodies) for key, bodies in self._bodies.items()} if missing else {}
+            self._build({key: max(sizes.get(key, 0), needed.get(key, 0)) for key in {*sizes, *needed}})
+        return {key: self._bodies[key][:count] for key, count in needed.items()}
+
+    def place(self, body: int, position: Sequence[float], quaternion: Sequence[float]) -> None:
+        """Put a body at a position (Bullet units) and orientation, at rest, with a fresh broadphase proxy."""
+        bullet, client = self.bullet, self.client
+        bullet.resetBasePositionAndOrientation(body, position, quaternion, physicsClientId=client)
+        bullet.resetBaseVelocity(body, _ZERO, _ZERO, physicsClientId=client)
+        bullet.setCollisionFilterGroupMask(body, -1, 1, 1, physicsClientId=client)
+
+    def wake(
+        self, body: int, category: int, quaternion: Sequence[float], *, fixed: bool, damping: tuple[float, float]
+    ) -> None:
+        """Turn a parked body to its orientation and give it the dynamics of the coming simulation."""
+        bullet, client = self.bullet, self.client
+        bullet.resetBasePositionAndOrientation(body, self._parking[body], quaternion, physicsClientId=client)
+        if self._library.static[category]:
+            return
+        bullet.resetBaseVelocity(body, _ZERO, _ZERO, physicsClientId=client)
+        bullet.changeDynamics(
+            body,
+            -1,
+            mass=0.0 if fixed else float(self._library.assets[category].asset.mass),
+            localInertiaDiagonal=_ZERO if fixed else self._inertia(category),
+            linearDamping=damping[0],
+            angularDamping=damping[1],
+            activationState=bullet.ACTIVATION_STATE_DISABLE_SLEEPING,
+            physicsClientId=client,
+        )
+
+    def park(self, body: int, category: int) -> None:
+        """Take a body out of the scene."""
+        self.place(body, self._parking[body], _UPRIGHT)
+        if not self._library.static[category]:
+            self.bullet.changeDynamics(
+                body, -1, activationState=self.bullet.ACTIVATION_STATE_SLEEP, physicsClientId=self.client
+            )
+
+    def clear(self) -> None:
+        """Drop all bodies; the next :meth:`take` builds those that it needs."""
+        self._bodies = {}
+
+    def close(self) -> None:
+        """Disconnect from PyBullet."""
+        if self.client >= 0:
+            self.bullet.disconnect(self.client)
+            self.client = -1
+
+    # -- construction ---------------------------------------------------------------------------
+
+    def _build(self, sizes: Mapping[BodyKey, int]) -> None:
+        bullet, client = self.bullet, self.client
+        bullet.resetSimulation(flags=bullet.RESET_USE_SIMPLE_BROADPHASE, physicsClientId=client)
+        bullet.setGravity(0.0, 0.0, -GRAVITY * SCALE, physicsClientId=client)
+        bullet.setPhysicsEngineParameter(
+            numSubSteps=0,
+            contactBreakingThreshold=2e-3 * SCALE,
+            deterministicOverlappingPairs=1,
+            enableFileCaching=0,
+            solverResidualThreshold=0.0,
+            contactERP=0.2,  # overlaps within the limits close in 10 ms; 0.4 makes objects hop
+            physicsClientId=client,
+        )
+        # A shared small visual: without one PyBullet would read the collision mesh again for every body.
+        visual = bullet.createVisualShape(bullet.GEOM_BOX, halfExtents=(1e-3, 1e-3, 1e-3), physicsClientId=client)
+        self._bodies, self._parking = {}, {}
+        for key in sorted(sizes):  # one order in every process, whatever was asked for first
+            shape = self._shape(key)
+            self._bodies[key] = []
+            for _ in range(sizes[key]):
+                place = (0.0, 0.0, _PARKING + _PARKING_STEP * len(self._parking))
+                body = self._body(key[0], shape, visual, place)
+                self._parking[body] = place
+                self._bodies[key].append(body)
+
+    def _shape(self, key: BodyKey) -> int:
+        """Collision shape of an asset: a compound of its convex parts, about the centre of mass."""
+        category, level = key
+        if key not in self._wavefronts:
+            geometry: LevelGeometry = getattr(self._library.assets[category], level)
+            axes, center = self.principal(category)[0], self._library.center_of_mass[category]
+            self._wavefronts[key] = _wavefront(
+                [SCALE * (inset_hull(part, MARGIN) - center) @ axes for part in geometry.parts]
+            )
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "hulls.obj"
+            path.write_text(self._wavefronts[key])
+            shape = int(
+                self.bullet.createCollisionShape(self.bullet.GEOM_MESH, fileName=str(path), physicsClientId=self.client)
+            )
+        if shape < 0:
+            name = self._library.assets[category].asset.name
+            raise PhysicsError(f"PyBullet refused the collision shape of asset {name!r} ({level} parts)")
+        return shape
+
+    def _inertia(self, category: int) -> list[float]:
+        return (SCALE**2 * self.principal(category)[1]).tolist()  # type: ignore[no-any-return]
+
+    def _body(self, category: int, shape: int, visual: int, place: tuple[float, float, float]) -> int:
+        static = bool(self._library.static[category])
+        mass = 0.0 if static else float(self._library.assets[category].asset.mass)
+        body = self.bullet.createMultiBody(
+            mass,
+            shape,
+            visual,
+            basePosition=place,
+            useMaximalCoordinates=True,
+            physicsClientId=self.client,
+        )
+        if body < 0:
+            raise PhysicsError(f"PyBullet could not create a body for asset category {category}")
+        # Bullet multiplies the friction coefficients of the two bodies.
+        settings: dict[str, Any] = {"lateralFriction": math.sqrt(FRICTION), "restitution": 0.0}
+        if not static:
+            # The mass goes in with the inertia: alone, the inertia call would reset the mass.
+            settings |= {"mass": mass, "localInertiaDiagonal": self._inertia(category)}
+            settings["activationState"] = self.bullet.ACTIVATION_STATE_SLEEP
+        self.bullet.changeDynamics(body, -1, physicsClientId=self.client, **settings)
+        return int(body)
+
+
+def _import_bullet() -> Any:
+    try:
+        with _silence():
+            import pybullet
+    except ImportError as error:
+        raise MissingDependencyError(
+            "settling and equilibrium need pybullet, whose wheels exist for Python 3.10 and 3.11; "
+            "install it there with: pip install pybullet"
+        ) from error
+    return pybullet
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Keep the greeting that PyBullet prints on import out of the user's terminal."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    with open(os.devnull, "w") as sink:
+        kept = os.dup(1), os.dup(2)
+        try:
+            os.dup2(sink.fileno(), 1)
+            os.dup2(sink.fileno(), 2)
+            yield
+        finally:
+            for copy, descriptor in zip(kept, (1, 2), strict=True):
+                os.dup2(copy, descriptor)
+                os.close(copy)
+
+
+def _wavefront(hulls: list[Array]) -> str:
+    """A Wavefront file with one group per hull (V, 3); Bullet makes a compound of them."""
+    lines: list[str] = []
+    offset = 1
+    for index, vertices in enumerate(hulls):
+        lines.append(f"o hull{index}")
+        lines.extend(f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices)
+        lines.extend(f"f {a + offset} {b + offset} {c + offset}" for a, b, c in ConvexHull(vertices).simplices)
+        offset += len(vertices)
+    return "\n".join(lines) + "\n"
