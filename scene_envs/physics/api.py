@@ -11,6 +11,7 @@ from torch import Tensor
 
 from scene_envs.errors import InvalidInputError
 from scene_envs.physics.kernels import Chunk
+from scene_envs.physics.motion import CONVERGED, ITERATIONS
 from scene_envs.physics.pool import PhysicsPool, run_in_process
 from scene_envs.physics.results import (
     EquilibriumResult,
@@ -24,10 +25,6 @@ from scene_envs.physics.results import (
 from scene_envs.rotations import geodesic_angle, project_to_so3
 from scene_envs.scene import SceneBatch
 
-TIME_STEP = 1.0 / 480.0
-"""Longest integration step while settling, s."""
-_SHORT_STEP = 1.0 / 960.0
-"""The same in further rounds of making ready."""
 _READY_DEPTH, _READY_DURATION = 1e-4, 2.0
 """What a ready object may overlap (m), and how long it stays where it is (s)."""
 _CHUNK = 8
@@ -110,7 +107,7 @@ def equilibrium(batch: SceneBatch, *, duration: float = 0.1, pool: PhysicsPool |
 
 
 def settle(
-    batch: SceneBatch, *, duration: float = 1.0, time_step: float = TIME_STEP, pool: PhysicsPool | None = None
+    batch: SceneBatch, *, duration: float = 1.0, iterations: int = ITERATIONS, pool: PhysicsPool | None = None
 ) -> SettleResult:
     """Let every scene come to rest under gravity, with slight damping.
 
@@ -120,16 +117,15 @@ def settle(
     Args:
         batch: B scenes of N slots.
         duration: s.
-        time_step: longest integration step, s; tall stacks get shorter ones. Shorter steps leave smaller overlaps.
+        iterations: of the contact solver per step; more of them leave smaller overlaps.
         pool: worker processes; None computes in this process.
 
-    Raises InvalidInputError, also for times that are not positive, and MissingDependencyError as
-    :func:`feasibility` does.
+    Raises InvalidInputError, also for fewer than one iteration, and MissingDependencyError as :func:`feasibility`
+    does.
     """
-    for name, value in (("duration", duration), ("time_step", time_step)):
-        if not 0.0 < value < float("inf"):
-            raise InvalidInputError(f"{name}={value} must be a positive number of seconds")
-    rows = _run("settle", batch, {"duration": duration, "time_step": time_step}, pool)
+    if iterations < 1:
+        raise InvalidInputError(f"iterations={iterations} must be at least 1")
+    rows = _run("settle", batch, {"duration": duration, "iterations": iterations}, pool)
     settled, displacement, rotation = _moved(rows, batch)
     return SettleResult(settled, displacement, rotation, _valid(rows))
 
@@ -160,8 +156,8 @@ def make_ready(
 
     A free object is ready when it is inside the workspace, overlaps nothing deeper than 0.1 mm, and stays within 1 mm
     and 0.01 rad of where it is for 2 s of simulation. Scenes with objects that are not ready go through projection and
-    settling again, with shorter time steps, up to ``rounds`` times in all. The round with most ready objects is kept,
-    the earliest of equal ones.
+    settling again, with more solver iterations, up to ``rounds`` times in all. The round with most ready objects is
+    kept, the earliest of equal ones.
 
     Args:
         batch: B scenes of N slots.
@@ -173,7 +169,7 @@ def make_ready(
     """
     if rounds < 1:
         raise InvalidInputError(f"rounds={rounds} must be at least 1: each projects and settles once")
-    best = last = _make_ready_once(batch, duration, TIME_STEP, pool)
+    best = last = _make_ready_once(batch, duration, ITERATIONS, pool)
     tensor, ready, counts = best.batch.tensor.clone(), best.ready.clone(), best.counts.clone()
     free = best.batch.is_free.sum(dim=-1)
     scenes = torch.arange(len(batch))  # that went through the last round
@@ -182,7 +178,7 @@ def make_ready(
         if not len(again):
             break
         scenes = scenes[again]
-        last = _make_ready_once(last.batch[again], duration, _SHORT_STEP, pool)
+        last = _make_ready_once(last.batch[again], duration, CONVERGED, pool)
         better = last.counts > counts[scenes]
         improved = scenes[better]
         tensor[improved], ready[improved] = last.batch.tensor[better], last.ready[better]
@@ -190,10 +186,10 @@ def make_ready(
     return ReadyResult(SceneBatch(tensor, best.batch.scene_type), ready, counts, best.valid)
 
 
-def _make_ready_once(batch: SceneBatch, duration: float, time_step: float, pool: PhysicsPool | None) -> ReadyResult:
+def _make_ready_once(batch: SceneBatch, duration: float, iterations: int, pool: PhysicsPool | None) -> ReadyResult:
     """One round of :func:`make_ready`."""
     projected = project(batch, pool=pool)
-    settled = settle(projected.batch, duration=duration, time_step=time_step, pool=pool)
+    settled = settle(projected.batch, duration=duration, iterations=iterations, pool=pool)
     judged = feasibility(settled.batch, max_penetration=_READY_DEPTH, duration=_READY_DURATION, pool=pool)
     valid = projected.valid & settled.valid & judged.valid
     ready = judged.feasible & settled.batch.in_workspace & valid[:, None]

@@ -109,14 +109,14 @@ def penetration_kernel(chunk: Chunk) -> dict[str, Any]:
     }
 
 
-def settle_kernel(chunk: Chunk, *, duration: float, time_step: float) -> dict[str, Any]:
+def settle_kernel(chunk: Chunk, *, duration: float, iterations: int) -> dict[str, Any]:
     """See :func:`scene_envs.physics.settle`."""
     physics = physics_of(chunk.scene_type)
     translations, rotations = chunk.translations.copy(), chunk.rotations.copy()
     valid = np.ones(len(chunk), dtype=bool)
     for index in range(len(chunk)):
         objects = _objects(physics, chunk.row(index))
-        new_rotation, new_translation, valid[index] = settle_scene(physics, objects, duration, time_step)
+        new_rotation, new_translation, valid[index] = settle_scene(physics, objects, duration, iterations)
         if valid[index]:
             translations[index, objects.slot] = new_translation
             rotations[index, objects.slot] = new_rotation

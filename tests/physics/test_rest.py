@@ -103,8 +103,8 @@ def test_a_falling_post_knocks_over_the_next_one(monkeypatch: pytest.MonkeyPatch
 
 
 def test_what_falls_onto_an_object_at_rest_is_not_missed() -> None:
-    """A box falls 8 cm onto the end of another one's overhang and tips it."""
-    batch = scene(("cube", 0.0, 0.0, 0.0), ("cube", 0.04, 0.0, SIDE), ("cube", 0.125, 0.0, 2 * SIDE + 0.08))
+    """A box falls 8 cm onto another one's overhang; the centre of mass of the two is past the edge."""
+    batch = scene(("cube", 0.0, 0.0, 0.0), ("cube", 0.04, 0.0, SIDE), ("cube", 0.085, 0.0, 2 * SIDE + 0.08))
     assert feasibility(batch[:1], duration=0.02).feasible[0, 1:3].tolist() == [True, True]
     assert not bool(feasibility(batch, duration=0.4).feasible[0, 2])
 
