@@ -155,9 +155,9 @@ def make_ready(
     """Project, settle, then count the simulation-ready objects.
 
     A free object is ready when it is inside the workspace, overlaps nothing deeper than 0.1 mm, and stays within 1 mm
-    and 0.01 rad of where it is for 2 s of simulation. Scenes with objects that are not ready go through projection and
-    settling again, with more solver iterations, up to ``rounds`` times in all. The round with most ready objects is
-    kept, the earliest of equal ones.
+    and 0.01 rad of where it is for 2 s of simulation, also without the objects that are not ready. Scenes with objects
+    that are not ready go through projection and settling again, with more solver iterations, up to ``rounds`` times
+    in all. The round with most ready objects is kept, the earliest of equal ones.
 
     Args:
         batch: B scenes of N slots.
@@ -186,14 +186,37 @@ def make_ready(
     return ReadyResult(SceneBatch(tensor, best.batch.scene_type), ready, counts, best.valid)
 
 
+def _ready_alone(batch: SceneBatch, ready: Tensor, pool: PhysicsPool | None) -> Tensor:
+    """Which of the ``ready`` objects (B, N) are ready without the others: those that lean on what is not are struck."""
+    ready = ready.clone()
+    scenes = (ready.any(dim=-1) & (batch.is_free & ~ready).any(dim=-1)).nonzero()[:, 0]
+    while len(scenes):
+        judged = _judge_ready(_keep(batch[scenes], ready[scenes]), pool)
+        struck = (ready[scenes] & ~judged).any(dim=-1)
+        ready[scenes] &= judged
+        scenes = scenes[struck]
+    return ready
+
+
+def _keep(batch: SceneBatch, kept: Tensor) -> SceneBatch:
+    """The scenes with all free objects but ``kept`` (B, N) removed."""
+    categories = batch.categories.masked_fill(batch.is_free & ~kept, batch.scene_type.num_assets)
+    return SceneBatch.from_parts(batch.translations, batch.rotations, categories, batch.scene_type)
+
+
 def _make_ready_once(batch: SceneBatch, duration: float, iterations: int, pool: PhysicsPool | None) -> ReadyResult:
     """One round of :func:`make_ready`."""
     projected = project(batch, pool=pool)
     settled = settle(projected.batch, duration=duration, iterations=iterations, pool=pool)
-    judged = feasibility(settled.batch, max_penetration=_READY_DEPTH, duration=_READY_DURATION, pool=pool)
-    valid = projected.valid & settled.valid & judged.valid
-    ready = judged.feasible & settled.batch.in_workspace & valid[:, None]
+    valid = projected.valid & settled.valid
+    ready = _ready_alone(settled.batch, _judge_ready(settled.batch, pool) & valid[:, None], pool)
     return ReadyResult(settled.batch, ready, ready.sum(dim=-1), valid)
+
+
+def _judge_ready(batch: SceneBatch, pool: PhysicsPool | None) -> Tensor:
+    """(B, N) free objects inside the workspace that hardly overlap and stay where they are."""
+    judged = feasibility(batch, max_penetration=_READY_DEPTH, duration=_READY_DURATION, pool=pool)
+    return judged.feasible & batch.in_workspace & judged.valid[:, None]
 
 
 # -- from and to tensors ------------------------------------------------------------------------
