@@ -23,7 +23,7 @@ from scene_envs.physics.collision import Collider
 from scene_envs.physics.minimum_translation import Tried, minimum_translations
 from scene_envs.physics.placement import Objects
 from scene_envs.physics.planes import Planes, near_pairs, nearest, separating_planes
-from scene_envs.physics.spreading import heaps, part_products, spread
+from scene_envs.physics.spreading import corner_tests, heaps, spread
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -32,12 +32,12 @@ Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 TOLERANCE = 1e-4
 """Depth (m) up to which a projected scene counts as free of overlap."""
-WORK = 60_000.0
+WORK = 10_000.0
 """Units of work (pairs of convex parts, or rows solved) until a search ends."""
 SEARCHES = 3
 """Searches for a scene: the first from where the objects are, the others after what overlaps was spread."""
-_OVERLAPPING = 20_000
-"""Pairs of convex parts in overlapping object pairs that are too many for minimum translations."""
+_OVERLAPPING = 3_000_000
+"""Corner tests in overlapping object pairs that are too many for minimum translations."""
 _ROUNDS = 30
 """Rounds until what still overlaps is left as it is,"""
 _PATIENCE = 10
@@ -81,7 +81,7 @@ def project_objects(collider: Collider, objects: Objects, workspace: Corners) ->
     """
     home = objects.translation
     bounds = _bounds(home, objects, workspace)
-    chosen, start, best = heaps(collider.library, objects), objects, None
+    chosen, start, best = heaps(collider, objects), objects, None
     wanted = home
     for _ in range(SEARCHES):
         if chosen.any():
@@ -104,7 +104,7 @@ def _search(collider: Collider, objects: Objects, bounds: tuple[Array, Array]) -
     tried: Tried = {}
     current = replace(objects, translation=nearest(objects, home, walls, budget))
     for _ in range(_ROUNDS):
-        first, second, measured = _measure(collider, current)
+        first, second, measured = _measure(collider, current, budget)
         way = float(((current.translation - home) ** 2).sum())
         is_free = measured.residual_depth <= 0.5 * TOLERANCE
         gain = best_way - way
@@ -121,12 +121,13 @@ def _search(collider: Collider, objects: Objects, bounds: tuple[Array, Array]) -
             break
         elif best_way < np.inf:
             break  # a refinement that ran into something else: what was free of overlap stands
-        if budget.is_spent or part_products(collider.library, current, first, second).sum() > _OVERLAPPING:
+        if budget.is_spent or corner_tests(collider.library, current, first, second).sum() > _OVERLAPPING:
             break
         translation = _round(collider, current, home, first, second, bounds, walls, tried, budget)
         current = replace(current, translation=translation)
     assert best is not None
-    return best
+    inside = _inside(best.translation, bounds)
+    return best if inside is best.translation else _measure(collider, replace(objects, translation=inside), budget)[2]
 
 
 def _round(
@@ -152,9 +153,10 @@ def _round(
     return nearest(current, home, planes + walls, budget)
 
 
-def _measure(collider: Collider, objects: Objects) -> tuple[Index, Index, Projection]:
+def _measure(collider: Collider, objects: Objects, budget: Budget) -> tuple[Index, Index, Projection]:
     """Object pairs whose fine parts overlap beyond the tolerance, and the overlap of all."""
     pairs = collider.pairs(objects)
+    budget.spend(len(pairs.contacts.gap))
     deep = pairs.depth > 0.5 * TOLERANCE
     first, second = pairs.first[deep], pairs.second[deep]
     overlapping = np.isin(np.arange(len(objects)), np.concatenate([first, second]))
@@ -167,6 +169,12 @@ def _bounds(home: Array, objects: Objects, workspace: Corners) -> tuple[Array, A
     low, high = np.array(workspace[0]), np.array(workspace[1])
     loose = objects.fixed | ((home < low - _OUTSIDE) | (home > high + _OUTSIDE)).any(axis=1)
     return np.where(loose[:, None], -np.inf, low + _INSIDE), np.where(loose[:, None], np.inf, high - _INSIDE)
+
+
+def _inside(translation: Array, bounds: tuple[Array, Array]) -> Array:
+    """The translations; those that slack let leave the workspace are put back."""
+    clipped = np.clip(translation, *bounds)
+    return clipped if (np.abs(clipped - translation) > 0.9 * _INSIDE).any() else translation
 
 
 def _walls(bounds: tuple[Array, Array]) -> Planes:

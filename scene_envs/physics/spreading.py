@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_envs.physics.collision import scene_pairs
+from scene_envs.physics.collision import Collider, scene_pairs
 from scene_envs.physics.geometry import LibraryGeometry
 from scene_envs.physics.placement import Objects, object_boxes, place
 from scene_envs.physics.planes import CLEARANCE
@@ -20,8 +20,12 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-_HEAP = 100_000
-"""Pairs of convex parts, in object pairs whose boxes meet, from which a group of objects is a heap."""
+_HEAP = 3_000_000
+"""Corner tests from which a group of objects whose boxes meet may be a heap,"""
+_DEEP = 5e-3
+"""which it is when the two that have most in common overlap deeper than this (m)."""
+_LOOKED_AT = 3
+"""Object pairs of a group that are measured to find out."""
 _WINDOWS = (0.3, 1.0, 4.0, 20.0)
 """Half widths (m) of the cubes around a wanted place that are searched, one after the other."""
 _BINS = 20
@@ -30,9 +34,12 @@ _FIXED = 1000
 """Overlapping a box of a fixed object counts as much as overlapping this many free objects."""
 
 
-def heaps(library: LibraryGeometry, objects: Objects) -> Mask:
-    """(n,) free objects of one scene in groups whose boxes meet so often that exact tests would take too long."""
-    low, high = object_boxes(place(library, objects, "coarse"))
+def heaps(collider: Collider, objects: Objects) -> Mask:
+    """(n,) free objects of one scene in groups that overlap so much that exact tests would take too long.
+
+    Nested objects that stand as they should meet as often, but hardly overlap: they are no heap.
+    """
+    low, high = object_boxes(place(collider.library, objects, "coarse"))
     first, second = scene_pairs(objects)
     meet = ((low[first] < high[second]) & (low[second] < high[first])).all(axis=1)
     first, second = first[meet], second[meet]
@@ -40,14 +47,23 @@ def heaps(library: LibraryGeometry, objects: Objects) -> Mask:
     both = free[first] & free[second]
     group = components(len(objects), first[both], second[both])
     owner = group[np.where(free[first], first, second)]
-    parts = np.bincount(owner, weights=part_products(library, objects, first, second), minlength=len(objects))
-    return free & (parts[group] > _HEAP)
+    tests = np.bincount(owner, weights=corner_tests(collider.library, objects, first, second), minlength=len(objects))
+    chosen = np.zeros(len(objects), dtype=bool)
+    for number in np.flatnonzero(tests > _HEAP):
+        a, b = first[owner == number], second[owner == number]
+        common = np.prod(np.minimum(high[a], high[b]) - np.maximum(low[a], low[b]), axis=1)
+        smaller = np.minimum(np.prod(high[a] - low[a], axis=1), np.prod(high[b] - low[b], axis=1))
+        most = np.argsort(-common / np.maximum(smaller, 1e-12), kind="stable")[:_LOOKED_AT]
+        looked_at = objects[np.unique(np.concatenate([a[most], b[most]]))]
+        if collider.pairs(looked_at).depth.max(initial=0.0) > _DEEP:
+            chosen |= free & (group == number)
+    return chosen
 
 
-def part_products(library: LibraryGeometry, objects: Objects, first: Index, second: Index) -> Array:
-    """(P,) how many pairs of fine convex parts each object pair has."""
-    counts = np.array([len(asset.fine.parts) for asset in library.assets], dtype=np.float64)[objects.category]
-    return counts[first] * counts[second]  # type: ignore[no-any-return]
+def corner_tests(library: LibraryGeometry, objects: Objects, first: Index, second: Index) -> Array:
+    """(P,) corners of one object's parts times face directions of the other's, both ways: the work of one test."""
+    corners, directions = library.corners[objects.category], library.directions[objects.category]
+    return (corners[first] * directions[second] + directions[first] * corners[second]).astype(np.float64)
 
 
 def spread(
