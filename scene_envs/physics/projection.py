@@ -36,7 +36,7 @@ WORK = 10_000.0
 """Units of work (pairs of convex parts, or rows solved) until a search ends."""
 SEARCHES = 3
 """Searches for a scene: the first from where the objects are, the others after what overlaps was spread."""
-_OVERLAPPING = 3_000_000
+_OVERLAPPING = 2_000_000
 """Corner tests in overlapping object pairs that are too many for minimum translations."""
 _ROUNDS = 30
 """Rounds until what still overlaps is left as it is,"""

@@ -28,7 +28,7 @@ _LOOKED_AT = 3
 """Object pairs of a group that are measured to find out."""
 _WINDOWS = (0.3, 1.0, 4.0, 20.0)
 """Half widths (m) of the cubes around a wanted place that are searched, one after the other."""
-_BINS = 20
+_BINS = 16
 """Coordinates looked at along each axis come from this many equal intervals, at most two from each."""
 _FIXED = 1000
 """Overlapping a box of a fixed object counts as much as overlapping this many free objects."""
