@@ -1,6 +1,6 @@
 """Projection: how many scenes come free of overlap, how fast, and how far objects move beside a general NLP solver.
 
-    python benchmarks/projection.py [--count 40] [--small 20] [--starts 6] [--seed 0] [--types ...]
+    python benchmarks/projection.py [--count 40] [--small 20] [--starts 6] [--seed 0] [--types ...] [--heaps]
 
 *Each type*: generated scenes whose free objects were moved by Gaussian noise of 1 and 2 cm along every axis. Times
 are CPU time of one thread, scene by scene. *Small scenes*: 2 to 8 free objects that overlap, cut out of the jittered
@@ -9,6 +9,11 @@ pair of convex parts (FCL) at least the clearance that projection asks for, the 
 the fine parts and the coarse hulls, from the given poses and from random ones 1 cm around them, and the fine parts
 once more from what projection found; its best solution that FCL finds free of overlap counts. The ratio is between the
 square roots of what both minimise. *Alone* counts the scenes that SLSQP solves without the start from ours.
+
+``--heaps`` measures degenerate scenes alone, at the largest count of each type: all free objects at one point of the
+workspace or 10 m outside it, at one place in pairs, in a tower 10 mm apart, in a cube of 5 cm, or in what is welded;
+of random assets, and all of the asset with most convex parts. Each has 10 um of noise. *Left* is the deepest overlap
+that is left, the largest over the scenes.
 """
 
 from __future__ import annotations
@@ -31,6 +36,7 @@ from scene_envs.physics.placement import Level, Objects, flatten, part_pairs, pl
 from scene_envs.physics.planes import CLEARANCE
 from scene_envs.physics.projection import TOLERANCE
 from scene_envs.physics.separation import separations
+from scene_envs.rotations import yaw_matrix
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import list_scene_types
 
@@ -44,6 +50,62 @@ def jittered(batch: SceneBatch, scale: float, generator: torch.Generator) -> Sce
     """Gaussian noise of ``scale`` m along every axis on the translations of free objects."""
     noise = scale * torch.randn(batch.translations.shape, generator=generator) * batch.is_free.unsqueeze(-1)
     return batch.with_poses(batch.translations + noise, batch.rotations)
+
+
+HEAPS = ("point", "outside", "pairs", "nested", "cube", "buried")
+"""Kinds of degenerate scenes."""
+
+
+def heap(name: str, kind: str, rng: np.random.Generator, *, one_asset: bool) -> SceneBatch:
+    """One degenerate scene of a type, all slots taken."""
+    batch = SceneBatch.empty(name, 1)
+    scene_type = batch.scene_type
+    free = [index for index in range(scene_type.num_assets) if index not in scene_type.welded_categories]
+    if one_asset:
+        free = [max(free, key=lambda index: len(scene_type.library.assets[index].fine))]
+    slots = torch.nonzero(batch.is_empty[0]).flatten().tolist()
+    low, high = (np.array(corner) for corner in scene_type.workspace)
+    center, count = (low + high) / 2, len(slots)
+    places: Array = np.tile(center, (count, 1))
+    if kind == "outside":
+        places += [10.0, 0.0, 0.0]
+    elif kind == "pairs":
+        places = np.repeat(rng.uniform(low, high, (count, 3)), 2, axis=0)[:count]
+    elif kind == "nested":
+        places[:, 2] += 0.01 * np.arange(count)
+    elif kind == "cube":
+        places += rng.uniform(-0.025, 0.025, (count, 3))
+    elif kind == "buried":
+        places = rng.uniform([-0.1, -0.1, -0.15], [0.1, 0.1, -0.01], (count, 3))
+    chosen, turns = rng.choice(free, count), rng.uniform(0.0, 2.0 * np.pi, count)
+    if kind == "pairs":
+        chosen, turns = np.repeat(chosen, 2)[:count], np.zeros(count)
+    translations, rotations, categories = batch.translations.clone(), batch.rotations.clone(), batch.categories.clone()
+    translations[0, slots] = torch.from_numpy(places + 1e-5 * rng.standard_normal((count, 3))).float()
+    rotations[0, slots] = yaw_matrix(torch.from_numpy(turns).float())
+    categories[0, slots] = torch.from_numpy(chosen)
+    if kind == "buried" and "cafe_table" in scene_type.welded:
+        categories[0, slots[0]] = scene_type.assets.index("cafe_table")
+        translations[0, slots[0]], rotations[0, slots[0]] = torch.zeros(3), torch.eye(3)
+    return SceneBatch.from_parts(translations, rotations, categories, scene_type)
+
+
+def measure_heaps(name: str, count: int, seed: int, table: Table) -> None:
+    """Two rows: random assets, and one asset; the slowest of ``count`` scenes of each kind."""
+    project(get_grammar(name).sample(np.random.default_rng(seed), 1))
+    for one_asset in (False, True):
+        cells, solved, left, total = [], 0, 0.0, 0
+        for kind in HEAPS:
+            spent = []
+            for index in range(count):
+                batch = heap(name, kind, np.random.default_rng([seed, index]), one_asset=one_asset)
+                start = time.process_time()
+                result = project(batch)
+                spent.append(1e3 * (time.process_time() - start))
+                solved, total = solved + int(result.converged[0]), total + 1
+                left = max(left, 1e3 * float(result.residual_depth[0]))
+            cells.append(f"{max(spent):.0f}")
+        table.add_row(name, "one" if one_asset else "random", *cells, f"{solved} of {total}", f"{left:.1f}")
 
 
 def small_scenes(batch: SceneBatch, rng: np.random.Generator) -> SceneBatch:
@@ -216,10 +278,18 @@ def main() -> None:
     parser.add_argument("--small", type=int, default=20, help="small scenes per type for the comparison")
     parser.add_argument("--starts", type=int, default=6, help="starts of SLSQP per scene")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--heaps", action="store_true", help="measure degenerate scenes, and nothing else")
     parser.add_argument("--types", nargs="*", default=list_scene_types())
     options = parser.parse_args()
     torch.set_num_threads(1)
     console = Console()
+    if options.heaps:
+        headers = ("scene type", "assets", *HEAPS, "free of overlap", "left mm")
+        table = Table(*headers, title="heaps: slowest scene of each kind, ms")
+        for name in options.types:
+            measure_heaps(name, options.count, options.seed, table)
+        console.print(table)
+        return
     if options.count:
         columns = ("scene type", "jitter", "objects", "free of overlap", "median ms", "90 % ms", "moved mm", "outside")
         table = Table(*columns, title="each type")

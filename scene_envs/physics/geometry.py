@@ -129,6 +129,9 @@ class LibraryGeometry:
         self.assets = tuple(self._add(asset) for asset in assets)
         self.static = np.array([asset.static or asset.mass <= 0 for asset in assets])
         self.center_of_mass = np.stack([np.asarray(asset.center_of_mass, dtype=np.float64) for asset in assets])
+        fine = [asset.fine.parts for asset in self.assets]
+        self.corners = np.array([sum(len(part.vertices) for part in parts) for parts in fine], dtype=np.int64)
+        self.directions = np.array([sum(len(part.normals) for part in parts) for parts in fine], dtype=np.int64)
         self.size_class = np.array([part.size_class for part in self.parts], dtype=np.int64)
         self.row = np.zeros(len(self.parts), dtype=np.int64)
         self.tables: list[PartTable | None] = []

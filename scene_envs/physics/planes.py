@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear, nnls
+from scipy.optimize import nnls
+from scipy.sparse import csr_array
 
+from scene_envs.physics.budget import Budget
 from scene_envs.physics.collision import Collider, scene_pairs
 from scene_envs.physics.placement import Objects, object_boxes, part_pairs, place
 from scene_envs.physics.separation import grouped_gaps
@@ -27,6 +29,14 @@ _MET = 1e-7
 """A plane broken by less than this (m) is met."""
 _APART = 1e-6
 """Parts whose best face plane leaves at least minus this (m) count as apart."""
+_EXACT = 200
+"""Planes up to which the least-distance problem is solved exactly."""
+_STEPS = 400
+"""Steps of the first-order method that solves larger problems."""
+_ITERATIONS = 1e8
+"""Matrix entries that the exact method may visit."""
+_ROWS_SQUARED = 25.0
+"""Squared rows of one least-distance problem that cost one unit of work."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +73,7 @@ def near_pairs(collider: Collider, objects: Objects) -> tuple[Index, Index]:
 
 
 def separating_planes(
-    collider: Collider, objects: Objects, first: Index, second: Index, extra: Array, home: Array
+    collider: Collider, objects: Objects, first: Index, second: Index, extra: Array, home: Array, budget: Budget
 ) -> Planes:
     """Planes that keep object pairs apart.
 
@@ -75,15 +85,18 @@ def separating_planes(
         objects: of one scene, at their current translations.
         first: (P,) object rows.
         second: (P,) object rows.
-        extra: (P, 3) m, added to the offset of each pair: the way out, for pairs that overlap.
+        extra: (P, 3) m, added to the offset of each pair: the minimum translation, for pairs that overlap.
         home: (n, 3) translations that the objects would rather have, m.
+        budget: charged with one unit per plane.
     """
     coarse, apart = _planes_at("coarse", collider, objects, first, second, extra, home)
+    budget.spend(len(coarse.pair))
     nested = np.unique(coarse.pair[~apart])
     if not len(nested):
         return coarse.planes(np.ones(len(coarse.pair), dtype=bool))
     kept = coarse.planes(~np.isin(coarse.pair, nested))
     fine, apart = _planes_at("fine", collider, objects, first[nested], second[nested], extra[nested], home)
+    budget.spend(len(fine.pair))
     return kept + fine.planes(np.ones(len(fine.pair), dtype=bool))
 
 
@@ -127,10 +140,10 @@ def _planes_at(
     return _PartPlanes(pair, first[pair], second[pair], direction, bound), best >= -_APART
 
 
-def nearest(objects: Objects, home: Array, planes: Planes) -> Array:
+def nearest(objects: Objects, home: Array, planes: Planes, budget: Budget) -> Array:
     """Translations (n, 3) nearest to ``home`` that satisfy the planes, as well as they can be.
 
-    Objects that no plane connects are solved on their own.
+    Objects that no plane connects are solved on their own. ``budget`` is charged with the rows solved.
     """
     result = home.copy()
     free = ~objects.fixed
@@ -150,31 +163,62 @@ def nearest(objects: Objects, home: Array, planes: Planes) -> Array:
         line = np.arange(len(rows))
         matrix[line, column[planes.second[rows]]] += planes.direction[rows]
         matrix[line, column[planes.first[rows]]] -= planes.direction[rows]
-        moved = least_distance(matrix[:, :-1].reshape(len(rows), -1), needed[rows])
+        moved = least_distance(matrix[:, :-1].reshape(len(rows), -1), needed[rows], budget)
         result[members] += moved.reshape(-1, 3)
     return result
 
 
-def least_distance(matrix: Array, needed: Array) -> Array:
+def least_distance(matrix: Array, needed: Array, budget: Budget) -> Array:
     """The shortest x with ``matrix @ x + s >= needed``, slack s costing ``_SLACK`` squared.
 
     Lawson and Hanson's least-distance programme (1974, ch. 23) through non-negative least squares on its dual.
-    Most rows are met by themselves: they join only when a solution without them breaks them.
+    Most rows are met by themselves: they join only when a solution without them breaks them. Problems of more than
+    ``_EXACT`` rows, and those on which the exact method fails, are solved approximately. When ``budget`` is spent,
+    the last solution is returned.
     """
     x = np.zeros(matrix.shape[1])
     used = needed > 0
     broken = used
-    while broken.any():
+    while broken.any() and not budget.is_spent:
         used = used | broken
         rows = np.flatnonzero(used)
-        system = np.vstack([matrix[rows].T, np.eye(len(rows)) / _SLACK, needed[rows]])
-        target = np.zeros(len(system))
-        target[-1] = 1.0
-        try:
-            multipliers, _ = nnls(system, target, maxiter=30 * len(rows))
-        except RuntimeError:  # out of iterations: a slower method that always ends
-            multipliers = lsq_linear(system, target, bounds=(0.0, np.inf), tol=1e-12).x
-        residual = system @ multipliers - target
-        x = -residual[: matrix.shape[1]] / residual[-1]
+        budget.spend(min(len(rows), _EXACT) ** 2 / _ROWS_SQUARED)
+        x = _exact(matrix[rows], needed[rows]) if len(rows) <= _EXACT else _approximate(matrix[rows], needed[rows])
         broken = ~used & (matrix @ x < needed - _MET)
     return x
+
+
+def _exact(matrix: Array, needed: Array) -> Array:
+    """Solution with all rows, through non-negative least squares."""
+    count, width = matrix.shape
+    system = np.vstack([matrix.T, np.eye(count) / _SLACK, needed])
+    target = np.zeros(len(system))
+    target[-1] = 1.0
+    try:
+        multipliers, _ = nnls(system, target, maxiter=int(min(30 * count, max(3 * count, _ITERATIONS / system.size))))
+    except RuntimeError:  # out of iterations
+        return _approximate(matrix, needed)
+    residual = system @ multipliers - target
+    return -residual[:width] / residual[-1]  # type: ignore[no-any-return]
+
+
+def _approximate(matrix: Array, needed: Array) -> Array:
+    """Solution after a set number of steps of accelerated projected gradient ascent on the dual.
+
+    FISTA (Beck and Teboulle, 2009), started again whenever its momentum points downhill (O'Donoghue and Candes, 2015).
+    """
+    sparse = csr_array(matrix)
+    transposed = csr_array(matrix.T)
+    size = abs(sparse)
+    step = 1.0 / (float(size.sum(axis=0).max()) * float(size.sum(axis=1).max()) + _SLACK**-2)
+    multipliers = ahead = np.zeros(len(needed))
+    momentum = 1.0
+    for _ in range(_STEPS):
+        slope = needed - sparse @ (transposed @ ahead) - ahead / _SLACK**2
+        new = np.maximum(ahead + step * slope, 0.0)
+        if slope @ (new - multipliers) < 0:
+            momentum = 1.0
+        following = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * momentum**2))
+        ahead = new + (momentum - 1.0) / following * (new - multipliers)
+        multipliers, momentum = new, following
+    return transposed @ multipliers  # type: ignore[no-any-return]

@@ -1,11 +1,14 @@
 """Projection: the nearest translations at which no two objects overlap, rotations kept.
 
 With rotations fixed, "this part lies on that side of a plane with normal d" is exactly linear in the
-translations. Each object pair that overlaps is given a way out, the shortest straight one; the planes that
-separate its parts *there* are consistent with each other, so a thin wall that is straddled cannot ask for
-opposite moves. The nearest point under all planes is a least-distance problem, solved exactly, with slack that
-costs far more than distance, so that a crowded scene has a best effort. FCL has the last word after every round.
-Once nothing overlaps, planes are chosen anew at the solution, which can only shorten the way, until it does not.
+translations. Each object pair that overlaps is given a minimum translation; the planes that separate its parts
+*there* are consistent with each other, so a thin wall that is straddled cannot ask for opposite moves. The nearest
+point under all planes is a least-distance problem, with slack that costs far more than distance, so that a crowded
+scene has a best effort. FCL has the last word after every round. Once nothing overlaps, planes are chosen anew at the
+solution, which can only shorten the way, until it does not.
+
+The rounds end when their work budget is spent. Objects that overlap then, and heaps of objects from the start, are
+spread to free places, from where the rounds go on.
 """
 
 from __future__ import annotations
@@ -15,17 +18,26 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from scene_envs.physics.budget import Budget
 from scene_envs.physics.collision import Collider
+from scene_envs.physics.minimum_translation import Tried, minimum_translations
 from scene_envs.physics.placement import Objects
 from scene_envs.physics.planes import Planes, near_pairs, nearest, separating_planes
-from scene_envs.physics.ways_out import Tried, ways_out
+from scene_envs.physics.spreading import corner_tests, heaps, spread
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 TOLERANCE = 1e-4
 """Depth (m) up to which a projected scene counts as free of overlap."""
+WORK = 10_000.0
+"""Units of work (pairs of convex parts, or rows solved) until a search ends."""
+SEARCHES = 3
+"""Searches for a scene: the first from where the objects are, the others after what overlaps was spread."""
+_OVERLAPPING = 2_000_000
+"""Corner tests in overlapping object pairs that are too many for minimum translations."""
 _ROUNDS = 30
 """Rounds until what still overlaps is left as it is,"""
 _PATIENCE = 10
@@ -44,10 +56,19 @@ _OUTSIDE = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """Translations (n, 3) m after projection, and the deepest overlap that is left, m."""
+    """Translations of one scene's objects after projection.
+
+    Attributes:
+        translation: (n, 3) m.
+        residual_depth: deepest overlap that is left, m.
+        total_depth: sum over object pairs of the overlap that is left, m.
+        overlapping: (n,) bool, objects that still overlap another one.
+    """
 
     translation: Array
     residual_depth: float
+    total_depth: float
+    overlapping: Mask
 
 
 def project_objects(collider: Collider, objects: Objects, workspace: Corners) -> Projection:
@@ -60,21 +81,38 @@ def project_objects(collider: Collider, objects: Objects, workspace: Corners) ->
     """
     home = objects.translation
     bounds = _bounds(home, objects, workspace)
-    walls = _walls(bounds)
-    best, best_way, least = Projection(home, np.inf), np.inf, np.inf
+    chosen, start, best = heaps(collider, objects), objects, None
+    wanted = home
+    for _ in range(SEARCHES):
+        if chosen.any():
+            wanted = np.where(chosen[:, None], spread(collider.library, start, chosen, home, bounds), wanted)
+        found = _search(collider, replace(objects, translation=wanted), bounds)
+        if best is None or found.total_depth < best.total_depth:
+            best = found
+        if found.residual_depth <= TOLERANCE:
+            return found
+        chosen, start = found.overlapping & ~objects.fixed, replace(objects, translation=found.translation)
+    assert best is not None
+    return best
+
+
+def _search(collider: Collider, objects: Objects, bounds: tuple[Array, Array]) -> Projection:
+    """The nearest translations without overlap that a bounded number of rounds finds."""
+    home, walls, budget = objects.translation, _walls(bounds), Budget(WORK)
+    best, best_way = None, np.inf
+    waited = refinements = 0
     tried: Tried = {}
-    current = replace(objects, translation=nearest(objects, home, walls))
-    refinements = waited = 0
+    current = replace(objects, translation=nearest(objects, home, walls, budget))
     for _ in range(_ROUNDS):
-        first, second, residual, total = _overlapping(collider, current)
+        first, second, measured = _measure(collider, current, budget)
         way = float(((current.translation - home) ** 2).sum())
-        is_free = residual <= 0.5 * TOLERANCE
+        is_free = measured.residual_depth <= 0.5 * TOLERANCE
         gain = best_way - way
         waited += 1
-        if total < least and not is_free and best_way == np.inf:
-            best, least, waited = Projection(current.translation, residual), total, 0
-        elif is_free and way < best_way:
-            best, best_way = Projection(current.translation, residual), way
+        if best is None or (measured.total_depth < best.total_depth and not is_free and best_way == np.inf):
+            best, waited = measured, 0
+        if is_free and way < best_way:
+            best, best_way = measured, way
         if is_free:
             refinements += 1
             if refinements > _REFINEMENTS or way < _NEGLIGIBLE or gain < _GAIN * way:
@@ -83,8 +121,13 @@ def project_objects(collider: Collider, objects: Objects, workspace: Corners) ->
             break
         elif best_way < np.inf:
             break  # a refinement that ran into something else: what was free of overlap stands
-        current = replace(current, translation=_round(collider, current, home, first, second, bounds, walls, tried))
-    return best
+        if budget.is_spent or corner_tests(collider.library, current, first, second).sum() > _OVERLAPPING:
+            break
+        translation = _round(collider, current, home, first, second, bounds, walls, tried, budget)
+        current = replace(current, translation=translation)
+    assert best is not None
+    inside = _inside(best.translation, bounds)
+    return best if inside is best.translation else _measure(collider, replace(objects, translation=inside), budget)[2]
 
 
 def _round(
@@ -96,24 +139,29 @@ def _round(
     bounds: tuple[Array, Array],
     walls: Planes,
     tried: Tried,
+    budget: Budget,
 ) -> Array:
-    """The next translations: overlapping pairs (``first``, ``second``) on their way out, all others kept apart."""
+    """The next translations: overlapping pairs (``first``, ``second``) come free, all others are kept apart."""
     near_first, near_second = near_pairs(collider, current)
     extra = np.zeros((len(near_first), 3))
     if len(first):
         count = len(current)
-        out = ways_out(collider, current, first, second, bounds, tried)
+        moves = minimum_translations(collider, current, first, second, bounds, tried, budget)
         place_of = np.searchsorted(near_first * count + near_second, first * count + second)
-        extra[place_of] = out
-    planes = separating_planes(collider, current, near_first, near_second, extra, home)
-    return nearest(current, home, planes + walls)
+        extra[place_of] = moves
+    planes = separating_planes(collider, current, near_first, near_second, extra, home, budget)
+    return nearest(current, home, planes + walls, budget)
 
 
-def _overlapping(collider: Collider, objects: Objects) -> tuple[Index, Index, float, float]:
-    """Object pairs whose fine parts overlap beyond the tolerance, the deepest overlap, and the sum of them all."""
+def _measure(collider: Collider, objects: Objects, budget: Budget) -> tuple[Index, Index, Projection]:
+    """Object pairs whose fine parts overlap beyond the tolerance, and the overlap of all."""
     pairs = collider.pairs(objects)
+    budget.spend(len(pairs.contacts.gap))
     deep = pairs.depth > 0.5 * TOLERANCE
-    return pairs.first[deep], pairs.second[deep], float(pairs.depth.max(initial=0.0)), float(pairs.depth.sum())
+    first, second = pairs.first[deep], pairs.second[deep]
+    overlapping = np.isin(np.arange(len(objects)), np.concatenate([first, second]))
+    residual, total = float(pairs.depth.max(initial=0.0)), float(pairs.depth.sum())
+    return first, second, Projection(objects.translation, residual, total, overlapping)
 
 
 def _bounds(home: Array, objects: Objects, workspace: Corners) -> tuple[Array, Array]:
@@ -121,6 +169,12 @@ def _bounds(home: Array, objects: Objects, workspace: Corners) -> tuple[Array, A
     low, high = np.array(workspace[0]), np.array(workspace[1])
     loose = objects.fixed | ((home < low - _OUTSIDE) | (home > high + _OUTSIDE)).any(axis=1)
     return np.where(loose[:, None], -np.inf, low + _INSIDE), np.where(loose[:, None], np.inf, high - _INSIDE)
+
+
+def _inside(translation: Array, bounds: tuple[Array, Array]) -> Array:
+    """The translations; those that slack let leave the workspace are put back."""
+    clipped = np.clip(translation, *bounds)
+    return clipped if (np.abs(clipped - translation) > 0.9 * _INSIDE).any() else translation
 
 
 def _walls(bounds: tuple[Array, Array]) -> Planes:

@@ -11,7 +11,8 @@ from simple_scenes import scene as boxes
 
 from scene_envs.assets import get_library
 from scene_envs.grammars import get_grammar
-from scene_envs.physics import penetration, planes, project
+from scene_envs.physics import penetration, planes, project, projection
+from scene_envs.physics.budget import Budget
 from scene_envs.rotations import yaw_matrix
 from scene_envs.scene import SceneBatch
 
@@ -48,29 +49,153 @@ def tiers(batch: SceneBatch) -> torch.Tensor:
     return (batch.translations[..., 2, None] + 5e-3 >= TIERS).sum(dim=-1)
 
 
+def heap(name: str, kind: str, asset: str | None = None) -> SceneBatch:
+    """A scene of ``name`` at its largest count, all slots taken by degenerate placements, 10 um of noise on each.
+
+    ``kind``: at one "point" of the workspace, "outside" (10 m away), coincident "pairs", a "nested" tower 10 mm apart,
+    a "cube" of 5 cm, or "buried" in what is welded. Free assets at random, or all of them ``asset``.
+    """
+    rng = np.random.default_rng(0)
+    batch = SceneBatch.empty(name, 1)
+    scene_type = batch.scene_type
+    names = [asset] if asset else [a for i, a in enumerate(scene_type.assets) if i not in scene_type.welded_categories]
+    slots = torch.nonzero(batch.is_empty[0]).flatten().tolist()
+    low, high = (np.array(corner) for corner in scene_type.workspace)
+    center, count = (low + high) / 2, len(slots)
+    places = {
+        "point": lambda: np.tile(center, (count, 1)),
+        "outside": lambda: np.tile(center + np.array([10.0, 0.0, 0.0]), (count, 1)),
+        "pairs": lambda: np.repeat(rng.uniform(low, high, (count, 3)), 2, axis=0)[:count],
+        "nested": lambda: center + np.arange(count)[:, None] * [0.0, 0.0, 0.01],
+        "cube": lambda: center + rng.uniform(-0.025, 0.025, (count, 3)),
+        "buried": lambda: rng.uniform([-0.1, -0.1, -0.15], [0.1, 0.1, -0.01], (count, 3)),
+    }[kind]()
+    translations, rotations, categories = batch.translations.clone(), batch.rotations.clone(), batch.categories.clone()
+    translations[0, slots] = torch.from_numpy(places + 1e-5 * rng.standard_normal((count, 3))).float()
+    chosen = np.repeat(rng.choice(names, count), 2)[:count] if kind == "pairs" else rng.choice(names, count)
+    categories[0, slots] = torch.tensor([scene_type.assets.index(choice) for choice in chosen])
+    turns = rng.uniform(0.0, 2.0 * np.pi, count) * (kind != "pairs")
+    rotations[0, slots] = yaw_matrix(torch.from_numpy(turns).float())
+    if kind == "buried" and "cafe_table" in scene_type.welded:
+        categories[0, slots[0]], translations[0, slots[0]] = scene_type.assets.index("cafe_table"), torch.zeros(3)
+        rotations[0, slots[0]] = torch.eye(3)
+    return SceneBatch.from_parts(translations, rotations, categories, scene_type)
+
+
+def check_result(batch: SceneBatch) -> None:
+    """Finite, an honest residual, what is fixed in place, what was inside inside, and the same again."""
+    result = project(batch)
+    assert result.valid.tolist() == [True]
+    assert bool(result.batch.translations.isfinite().all())
+    left = float(penetration(result.batch).depth.max())
+    assert float(result.residual_depth[0]) == pytest.approx(left, abs=1e-5)
+    assert bool(result.converged[0]) == (float(result.residual_depth[0]) <= projection.TOLERANCE)
+    fixed = ~batch.is_free
+    assert torch.equal(result.batch.translations[fixed], batch.translations[fixed])
+    torch.testing.assert_close(result.batch.rotations, batch.rotations, atol=1e-5, rtol=0)
+    assert bool((result.batch.in_workspace | ~batch.in_workspace)[batch.is_free].all())
+    assert torch.equal(project(batch).batch.translations, result.batch.translations)
+
+
+@pytest.mark.parametrize("kind", ["point", "outside", "pairs", "nested", "cube", "buried"])
+@pytest.mark.parametrize("name", TYPES)
+def test_heaps_come_back_finite_and_honest(name: str, kind: str) -> None:
+    check_result(heap(name, kind))
+
+
+@pytest.mark.parametrize(
+    ("name", "asset"),
+    [
+        ("breakfast_table_high_clutter", "bowl"),
+        ("dimsum_table", "steamer_lid"),
+        ("pantry_shelf", "fruit_bowl"),
+        ("restaurant_high_clutter", "chair"),
+    ],
+)
+def test_heaps_of_one_asset_come_back_finite_and_honest(name: str, asset: str) -> None:
+    """Sixty fruit bowls have no room in the shelf; all others have."""
+    batch = heap(name, "point", asset)
+    check_result(batch)
+    assert bool(project(batch).converged[0]) == (name != "pantry_shelf")
+
+
+@pytest.mark.parametrize("name", TYPES)
+def test_heaps_that_have_room_come_apart(name: str) -> None:
+    for kind in ("point", "outside"):
+        assert project(heap(name, kind)).converged.tolist() == [True]
+
+
+@pytest.mark.parametrize("asset", ["fruit_bowl", "pear_bosc"])
+def test_the_work_on_a_scene_is_bounded(monkeypatch: pytest.MonkeyPatch, asset: str) -> None:
+    """The squared rows of all exact least-distance problems stay within the budget of all searches."""
+    rows: list[int] = []
+    exact = planes.nnls
+
+    def counted(system: np.ndarray, target: np.ndarray, maxiter: int) -> tuple[np.ndarray, float]:
+        rows.append(system.shape[1])
+        return exact(system, target, maxiter=maxiter)  # type: ignore[no-any-return]
+
+    monkeypatch.setattr(planes, "nnls", counted)
+    for kind in ("point", "pairs", "buried"):
+        rows.clear()
+        project(heap("pantry_shelf", kind, asset))
+        one_more = max(rows, default=0) ** 2
+        assert sum(row**2 for row in rows) <= projection.SEARCHES * (25.0 * projection.WORK + one_more)
+
+
+def test_the_rest_of_the_scene_stays_when_a_heap_is_spread() -> None:
+    """Thirty cups at one point of the table are spread; four plates far from them do not move."""
+    plates = [("dinner_plate", x, y, 0.0) for x in (-0.34, 0.34) for y in (-0.34, 0.34)]
+    batch = scene_of(*[("teacup", 1e-5 * i, 0.0, 0.0) for i in range(29)], *plates)
+    result = project(batch)
+    assert bool(result.converged[0])
+    assert float(result.moved[0, 30:].max()) < 1e-3
+
+
+def test_a_tall_nest_of_bowls_is_no_heap() -> None:
+    """Bowls that stand in each other without overlap stay, however many they are."""
+    name = "breakfast_table_high_clutter"
+    batch = scene_of(*[("bowl", 0.0, 0.0, 0.02 * i) for i in range(24)], scene_type=name)
+    assert float(penetration(batch).depth.max()) < 1e-4
+    assert float(project(batch).moved.max()) < 1e-3
+
+
+def test_large_least_distance_problems_are_solved_closely() -> None:
+    """A row of 300 unit moves, each at least 1 more than the one before it: the mean stays, as in closed form."""
+    count = 300
+    matrix = np.eye(count, count + 1, 1) - np.eye(count, count + 1)
+    x = planes.least_distance(matrix, np.full(count, 1e-3), Budget(projection.WORK))
+    assert len(x) == count + 1
+    assert float(np.abs(x.mean())) < 1e-6
+    near = np.random.default_rng(0).uniform(0.0, 1.0, count)
+    pairs = np.kron(np.eye(count), [[-1.0, 1.0]])
+    moved = planes.least_distance(pairs, near, Budget(projection.WORK)).reshape(count, 2)
+    np.testing.assert_allclose(moved, near[:, None] * [-0.5, 0.5], atol=1e-4)
+
+
 def test_the_least_distance_is_found_when_the_first_method_gives_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """x + y >= 1, x >= 0.8, y >= -1: the nearest point to the origin is (0.8, 0.2)."""
     matrix, needed = np.array([[1.0, 1.0], [1.0, 0.0], [0.0, 1.0]]), np.array([1.0, 0.8, -1.0])
     expected = pytest.approx([0.8, 0.2], abs=1e-4)
-    assert planes.least_distance(matrix, needed).tolist() == expected
+    assert planes.least_distance(matrix, needed, Budget(projection.WORK)).tolist() == expected
 
     def gives_up(*_: object, **__: object) -> None:
         raise RuntimeError("Maximum number of iterations reached.")
 
     monkeypatch.setattr(planes, "nnls", gives_up)
-    assert planes.least_distance(matrix, needed).tolist() == expected
+    assert planes.least_distance(matrix, needed, Budget(projection.WORK)).tolist() == expected
 
 
 def test_two_steamers_share_the_way_apart() -> None:
-    """Equal and opposite moves, together as long as the way out of the hulls' Minkowski difference (scipy)."""
+    """Equal and opposite moves, together the minimum translation of the hulls' Minkowski difference (scipy)."""
     batch = scene_of(("steamer_bottom", -0.11, 0.0, 0.0), ("steamer_bottom", 0.11, 0.0, 0.0))
     hull = batch.scene_type.library["steamer_bottom"].coarse[0].vertices
     difference = (hull[:, None] - (hull + np.array([0.22, 0.0, 0.0]))[None]).reshape(-1, 3)
-    way_out = -ConvexHull(difference).equations[:, 3].max()  # from the origin to the nearest face
+    shortest = -ConvexHull(difference).equations[:, 3].max()  # from the origin to the nearest face
     result = project(batch)
     moves = (result.batch.translations - batch.translations)[0, 1:3]
     torch.testing.assert_close(moves[0], -moves[1], atol=1e-4, rtol=0)
-    assert float(result.moved[0, 1:3].sum()) == pytest.approx(way_out, abs=2e-4)
+    assert float(result.moved[0, 1:3].sum()) == pytest.approx(shortest, abs=2e-4)
     assert bool(result.converged[0])
 
 
@@ -171,7 +296,7 @@ def test_more_volume_than_room_gives_the_best_effort_and_says_so() -> None:
 
 
 def test_what_is_sunk_into_a_corner_comes_out_of_both() -> None:
-    """Through a side wall and into the board: the way out is the diagonal, 10 mm up and 20 mm inward."""
+    """Through a side wall and into the board: the shortest way is the diagonal, 10 mm up and 20 mm inward."""
     wall = 0.284  # inner face of the side, m
     case = get_library(("game_case",))["game_case"].bounds
     batch = scene_of(("game_case", 0.0, wall - case[1, 1] + 0.02, -0.1232 - 0.01), scene_type="living_room_shelf")

@@ -1,8 +1,8 @@
-"""The shortest way out of an overlap: how far one object has to go, and where, until it is free of another one.
+"""Minimum translations: the shortest straight moves that free overlapping object pairs.
 
-Along a straight line, two convex parts overlap during one interval, which follows from their face planes. The way
-out in a direction ends where no interval of any two parts reaches: beside the other object, above it, or in its
-hollow.
+Along a straight line, two convex parts overlap during one interval, which follows from their face planes. A translation
+in some direction is long enough where no interval of any two parts reaches: beside the other object, above it, or in
+its hollow.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from scene_envs.physics.budget import Budget
 from scene_envs.physics.collision import Collider
 from scene_envs.physics.placement import Objects, object_boxes, part_pairs, place
 from scene_envs.physics.planes import CLEARANCE
@@ -19,29 +20,35 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _AROUND = 0.06
-"""Parts further away than this (m) are not looked at when a way is measured."""
+"""Parts further away than this (m) are not looked at when a translation is measured."""
 _OWN = 4
 """How many face directions of the overlapping parts are tried per pair, beside the common ones."""
 _STEPS = 6
 """Parts that a walk leaves, one after the other."""
 _DOWN = 3.0
-"""A way down out of a fixed object counts this many times: what lies in a board belongs on it."""
+"""A translation down, out of a fixed object counts this many times: what lies in a board belongs on it."""
 _UP = 1.4
-"""A way up counts this many times: the lower object rests on something and cannot share it."""
+"""A translation up counts this many times: the lower object rests on something and cannot share it."""
 _BLOCKED = 20.0
-"""A way that leaves the workspace or ends in a fixed object counts this many times."""
+"""A translation that leaves the workspace or ends in a fixed object counts this many times."""
 _REPEATED = 2.5
-"""A way that was tried and did not help counts this many times more each time."""
-_SAME_WAY = 0.7
-"""Cosine from which two ways are the same."""
+"""A direction that was tried and did not help counts this many times more each time."""
+_SAME_DIRECTION = 0.7
+"""Cosine from which two directions are the same."""
 _AXES = np.concatenate([np.eye(3), -np.eye(3)])
 
 Tried = dict[tuple[int, int], list[Array]]
-"""The ways tried for each object pair so far."""
+"""The directions tried for each object pair so far."""
 
 
-def ways_out(
-    collider: Collider, objects: Objects, first: Index, second: Index, bounds: tuple[Array, Array], tried: Tried
+def minimum_translations(
+    collider: Collider,
+    objects: Objects,
+    first: Index,
+    second: Index,
+    bounds: tuple[Array, Array],
+    tried: Tried,
+    budget: Budget,
 ) -> Array:
     """(P, 3) m: what to add to the offset of each overlapping object pair to free it.
 
@@ -51,37 +58,39 @@ def ways_out(
         first: (P,) object rows.
         second: (P,) object rows.
         bounds: lowest and highest translations (n, 3), (n, 3) m.
-        tried: ways that did not help; the ones returned are added.
+        tried: directions that did not help; those of the translations returned are added.
+        budget: charged with one unit per pair of parts.
     """
     placed = place(collider.library, objects, "fine")
     pair, a, b = part_pairs(placed, first, second)
     near = ((placed.low[a] <= placed.high[b] + _AROUND) & (placed.low[b] <= placed.high[a] + _AROUND)).all(axis=1)
     pair, a, b = pair[near], a[near], b[near]
+    budget.spend(len(pair))
     offset = objects.translation[second] - objects.translation[first]
     groups = list(grouped_gaps(collider.library, placed.parts, a, b, offset[pair]))
     walk = _walk(objects, first, second, pair, groups, bounds)
-    ways = _directions(len(first), pair, groups, offset, walk)
-    lengths = _lengths(len(first), pair, groups, ways)
-    costs = lengths * _weights(collider, objects, first, second, ways, lengths, bounds)
+    directions = _directions(len(first), pair, groups, offset, walk)
+    lengths = _lengths(len(first), pair, groups, directions)
+    costs = lengths * _weights(collider, objects, first, second, directions, lengths, bounds)
     for row, key in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
         for old in tried.get(key, ()):
-            costs[row, ways[row] @ old > _SAME_WAY] *= _REPEATED
+            costs[row, directions[row] @ old > _SAME_DIRECTION] *= _REPEATED
     best = costs.argmin(axis=1)
     line = np.arange(len(first))
     for row, key in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
-        tried.setdefault(key, []).append(ways[row, best[row]])
-    return ways[line, best] * (lengths[line, best] + CLEARANCE)[:, None]  # type: ignore[no-any-return]
+        tried.setdefault(key, []).append(directions[row, best[row]])
+    return directions[line, best] * (lengths[line, best] + CLEARANCE)[:, None]  # type: ignore[no-any-return]
 
 
 def _directions(count: int, pair: Index, groups: list[tuple[Index, Array, Array]], offset: Array, walk: Array) -> Array:
     """(P, D, 3) directions to try: the axes, away from and toward the other's centre, the parts' own, the walk's."""
-    ways = np.zeros((count, 9 + 2 * _OWN, 3))
-    ways[:, :6] = _AXES
+    directions = np.zeros((count, 9 + 2 * _OWN, 3))
+    directions[:, :6] = _AXES
     level = offset * np.array([1.0, 1.0, 0.0])
     length = np.linalg.norm(level, axis=1, keepdims=True)
     level = np.where(length > 1e-6, level / np.maximum(length, 1e-6), np.array([1.0, 0.0, 0.0]))
-    ways[:, 6], ways[:, 7] = level, -level
-    ways[:, 8:] = level[:, None]
+    directions[:, 6], directions[:, 7] = level, -level
+    directions[:, 8:] = level[:, None]
     rows = np.concatenate([group[0] for group in groups])
     depth, direction = np.empty(len(rows)), np.empty((len(rows), 3))
     start = 0
@@ -97,10 +106,10 @@ def _directions(count: int, pair: Index, groups: list[tuple[Index, Array, Array]
         _, leading, members = np.unique(owner[order], return_index=True, return_counts=True)
         rank = np.arange(len(order)) - np.repeat(leading, members)
         top = order[rank < _OWN]
-        ways[owner[top], base + rank[rank < _OWN]] = direction[top]
+        directions[owner[top], base + rank[rank < _OWN]] = direction[top]
     length = np.linalg.norm(walk, axis=1)
-    ways[length > 0, -1] = walk[length > 0] / length[length > 0, None]
-    return ways
+    directions[length > 0, -1] = walk[length > 0] / length[length > 0, None]
+    return directions
 
 
 def _walk(
@@ -146,12 +155,12 @@ def _walk(
     return walk
 
 
-def _lengths(count: int, pair: Index, groups: list[tuple[Index, Array, Array]], ways: Array) -> Array:
-    """(P, D) m: how far to go along each way until no parts overlap."""
-    enter = np.full((len(pair), ways.shape[1]), np.inf)
+def _lengths(count: int, pair: Index, groups: list[tuple[Index, Array, Array]], directions: Array) -> Array:
+    """(P, D) m: how far to go in each direction until no parts overlap."""
+    enter = np.full((len(pair), directions.shape[1]), np.inf)
     leave = np.full_like(enter, -np.inf)
     for rows, gaps, normals in groups:
-        speed = np.einsum("qki,qdi->qkd", normals, ways[pair[rows]])
+        speed = np.einsum("qki,qdi->qkd", normals, directions[pair[rows]])
         with np.errstate(divide="ignore", invalid="ignore"):
             when = -gaps[..., None] / speed
         never = ((np.abs(speed) < 1e-9) & (gaps[..., None] >= 0)).any(axis=1)
@@ -161,7 +170,7 @@ def _lengths(count: int, pair: Index, groups: list[tuple[Index, Array, Array]], 
     order = np.argsort(pair, kind="stable")
     enter, leave, owner = enter[order], leave[order], pair[order]
     present, starts = np.unique(owner, return_index=True)
-    length = np.zeros((count, ways.shape[1]))
+    length = np.zeros((count, directions.shape[1]))
     for _ in range(24):
         here = length[owner]
         inside = (enter < here + 1e-7) & (leave > here + 1e-7)
@@ -178,14 +187,14 @@ def _weights(
     objects: Objects,
     first: Index,
     second: Index,
-    ways: Array,
+    directions: Array,
     lengths: Array,
     bounds: tuple[Array, Array],
 ) -> Array:
-    """(P, D) how much more a metre of each way counts."""
+    """(P, D) how much more a metre in each direction counts."""
     weight = np.ones(lengths.shape)
     fixed = objects.fixed[first] | objects.fixed[second]
-    # The way of the free object, or of the upper one of two.
+    # The motion of the free object, or of the upper one of two.
     upper = np.where(
         objects.fixed[first],
         second,
@@ -193,17 +202,17 @@ def _weights(
             objects.fixed[second] | (objects.translation[first, 2] > objects.translation[second, 2]), first, second
         ),
     )
-    way = np.where((upper == second)[:, None, None], ways, -ways)
-    weight[fixed[:, None] & (way[..., 2] < -0.7)] *= _DOWN
-    weight[~fixed[:, None] & (np.abs(way[..., 2]) > 0.7)] *= _UP
-    target = objects.translation[upper][:, None] + way * lengths[..., None]
+    motion = np.where((upper == second)[:, None, None], directions, -directions)
+    weight[fixed[:, None] & (motion[..., 2] < -0.7)] *= _DOWN
+    weight[~fixed[:, None] & (np.abs(motion[..., 2]) > 0.7)] *= _UP
+    target = objects.translation[upper][:, None] + motion * lengths[..., None]
     low, high = bounds
     leaves = ((target < low[upper][:, None] - 1e-6) | (target > high[upper][:, None] + 1e-6)).any(axis=2)
-    weight[leaves & (fixed[:, None] | (way[..., 2] > 0.7))] *= _BLOCKED
+    weight[leaves & (fixed[:, None] | (motion[..., 2] > 0.7))] *= _BLOCKED
     if objects.fixed.any():
         low, high = object_boxes(place(collider.library, objects, "coarse"))
         boards = place(collider.library, objects[objects.fixed], "coarse")
-        rise = np.where(way[..., 2] > 0.7, lengths, 0.0)  # (P, D)
+        rise = np.where(motion[..., 2] > 0.7, lengths, 0.0)  # (P, D)
         over = (boards.low[None, :, :2] < high[upper][:, None, :2]) & (
             boards.high[None, :, :2] > low[upper][:, None, :2]
         )
