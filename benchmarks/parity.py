@@ -7,11 +7,13 @@ Scenes, so many of each type and kind: as generated; with Gaussian noise on ever
 0.4 mm in height, and of 10 mm and 2 mm; and samples of the shipped prior in 50 steps.
 
 Drake's verdict. All fine convex parts of an asset become convex geometries of one body; welded objects belong to the
-world. Depths are those of `QueryObject.ComputePointPairPenetration` between parts; the depth of an object pair is
-its deepest part pair, and an object in a pair deeper than 1 mm is infeasible. Such objects are put out of reach, and
-the others move for 0.1 s under gravity in the discrete `MultibodyPlant`: 1 ms steps, SAP's solver with Drake's default
-approximation of contact ("lagged"), one friction everywhere. An object that is then more than 1 mm (object frame) or
-0.01 rad from its pose is infeasible. Every object is simulated, with all its parts at their true size.
+world. The depth of two parts is that of `QueryObject.ComputePointPairPenetration`, and where this exceeds 1 mm the
+smaller of it and `ComputeSignedDistancePairClosestPoints`: both iterate, and may stop at a way out that is not the
+shortest. The depth of an object pair is its deepest part pair, and an object in a pair deeper than 1 mm is
+infeasible. Such objects are put out of reach, and the others move for 0.1 s under gravity in the discrete
+`MultibodyPlant`: 1 ms steps, SAP's solver with Drake's default approximation of contact ("lagged"), one friction
+everywhere. An object that is then more than 1 mm (object frame) or 0.01 rad from its pose is infeasible. Every object
+is simulated, with all its parts at their true size.
 
 Contact is hydroelastic by default, over a patch: welded objects rigid, others compliant with 1e8 Pa, so that objects at
 rest sink by micrometres. `--contact point` has one point per part pair, on which a box rocks. Hunt-Crossley dissipation
@@ -170,9 +172,13 @@ class DrakeScene:
         for slot, body in self.bodies.items():
             self.plant.SetFreeBodyPose(context, body, self.poses[slot])
         depth = np.zeros(count)
-        for pair in self.plant.get_geometry_query_input_port().Eval(context).ComputePointPairPenetration():
+        query = self.plant.get_geometry_query_input_port().Eval(context)
+        for pair in query.ComputePointPairPenetration():
+            way_out = pair.depth
+            if way_out > DEEP:
+                way_out = min(way_out, -query.ComputeSignedDistancePairClosestPoints(pair.id_A, pair.id_B).distance)
             for slot in (self.slot_of[pair.id_A], self.slot_of[pair.id_B]):
-                depth[slot] = max(depth[slot], pair.depth)
+                depth[slot] = max(depth[slot], way_out)
         kept = [slot for slot in self.bodies if depth[slot] <= DEEP]
         for slot in self.bodies.keys() - kept:
             away = RigidTransform(np.array([_AWAY * (2 + slot), 0.0, 0.0]))
