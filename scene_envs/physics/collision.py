@@ -136,7 +136,7 @@ class Collider:
 
     def __init__(self, library: LibraryGeometry) -> None:
         self.library = library
-        self.depth = PenetrationDepth(library)
+        self.depth = PenetrationDepth([part.vertices for part in library.parts])
 
     def pairs(self, objects: Objects, *, totals: bool = False) -> ObjectPairs:
         """Near pairs of objects within each scene; two fixed objects are never a pair.

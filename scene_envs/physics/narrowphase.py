@@ -15,13 +15,12 @@ References: D. Gregorius, "The Separating Axis Test between Convex Polyhedra", G
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scene_envs.physics.features import PartFeatures
-from scene_envs.physics.geometry import LibraryGeometry
 from scene_envs.physics.separation import PlacedParts
 
 Array = NDArray[np.float64]
@@ -34,14 +33,14 @@ _ROUNDING = 1e-13
 
 
 class PenetrationDepth:
-    """Penetration depth of pairs of parts of a library at any poses.
+    """Penetration depth of pairs of convex parts at any poses.
 
     Args:
-        library: geometry of the assets.
+        parts: corners (V, 3) of each part in its own frame, m; points inside the hull are ignored.
     """
 
-    def __init__(self, library: LibraryGeometry) -> None:
-        features = [PartFeatures.of(part.vertices) for part in library.parts]
+    def __init__(self, parts: Sequence[Array]) -> None:
+        features = [PartFeatures.of(vertices) for vertices in parts]
         self._corners = _Ragged([part.corners for part in features])
         self._normals = _Ragged([part.normals for part in features])
         self._edges = _Ragged([part.edge_direction for part in features])
@@ -49,7 +48,7 @@ class PenetrationDepth:
         self._edge_point = np.concatenate([part.edge_point for part in features]).T.copy()
         self._edge_outward = np.concatenate([part.edge_outward for part in features]).T.copy()
         self._edge_faces = np.concatenate([part.edge_faces for part in features]).T.copy()  # within the part
-        # corners once more, in tables of equal length padded with copies of the first, for all faces against all corners
+        # corners once more, in tables of equal length padded with repetitions
         self._table = np.array([max(3, (len(part.corners) - 1).bit_length()) for part in features], dtype=np.int64)
         self._row = np.zeros(len(features), dtype=np.int64)
         self._tables: dict[int, Array] = {}  # (3, parts, 2^k)
@@ -63,7 +62,7 @@ class PenetrationDepth:
         """Depth of each pair of placed parts.
 
         Args:
-            placed: the parts.
+            placed: the parts and their poses.
             first: (P,) rows of ``placed``.
             second: (P,) rows of ``placed``.
 
