@@ -92,7 +92,8 @@ class PartFeatures:
         outward /= np.linalg.norm(outward, axis=1, keepdims=True)
         middle = corners.mean(axis=0)
         height = np.einsum("ei,ei->e", outward, ends.mean(axis=1) - middle)
-        outward[height < -_FLAT * np.abs(corners - middle).max()] *= -1.0  # the two edges of a line are opposite already
+        # the two edges of a line, at height 0, are opposite already
+        outward[height < -_FLAT * np.abs(corners - middle).max()] *= -1.0
         return cls(corners, normals, offsets, ends[:, 0], along, faces, outward)
 
 

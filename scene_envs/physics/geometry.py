@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 _CONTAINED = 1e-6
 """A fine corner this far (m) outside every coarse part still counts as inside."""
 
+
 @dataclass(frozen=True, eq=False)
 class LevelGeometry:
     """All parts of one asset at one level of detail.

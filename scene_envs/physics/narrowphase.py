@@ -91,7 +91,7 @@ class PenetrationDepth:
         return depth, _turned(turn, normal).T
 
     def _edge_depths(self, halves: _Halves, faces: _Faces, pairs: Index, depth: Array, normal: Array) -> None:
-        """Lower ``depth`` (P,) where two edges cross nearer than the faces; ``normal`` (3, P), frame of the first part."""
+        """Lower ``depth`` (P,) and set ``normal`` (3, P), first part's frame, where edges are nearer than faces."""
         sides = [self._useful_edges(halves, faces, 2 * pairs + side, depth) for side in (0, 1)]
         count = np.bincount(sides[1].half >> 1, minlength=len(depth))
         start = np.cumsum(count) - count
@@ -236,7 +236,7 @@ class _Faces:
                     self._corner[axis, some] = column[line, lowest]
 
     def least_depth(self) -> tuple[Array, Array]:
-        """Least depth (P,) m over the faces of both parts, and its normal (3, P) from first to second, first's frame."""
+        """Least depth (P,) m over all faces, and its normal (3, P) from first to second, in the first's frame."""
         depth = np.minimum.reduceat(self.depth, self.start[::2])
         pair = self._half >> 1
         best = np.flatnonzero(self.depth == depth[pair])[::-1]

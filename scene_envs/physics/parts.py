@@ -32,7 +32,7 @@ class PartGeometry:
 
     @classmethod
     def of(cls, part: ConvexPart) -> PartGeometry:
-        """Face planes of ``part``; triangles of one flat face give one plane, a part without area six arbitrary ones."""
+        """Face planes of ``part``; triangles of one flat face give one plane, a part without area those of its box."""
         corners = part.vertices[part.faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         lengths = np.linalg.norm(normals, axis=1)
