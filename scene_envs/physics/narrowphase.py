@@ -25,6 +25,7 @@ from scene_envs.physics.separation import PlacedParts
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 _BLOCK = 1 << 15
 """Elements of the arrays that hold face-corner or edge-edge combinations at a time (they stay in the cache)."""
@@ -43,18 +44,23 @@ class PenetrationDepth:
         features = [PartFeatures.of(vertices) for vertices in parts]
         self._corners = _Ragged([part.corners for part in features])
         self._normals = _Ragged([part.normals for part in features])
-        self._edges = _Ragged([part.edge_direction for part in features])
         self._offset = np.concatenate([part.offsets for part in features])
-        self._edge_point = np.concatenate([part.edge_point for part in features]).T.copy()
-        self._edge_outward = np.concatenate([part.edge_outward for part in features]).T.copy()
         self._edge_faces = np.concatenate([part.edge_faces for part in features]).T.copy()  # within the part
-        # corners once more, in tables of equal length padded with repetitions
+        edges = [
+            np.stack(
+                [part.edge_point, part.edge_direction, part.edge_outward, *part.normals[part.edge_faces.T]], axis=1
+            )
+            for part in features
+        ]
+        self._edges = _Ragged(edges)
+        # Corners once more, for all faces against all corners: tables of 2^k corners per part, padded with repetitions.
+        # The parts are in the order of their size, so that a table holds all parts up to its size.
         self._table = np.array([max(3, (len(part.corners) - 1).bit_length()) for part in features], dtype=np.int64)
-        self._row = np.zeros(len(features), dtype=np.int64)
+        order = np.argsort(self._table, kind="stable")
+        self._row = np.argsort(order)
         self._tables: dict[int, Array] = {}  # (3, parts, 2^k)
         for index in np.unique(self._table):
-            members = np.flatnonzero(self._table == index)
-            self._row[members] = np.arange(len(members))
+            members = order[self._table[order] <= index]
             padded = [np.resize(features[m].corners, (1 << int(index), 3)) for m in members]
             self._tables[int(index)] = np.stack(padded).transpose(2, 0, 1).copy()
 
@@ -92,7 +98,9 @@ class PenetrationDepth:
 
     def _edge_depths(self, halves: _Halves, faces: _Faces, pairs: Index, depth: Array, normal: Array) -> None:
         """Lower ``depth`` (P,) and set ``normal`` (3, P), first part's frame, where edges are nearer than faces."""
-        sides = [self._useful_edges(halves, faces, 2 * pairs + side, depth) for side in (0, 1)]
+        both = self._useful_edges(halves, faces, (2 * pairs[:, None] + (0, 1)).ravel(), depth)
+        sides = [both[both.half & 1 == side] for side in (0, 1)]
+        sides[1] = sides[1].turned(halves)
         count = np.bincount(sides[1].half >> 1, minlength=len(depth))
         start = np.cumsum(count) - count
         of_first = sides[0].half >> 1
@@ -124,7 +132,7 @@ class PenetrationDepth:
             current = following[goes_on]
 
     def _useful_edges(self, halves: _Halves, faces: _Faces, half: Index, depth: Array) -> _Edges:
-        """The edges of the owners of some half pairs that can improve on ``depth`` (P,)."""
+        """The edges of the owners of some half pairs that can improve on ``depth`` (P,), in the owners' frames."""
         part = halves.owner[half]
         row, within = _expand(self._edges.count[part])
         edge = self._edges.start[part][row] + within
@@ -135,39 +143,22 @@ class PenetrationDepth:
         limit = depth[half >> 1] - _ROUNDING
         kept = np.flatnonzero((faces.corner_depth(one, two) < limit) & (faces.corner_depth(two, one) < limit))
         edge, half, one, two = edge[kept], half[kept], one[kept], two[kept]
-        vectors = [
-            np.take(array, index, axis=1)
-            for array, index in (
-                (self._edge_point, edge),
-                (self._edges.vectors, edge),
-                (self._edge_outward, edge),
-                (self._normals.vectors, faces.normal[one]),
-                (self._normals.vectors, faces.normal[two]),
-            )
-        ]
-        if len(half) and half[0] & 1:  # the second part's, into the frame of the first
-            turn = np.take(halves.turn, half, axis=2)
-            vectors = [_turned(turn, vector) for vector in vectors]
-            vectors[0] += np.take(halves.move, half, axis=1)
-        return _Edges(half, *vectors)
+        return _Edges(half, self._edges.vectors.take(edge, axis=2))
 
     def _width(self, halves: _Halves, pair: Index, direction: Array) -> Array:
         """Overlap (Q,) m of the shadows of some pairs on a direction (3, Q) each, frame of the first part."""
-        turned = -_turned(np.take(halves.turn, 2 * pair, axis=2), direction)
-        tops = self._highest(halves.owner[2 * pair], direction) + self._highest(halves.owner[2 * pair + 1], turned)
-        return tops - _dot(turned, np.take(halves.move, 2 * pair, axis=1))
-
-    def _highest(self, part: Index, direction: Array) -> Array:
-        """Greatest height (Q,) m of a part along a direction (3, Q), both in its frame."""
+        turned = -_turned(halves.turn.take(2 * pair, axis=2), direction)
+        part = np.concatenate([halves.owner[2 * pair], halves.owner[2 * pair + 1]])
         count = self._corners.count[part]
         row, within = _expand(count)
-        corner = np.take(self._corners.vectors, self._corners.start[part][row] + within, axis=1)
-        height = _dot(corner, np.take(direction, row, axis=1))
-        return np.asarray(np.maximum.reduceat(height, np.cumsum(count) - count))
+        corner = self._corners.vectors.take(self._corners.start[part][row] + within, axis=1)
+        height = _dot(corner, np.concatenate([direction, turned], axis=1).take(row, axis=1))
+        top = np.maximum.reduceat(height, np.cumsum(count) - count).reshape(2, -1)
+        return np.asarray(top[0] + top[1] - _dot(turned, halves.move.take(2 * pair, axis=1)))
 
 
 class _Ragged:
-    """Vectors of all parts in one array: ``vectors`` (3, n), where each part's begin, and how many they are."""
+    """Vectors of all parts in one array: ``vectors`` (3, ..., n), where each part's begin, and how many they are."""
 
     def __init__(self, vectors: list[Array]) -> None:
         self.vectors = np.concatenate(vectors).T.copy()
@@ -210,14 +201,16 @@ class _Faces:
         self.start = np.cumsum(count) - count
         half, within = _expand(count)
         self.normal = depths._normals.start[halves.owner][half] + within
-        self._own = np.take(depths._normals.vectors, self.normal, axis=1)
-        self._seen = _turned(np.take(halves.turn, half, axis=2), self._own)  # in the other's frame
-        self._level = _dot(self._seen, np.take(halves.move, half, axis=1)) + depths._offset[self.normal]
+        self._own = depths._normals.vectors.take(self.normal, axis=1)
+        self._seen = _turned(halves.turn.take(half, axis=2), self._own)  # in the other's frame
+        self._level = _dot(self._seen, halves.move.take(half, axis=1)) + depths._offset[self.normal]
         self._half, self._halves = half, halves
         self.support = np.empty(len(half), dtype=np.int64)
         self._corner = np.empty((3, len(half)))
         self.depth = np.empty(len(half))
         kind = depths._table[halves.other]
+        if len(half) << int(kind.max()) <= _BLOCK:
+            kind[:] = kind.max()
         for index in np.unique(kind):
             rows = np.flatnonzero(kind[half] == index)
             table = depths._tables[int(index)]
@@ -225,7 +218,7 @@ class _Faces:
             for begin in range(0, len(rows), step):
                 some = rows[begin : begin + step]
                 owners = depths._row[halves.other[half[some]]]
-                x, y, z = (np.take(column, owners, axis=0) for column in table)  # (rows, corners)
+                x, y, z = (column.take(owners, axis=0) for column in table)  # (rows, corners)
                 seen = self._seen[:, some, None]
                 height = seen[0] * x + seen[1] * y + seen[2] * z
                 lowest = height.argmin(axis=1)
@@ -249,42 +242,48 @@ class _Faces:
 
     def corner_depth(self, one: Index, two: Index) -> Array:
         """Depth (m) of the deepest corner under face ``one`` under face ``two``."""
-        return self._level[two] - _dot(np.take(self._seen, two, axis=1), np.take(self._corner, one, axis=1))
+        return self._level[two] - _dot(self._seen.take(two, axis=1), self._corner.take(one, axis=1))
 
 
 class _Edges:
-    """Edges in the frame of the first part: half pair (n,), and (3, n) end, direction, outward vector, two normals."""
+    """Edges of pairs: half pair (n,), and (3, 5, n) an end (m), direction, outward vector, normals of the two faces."""
 
-    def __init__(self, half: Index, point: Array, along: Array, outward: Array, one: Array, two: Array) -> None:
-        self.half, self.point, self.along, self.outward, self.one, self.two = half, point, along, outward, one, two
+    def __init__(self, half: Index, vectors: Array) -> None:
+        self.half, self.vectors = half, vectors
+
+    def __getitem__(self, rows: Mask) -> _Edges:
+        return _Edges(self.half[rows], self.vectors[:, :, rows])
+
+    def turned(self, halves: _Halves) -> _Edges:
+        """In the frame of the other part."""
+        vectors = _turned(halves.turn.take(self.half, axis=2)[:, :, None], self.vectors)
+        vectors[:, 0] += halves.move.take(self.half, axis=1)
+        return _Edges(self.half, vectors)
 
 
 def _crossings(a: _Edges, i: Index, b: _Edges, j: Index) -> tuple[Index, Array, Array]:
     """Pair (Q,), depth (Q,) and direction (3, Q) of the edges ``i`` of ``a`` and ``j`` of ``b`` whose arcs cross."""
-    along = np.take(a.along, i, axis=1)
-    kept = _between(_dot(np.take(b.one, j, axis=1), along), _dot(np.take(b.two, j, axis=1), along))
+    kept = _opposite(_dot(b.vectors[:, 3:].take(j, axis=2), a.vectors[:, 1].take(i, axis=1)[:, None]))
     i, j = i[kept], j[kept]
-    along = np.take(b.along, j, axis=1)
-    one, two = np.take(a.one, i, axis=1), np.take(a.two, i, axis=1)
-    sine_one, sine_two = _dot(one, along), _dot(two, along)
-    kept = _between(sine_one, sine_two)
-    i, j, along, sine_one, sine_two = i[kept], j[kept], along[:, kept], sine_one[kept], sine_two[kept]
+    along = b.vectors[:, 1].take(j, axis=1)
+    sines = _dot(a.vectors[:, 3:].take(i, axis=2), along[:, None])
+    kept = _opposite(sines)
+    i, j, along, sines = i[kept], j[kept], along[:, kept], sines[:, kept]
     # The point of the arc at right angles to the other edge, between the arc's middle and the end beyond that edge
-    middle = np.take(a.outward, i, axis=1)
+    point, _, middle, one, two = a.vectors.take(i, axis=2).swapaxes(0, 1)
     sine = _dot(middle, along)
-    use_one = (sine_one > 0) != (sine > 0)
-    end = np.where(use_one, one[:, kept], two[:, kept])
-    normal = middle * np.abs(np.where(use_one, sine_one, sine_two)) + end * np.abs(sine)
+    use_one = (sines[0] > 0) != (sine > 0)
+    normal = middle * np.abs(np.where(use_one, *sines)) + np.where(use_one, one, two) * np.abs(sine)
     normal /= np.sqrt(_dot(normal, normal))
-    faces = np.flatnonzero(_dot(normal, np.take(b.outward, j, axis=1)) < 0)
-    i, j, normal = i[faces], j[faces], normal[:, faces]
-    depth = _dot(normal, np.take(a.point, i, axis=1) - np.take(b.point, j, axis=1))
-    return a.half[i] >> 1, depth, normal
+    other, _, outward, _, _ = b.vectors.take(j, axis=2).swapaxes(0, 1)
+    facing = np.flatnonzero(_dot(normal, outward) < 0)
+    depth = _dot(normal, point - other)
+    return a.half[i[facing]] >> 1, depth[facing], normal[:, facing]
 
 
-def _between(one: Array, two: Array) -> Index:
-    """Where one value is positive and the other negative, by more than rounding."""
-    return np.flatnonzero((np.minimum(one, two) < -_ROUNDING) & (np.maximum(one, two) > _ROUNDING))
+def _opposite(values: Array) -> Index:
+    """Columns of (2, n) with one positive and one negative value, by more than rounding."""
+    return np.flatnonzero((np.minimum(*values) < -_ROUNDING) & (np.maximum(*values) > _ROUNDING))
 
 
 def _dot(one: Array, two: Array) -> Array:
@@ -292,7 +291,7 @@ def _dot(one: Array, two: Array) -> Array:
 
 
 def _turned(rotation: Array, vectors: Array) -> Array:
-    """(3, 3, n) applied to (3, n); written out, so that a column's result never depends on the others."""
+    """(3, 3, ..., n) applied to (3, ..., n); written out, so that a column's result never depends on the others."""
     return rotation[:, 0] * vectors[0] + rotation[:, 1] * vectors[1] + rotation[:, 2] * vectors[2]  # type: ignore[no-any-return]
 
 
