@@ -53,14 +53,13 @@ class PenetrationDepth:
             for part in features
         ]
         self._edges = _Ragged(edges)
-        # Corners once more, for all faces against all corners: tables of 2^k corners per part, padded with repetitions.
-        # The parts are in the order of their size, so that a table holds all parts up to its size.
+        # Corners once more, for all faces against all corners: tables of 2^k corners per part, padded with repetitions
         self._table = np.array([max(3, (len(part.corners) - 1).bit_length()) for part in features], dtype=np.int64)
-        order = np.argsort(self._table, kind="stable")
-        self._row = np.argsort(order)
+        self._row = np.zeros(len(features), dtype=np.int64)
         self._tables: dict[int, Array] = {}  # (3, parts, 2^k)
         for index in np.unique(self._table):
-            members = order[self._table[order] <= index]
+            members = np.flatnonzero(self._table == index)
+            self._row[members] = np.arange(len(members))
             padded = [np.resize(features[m].corners, (1 << int(index), 3)) for m in members]
             self._tables[int(index)] = np.stack(padded).transpose(2, 0, 1).copy()
 
@@ -209,8 +208,6 @@ class _Faces:
         self._corner = np.empty((3, len(half)))
         self.depth = np.empty(len(half))
         kind = depths._table[halves.other]
-        if len(half) << int(kind.max()) <= _BLOCK:
-            kind[:] = kind.max()
         for index in np.unique(kind):
             rows = np.flatnonzero(kind[half] == index)
             table = depths._tables[int(index)]
