@@ -5,9 +5,9 @@
 *Each type*: generated scenes whose free objects were moved by Gaussian noise of 1 and 2 cm along every axis. Times
 are CPU time of one thread, scene by scene. *Small scenes*: 2 to 8 free objects that overlap, cut out of the jittered
 scenes, solved by projection and by scipy's SLSQP: least sum of squared translations, the signed distance of every near
-pair of convex parts (FCL) at least the clearance that projection asks for, the workspace as bounds. SLSQP solves both
+pair of convex parts at least the clearance that projection asks for, the workspace as bounds. SLSQP solves both
 the fine parts and the coarse hulls, from the given poses and from random ones 1 cm around them, and the fine parts
-once more from what projection found; its best solution that FCL finds free of overlap counts. The ratio is between the
+once more from what projection found; its best solution that is free of overlap counts. The ratio is between the
 square roots of what both minimise. *Alone* counts the scenes that SLSQP solves without the start from ours.
 
 ``--heaps`` measures degenerate scenes alone, at the largest count of each type: all free objects at one point of the
@@ -22,6 +22,7 @@ import argparse
 import time
 from dataclasses import replace
 
+import fcl
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -29,13 +30,14 @@ from rich.console import Console
 from rich.table import Table
 from scipy.optimize import minimize
 
+from scene_envs.assets.shapes import convex_hull
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import project
 from scene_envs.physics.motion import Physics, physics_of
 from scene_envs.physics.placement import Level, Objects, flatten, part_pairs, place
 from scene_envs.physics.planes import CLEARANCE
 from scene_envs.physics.projection import TOLERANCE
-from scene_envs.physics.separation import separations
+from scene_envs.physics.separation import PlacedParts
 from scene_envs.rotations import yaw_matrix
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import list_scene_types
@@ -135,6 +137,7 @@ class SmallProgram:
         self, physics: Physics, objects: Objects, workspace: tuple[tuple[float, ...], ...], level: Level
     ) -> None:
         self.physics, self.objects, self.level = physics, objects, level
+        self.shapes: dict[tuple[int, int], fcl.CollisionObject] = {}
         self.free = np.flatnonzero(~objects.fixed)
         self.column = np.full(len(objects), -1)
         self.column[self.free] = np.arange(len(self.free))
@@ -155,20 +158,34 @@ class SmallProgram:
         translation[self.free] = x.reshape(-1, 3)
         moved = replace(self.objects, translation=translation)
         parts = place(self.physics.library, moved, self.level).parts
-        gap, normal = separations(self.physics.library, parts, self.a, self.b)
+        depth, normal = self.physics.collider.depth(parts, self.a, self.b)
+        gap = -depth
         jacobian = np.zeros((len(gap), len(self.free) + 1, 3))
-        for row, (i, j) in enumerate(zip(self.a, self.b, strict=True)):
-            distance, on_a, on_b = self.physics.collider.distance.witness(
-                int(parts.part[i]), parts.rotation[i], parts.translation[i],
-                int(parts.part[j]), parts.rotation[j], parts.translation[j],
-            )  # fmt: skip
-            if (distance > 0 and distance > gap[row] + 1e-6) or gap[row] + 1e-6 < distance < 0:
-                way = on_b - on_a if distance > 0 else on_a - on_b
-                gap[row], normal[row] = distance, way / max(float(np.linalg.norm(way)), 1e-12)
+        for row in np.flatnonzero(gap > 0):  # at most the distance: nearest may be a corner and a corner
+            way = self._nearest(parts, self.a[row], self.b[row])
+            distance = float(np.linalg.norm(way))
+            if distance > gap[row] + 1e-6:
+                gap[row], normal[row] = distance, way / distance
         line = np.arange(len(gap))
         jacobian[line, self.column[self.second[self.pair]]] += normal
         jacobian[line, self.column[self.first[self.pair]]] -= normal
         return gap - CLEARANCE, jacobian[:, :-1].reshape(len(gap), -1)
+
+    def _nearest(self, parts: PlacedParts, a: int, b: int) -> Array:
+        """From the nearest point of one placed part to that of another that is apart from it (3,), m."""
+        result = fcl.DistanceResult()
+        shapes = [self._shape(int(parts.part[i]), side) for side, i in enumerate((a, b))]
+        for shape, i in zip(shapes, (a, b), strict=True):
+            shape.setTransform(fcl.Transform(parts.rotation[i], parts.translation[i]))
+        fcl.distance(*shapes, fcl.DistanceRequest(enable_nearest_points=True), result)
+        return np.asarray(result.nearest_points[1]) - np.asarray(result.nearest_points[0])
+
+    def _shape(self, part: int, side: int) -> fcl.CollisionObject:
+        if (part, side) not in self.shapes:
+            hull = convex_hull(self.physics.library.parts[part].vertices)
+            table = np.column_stack([np.full(len(hull.faces), 3), hull.faces]).astype(np.int32).ravel()
+            self.shapes[part, side] = fcl.CollisionObject(fcl.Convex(hull.vertices.copy(), len(hull.faces), table))
+        return self.shapes[part, side]
 
     def solve(self, start: Array) -> Array:
         """SLSQP from one start."""

@@ -1,6 +1,6 @@
 """SceneEnvs: Gymnasium environments for steering 3D scene generation.
 
-Importing this package registers the environments and does nothing more; torch, PyBullet and FCL load
+Importing this package registers the environments and does nothing more; torch and PyBullet load
 when an environment is built or when a public name below is first used.
 """
 

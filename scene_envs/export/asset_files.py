@@ -80,7 +80,8 @@ class AssetFiles:
         """``inset_00.obj`` …, the fine parts with every face moved inward by ``inset`` m, for Bullet."""
 
         def write(folder: Path) -> list[Path]:
-            from scene_envs.physics.geometry import PartGeometry, inset_hull
+            from scene_envs.physics.geometry import inset_hull
+            from scene_envs.physics.parts import PartGeometry
 
             hulls = [convex_hull(inset_hull(PartGeometry.of(part), inset)) for part in asset.fine]
             return _write_parts(hulls, folder, "inset")

@@ -1,7 +1,8 @@
-"""Which objects of a scene overlap, and how deep: boxes, then face planes, then FCL."""
+"""Which objects of a scene overlap, and how deep: boxes, then face planes, then exact depths of parts."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_envs.physics.geometry import LibraryGeometry
-from scene_envs.physics.narrowphase import PartDistance
+from scene_envs.physics.narrowphase import PenetrationDepth
 from scene_envs.physics.placement import Objects, PlacedObjects, object_boxes, part_pairs, place
 from scene_envs.physics.separation import separations
 
@@ -18,7 +19,7 @@ Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 TOUCHING = 2e-5
-"""Overlap (m) below which the face-plane bound is taken as the depth, without asking FCL."""
+"""Overlap (m) below which the face-plane bound is taken as the depth, without looking for the exact one."""
 NEAR = 3e-3
 """Object pairs whose boxes are at most this far apart (m) are listed,"""
 NEAR_FIXED = 0.06
@@ -135,7 +136,7 @@ class Collider:
 
     def __init__(self, library: LibraryGeometry) -> None:
         self.library = library
-        self.distance = PartDistance(library)
+        self.depth = PenetrationDepth([part.vertices for part in library.parts])
 
     def pairs(self, objects: Objects, *, totals: bool = False) -> ObjectPairs:
         """Near pairs of objects within each scene; two fixed objects are never a pair.
@@ -232,25 +233,39 @@ class Collider:
         deep = bound > 0
         pair, a, b, bound = pair[deep], a[deep], b[deep], bound[deep]
         order = np.lexsort((-bound, pair))
-        parts = fine.parts
-        for row in order:
-            target = hard[pair[row]]
-            if not totals and bound[row] <= depth[target]:
-                continue
-            value = float(bound[row])
-            if value > TOUCHING:
-                i, j = a[row], b[row]
-                value = min(
-                    value,
-                    -self.distance(
-                        int(parts.part[i]), parts.rotation[i], parts.translation[i],
-                        int(parts.part[j]), parts.rotation[j], parts.translation[j],
-                    ),
-                )  # fmt: skip
-            if value > 0:
-                depth[target] = max(depth[target], value)
-                total[target] += value
-                part_count[target] += 1
+        a, b, bound, target = a[order], b[order], bound[order], hard[pair[order]]
+        for rows in _rounds(target, bound, depth, totals):
+            value = bound[rows]
+            ask = np.flatnonzero(value > TOUCHING)
+            exact, _ = self.depth(fine.parts, a[rows[ask]], b[rows[ask]])
+            value[ask] = np.minimum(value[ask], exact)
+            meet = value > 0
+            np.maximum.at(depth, target[rows[meet]], value[meet])
+            np.add.at(total, target[rows[meet]], value[meet])
+            np.add.at(part_count, target[rows[meet]], 1)
+
+
+def _rounds(target: Index, bound: Array, depth: Array, every: bool) -> Iterator[Index]:
+    """Rows of candidates that can still deepen their object pair; twice as many per pair in each round.
+
+    Args:
+        target: (Q,) object pair of each candidate, those of one pair together.
+        bound: (Q,) m, at most this deep; descending within a pair.
+        depth: (P,) m, found so far; the caller updates it between rounds.
+        every: all candidates at once.
+    """
+    rows = np.arange(len(target))
+    if every:
+        yield rows
+        return
+    leading = np.diff(target, prepend=-1) != 0
+    rank = rows - rows[leading][np.cumsum(leading) - 1]
+    size = 1
+    while len(rows):
+        now = rank[rows] < 2 * size - 1
+        yield rows[now]
+        rows, size = rows[~now], 2 * size
+        rows = rows[bound[rows] > depth[target[rows]]]
 
 
 def _boxes_near(

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-if TYPE_CHECKING:
-    from scene_envs.physics.geometry import PartGeometry
+from scene_envs.physics.parts import PartGeometry
 
 Array = NDArray[np.float64]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,53 +11,12 @@ from scipy.spatial import ConvexHull, QhullError
 
 from scene_envs.assets.base import Asset, ConvexPart
 from scene_envs.physics.contact_faces import ContactFace, contact_face
+from scene_envs.physics.parts import SIZE_CLASSES, PartGeometry
 
 Array = NDArray[np.float64]
 
 _CONTAINED = 1e-6
 """A fine corner this far (m) outside every coarse part still counts as inside."""
-
-SIZE_CLASSES = ((8, 6), (16, 16), (32, 24))
-"""(corners, face directions) up to which parts share padded arrays; larger parts make a last class."""
-
-
-@dataclass(frozen=True, eq=False)
-class PartGeometry:
-    """A convex part with its face planes, asset frame.
-
-    Attributes:
-        vertices: (V, 3) m.
-        faces: (F, 3) int64 triangles.
-        normals: (K, 3) distinct outward face normals.
-        offsets: (K,) m; the part is where ``normals @ x <= offsets``.
-    """
-
-    vertices: Array
-    faces: NDArray[np.int64]
-    normals: Array
-    offsets: Array
-
-    @classmethod
-    def of(cls, part: ConvexPart) -> PartGeometry:
-        """Face planes of ``part``; triangles of one flat face give one plane."""
-        corners = part.vertices[part.faces]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        lengths = np.linalg.norm(normals, axis=1)
-        normals = normals[lengths > 1e-14] / lengths[lengths > 1e-14, None]
-        kept: list[int] = []
-        for index, normal in enumerate(normals):
-            if all(normals[other] @ normal < 1.0 - 1e-9 for other in kept):
-                kept.append(index)
-        normals = normals[kept]
-        return cls(part.vertices, part.faces, normals, (normals @ part.vertices.T).max(axis=1))
-
-    @cached_property
-    def size_class(self) -> int:
-        """Index into the padded arrays that hold this part."""
-        for index, (corners, directions) in enumerate(SIZE_CLASSES):
-            if len(self.vertices) <= corners and len(self.normals) <= directions:
-                return index
-        return len(SIZE_CLASSES)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,8 +4,8 @@ With rotations fixed, "this part lies on that side of a plane with normal d" is 
 translations. Each object pair that overlaps is given a minimum translation; the planes that separate its parts
 *there* are consistent with each other, so a thin wall that is straddled cannot ask for opposite moves. The nearest
 point under all planes is a least-distance problem, with slack that costs far more than distance, so that a crowded
-scene has a best effort. FCL has the last word after every round. Once nothing overlaps, planes are chosen anew at the
-solution, which can only shorten the way, until it does not.
+scene has a best effort. Exact depths have the last word after every round. Once nothing overlaps, planes are chosen
+anew at the solution, which can only shorten the way, until it does not.
 
 The rounds end when their work budget is spent. Objects that overlap then, and heaps of objects from the start, are
 spread to free places, from where the rounds go on.

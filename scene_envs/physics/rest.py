@@ -16,7 +16,8 @@ from scipy.spatial import ConvexHull, QhullError
 from scene_envs.physics import rigid
 from scene_envs.physics.collision import NEAR, Contacts, ObjectPairs, scene_pairs
 from scene_envs.physics.constants import GRAVITY
-from scene_envs.physics.geometry import AssetGeometry, LibraryGeometry, PartGeometry
+from scene_envs.physics.geometry import AssetGeometry, LibraryGeometry
+from scene_envs.physics.parts import PartGeometry
 from scene_envs.physics.placement import Objects
 
 Array = NDArray[np.float64]

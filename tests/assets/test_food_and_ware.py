@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull
 
 from scene_envs.assets import get_library, list_assets
 from scene_envs.physics import equilibrium, feasibility, penetration, project, settle
-from scene_envs.physics.geometry import PartGeometry
+from scene_envs.physics.parts import PartGeometry
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import Camera, FixedObject, SceneType, get_scene_type, list_scene_types
 

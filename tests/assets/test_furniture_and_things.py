@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull
 from scene_envs.assets import get_library, list_assets
 from scene_envs.assets.recipes.shelf import TIERS
 from scene_envs.physics import feasibility, penetration, settle
-from scene_envs.physics.geometry import PartGeometry
+from scene_envs.physics.parts import PartGeometry
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import Camera, FixedObject, SceneType
 

@@ -21,7 +21,7 @@ from scene_envs.errors import InvalidInputError, MissingDependencyError, Unknown
 from scene_envs.export import AssetFiles, export, formats, get_format, list_formats, register_format
 from scene_envs.export.asset_files import Palette, face_colors, textured_mesh, visual_mesh
 from scene_envs.export.placed import angle_axis, exact_rotations, identifiers, quaternion
-from scene_envs.physics.geometry import PartGeometry
+from scene_envs.physics.parts import PartGeometry
 from scene_envs.scene import SceneBatch
 
 TEXT = ("urdf", "sdf", "drake", "mjcf")
