@@ -12,7 +12,7 @@ square roots of what both minimise. *Alone* counts the scenes that SLSQP solves 
 
 ``--heaps`` measures degenerate scenes alone, at the largest count of each type: all free objects at one point of the
 workspace or 10 m outside it, at one place in pairs, in a tower 10 mm apart, in a cube of 5 cm, or in what is welded;
-of random assets, and all of the asset with most convex parts. Each has 10 um of noise. *Left* is the deepest overlap
+of random assets, and all of the asset with most convex parts. *Left* is the deepest overlap
 that is left, the largest over the scenes.
 """
 
@@ -83,7 +83,7 @@ def heap(name: str, kind: str, rng: np.random.Generator, *, one_asset: bool) -> 
     if kind == "pairs":
         chosen, turns = np.repeat(chosen, 2)[:count], np.zeros(count)
     translations, rotations, categories = batch.translations.clone(), batch.rotations.clone(), batch.categories.clone()
-    translations[0, slots] = torch.from_numpy(places + 1e-5 * rng.standard_normal((count, 3))).float()
+    translations[0, slots] = torch.from_numpy(places).float()
     rotations[0, slots] = yaw_matrix(torch.from_numpy(turns).float())
     categories[0, slots] = torch.from_numpy(chosen)
     if kind == "buried" and "cafe_table" in scene_type.welded:

@@ -50,7 +50,7 @@ def tiers(batch: SceneBatch) -> torch.Tensor:
 
 
 def heap(name: str, kind: str, asset: str | None = None) -> SceneBatch:
-    """A scene of ``name`` at its largest count, all slots taken by degenerate placements, 10 um of noise on each.
+    """A scene of ``name`` at its largest count, all slots taken by degenerate placements.
 
     ``kind``: at one "point" of the workspace, "outside" (10 m away), coincident "pairs", a "nested" tower 10 mm apart,
     a "cube" of 5 cm, or "buried" in what is welded. Free assets at random, or all of them ``asset``.
@@ -71,7 +71,7 @@ def heap(name: str, kind: str, asset: str | None = None) -> SceneBatch:
         "buried": lambda: rng.uniform([-0.1, -0.1, -0.15], [0.1, 0.1, -0.01], (count, 3)),
     }[kind]()
     translations, rotations, categories = batch.translations.clone(), batch.rotations.clone(), batch.categories.clone()
-    translations[0, slots] = torch.from_numpy(places + 1e-5 * rng.standard_normal((count, 3))).float()
+    translations[0, slots] = torch.from_numpy(places).float()
     chosen = np.repeat(rng.choice(names, count), 2)[:count] if kind == "pairs" else rng.choice(names, count)
     categories[0, slots] = torch.tensor([scene_type.assets.index(choice) for choice in chosen])
     turns = rng.uniform(0.0, 2.0 * np.pi, count) * (kind != "pairs")
