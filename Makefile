@@ -3,6 +3,7 @@
 # Each is the only command needed on a Linux machine with Python 3.11; the first one installs into .venv.
 
 JOBS ?= 2
+SEED ?= $(shell date +%s)
 ENV := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 PIP := .venv/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt
 
@@ -15,7 +16,7 @@ demo: install
 	.venv/bin/scene-envs demo output=runs/demo
 
 test: install-dev
-	$(ENV) .venv/bin/python -m pytest -n $(JOBS) --dist worksteal --doctest-modules scene_envs rewards agents configs tests
+	$(ENV) .venv/bin/python -m pytest --randomly-seed=$(SEED) -n $(JOBS) --dist worksteal --doctest-modules scene_envs rewards agents configs tests
 
 lint: install-dev
 	.venv/bin/ruff check .
