@@ -10,15 +10,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scene_envs.env_reward import Score
-from scene_envs.errors import unknown_name
-from scene_envs.scene import SceneBatch
-from scene_envs.search_masks import (
+from scene_envs.envs.masks import (
     MASK_GENERATORS,
     MaskGenerator,
     bad_objects,
     resolve_mask_generator,
 )
+from scene_envs.envs.scoring import Score
+from scene_envs.errors import unknown_name
+from scene_envs.scene import SceneBatch
 
 MAX_PENETRATION = 1e-3
 """Object pairs that overlap deeper than this (m) count, as in feasibility."""

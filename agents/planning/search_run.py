@@ -13,10 +13,10 @@ from typing import Any
 from agents.planning.mask_generators import search_mask
 from agents.planning.planners import BestOfPlanner, PlanResult, UCTPlanner
 from agents.planning.search_report import draw_curve, draw_scene
+from scene_envs.envs import SearchEnv
 from scene_envs.errors import InvalidInputError, SceneEnvsError
 from scene_envs.protocols import resolve_prior
 from scene_envs.scene import SceneBatch
-from scene_envs.search import SearchEnv
 
 Progress = Callable[[str, int, int, float], None]
 """Called after every round with the planner's name, the expansions so far, the budget and the best Φ so far."""

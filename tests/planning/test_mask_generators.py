@@ -10,10 +10,10 @@ import torch
 
 from agents.planning.mask_generators import CulpritsMask, cover, search_mask
 from rewards import RewardOutput
-from scene_envs.env_reward import RewardScorer, Score
+from scene_envs.envs.masks import MaskGenerator, infeasible_mask
+from scene_envs.envs.scoring import RewardScorer, Score
 from scene_envs.errors import UnknownNameError
 from scene_envs.scene import SceneBatch
-from scene_envs.search_masks import MaskGenerator, infeasible_mask
 
 
 def table_with(*objects: tuple[str, float, float, float]) -> SceneBatch:

@@ -12,9 +12,9 @@ import torch
 from agents.planning import SearchOutcome, UCTPlanner, run_search
 from agents.prior import ScenePrior, tiny_prior
 from rewards import RewardContext, RewardOutput
+from scene_envs.envs import SearchEnv
 from scene_envs.errors import InvalidInputError, SceneEnvsError
 from scene_envs.scene import SceneBatch
-from scene_envs.search import SearchEnv
 
 SETTINGS = {"budget": 24, "branching": 3, "num_steps": 4, "max_depth": 5, "seed": 3, "mask": "infeasible"}
 

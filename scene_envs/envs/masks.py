@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scene_envs.env_reward import Score
+from scene_envs.envs.scoring import Score
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.scene import SceneBatch
 
