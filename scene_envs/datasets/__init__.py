@@ -11,7 +11,7 @@ from scene_envs.datasets.store import StorageError
 from scene_envs.datasets.stream import SceneStream
 from scene_envs.datasets.union import from_union, to_union, union_normalizer
 from scene_envs.datasets.verification import judge_scenes, verify_scenes
-from scene_envs.unions import union_scene_type
+from scene_envs.scene_types import union_scene_type
 
 __all__ = [
     "DatasetInfo",

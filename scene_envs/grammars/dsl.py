@@ -17,8 +17,7 @@ from itertools import accumulate
 import numpy as np
 
 from scene_envs.errors import InvalidInputError
-from scene_envs.grammars.containers import Filling
-from scene_envs.grammars.towers import Node, Surface, Tower
+from scene_envs.grammars.towers import Filling, Node, Surface, Tower
 from scene_envs.grammars.wishes import Gaussian, Wish, Yaw
 
 _CENTER = Gaussian(along=0.0)
