@@ -14,8 +14,8 @@ from agents.planning.mask_generators import search_mask
 from agents.planning.planners import BestOfPlanner, PlanResult, UCTPlanner
 from agents.planning.search_report import draw_curve, draw_scene
 from scene_envs.envs import SearchEnv
+from scene_envs.envs.resolvers import resolve_prior
 from scene_envs.errors import InvalidInputError, SceneEnvsError
-from scene_envs.protocols import resolve_prior
 from scene_envs.scene import SceneBatch
 
 Progress = Callable[[str, int, int, float], None]

@@ -33,8 +33,7 @@ class DenoisingTorchRLEnv(EnvBase):
         num_envs: B.
         **settings: fields of :class:`~scene_envs.envs.settings.DenoisingSettings`.
 
-    >>> from agents.prior import tiny_prior
-    >>> env = DenoisingTorchRLEnv(2, prior=tiny_prior(), reward="object_count", num_steps=3)
+    >>> env = DenoisingTorchRLEnv(2, reward="object_count", num_steps=3)
     >>> env.rollout(3)["next", "terminated"].squeeze(-1).tolist()
     [[False, False, True], [False, False, True]]
     """
@@ -108,9 +107,7 @@ class DenoisingTorchRLEnv(EnvBase):
             policy: ``(x_t (B, N, D), step) -> action (B, N, D)``. Called without gradients.
             prompts: one per episode, in place of drawn ones; an environment made without ``prompt`` ignores them.
 
-        >>> from agents.prior import tiny_prior
-        >>> prior = tiny_prior()
-        >>> env = DenoisingTorchRLEnv(2, prior=prior, reward="object_count", num_steps=3, action_mode="noise")
+        >>> env = DenoisingTorchRLEnv(2, reward="object_count", num_steps=3, action_mode="noise")
         >>> trajectories = env.collect(lambda x, step: torch.randn_like(x))
         >>> tuple(trajectories.scenes.shape), tuple(trajectories.reward.shape)
         ((4, 2, 34, 20), (2,))

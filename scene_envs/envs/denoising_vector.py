@@ -29,8 +29,7 @@ class DenoisingVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
     ``info`` values are (B,) arrays, each with its ``_key`` mask. In ``SameStep`` mode the step that ends an
     episode also gives ``final_obs`` ((B,) objects, each the dict of one environment) and ``final_info``.
 
-    >>> from agents.prior import tiny_prior
-    >>> env = DenoisingVectorEnv(3, prior=tiny_prior(), num_steps=1)
+    >>> env = DenoisingVectorEnv(3, num_steps=1)
     >>> observation, info = env.reset(seed=0)
     >>> observation["scene"].shape, info["timestep"].tolist()
     ((3, 34, 20), [1000, 1000, 1000])

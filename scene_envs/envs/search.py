@@ -96,8 +96,7 @@ class SearchProblem:
         evaluations: denoiser evaluations (NFE) spent so far, ``num_steps`` per generated scene and twice that many with
             guidance.
 
-    >>> from agents.prior import tiny_prior
-    >>> problem = SearchProblem(prior=tiny_prior(), objective="object_count", num_steps=2, max_depth=1)
+    >>> problem = SearchProblem(objective="object_count", num_steps=2, max_depth=1)
     >>> root = problem.root(seed=0)
     >>> children = problem.expand_batch([(root, action) for action in problem.legal_actions(root)])
     >>> [child.path for child in children], problem.evaluations

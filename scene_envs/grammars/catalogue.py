@@ -9,6 +9,7 @@ from scene_envs.errors import unknown_name
 from scene_envs.grammars.grammar import GRAMMARS, Grammar
 from scene_envs.plugins import load_plugins
 from scene_envs.scene_types import SceneType
+from scene_envs.scene_types.registry import PLUGINS
 
 
 @cache
@@ -36,7 +37,7 @@ def grammar_factory(name: str) -> Callable[[], Grammar]:
     """The function registered as ``name``; raises UnknownNameError with the nearest known name."""
     _load_built_in()
     if name not in GRAMMARS:
-        load_plugins()
+        load_plugins(PLUGINS)
     if name not in GRAMMARS:
         raise unknown_name("grammar", name, GRAMMARS)
     return GRAMMARS[name]
@@ -45,5 +46,5 @@ def grammar_factory(name: str) -> Callable[[], Grammar]:
 def list_grammars() -> list[str]:
     """Names of all registered grammars, those of installed packages included, sorted."""
     _load_built_in()
-    load_plugins()
+    load_plugins(PLUGINS)
     return sorted(GRAMMARS)

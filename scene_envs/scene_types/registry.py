@@ -10,6 +10,9 @@ from scene_envs.scene_types.base import SceneType
 from scene_envs.scene_types.built_in import BUILT_IN
 from scene_envs.scene_types.unions import union_of
 
+PLUGINS = "scene_envs.scene_types"
+"""Entry-point group of modules that register scene types and their grammars when they are imported."""
+
 _REGISTRY: dict[str, SceneType] = {scene_type.name: scene_type for scene_type in BUILT_IN}
 
 
@@ -31,7 +34,7 @@ def get_scene_type(name: str | SceneType) -> SceneType:
     if isinstance(name, SceneType):
         return name
     if name not in _REGISTRY:
-        load_plugins()
+        load_plugins(PLUGINS)
     if name not in _REGISTRY and "+" in name:
         return union_scene_type(name.split("+"), name)
     if name not in _REGISTRY:
@@ -41,7 +44,7 @@ def get_scene_type(name: str | SceneType) -> SceneType:
 
 def list_scene_types() -> list[str]:
     """Names of all registered scene types, those of installed packages included, sorted."""
-    load_plugins()
+    load_plugins(PLUGINS)
     return sorted(_REGISTRY)
 
 
