@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from scene_envs.envs.denoising_torchrl import DenoisingTorchRLEnv
     from scene_envs.envs.denoising_vector import DenoisingVectorEnv
     from scene_envs.envs.errors import ResetNeededError
+    from scene_envs.envs.masks import list_masks, register_mask
     from scene_envs.envs.search import SearchProblem, SearchState
     from scene_envs.envs.search_gymnasium import SearchEnv
     from scene_envs.envs.trajectories import Trajectories
@@ -27,6 +28,8 @@ __all__ = [
     "SearchProblem",
     "SearchState",
     "Trajectories",
+    "list_masks",
+    "register_mask",
 ]
 
 __getattr__ = lazy_names(
@@ -41,5 +44,7 @@ __getattr__ = lazy_names(
         "SearchProblem": "scene_envs.envs.search",
         "SearchState": "scene_envs.envs.search",
         "Trajectories": "scene_envs.envs.trajectories",
+        "list_masks": "scene_envs.envs.masks",
+        "register_mask": "scene_envs.envs.masks",
     },
 )

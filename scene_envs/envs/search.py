@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scene_envs.envs.masks import resolve_mask_generator
+from scene_envs.envs.masks import resolve_mask
 from scene_envs.envs.prompts import EnvPrompts
 from scene_envs.envs.scoring import RewardScorer, Score
 from scene_envs.envs.settings import SearchSettings, takes
@@ -115,7 +115,7 @@ class SearchProblem:
         self.scale = float(free_slots) if chosen.objective_scale is None else chosen.objective_scale
         self.prompting = EnvPrompts(self.prior, chosen.prompt, chosen.guidance, self.slots)
         self.prompt = self.prompting.draw(np.random.default_rng(0)) if self.prompting.given else None
-        self.mask_generator = resolve_mask_generator(chosen.mask)
+        self.mask_generator = resolve_mask(chosen.mask)
         self.scorer = RewardScorer(chosen.objective, chosen.workers)
         self.evaluations = 0
 

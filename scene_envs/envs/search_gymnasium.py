@@ -24,9 +24,10 @@ class SearchEnv(gym.Env[Any, Any]):
 
     ## Description
 
-    A state is a scene with a mask that says which of its slots are to be regenerated: the objects that the
-    objective blames, and the empty slots. An action chooses one of `branching` inpaintings of those slots by the
-    scene prior (Pfaff et al. 2025, inference-time search). Good choices keep what works and replace what does not.
+    A state is a scene with a mask that says which of its slots are to be regenerated: by default the fewest objects
+    whose removal ends all overlaps, those that fall or slide, and a few empty slots. An action chooses one of
+    `branching` inpaintings of those slots by the scene prior (Pfaff et al. 2025, inference-time search). Good choices
+    keep what works and replace what does not.
 
     Planners use the state directly. It is immutable and picklable and holds no simulator: `clone_state`,
     `restore_state`, `legal_actions`, `action_masks`, `expand`, `expand_batch`, `evaluate`, `best_state`. The random
@@ -86,7 +87,7 @@ class SearchEnv(gym.Env[Any, Any]):
     | `num_steps` | `50` | denoising steps per inpainting |
     | `prior` | `None` | name, path or prior; `None` is the shipped prior of the scene type |
     | `slots` | `None` | slots per scene; `None` is the scene type's number, more is allowed |
-    | `mask` | `"infeasible"` | mask generator: `"infeasible"` (blamed objects, empty slots), `"random"`, a function |
+    | `mask` | `"culprits"` | mask generator: also `"infeasible"`, `"random"`, a registered name, a function |
     | `objective_scale` | `None` | objective value at which Φ = 1; `None` is the number of free slots |
     | `workers` | `0` | processes for physics in the objective; 0 computes in this one |
     | `render_mode` | `None` | `"rgb_array"` renders the current scene |

@@ -99,7 +99,7 @@ class SearchSettings(EnvSettings):
     objective: Any = "feasible_objects"
     branching: int = 4
     max_depth: int = 10
-    mask: Any = "infeasible"
+    mask: Any = "culprits"
     objective_scale: float | None = None
 
     def __post_init__(self) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars.layout import Frame, Layout, Pose
 from scene_envs.grammars.towers import Surface, Tower
-from scene_envs.scene import SceneBatch
+from scene_envs.scene import POSE, POSE_FEATURES, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
 _MAX_STRUCTURES = 10_000
@@ -116,9 +116,9 @@ class Grammar:
     def _write(self, scene: NDArray[np.float32], poses: Sequence[Pose]) -> None:
         scene[:] = self._blank
         for slot, pose in enumerate(poses, start=len(self.scene_type.fixed)):
-            scene[slot, :12] = (*pose.translation, *pose.rotation)
+            scene[slot, POSE] = (*pose.translation, *pose.rotation)
             scene[slot, -1] = 0.0
-            scene[slot, 12 + self._category[pose.asset]] = 1.0
+            scene[slot, POSE_FEATURES + self._category[pose.asset]] = 1.0
 
 
 GRAMMARS: dict[str, Callable[[], Grammar]] = {}

@@ -120,7 +120,8 @@ def test_a_real_network_agrees_up_to_rounding(free_objects):
         assert torch.equal(child.scene[kept], root.scene[kept])
 
 
-def test_only_masked_slots_change_and_welded_ones_never(env):
+def test_only_masked_slots_change_and_welded_ones_never(prior, free_objects):
+    env = SearchEnv(prior=prior, objective=free_objects, num_steps=2, mask="infeasible")
     env.reset(seed=2)
     root = env.clone_state()
     assert root.mask.any()
