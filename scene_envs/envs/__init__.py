@@ -3,6 +3,8 @@
 ``gym.make("scene_envs:SceneEnvs/Denoising-v0")`` and ``…/Search-v0`` need no import from here.
 """
 
+from __future__ import annotations
+
 from typing import TYPE_CHECKING
 
 from scene_envs.lazy import lazy_names
@@ -13,20 +15,24 @@ if TYPE_CHECKING:
     from scene_envs.envs.denoising_torchrl import DenoisingTorchRLEnv
     from scene_envs.envs.denoising_vector import DenoisingVectorEnv
     from scene_envs.envs.errors import ResetNeededError
-    from scene_envs.envs.masks import list_masks, register_mask
+    from scene_envs.envs.masks import MaskGenerator, list_masks, register_mask
+    from scene_envs.envs.scoring import Score
     from scene_envs.envs.search import SearchProblem, SearchState
     from scene_envs.envs.search_gymnasium import SearchEnv
-    from scene_envs.envs.trajectories import Trajectories
+    from scene_envs.envs.trajectories import StepResult, Trajectories
 
 __all__ = [
     "DenoisingCore",
     "DenoisingEnv",
     "DenoisingTorchRLEnv",
     "DenoisingVectorEnv",
+    "MaskGenerator",
     "ResetNeededError",
+    "Score",
     "SearchEnv",
     "SearchProblem",
     "SearchState",
+    "StepResult",
     "Trajectories",
     "list_masks",
     "register_mask",
@@ -35,16 +41,15 @@ __all__ = [
 __getattr__ = lazy_names(
     __name__,
     {
-        "DenoisingCore": "scene_envs.envs.denoising",
-        "DenoisingEnv": "scene_envs.envs.denoising_gymnasium",
-        "DenoisingTorchRLEnv": "scene_envs.envs.denoising_torchrl",
-        "DenoisingVectorEnv": "scene_envs.envs.denoising_vector",
-        "ResetNeededError": "scene_envs.envs.errors",
-        "SearchEnv": "scene_envs.envs.search_gymnasium",
-        "SearchProblem": "scene_envs.envs.search",
-        "SearchState": "scene_envs.envs.search",
-        "Trajectories": "scene_envs.envs.trajectories",
-        "list_masks": "scene_envs.envs.masks",
-        "register_mask": "scene_envs.envs.masks",
+        "scene_envs.envs.denoising": ["DenoisingCore"],
+        "scene_envs.envs.denoising_gymnasium": ["DenoisingEnv"],
+        "scene_envs.envs.denoising_torchrl": ["DenoisingTorchRLEnv"],
+        "scene_envs.envs.denoising_vector": ["DenoisingVectorEnv"],
+        "scene_envs.envs.errors": ["ResetNeededError"],
+        "scene_envs.envs.masks": ["MaskGenerator", "list_masks", "register_mask"],
+        "scene_envs.envs.scoring": ["Score"],
+        "scene_envs.envs.search": ["SearchProblem", "SearchState"],
+        "scene_envs.envs.search_gymnasium": ["SearchEnv"],
+        "scene_envs.envs.trajectories": ["StepResult", "Trajectories"],
     },
 )
