@@ -2,6 +2,7 @@
 
 from scene_envs.grammars.catalogue import get_grammar, list_grammars
 from scene_envs.grammars.containers import Heap, Standing
+from scene_envs.grammars.distributions import Gaussian, Line, Moved, Uniform, Yaw
 from scene_envs.grammars.dsl import (
     NOTHING,
     Cluster,
@@ -18,7 +19,6 @@ from scene_envs.grammars.grammar import Grammar, register_grammar
 from scene_envs.grammars.plan import Disc, Rectangle
 from scene_envs.grammars.surface import FreeSurface, Outline, Region
 from scene_envs.grammars.towers import Filling, Node, Surface, Tower
-from scene_envs.grammars.wishes import Gaussian, Line, Moved, Uniform, Yaw
 
 __all__ = [
     "NOTHING",

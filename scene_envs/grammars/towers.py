@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from scene_envs.grammars.distributions import Moved, PositionDistribution, Yaw
 from scene_envs.grammars.surface import Region
-from scene_envs.grammars.wishes import Moved, Wish, Yaw
 
 if TYPE_CHECKING:
     from scene_envs.assets.base import Asset
@@ -38,7 +38,7 @@ class Tower:
     """
 
     assets: tuple[str, ...]
-    where: Wish
+    where: PositionDistribution
     step: float | None = None
     yaw: Yaw = Yaw()  # noqa: RUF009  (frozen)
     loads: tuple[tuple[Surface, tuple[Tower, ...]], ...] = ()
