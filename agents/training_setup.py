@@ -12,12 +12,14 @@ from agents.new_prior import FITTED_ON, build_prior
 from agents.pretrain_config import PretrainConfig
 from agents.prior import ScenePrior
 from agents.training_data import PROMPTS_PER_SCENE, GrammarStream, SceneTable, TrainingData, UnionTable
-from scene_envs.datasets import SceneDataset, fixed_normalizer, to_union, union_normalizer, union_scene_type
+from scene_envs.datasets import SceneDataset, to_union
 from scene_envs.datasets.prompts import describe_all
+from scene_envs.datasets.ranges import fixed_normalizer
+from scene_envs.datasets.union import union_normalizer
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import register_scene_type
+from scene_envs.scene_types import register_scene_type, union_scene_type
 
 _SAMPLE = 1024
 """Scenes of a grammar to which the moments and the vocabulary are fitted."""

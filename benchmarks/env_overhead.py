@@ -2,9 +2,9 @@
 
     python benchmarks/env_overhead.py [--prior dimsum_table] [--batch 128] [--steps 10] [--rounds 3]
 
-Every face runs the same chain as the bare loop: the prior's posterior, one normal draw a step, and the decoding and
+Every adapter runs the same chain as the bare loop: the prior's posterior, one normal draw a step, and the decoding and
 counting of the finished scenes. Times are CPU seconds of one thread, which a busy machine disturbs little; the bare
-loop is timed again in every round, and the table gives the median over rounds of face / bare. The single
+loop is timed again in every round, and the table gives the median over rounds of adapter / bare. The single
 environment is compared with a bare loop of one scene. Freed memory is kept by the process: how often glibc gives it
 back to the kernel depends on what else is alive, and would swamp the differences that are looked for.
 """
@@ -24,8 +24,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from rewards import RewardContext, evaluate_reward, resolve_reward
-from scene_envs.denoising_torchrl import DenoisingTorchRLEnv
-from scene_envs.env_spaces import resolve_scene_and_prior
+from scene_envs.envs import DenoisingTorchRLEnv
+from scene_envs.envs.spaces import resolve_scene_and_prior
 from scene_envs.protocols import PriorLike
 from scene_envs.scene import SceneBatch
 
@@ -126,7 +126,7 @@ def cpu_seconds(run: Callable[[], None]) -> float:
 
 
 def compare(bare: Callable[[], None], faces: Sequence[tuple[str, Callable[[], None]]], rounds: int) -> list[str]:
-    """One row per face: median CPU seconds, median ratio to the bare loop of the same round."""
+    """One row per adapter: median CPU seconds, median ratio to the bare loop of the same round."""
     times: dict[str, list[float]] = {name: [] for name, _ in faces}
     base: list[float] = []
     for _, run in (("bare", bare), *faces):
@@ -167,7 +167,7 @@ def main() -> None:
         ("gymnasium vector", gymnasium_vector(prior, batch, steps)),
     )
     print(f"B = {batch}, {steps} steps, prior {arguments.prior}, one thread, median of {rounds} rounds\n")
-    header = ["| face | CPU s per batch of episodes | ratio to bare loop |", "|---|---|---|"]
+    header = ["| adapter | CPU s per batch of episodes | ratio to bare loop |", "|---|---|---|"]
     print("\n".join([*header, *compare(bare_loop(prior, batch, steps), batched, rounds)]))
     single = (("gymnasium single, B = 1", gymnasium_single(prior, steps)),)
     print("\n".join(compare(bare_loop(prior, 1, steps), single, 5 * rounds)))

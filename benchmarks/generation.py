@@ -21,15 +21,9 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from scene_envs.datasets import (
-    SceneDataset,
-    SceneStream,
-    describe_all,
-    fixed_normalizer,
-    generate,
-    judge_scenes,
-    verify_scenes,
-)
+from scene_envs.datasets import SceneDataset, SceneStream, describe_all, generate, judge_scenes
+from scene_envs.datasets.ranges import fixed_normalizer
+from scene_envs.datasets.verification import verify_scenes
 from scene_envs.grammars import get_grammar
 
 

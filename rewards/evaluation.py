@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from rewards.base import RewardContext, RewardOutput
-from rewards.registry import as_output, reward_name
+from rewards.registry import as_output, resolve_reward, reward_name
 from scene_envs.errors import RewardError
+from scene_envs.protocols import SceneScorer
 from scene_envs.scene import SceneBatch
 
 logger = logging.getLogger(__name__)
@@ -47,6 +48,23 @@ def evaluate_reward(
         if strict:
             raise
         return _failed(reward, batch, str(error))
+
+
+def reward_scorer(reward: Any) -> SceneScorer:
+    """``reward``, resolved, as environments call it; what the entry point ``scene_envs.resolvers`` names.
+
+    Args:
+        reward: a name, mapping, function, class or reward; see :func:`rewards.resolve_reward`.
+
+    >>> reward_scorer("object_count")(SceneBatch.empty("dimsum_table", 2)).value
+    tensor([1., 1.])
+    """
+    resolved = resolve_reward(reward)
+
+    def score(batch: SceneBatch, *, prompts: tuple[str, ...] | None = None, pool: Any = None) -> RewardOutput:
+        return evaluate_reward(resolved, batch, RewardContext(prompts=prompts, pool=pool))
+
+    return score
 
 
 def _evaluate(reward: Any, batch: SceneBatch, context: RewardContext) -> RewardOutput:

@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from types import ModuleType
 from typing import Any, TypeVar
 
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from rewards.base import Reward, RewardContext, RewardOutput
 from scene_envs.errors import InvalidInputError, RewardError, unknown_name
+from scene_envs.plugins import plugin_entry_points
 from scene_envs.scene import SceneBatch
 
 ENTRY_POINT_GROUP = "scene_envs.rewards"
@@ -193,7 +194,7 @@ def reward_name(reward: Any) -> str:
 
 
 def _plugins() -> dict[str, EntryPoint]:
-    return {point.name: point for point in entry_points(group=ENTRY_POINT_GROUP)}
+    return plugin_entry_points(ENTRY_POINT_GROUP)
 
 
 def _find(name: str) -> Callable[..., Any]:

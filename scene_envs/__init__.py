@@ -1,50 +1,118 @@
 """SceneEnvs: Gymnasium environments for steering 3D scene generation.
 
-Importing this package registers the environments and does nothing more; torch and PyBullet load
-when an environment is built or when a public name below is first used.
+Importing this package registers the environments and does nothing more; torch and PyBullet load when an
+environment is built or when a public name is first used. The names below are those that most users need; the packages
+``assets``, ``datasets``, ``envs``, ``export``, ``grammars``, ``physics``, ``render`` and ``scene_types`` have more.
 """
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from scene_envs.lazy import lazy_names
 from scene_envs.registration import register_envs
 
 if TYPE_CHECKING:
-    from scene_envs.errors import SceneEnvsError
+    from scene_envs.assets import list_assets, load_library
+    from scene_envs.datasets import SceneDataset, describe, generate, parse_prompt
+    from scene_envs.envs import (
+        DenoisingEnv,
+        DenoisingTorchRLEnv,
+        DenoisingVectorEnv,
+        SearchEnv,
+        list_masks,
+        register_mask,
+    )
+    from scene_envs.errors import InvalidInputError, SceneEnvsError, UnknownNameError
+    from scene_envs.export import list_formats, register_format
+    from scene_envs.grammars import Grammar, get_grammar, list_grammars, register_grammar
     from scene_envs.normalizer import Normalizer
+    from scene_envs.physics import PhysicsPool, feasibility, make_ready, penetration, project, settle
+    from scene_envs.render import write_viewer
     from scene_envs.scene import SceneBatch
-    from scene_envs.scene_types import SceneType, get_scene_type, list_scene_types, register_scene_type
+    from scene_envs.scene_types import (
+        Camera,
+        FixedObject,
+        SceneType,
+        get_scene_type,
+        list_scene_types,
+        register_scene_type,
+        union_scene_type,
+    )
 
 __version__ = "0.1.0"
 
-_LAZY = {
-    "SceneEnvsError": "scene_envs.errors",
-    "Normalizer": "scene_envs.normalizer",
-    "SceneBatch": "scene_envs.scene",
-    "SceneType": "scene_envs.scene_types",
-    "get_scene_type": "scene_envs.scene_types",
-    "list_scene_types": "scene_envs.scene_types",
-    "register_scene_type": "scene_envs.scene_types",
-}
-
 __all__ = [
+    "Camera",
+    "DenoisingEnv",
+    "DenoisingTorchRLEnv",
+    "DenoisingVectorEnv",
+    "FixedObject",
+    "Grammar",
+    "InvalidInputError",
     "Normalizer",
+    "PhysicsPool",
     "SceneBatch",
+    "SceneDataset",
     "SceneEnvsError",
     "SceneType",
+    "SearchEnv",
+    "UnknownNameError",
     "__version__",
+    "describe",
+    "feasibility",
+    "generate",
+    "get_grammar",
     "get_scene_type",
+    "list_assets",
+    "list_formats",
+    "list_grammars",
+    "list_masks",
     "list_scene_types",
+    "load_library",
+    "make_ready",
+    "parse_prompt",
+    "penetration",
+    "project",
+    "register_format",
+    "register_grammar",
+    "register_mask",
     "register_scene_type",
+    "settle",
+    "union_scene_type",
+    "write_viewer",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(import_module(_LAZY[name]), name)
-    raise AttributeError(f"module 'scene_envs' has no attribute {name!r}")
-
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "scene_envs.assets": ["list_assets", "load_library"],
+        "scene_envs.datasets": ["SceneDataset", "describe", "generate", "parse_prompt"],
+        "scene_envs.envs": [
+            "DenoisingEnv",
+            "DenoisingTorchRLEnv",
+            "DenoisingVectorEnv",
+            "SearchEnv",
+            "list_masks",
+            "register_mask",
+        ],
+        "scene_envs.errors": ["InvalidInputError", "SceneEnvsError", "UnknownNameError"],
+        "scene_envs.export": ["list_formats", "register_format"],
+        "scene_envs.grammars": ["Grammar", "get_grammar", "list_grammars", "register_grammar"],
+        "scene_envs.normalizer": ["Normalizer"],
+        "scene_envs.physics": ["PhysicsPool", "feasibility", "make_ready", "penetration", "project", "settle"],
+        "scene_envs.render": ["write_viewer"],
+        "scene_envs.scene": ["SceneBatch"],
+        "scene_envs.scene_types": [
+            "Camera",
+            "FixedObject",
+            "SceneType",
+            "get_scene_type",
+            "list_scene_types",
+            "register_scene_type",
+            "union_scene_type",
+        ],
+    },
+)
 
 register_envs()

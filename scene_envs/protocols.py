@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from importlib import import_module
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from torch import Generator, Tensor
@@ -14,24 +13,40 @@ from scene_envs.scene_types import SceneType
 
 
 class RewardResult(Protocol):
-    """What a reward returns; see ``rewards.RewardOutput``."""
+    """What a reward says of B scenes with N slots."""
 
     @property
     def value(self) -> Tensor:
-        """(B,)."""
+        """(B,) float32, larger is better; anything where not valid."""
         ...
 
     @property
     def is_valid(self) -> Tensor:
-        """(B,) bool."""
+        """(B,) bool: rows that could be scored."""
+        ...
+
+    @property
+    def terms(self) -> Mapping[str, Tensor]:
+        """Named (B,) floats worth logging."""
+        ...
+
+    @property
+    def per_object(self) -> Tensor | None:
+        """(B, N) float credit per slot, or None."""
+        ...
+
+    @property
+    def object_flags(self) -> Mapping[str, Tensor]:
+        """Named (B, N) bools, such as ``"feasible"``."""
         ...
 
 
-@runtime_checkable
-class RewardLike(Protocol):
-    """Scores a batch of scenes; see ``rewards.Reward``."""
+class SceneScorer(Protocol):
+    """A reward as environments call it. A reward that fails gives invalid rows and does not raise."""
 
-    def __call__(self, batch: SceneBatch, context: Any) -> RewardResult: ...
+    def __call__(self, batch: SceneBatch, *, prompts: tuple[str, ...] | None = None, pool: Any = None) -> RewardResult:
+        """Score B scenes, made for ``prompts`` if any, with worker processes ``pool`` for physics if any."""
+        ...
 
 
 class StepTableLike(Protocol):
@@ -52,7 +67,7 @@ class StepTableLike(Protocol):
 
 @runtime_checkable
 class PriorLike(Protocol):
-    """A trained denoiser with its schedule, layout and normalizer; see ``agents.prior.ScenePrior``.
+    """A trained denoiser with its schedule, layout and normalizer.
 
     All tensors are normalised scenes x (B, N, D).
     """
@@ -81,7 +96,7 @@ class PriorLike(Protocol):
         ...
 
     def transition(self, x_t: Tensor, step: int, table: StepTableLike) -> Any:
-        """p(x_{t-1} | x_t) at ``table.timesteps[step]``, an object like ``agents.diffusion.ReverseStep``.
+        """p(x_{t-1} | x_t) at ``table.timesteps[step]``, an object with ``from_noise(noise)``.
 
         Known entries are certain; at the last step all are.
         """
@@ -112,7 +127,7 @@ class EncodedPriorLike(PriorLike, Protocol):
 
 
 class PromptedPriorLike(PriorLike, Protocol):
-    """A prior whose ``conditional`` is True: it reads prompts; see ``agents.prompt_reading.PromptReader``."""
+    """A prior whose ``conditional`` is True: it reads prompts."""
 
     @property
     def prompt_space(self) -> tuple[int, int]:
@@ -145,20 +160,3 @@ class PromptedPriorLike(PriorLike, Protocol):
     ) -> SceneBatch:
         """As for any prior, the whole scenes following ``prompt``."""
         ...
-
-
-def resolve_reward(reward: Any) -> Any:
-    """A reward object from a name, a mapping, a function or a reward (loads the ``rewards`` package)."""
-    return import_module("rewards").resolve_reward(reward)
-
-
-def reward_context(**fields: Any) -> Any:
-    """A ``rewards.RewardContext`` with the given fields."""
-    return import_module("rewards").RewardContext(**fields)
-
-
-def resolve_prior(prior: Any) -> PriorLike:
-    """A prior from a name, a path or a prior (loads the ``agents`` package)."""
-    if isinstance(prior, str):
-        return import_module("agents.prior").ScenePrior.load(prior)  # type: ignore[no-any-return]
-    return prior  # type: ignore[no-any-return]

@@ -11,13 +11,13 @@ def register_envs() -> None:
         return
     gymnasium.register(
         id="SceneEnvs/Denoising-v0",
-        entry_point="scene_envs.denoising_envs:DenoisingEnv",
-        vector_entry_point="scene_envs.denoising_envs:DenoisingVectorEnv",
+        entry_point="scene_envs.envs.denoising_gymnasium:DenoisingEnv",
+        vector_entry_point="scene_envs.envs.denoising_vector:DenoisingVectorEnv",
         disable_env_checker=True,
         order_enforce=True,
     )
     gymnasium.register(
         id="SceneEnvs/Search-v0",
-        entry_point="scene_envs.search:SearchEnv",
+        entry_point="scene_envs.envs.search_gymnasium:SearchEnv",
         disable_env_checker=True,
     )

@@ -14,10 +14,12 @@ from scene_envs.normalizer import Normalizer
 from scene_envs.rotations import project_to_so3
 from scene_envs.scene_types import SceneType, get_scene_type
 
-POSE = slice(0, 12)
+POSE_FEATURES = 12
+"""Numbers of a pose: translation (3) and rotation matrix (9)."""
+POSE = slice(0, POSE_FEATURES)
 TRANSLATION = slice(0, 3)
-ROTATION = slice(3, 12)
-CATEGORY = slice(12, None)
+ROTATION = slice(3, POSE_FEATURES)
+CATEGORY = slice(POSE_FEATURES, None)
 
 
 class SceneBatch:

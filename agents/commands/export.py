@@ -57,7 +57,7 @@ def config() -> type[ExportConfig]:
 
 def run(settings: ExportConfig, run: Run) -> None:
     """Read or draw the scenes and write them."""
-    from scene_envs.export import resolve_formats
+    from scene_envs.export.formats import resolve_formats
     from scene_envs.physics import PhysicsPool
     from scene_envs.scene import SceneBatch
 

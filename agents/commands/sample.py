@@ -66,7 +66,7 @@ def run(settings: SampleConfig, run: Run) -> None:
     """Draw, score, save and picture the scenes."""
     from agents.prior import ScenePrior
     from rewards import resolve_reward
-    from scene_envs.export import resolve_formats
+    from scene_envs.export.formats import resolve_formats
     from scene_envs.physics import PhysicsPool
     from scene_envs.scene import SceneBatch
 

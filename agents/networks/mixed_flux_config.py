@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.scene import POSE_FEATURES as POSE
 
-POSE = 12
-"""Numbers of a pose: translation and rotation matrix."""
 ATTENTIONS = ("plain", "relative")
 """How slots attend to each other: by content alone, or seeing where the others stand as well."""
 TEXT_REACHES = ("all", "double")

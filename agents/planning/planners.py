@@ -18,7 +18,7 @@ _ROOT: tuple[int, ...] = ()
 
 
 class Searchable(Protocol):
-    """What a planner needs; ``scene_envs.search.SearchEnv`` has it, and so may any deterministic tree.
+    """What a planner needs; ``scene_envs.envs.SearchEnv`` has it, and so may any deterministic tree.
 
     States are immutable. A state with an attribute ``valid`` that is False could not be scored: it is counted and
     left out of the tree.

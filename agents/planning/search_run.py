@@ -10,13 +10,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from agents.planning.mask_generators import search_mask
 from agents.planning.planners import BestOfPlanner, PlanResult, UCTPlanner
 from agents.planning.search_report import draw_curve, draw_scene
+from scene_envs.envs import SearchEnv
+from scene_envs.envs.resolvers import resolve_prior
 from scene_envs.errors import InvalidInputError, SceneEnvsError
-from scene_envs.protocols import resolve_prior
 from scene_envs.scene import SceneBatch
-from scene_envs.search import SearchEnv
 
 Progress = Callable[[str, int, int, float], None]
 """Called after every round with the planner's name, the expansions so far, the budget and the best Φ so far."""
@@ -35,7 +34,7 @@ class SearchConfig:
         exploration: weight of the UCB1 bound.
         parallel: scenes generated per batch of the search; None takes ``branching``.
         mask: which objects to regenerate: ``"culprits"``, ``"infeasible"``, ``"random"``, or a function; see
-            :mod:`agents.planning.mask_generators`.
+            :mod:`scene_envs.envs.masks`.
         slots: slots per scene; None takes the scene type's.
         objective_scale: objective at which Φ is 1; None takes the environment's.
         seed: of the tree; the baseline's first scenes are those of the tree.
@@ -168,7 +167,7 @@ def _plan(
         num_steps=config.num_steps,
         prior=prior,
         slots=config.slots,
-        mask=search_mask(config.mask),
+        mask=config.mask,
         objective_scale=config.objective_scale,
         workers=config.workers,
         prompt=config.prompt,

@@ -25,7 +25,7 @@ from agents.post_training.real_scenes import RealScenes
 from agents.post_training.rollouts import Rollout, collect, stream_seed
 from agents.prior import ScenePrior
 from agents.prompt_room import no_text
-from scene_envs.denoising_torchrl import DenoisingTorchRLEnv
+from scene_envs.envs import DenoisingTorchRLEnv
 
 
 class NonFiniteGradient(Exception):

@@ -31,7 +31,7 @@ class DenoisingPolicy(TensorDictModuleBase):
         guidance: w of classifier-free guidance; the guided chain is the policy then.
 
     >>> from agents.prior import tiny_prior
-    >>> from scene_envs.denoising_torchrl import DenoisingTorchRLEnv
+    >>> from scene_envs.envs import DenoisingTorchRLEnv
     >>> prior = tiny_prior()
     >>> env = DenoisingTorchRLEnv(2, prior=prior, num_steps=4)
     >>> env.rollout(4, DenoisingPolicy(prior, 4))["action_log_prob"].shape

@@ -15,7 +15,7 @@ from torch import Generator, Tensor
 
 from agents.prior import ScenePrior
 from scene_envs.datasets.prompts import describe_all
-from scene_envs.env_prompts import PROMPT_SOURCES, grammar_prompts
+from scene_envs.envs.prompts import PROMPT_SOURCES, grammar_prompts
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 

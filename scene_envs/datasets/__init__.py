@@ -5,13 +5,11 @@ from scene_envs.datasets.generate import GenerationReport, generate
 from scene_envs.datasets.info import DatasetInfo, read_metadata
 from scene_envs.datasets.mixing import MixedDataset, mix
 from scene_envs.datasets.prompts import PromptFacts, SceneFacts, describe, describe_all, parse_prompt, scene_facts
-from scene_envs.datasets.ranges import fixed_normalizer
 from scene_envs.datasets.splits import Part
 from scene_envs.datasets.store import StorageError
 from scene_envs.datasets.stream import SceneStream
-from scene_envs.datasets.union import from_union, to_union, union_normalizer
-from scene_envs.datasets.verification import judge_scenes, verify_scenes
-from scene_envs.unions import union_scene_type
+from scene_envs.datasets.union import from_union, to_union
+from scene_envs.datasets.verification import judge_scenes
 
 __all__ = [
     "DatasetInfo",
@@ -25,7 +23,6 @@ __all__ = [
     "StorageError",
     "describe",
     "describe_all",
-    "fixed_normalizer",
     "from_union",
     "generate",
     "judge_scenes",
@@ -34,7 +31,4 @@ __all__ = [
     "read_metadata",
     "scene_facts",
     "to_union",
-    "union_normalizer",
-    "union_scene_type",
-    "verify_scenes",
 ]

@@ -18,7 +18,7 @@ from scene_envs.datasets.shards import Job, shard_journal
 from scene_envs.datasets.workers import Work, run_processes, write_shard_of
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
 from scene_envs.grammars import Grammar, get_grammar
-from scene_envs.grammars.grammar import grammar_factory
+from scene_envs.grammars.catalogue import grammar_factory
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene_types import SceneType, get_scene_type
 

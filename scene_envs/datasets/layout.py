@@ -15,7 +15,7 @@ from scene_envs.datasets.info import DatasetInfo
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.normalizer import Normalizer
 from scene_envs.rotations import project_to_so3
-from scene_envs.scene import SceneBatch
+from scene_envs.scene import CATEGORY, POSE, POSE_FEATURES, ROTATION, SceneBatch
 from scene_envs.scene_types import FixedObject, SceneType
 
 FIXED_TOLERANCE = 1e-3
@@ -61,7 +61,7 @@ class Layout:
         order[found] = torch.arange(len(found))
         doubled = torch.bincount(found, minlength=len(order)) > 1
         order[doubled] = len(self.info.model_paths)
-        features = torch.cat([torch.arange(12), 12 + order])
+        features = torch.cat([torch.arange(POSE_FEATURES), POSE_FEATURES + order])
         files = self.info.normalizer
         return Normalizer(*(v[features] for v in (files.scale, files.min, files.input_min, files.input_max)))
 
@@ -78,13 +78,13 @@ class Layout:
             return torch.empty(0, slots, self.scene_type.features)
         _check(~torch.isfinite(values).all(dim=-1), rows, "holds a value that is not finite")
         raw = self.info.normalizer.unnormalize(values)
-        one_hot = raw[..., 12:]
+        one_hot = raw[..., CATEGORY]
         found = one_hot.argmax(dim=-1)
         exact = torch.nn.functional.one_hot(found, one_hot.shape[-1])
         _check((one_hot - exact).abs().amax(dim=-1) > _ONE_HOT, rows, "is not one-hot over the assets and empty")
         categories = self._categories[found]  # type: ignore[attr-defined]
         empty = self.scene_type.num_assets
-        rotations = self._rotations(raw[..., 3:12].unflatten(-1, (3, 3)), categories != empty, rows)
+        rotations = self._rotations(raw[..., ROTATION].unflatten(-1, (3, 3)), categories != empty, rows)
         batch = SceneBatch.from_parts(raw[..., :3], rotations, categories, self.scene_type)
         if self.slots is not None:
             batch = batch.with_slots(self.slots)
@@ -121,14 +121,14 @@ def place_fixed(batch: SceneBatch, tolerance: float, place: str = "the batch", s
     for slot, fixed in enumerate(batch.scene_type.fixed):
         wanted = _fixed_row(fixed, batch.scene_type)
         rest = tensor[:, slot:]
-        is_it = rest[..., 12:].argmax(dim=-1) == int(wanted[12:].argmax())
-        distance = (rest[..., :12] - wanted[:12]).abs().amax(dim=-1).masked_fill(~is_it, torch.inf)
+        is_it = rest[..., CATEGORY].argmax(dim=-1) == int(wanted[CATEGORY].argmax())
+        distance = (rest[..., POSE] - wanted[POSE]).abs().amax(dim=-1).masked_fill(~is_it, torch.inf)
         nearest = distance.argmin(dim=1)
         there = is_it.any(dim=1)
         off = there & (distance.amin(dim=1) > tolerance)
         if bool(off.any()):
             row = int(torch.nonzero(off)[0])
-            pose = [round(value, 4) for value in rest[row, int(nearest[row]), :12].tolist()]
+            pose = [round(value, 4) for value in rest[row, int(nearest[row]), POSE].tolist()]
             raise InvalidInputError(
                 f"row {start + row} of {place} has the fixed {fixed.asset!r} at {pose[:3]} m, rotation {pose[3:]}; "
                 f"scene type {batch.scene_type.name!r} has it at {list(fixed.translation)} m, rotation "
@@ -158,8 +158,8 @@ def _to_slot(tensor: Tensor, source: Tensor, slot: int) -> Tensor:
 
 def _fixed_row(fixed: FixedObject, scene_type: SceneType) -> Tensor:
     row = torch.zeros(scene_type.features)
-    row[:12] = torch.tensor([*fixed.translation, *fixed.rotation])
-    row[12 + scene_type.assets.index(fixed.asset)] = 1.0
+    row[POSE] = torch.tensor([*fixed.translation, *fixed.rotation])
+    row[POSE_FEATURES + scene_type.assets.index(fixed.asset)] = 1.0
     return row
 
 

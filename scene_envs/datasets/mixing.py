@@ -31,7 +31,7 @@ class MixedDataset:
         probabilities: positive, one per dataset; they are divided by their sum.
         batch_size: scenes per batch.
         seed: of the choices; the order within a dataset is the stream's.
-        union: of :func:`~scene_envs.unions.union_scene_type`, or None.
+        union: of :func:`~scene_envs.scene_types.union_scene_type`, or None.
 
     Raises:
         InvalidInputError: no streams, probabilities that do not fit them, or a bad batch size.

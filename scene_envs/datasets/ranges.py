@@ -8,6 +8,7 @@ from torch import Tensor
 
 from scene_envs.grammars import Grammar
 from scene_envs.normalizer import Normalizer
+from scene_envs.scene import CATEGORY
 
 _OBJECTS = 10_000
 """Objects the sample holds at least while all of them stand upright, unless that takes more than ``_SCENES``."""
@@ -41,7 +42,7 @@ def fixed_normalizer(grammar: Grammar) -> Normalizer:
     for feature in range(3, 12) if tilted else _PLANE:
         if tilted or high[feature] - low[feature] > _UPRIGHT:
             low[feature], high[feature] = -1.0, 1.0
-    low[12:], high[12:] = 0.0, 1.0
+    low[CATEGORY], high[CATEGORY] = 0.0, 1.0
     return Normalizer.from_range(low, high)
 
 

@@ -9,7 +9,7 @@ import torch
 from scene_envs.datasets.layout import place_fixed
 from scene_envs.errors import InvalidInputError
 from scene_envs.normalizer import Normalizer
-from scene_envs.scene import SceneBatch
+from scene_envs.scene import POSE, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
 
@@ -18,7 +18,7 @@ def to_union(batch: SceneBatch, union: SceneType) -> SceneBatch:
 
     Args:
         batch: B scenes of a type whose assets ``union`` has.
-        union: of :func:`~scene_envs.unions.union_scene_type`, or any scene type with those assets.
+        union: of :func:`~scene_envs.scene_types.union_scene_type`, or any scene type with those assets.
 
     Raises:
         InvalidInputError: an asset that ``union`` lacks.
@@ -46,8 +46,8 @@ def union_normalizer(normalizers: Sequence[Normalizer], union: SceneType) -> Nor
     if not normalizers:
         raise InvalidInputError("a union's normalizer needs at least one normalizer, got none")
     low, high = torch.zeros(union.features), torch.ones(union.features)
-    low[:12] = torch.stack([n.input_min[:12] for n in normalizers]).amin(dim=0)
-    high[:12] = torch.stack([n.input_max[:12] for n in normalizers]).amax(dim=0)
+    low[POSE] = torch.stack([n.input_min[POSE] for n in normalizers]).amin(dim=0)
+    high[POSE] = torch.stack([n.input_max[POSE] for n in normalizers]).amax(dim=0)
     return Normalizer.from_range(low, high)
 
 

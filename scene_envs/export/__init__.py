@@ -2,7 +2,7 @@
 
 from scene_envs.export.api import ExportReport, export
 from scene_envs.export.asset_files import AssetFiles
-from scene_envs.export.formats import ExportFormat, get_format, list_formats, register_format, resolve_formats
+from scene_envs.export.formats import ExportFormat, list_formats, register_format
 from scene_envs.export.placed import PlacedObject, PlacedScene, place
 
 __all__ = [
@@ -12,9 +12,7 @@ __all__ = [
     "PlacedObject",
     "PlacedScene",
     "export",
-    "get_format",
     "list_formats",
     "place",
     "register_format",
-    "resolve_formats",
 ]

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scene_envs.errors import InvalidInputError, MissingDependencyError, unknown_name
+from scene_envs.plugins import plugin_entry_points
 
 if TYPE_CHECKING:
     from scene_envs.export.asset_files import AssetFiles
@@ -97,7 +97,7 @@ def register_format(name: str, *, summary: str = "") -> Callable[[SceneWriter], 
 
 def list_formats() -> list[str]:
     """Names of all formats, those of installed packages included, sorted."""
-    return sorted({*_FORMATS, *(point.name for point in entry_points(group=ENTRY_POINT_GROUP))})
+    return sorted({*_FORMATS, *plugin_entry_points(ENTRY_POINT_GROUP)})
 
 
 def get_format(name: str) -> ExportFormat:
@@ -108,9 +108,9 @@ def get_format(name: str) -> ExportFormat:
     """
     if name in _FORMATS:
         return _FORMATS[name]
-    for point in entry_points(group=ENTRY_POINT_GROUP):
-        if point.name == name:
-            return ExportFormat(name, f"from {point.module}", point.value)
+    point = plugin_entry_points(ENTRY_POINT_GROUP).get(name)
+    if point is not None:
+        return ExportFormat(name, f"from {point.module}", point.value)
     raise unknown_name("export format", name, list_formats())
 
 

@@ -1,6 +1,8 @@
 """Scene grammars: distributions over structures and exact poses, one short file per scene type."""
 
-from scene_envs.grammars.containers import Filling, Heap, Standing
+from scene_envs.grammars.catalogue import get_grammar, list_grammars
+from scene_envs.grammars.containers import Heap, Standing
+from scene_envs.grammars.distributions import Gaussian, Line, Moved, Uniform, Yaw
 from scene_envs.grammars.dsl import (
     NOTHING,
     Cluster,
@@ -13,11 +15,10 @@ from scene_envs.grammars.dsl import (
     Stack,
     Tiers,
 )
-from scene_envs.grammars.grammar import Grammar, get_grammar, list_grammars, register_grammar
+from scene_envs.grammars.grammar import Grammar, register_grammar
 from scene_envs.grammars.plan import Disc, Rectangle
 from scene_envs.grammars.surface import FreeSurface, Outline, Region
-from scene_envs.grammars.towers import Node, Surface, Tower
-from scene_envs.grammars.wishes import Gaussian, Line, Moved, Uniform, Yaw
+from scene_envs.grammars.towers import Filling, Node, Surface, Tower
 
 __all__ = [
     "NOTHING",

@@ -8,11 +8,11 @@ from __future__ import annotations
 import math
 
 from scene_envs.grammars.containers import Heap, Standing
+from scene_envs.grammars.distributions import Gaussian, PositionDistribution, Uniform, Yaw
 from scene_envs.grammars.dsl import NOTHING, Cluster, Geometric, Group, Object, OneOf, Repeat
 from scene_envs.grammars.parts import maybe, middle, toast
 from scene_envs.grammars.surface import Region
 from scene_envs.grammars.towers import Node
-from scene_envs.grammars.wishes import Gaussian, Uniform, Wish, Yaw
 
 HALF_DEPTH, HALF_LENGTH = 0.2575, 0.65
 """How far (m) the frames of what stands on the table are from its middle, at most."""
@@ -33,7 +33,9 @@ def near(x: float, y: float) -> Uniform:
     return Uniform(0.015, 0.015, x, y)
 
 
-def bowl_of_food(where: Wish, yaw: Yaw, bread: float, apple: float, pear: float, beside: Node = NOTHING) -> Node:
+def bowl_of_food(
+    where: PositionDistribution, yaw: Yaw, bread: float, apple: float, pear: float, beside: Node = NOTHING
+) -> Node:
     """A bowl with bread leaning in it, fruit, or nothing, with these chances."""
     fruit = OneOf((apple, Object("apple_gala")), (pear, Object("pear_bosc")), (1.0 - bread - apple - pear, NOTHING))
     leaning = Heap(Object("bread_slice"), radius=0.01, upright=True)
@@ -80,7 +82,7 @@ def facing_pair(setting: Node) -> Node:
     )
 
 
-def anywhere() -> Wish:
+def anywhere() -> PositionDistribution:
     return Uniform(HALF_DEPTH, HALF_LENGTH)
 
 

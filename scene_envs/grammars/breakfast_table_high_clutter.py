@@ -6,11 +6,11 @@ Probabilities follow the scene grammar of the paper's dataset (Pfaff et al., CoR
 from __future__ import annotations
 
 from scene_envs.grammars.breakfast import TABLE, cereal, facing_pair, jugs, place_setting, shared_bowls, shared_plates
+from scene_envs.grammars.distributions import Uniform
 from scene_envs.grammars.dsl import Cluster, Group, OneOf
 from scene_envs.grammars.grammar import Grammar, register_grammar
 from scene_envs.grammars.parts import at_least
 from scene_envs.grammars.towers import Node, Surface
-from scene_envs.grammars.wishes import Uniform
 from scene_envs.scene_types import get_scene_type
 
 

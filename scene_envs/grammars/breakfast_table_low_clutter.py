@@ -16,11 +16,11 @@ from scene_envs.grammars.breakfast import (
     shared_bowls,
     shared_plates,
 )
+from scene_envs.grammars.distributions import Gaussian
 from scene_envs.grammars.dsl import Cluster, Group, OneOf
 from scene_envs.grammars.grammar import Grammar, register_grammar
 from scene_envs.grammars.parts import at_least
 from scene_envs.grammars.towers import Node, Surface
-from scene_envs.grammars.wishes import Gaussian
 from scene_envs.scene_types import get_scene_type
 
 

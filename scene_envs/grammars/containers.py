@@ -6,41 +6,23 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from scene_envs.grammars.plan import carrying_height, top_of
+from scene_envs.grammars.towers import ContentPose, Filling, Node
 from scene_envs.scene_types import Camera, FixedObject, SceneType
 
 if TYPE_CHECKING:
     from scene_envs.assets.base import Asset
-    from scene_envs.grammars.towers import Node
     from scene_envs.scene import SceneBatch
-
-Array = NDArray[np.float64]
-Pose = tuple[Array, Array]
-"""Rotation (3, 3) and translation (3,) m, in the container's frame."""
 
 _TRIES = 6
 _SETTLE = 1.5
 """How long (s) contents come to rest."""
 _NOWHERE = Camera((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
-
-
-class Filling(Protocol):
-    """What is inside a container, and how it starts before it comes to rest."""
-
-    @property
-    def node(self) -> Node:
-        """Draws the contents; only their asset names count."""
-        ...
-
-    def start(self, container: Asset, contents: Sequence[Asset], rng: np.random.Generator) -> list[Pose]:
-        """A pose for each of ``contents`` from which gravity takes it into the container."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -55,7 +37,7 @@ class Standing:
     node: Node
     radius: float
 
-    def start(self, container: Asset, contents: Sequence[Asset], rng: np.random.Generator) -> list[Pose]:
+    def start(self, container: Asset, contents: Sequence[Asset], rng: np.random.Generator) -> list[ContentPose]:
         """Feet on a circle on the floor of the jar, shafts near its rim, all around."""
         floor, rim = carrying_height(container), top_of(container)
         phase = rng.random() * 2.0 * math.pi
@@ -93,7 +75,7 @@ class Heap:
     radius: float = 0.02
     upright: bool = False
 
-    def start(self, container: Asset, contents: Sequence[Asset], rng: np.random.Generator) -> list[Pose]:
+    def start(self, container: Asset, contents: Sequence[Asset], rng: np.random.Generator) -> list[ContentPose]:
         """A column above the floor of the container."""
         z = carrying_height(container) + 0.002
         poses = []
@@ -131,7 +113,7 @@ class Containers:
 
     def fill(
         self, container: str, contents: Sequence[str], filling: Filling, rng: np.random.Generator, reasons: Counter[str]
-    ) -> list[Pose] | None:
+    ) -> list[ContentPose] | None:
         """Poses of the contents at rest in the container's frame; None when they would not stay in it."""
         from scene_envs.physics import feasibility, project, settle
 
@@ -149,7 +131,7 @@ class Containers:
             reasons[f"spilled from {container}"] += 1
         return None
 
-    def _batch(self, container: str, contents: Sequence[str], poses: Sequence[Pose]) -> SceneBatch:
+    def _batch(self, container: str, contents: Sequence[str], poses: Sequence[ContentPose]) -> SceneBatch:
         from scene_envs.scene import SceneBatch
 
         scene_type = self._alone(container)

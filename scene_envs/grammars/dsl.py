@@ -1,8 +1,8 @@
 """The words of a grammar: objects, stacks, choices and repetitions, each of which draws towers.
 
 A *tower* is what stands on a support: one object, or a stack of objects on the same vertical axis, with what
-stands on it and what is in it. Nodes say what is there (the structure); a *wish* such as
-:class:`~scene_envs.grammars.surface.Gaussian` says where.
+stands on it and what is in it. Nodes say what is there (the structure); a distribution such as
+:class:`~scene_envs.grammars.distributions.Gaussian` says where.
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ from itertools import accumulate
 import numpy as np
 
 from scene_envs.errors import InvalidInputError
-from scene_envs.grammars.containers import Filling
-from scene_envs.grammars.towers import Node, Surface, Tower
-from scene_envs.grammars.wishes import Gaussian, Wish, Yaw
+from scene_envs.grammars.distributions import Gaussian, PositionDistribution, Yaw
+from scene_envs.grammars.towers import Filling, Node, Surface, Tower
 
 _CENTER = Gaussian(along=0.0)
 
@@ -38,7 +37,7 @@ class Object:
     """
 
     asset: str
-    where: Wish = _CENTER
+    where: PositionDistribution = _CENTER
     yaw: Yaw = Yaw()  # noqa: RUF009  (frozen)
     on: Sequence[Surface] = ()
     inside: Filling | None = None
@@ -74,7 +73,7 @@ class Cluster:
     """
 
     member: Node
-    where: Wish
+    where: PositionDistribution
     yaw: Yaw = Yaw(std=0.0)  # noqa: RUF009  (frozen)
 
     def draw(self, rng: np.random.Generator, reasons: Counter[str]) -> list[Tower]:
@@ -105,7 +104,7 @@ class Stack:
     base: str
     then: Mapping[str | None, float]
     step: float | None = None
-    where: Wish = _CENTER
+    where: PositionDistribution = _CENTER
     at_most: int = 10
     yaw: Yaw = Yaw()  # noqa: RUF009  (frozen)
 
@@ -148,7 +147,7 @@ class Pile:
 
     members: tuple[tuple[float, str], ...]
     height: Geometric
-    where: Wish = _CENTER
+    where: PositionDistribution = _CENTER
     yaw: Yaw = Yaw()  # noqa: RUF009  (frozen)
 
     def __post_init__(self) -> None:

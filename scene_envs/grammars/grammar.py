@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property
-from importlib import import_module
+from functools import cached_property
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.errors import InvalidInputError
 from scene_envs.grammars.layout import Frame, Layout, Pose
 from scene_envs.grammars.towers import Surface, Tower
-from scene_envs.plugins import load_plugins
-from scene_envs.scene import SceneBatch
+from scene_envs.scene import POSE, POSE_FEATURES, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
 _MAX_STRUCTURES = 10_000
@@ -39,6 +37,7 @@ class Grammar:
             that fails one is thrown away.
         reasons: how often, and why, draws were thrown away since the grammar was made.
 
+    >>> from scene_envs.grammars import get_grammar
     >>> grammar = get_grammar("dimsum_table")
     >>> batch = grammar.sample(np.random.default_rng(0))
     >>> len(batch), bool(batch.counts >= 7)
@@ -117,60 +116,20 @@ class Grammar:
     def _write(self, scene: NDArray[np.float32], poses: Sequence[Pose]) -> None:
         scene[:] = self._blank
         for slot, pose in enumerate(poses, start=len(self.scene_type.fixed)):
-            scene[slot, :12] = (*pose.translation, *pose.rotation)
+            scene[slot, POSE] = (*pose.translation, *pose.rotation)
             scene[slot, -1] = 0.0
-            scene[slot, 12 + self._category[pose.asset]] = 1.0
+            scene[slot, POSE_FEATURES + self._category[pose.asset]] = 1.0
 
 
-_BUILT_IN = (
-    "breakfast_table_high_clutter",
-    "breakfast_table_low_clutter",
-    "dimsum_table",
-    "living_room_shelf",
-    "pantry_shelf",
-    "restaurant_high_clutter",
-    "restaurant_low_clutter",
-)
-"""Modules of this package that register a grammar when they are imported."""
-
-_REGISTRY: dict[str, Callable[[], Grammar]] = {}
+GRAMMARS: dict[str, Callable[[], Grammar]] = {}
+"""Functions registered so far, each of which makes a grammar, by name."""
 
 
 def register_grammar(name: str) -> Callable[[Callable[[], Grammar]], Callable[[], Grammar]]:
     """Decorator: make the function's grammar available as ``name``; the same name again replaces it."""
 
     def register(make: Callable[[], Grammar]) -> Callable[[], Grammar]:
-        _REGISTRY[name] = make
+        GRAMMARS[name] = make
         return make
 
     return register
-
-
-@cache
-def _load_built_in() -> None:
-    for name in _BUILT_IN:
-        import_module(f"scene_envs.grammars.{name}")
-
-
-def get_grammar(scene_type: str | SceneType | Grammar) -> Grammar:
-    """A fresh grammar by its name (built-in grammars are called like their scene type)."""
-    if isinstance(scene_type, Grammar):
-        return scene_type
-    return grammar_factory(scene_type.name if isinstance(scene_type, SceneType) else scene_type)()
-
-
-def grammar_factory(name: str) -> Callable[[], Grammar]:
-    """The function registered as ``name``; raises UnknownNameError with the nearest known name."""
-    _load_built_in()
-    if name not in _REGISTRY:
-        load_plugins()
-    if name not in _REGISTRY:
-        raise unknown_name("grammar", name, _REGISTRY)
-    return _REGISTRY[name]
-
-
-def list_grammars() -> list[str]:
-    """Names of all registered grammars, those of installed packages included, sorted."""
-    _load_built_in()
-    load_plugins()
-    return sorted(_REGISTRY)

@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 
 from scene_envs.grammars.containers import Heap
+from scene_envs.grammars.distributions import Line, PositionDistribution, Uniform, Yaw
 from scene_envs.grammars.dsl import NOTHING, Geometric, Group, Object, OneOf, Pile, Repeat, Stack, Tiers
 from scene_envs.grammars.grammar import Grammar, register_grammar
 from scene_envs.grammars.parts import at_least, maybe, middle, toast
 from scene_envs.grammars.shelf import HALF_DEPTH, HALF_WIDTH, MIDDLE, tiers
 from scene_envs.grammars.surface import Region
 from scene_envs.grammars.towers import Node, Surface
-from scene_envs.grammars.wishes import Line, Uniform, Wish, Yaw
 from scene_envs.scene_types import get_scene_type
 
 ALONG_SHELF = Yaw(std=0.015, choices=(math.pi / 2, -math.pi / 2))
@@ -28,7 +28,7 @@ NEARLY_SQUARE = Yaw(std=0.15, choices=(0.0, math.pi))
 """Game cases are put down with less care."""
 
 
-def anywhere() -> Wish:
+def anywhere() -> PositionDistribution:
     return Uniform(HALF_DEPTH, HALF_WIDTH, x=MIDDLE)
 
 

@@ -7,13 +7,13 @@ solver and objects fell off the shelf; here everything is placed where there is 
 from __future__ import annotations
 
 from scene_envs.grammars.containers import Heap
+from scene_envs.grammars.distributions import Uniform
 from scene_envs.grammars.dsl import Geometric, Group, Object, OneOf, Repeat, Tiers
 from scene_envs.grammars.grammar import Grammar, register_grammar
 from scene_envs.grammars.parts import at_least, maybe
 from scene_envs.grammars.shelf import HALF_DEPTH, HALF_WIDTH, MIDDLE, tiers
 from scene_envs.grammars.surface import Region
 from scene_envs.grammars.towers import Node, Surface
-from scene_envs.grammars.wishes import Uniform
 from scene_envs.scene_types import get_scene_type
 
 FRUIT = ("apple_gala", "apple_golden", "apple_green", "apple_red", "pear_anjou", "pear_bosc", "pear_red",

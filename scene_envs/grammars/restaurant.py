@@ -9,12 +9,12 @@ import math
 from collections.abc import Mapping, Sequence
 
 from scene_envs.grammars import dimsum_table as dimsum
+from scene_envs.grammars.distributions import Gaussian, Line, Uniform, Yaw
 from scene_envs.grammars.dsl import Cluster, Geometric, Group, Object, OneOf, Repeat, Stack
 from scene_envs.grammars.living_room_shelf import inner_tier, top_tier
 from scene_envs.grammars.shelf import tiers
 from scene_envs.grammars.surface import Region
 from scene_envs.grammars.towers import Node, Surface, Tower
-from scene_envs.grammars.wishes import Gaussian, Line, Uniform, Yaw
 
 FLOOR = -0.785
 """z of the floor (m); table tops are at 0."""

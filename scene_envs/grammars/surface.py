@@ -10,8 +10,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from scene_envs.grammars.distributions import PositionDistribution, Yaw
 from scene_envs.grammars.plan import Disc, Placed, Plan, inscribed, meet
-from scene_envs.grammars.wishes import Wish, Yaw
 
 _DRAWS = 24
 """Draws from a child's own distribution before the free region is enumerated."""
@@ -114,7 +114,7 @@ class Outline:
 class FreeSurface:
     """A flat support while it is being filled.
 
-    >>> from scene_envs.grammars.wishes import Gaussian
+    >>> from scene_envs.grammars.distributions import Gaussian
     >>> surface = FreeSurface(Region(0.5, 0.5))
     >>> rng = np.random.default_rng(0)
     >>> cup = Outline((Disc(0.1),), (Disc(0.1),))
@@ -149,9 +149,9 @@ class FreeSurface:
         return child
 
     def place(
-        self, wish: Wish, yaw: Yaw, outline: Outline, rng: np.random.Generator, levels: int = 1
+        self, where: PositionDistribution, yaw: Yaw, outline: Outline, rng: np.random.Generator, levels: int = 1
     ) -> tuple[float, float, tuple[float, ...]] | None:
-        """Place one child where its distribution, cut to the free region, says; None when there is no room.
+        """Place one child at a draw of ``where`` cut to the free region; None when there is no room.
 
         A few plain draws are tried first; on a crowded support the free cells are enumerated and one of
         them is drawn by its density.
@@ -163,7 +163,7 @@ class FreeSurface:
         half_x, half_y, radius = region.limits(outline.foot)
         keep_out = outline.core
         for _ in range(_DRAWS):
-            x, y = wish.draw(rng)
+            x, y = where.draw(rng)
             if abs(x - region.x) > half_x or abs(y - region.y) > half_y or x * x + y * y > radius * radius:
                 continue
             if self._is_taken(x, y, keep_out):
@@ -171,7 +171,7 @@ class FreeSurface:
             spot = self._settle(x, y, yaw, outline, rng, levels)
             if spot is not None:
                 return spot
-        return self._place_in_cells(wish, yaw, outline, rng, levels)
+        return self._place_in_cells(where, yaw, outline, rng, levels)
 
     def _is_taken(self, x: float, y: float, core: float) -> bool:
         """Whether a disc of radius ``core`` (m) at (x, y) meets another child's inner disc: a quick, generous test."""
@@ -194,10 +194,10 @@ class FreeSurface:
         return x, y, yaws
 
     def _place_in_cells(
-        self, wish: Wish, yaw: Yaw, outline: Outline, rng: np.random.Generator, levels: int
+        self, where: PositionDistribution, yaw: Yaw, outline: Outline, rng: np.random.Generator, levels: int
     ) -> tuple[float, float, tuple[float, ...]] | None:
         cells = self.region.cells
-        log_density = wish.log_density(cells)
+        log_density = where.log_density(cells)
         if log_density is None:
             return None
         free = np.isfinite(log_density) & self._roomy(cells, outline)

@@ -5,13 +5,19 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from scene_envs.grammars.containers import Filling
+from scene_envs.grammars.distributions import Moved, PositionDistribution, Yaw
 from scene_envs.grammars.surface import Region
-from scene_envs.grammars.wishes import Moved, Wish, Yaw
+
+if TYPE_CHECKING:
+    from scene_envs.assets.base import Asset
+
+ContentPose = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Rotation (3, 3) and translation (3,) m of an object in a container, in the container's frame."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +38,7 @@ class Tower:
     """
 
     assets: tuple[str, ...]
-    where: Wish
+    where: PositionDistribution
     step: float | None = None
     yaw: Yaw = Yaw()  # noqa: RUF009  (frozen)
     loads: tuple[tuple[Surface, tuple[Tower, ...]], ...] = ()
@@ -87,4 +93,17 @@ class Node(Protocol):
 
     def draw(self, rng: np.random.Generator, reasons: Counter[str]) -> list[Tower]:
         """Draw towers; count in ``reasons`` why draws were thrown away."""
+        ...
+
+
+class Filling(Protocol):
+    """What is inside a container, and how it starts before it comes to rest."""
+
+    @property
+    def node(self) -> Node:
+        """Draws the contents; only their asset names count."""
+        ...
+
+    def start(self, container: Asset, contents: Sequence[Asset], rng: np.random.Generator) -> list[ContentPose]:
+        """A pose for each of ``contents`` from which gravity takes it into the container."""
         ...

@@ -27,7 +27,7 @@ from agents.diffusion import (
 from agents.mixed_prior import MixedPrior
 from agents.post_training import DenoisingPolicy
 from agents.prior import ScenePrior, tiny_prior
-from scene_envs.denoising import DenoisingCore
+from scene_envs.envs import DenoisingCore
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.grammars import get_grammar
 

@@ -15,7 +15,7 @@ from agents.mixed_prior import MixedPrior
 from agents.post_training import DDPOSFLoss, DenoisingPolicy
 from agents.post_training.rollouts import collect
 from agents.prior import ScenePrior, tiny_prior
-from scene_envs.denoising_torchrl import DenoisingTorchRLEnv
+from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch

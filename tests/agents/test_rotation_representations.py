@@ -19,8 +19,7 @@ from agents.post_training import DDPOSFLoss, DenoisingPolicy
 from agents.post_training.rollouts import collect
 from agents.prior import ScenePrior, tiny_prior
 from agents.rotation_codes import ROTATION_WIDTHS, ROTATIONS, SceneCode, decode_rotations, encode_rotations
-from scene_envs.denoising_envs import DenoisingVectorEnv
-from scene_envs.denoising_torchrl import DenoisingTorchRLEnv
+from scene_envs.envs import DenoisingTorchRLEnv, DenoisingVectorEnv
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.grammars import get_grammar
 from scene_envs.normalizer import Normalizer

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import doctest
 import logging
 import sys
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -189,10 +187,3 @@ def test_corners_near_the_surface_are_drawn_onto_it() -> None:
     points = np.array([[0.03, 0.02, -0.101], [0.099, 0.05, 0.0], [0.101, 0.101, 0.101], [0.0, 0.0, 0.0]])
     drawn = drawn_to(cube, points, 0.003)
     assert drawn == pytest.approx(np.array([[0.03, 0.02, -0.1], [0.1, 0.05, 0.0], [0.1, 0.1, 0.1], [0.0, 0.0, 0.0]]))
-
-
-@pytest.mark.parametrize("name", ["hulls", "inertials", "class_colors"])
-def test_docstring_examples(name: str) -> None:
-    result = doctest.testmod(import_module(f"scene_envs.assets.importing.{name}"))
-    assert result.attempted > 0
-    assert result.failed == 0

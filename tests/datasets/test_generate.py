@@ -19,9 +19,11 @@ import pytest
 import torch
 from toy_grammars import TYPE, ToyGrammar, toy_cups
 
-from scene_envs.datasets import SceneDataset, StorageError, fixed_normalizer, generate, judge_scenes, verify_scenes
+from scene_envs.datasets import SceneDataset, StorageError, generate, judge_scenes
 from scene_envs.datasets import shards as shards_module
 from scene_envs.datasets.progress import generation_progress
+from scene_envs.datasets.ranges import fixed_normalizer
+from scene_envs.datasets.verification import verify_scenes
 from scene_envs.errors import CorruptFileError, InvalidInputError, PhysicsError, UnknownNameError
 from scene_envs.grammars import get_grammar, register_grammar
 from scene_envs.scene import SceneBatch

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from rewards.base import RewardOutput
-from scene_envs.denoising import DenoisingCore
-from scene_envs.env_errors import ResetNeededError
+from scene_envs.envs import DenoisingCore, ResetNeededError
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.scene import SceneBatch
 

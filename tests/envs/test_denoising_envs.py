@@ -1,4 +1,4 @@
-"""The Gymnasium faces: conformance, determinism, autoreset, and agreement with one another."""
+"""The Gymnasium adapters: conformance, determinism, autoreset, and agreement with one another."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode
 
-import scene_envs.env_spaces as env_spaces
+import scene_envs.envs.spaces as env_spaces
 from agents.prior import tiny_prior
-from scene_envs.denoising_envs import DenoisingEnv
-from scene_envs.env_errors import ResetNeededError
+from scene_envs.envs import DenoisingEnv, ResetNeededError
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 ID = "scene_envs:SceneEnvs/Denoising-v0"
@@ -25,7 +24,7 @@ MODES = ("next_sample", "noise")
 def flat_pictures(monkeypatch):
     """Pictures without a renderer: conformance of ``render`` is tested here, drawing is tested elsewhere."""
     blank = lambda batch: np.zeros((len(batch), 12, 16, 3), np.uint8)  # noqa: E731
-    monkeypatch.setattr("scene_envs.denoising_envs.picture", blank)
+    monkeypatch.setattr("scene_envs.envs.denoising_gymnasium.picture", blank)
 
 
 def actions(count, steps, seed=0):

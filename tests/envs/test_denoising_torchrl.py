@@ -1,4 +1,4 @@
-"""The torchrl face: specs, bit-identity with the vector face, partial resets, collectors."""
+"""The torchrl adapter: specs, bit-identity with the vector environment, partial resets, collectors."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from torchrl.envs.utils import check_env_specs
 
 from agents.prior import tiny_prior
-from scene_envs.denoising_torchrl import DenoisingTorchRLEnv
+from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.errors import InvalidInputError
 
 ID = "scene_envs:SceneEnvs/Denoising-v0"

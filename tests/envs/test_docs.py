@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from scene_envs.denoising_envs import DenoisingEnv
-from scene_envs.search import SearchEnv
+from scene_envs.envs import DenoisingEnv, SearchEnv
 
 DOCS = Path(__file__).parents[2] / "docs" / "envs"
 SECTIONS = [

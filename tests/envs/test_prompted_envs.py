@@ -14,14 +14,13 @@ import torch
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from torchrl.envs.utils import check_env_specs
 
-import scene_envs.env_spaces as env_spaces
+import scene_envs.envs.spaces as env_spaces
 from agents.prior import ScenePrior, tiny_prior
 from scene_envs.datasets.prompts import parse_prompt
-from scene_envs.denoising_torchrl import DenoisingTorchRLEnv
-from scene_envs.env_prompts import grammar_prompts
+from scene_envs.envs import DenoisingTorchRLEnv, SearchProblem
+from scene_envs.envs.prompts import grammar_prompts
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene_types import get_scene_type
-from scene_envs.search_problem import SearchProblem
 
 ID = "scene_envs:SceneEnvs/Denoising-v0"
 SEARCH = "scene_envs:SceneEnvs/Search-v0"

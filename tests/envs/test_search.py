@@ -13,13 +13,12 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 
 from agents.prior import tiny_prior
 from rewards.base import RewardOutput
-from scene_envs.env_errors import ResetNeededError
-from scene_envs.env_reward import Score
+from scene_envs.envs import ResetNeededError, SearchEnv
+from scene_envs.envs.masks import infeasible_mask, random_mask
+from scene_envs.envs.scoring import Score
+from scene_envs.envs.search import NodeRandomness
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.scene import SceneBatch
-from scene_envs.search import SearchEnv
-from scene_envs.search_masks import infeasible_mask, random_mask
-from scene_envs.search_state import NodeRandomness
 
 ID = "scene_envs:SceneEnvs/Search-v0"
 
@@ -31,7 +30,7 @@ def env(prior, free_objects):
 
 def test_check_env_passes_with_warnings_as_errors(prior, free_objects, monkeypatch):
     blank = lambda batch: np.zeros((len(batch), 12, 16, 3), np.uint8)  # noqa: E731
-    monkeypatch.setattr("scene_envs.search.picture", blank)
+    monkeypatch.setattr("scene_envs.envs.search_gymnasium.picture", blank)
     env = gym.make(ID, prior=prior, objective=free_objects, branching=3, max_depth=3, num_steps=2)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -121,7 +120,8 @@ def test_a_real_network_agrees_up_to_rounding(free_objects):
         assert torch.equal(child.scene[kept], root.scene[kept])
 
 
-def test_only_masked_slots_change_and_welded_ones_never(env):
+def test_only_masked_slots_change_and_welded_ones_never(prior, free_objects):
+    env = SearchEnv(prior=prior, objective=free_objects, num_steps=2, mask="infeasible")
     env.reset(seed=2)
     root = env.clone_state()
     assert root.mask.any()
@@ -228,7 +228,7 @@ def test_masks_fall_back_to_a_random_half():
 
 
 def test_spec_goes_to_json_and_actions_are_checked(env, prior, free_objects, monkeypatch):
-    monkeypatch.setattr("scene_envs.env_spaces.resolve_prior", lambda name: prior)
+    monkeypatch.setattr("scene_envs.envs.spaces.resolve_prior", lambda name: prior)
     made = gym.make(ID, objective="object_count", branching=2, num_steps=2)
     again = gym.make(gym.envs.registration.EnvSpec.from_json(made.spec.to_json()))
     assert data_equivalence(made.reset(seed=1), again.reset(seed=1), exact=True)

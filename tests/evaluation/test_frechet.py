@@ -17,9 +17,10 @@ from agents.evaluation.inception import _Pooling, frechet_inception_distance, lo
 from agents.evaluation.scene_tokens import blurred
 from agents.evaluation.set_encoder import SHIPPED, SetEncoder
 from agents.evaluation.set_encoder_training import SetEncoderTraining, damage, train_set_encoder
-from scene_envs.datasets import to_union, union_scene_type
+from scene_envs.datasets import to_union
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
 from scene_envs.scene import SceneBatch
+from scene_envs.scene_types import union_scene_type
 
 
 @pytest.fixture(scope="module")

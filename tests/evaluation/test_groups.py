@@ -10,11 +10,11 @@ import torch
 from agents.evaluation import grammar_scenes
 from agents.evaluation.groups import GROUPS, Material, choose_groups, measure_group
 from agents.evaluation.real_scenes import RealScenes
-from scene_envs.datasets import SceneDataset, union_scene_type
+from scene_envs.datasets import SceneDataset
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import get_scene_type
+from scene_envs.scene_types import get_scene_type, union_scene_type
 
 
 def save(batch: SceneBatch, folder: Path) -> str:

@@ -18,8 +18,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from scene_envs.errors import InvalidInputError, MissingDependencyError, UnknownNameError
-from scene_envs.export import AssetFiles, export, formats, get_format, list_formats, register_format
+from scene_envs.export import AssetFiles, export, formats, list_formats, register_format
 from scene_envs.export.asset_files import Palette, face_colors, textured_mesh, visual_mesh
+from scene_envs.export.formats import get_format
 from scene_envs.export.placed import angle_axis, exact_rotations, identifiers, quaternion
 from scene_envs.physics.parts import PartGeometry
 from scene_envs.scene import SceneBatch
@@ -239,7 +240,7 @@ def test_an_installed_package_can_offer_a_format(tmp_path, monkeypatch):
     point = importlib.metadata.EntryPoint(
         "their_arrays", "scene_envs.export.arrays:write_npz", formats.ENTRY_POINT_GROUP
     )
-    monkeypatch.setattr(formats, "entry_points", lambda group: [point] if group == formats.ENTRY_POINT_GROUP else [])
+    monkeypatch.setattr(formats, "plugin_entry_points", {formats.ENTRY_POINT_GROUP: {point.name: point}}.get)
     assert "their_arrays" in list_formats()
     assert export(laid_scene(), tmp_path, "their_arrays").scenes[0]["their_arrays"].name == "scene.npz"
 

@@ -91,9 +91,9 @@ def test_placement_keeps_distance_on_a_crowded_surface_and_says_when_it_is_full(
 
 def test_placement_follows_its_distribution_cut_to_the_free_region() -> None:
     rng = np.random.default_rng(0)
-    wish = Gaussian(x=0.6, y=0.0, along=0.05)
+    where = Gaussian(x=0.6, y=0.0, along=0.05)
     disc = Outline((Disc(0.1),), (Disc(0.0),))
-    xs = [FreeSurface(Region(0.475, 0.475)).place(wish, Yaw(), disc, rng) for _ in range(600)]
+    xs = [FreeSurface(Region(0.475, 0.475)).place(where, Yaw(), disc, rng) for _ in range(600)]
     mean = np.mean([spot[0] for spot in xs if spot is not None])
     expected = stats.truncnorm(-np.inf, (0.475 - 0.6) / 0.05, loc=0.6, scale=0.05).mean()
     assert mean == pytest.approx(expected, abs=4e-3)

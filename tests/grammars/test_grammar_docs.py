@@ -5,13 +5,16 @@ from __future__ import annotations
 import re
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 
-from scene_envs import grammars, scene_types
+from scene_envs import grammars
 from scene_envs.datasets import judge_scenes
-from scene_envs.grammars import Grammar, grammar
+from scene_envs.grammars import Grammar
+from scene_envs.grammars.grammar import GRAMMARS
+from scene_envs.scene_types import registry
 
 PAGE = (Path(__file__).parents[2] / "docs" / "grammars.md").read_text()
 BLOCKS = [block for block in re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL) if "gym.make" not in block]
@@ -22,9 +25,7 @@ def page() -> Any:
     """The names that the page defines, its blocks run in order."""
     names: dict[str, Any] = {}
     grammars.list_grammars()  # the built-in ones are registered for good, before the registry is swapped
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_types, "_REGISTRY", dict(scene_types._REGISTRY))
-        patch.setattr(grammar, "_REGISTRY", dict(grammar._REGISTRY))
+    with patch.dict(registry._REGISTRY), patch.dict(GRAMMARS):
         for block in BLOCKS:
             exec(compile(block, "docs/grammars.md", "exec"), names)
     return names

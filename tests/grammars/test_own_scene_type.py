@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
+from unittest.mock import patch
 
 import gymnasium as gym
 import numpy as np
@@ -19,13 +20,15 @@ from agents.new_prior import build_prior
 from agents.pretrain_config import PretrainConfig
 from agents.prior import ScenePrior, tiny_prior
 from rewards import RewardContext, check_reward, resolve_reward
-from scene_envs import SceneBatch, get_scene_type, list_scene_types, plugins, scene_types
+from scene_envs import SceneBatch, get_scene_type, list_scene_types, plugins
 from scene_envs.datasets import SceneDataset, generate, judge_scenes, parse_prompt, scene_facts
 from scene_envs.errors import UnknownNameError
 from scene_envs.export import export
-from scene_envs.grammars import get_grammar, grammar, list_grammars
+from scene_envs.grammars import get_grammar, list_grammars
+from scene_envs.grammars.grammar import GRAMMARS
 from scene_envs.physics import PhysicsPool, feasibility, make_ready
 from scene_envs.render import render, write_viewer
+from scene_envs.scene_types import registry
 
 PACKAGE = Path(__file__).parents[1] / "scene_type_package"
 DOCS = Path(__file__).parents[2] / "docs" / "grammars.md"
@@ -41,10 +44,8 @@ def tea_house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     command = [sys.executable, "-m", "pip", "install", *options, "--target", str(site), str(copy)]
     subprocess.run(command, check=True, capture_output=True, text=True)
     list_grammars()  # the built-in ones are registered for good, before the registry is swapped
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(site))
-        patch.setattr(scene_types, "_REGISTRY", dict(scene_types._REGISTRY))
-        patch.setattr(grammar, "_REGISTRY", dict(grammar._REGISTRY))
+    with pytest.MonkeyPatch.context() as monkeypatch, patch.dict(registry._REGISTRY), patch.dict(GRAMMARS):
+        monkeypatch.syspath_prepend(str(site))
         plugins.load_plugins.cache_clear()
         yield site
     plugins.load_plugins.cache_clear()

@@ -12,9 +12,9 @@ import torch
 from agents.planning import SearchOutcome, UCTPlanner, run_search
 from agents.prior import ScenePrior, tiny_prior
 from rewards import RewardContext, RewardOutput
+from scene_envs.envs import SearchEnv
 from scene_envs.errors import InvalidInputError, SceneEnvsError
 from scene_envs.scene import SceneBatch
-from scene_envs.search import SearchEnv
 
 SETTINGS = {"budget": 24, "branching": 3, "num_steps": 4, "max_depth": 5, "seed": 3, "mask": "infeasible"}
 
@@ -68,7 +68,8 @@ def test_the_same_seed_gives_the_same_tree_and_another_seed_another(run: Run) ->
 
 
 def test_a_scene_depends_on_its_path_and_not_on_the_order_of_the_search(run: Run) -> None:
-    settings = {"objective": central_objects, "branching": 3, "num_steps": 4, "max_depth": 5, "prior": run.prior}
+    settings = {key: SETTINGS[key] for key in ("branching", "num_steps", "max_depth", "mask")}
+    settings |= {"objective": central_objects, "prior": run.prior}
     with_batches = {n.path: n.state.scene for n in run.outcome.search.tree.nodes()}
     one_by_one = UCTPlanner(exploration=1.0, parallel=1).plan(fresh_root(SearchEnv(**settings), 3), budget=24)
     shared = [n for n in one_by_one.tree.nodes() if n.path in with_batches]

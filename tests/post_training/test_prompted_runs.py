@@ -18,7 +18,7 @@ from agents.prior import ScenePrior, tiny_prior
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.datasets import SceneDataset, generate
 from scene_envs.datasets.prompts import parse_prompt, scene_facts
-from scene_envs.denoising_torchrl import DenoisingTorchRLEnv
+from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 

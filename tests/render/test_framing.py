@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scene_envs.datasets import to_union, union_scene_type
+from scene_envs.datasets import to_union
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.grammars import get_grammar
 from scene_envs.render import picture_camera
 from scene_envs.render.cameras import light_camera
 from scene_envs.render.framing import fit_camera, frame_scene_type, scene_type_of_one
-from scene_envs.scene_types import Camera, FixedObject, SceneType, get_scene_type, list_scene_types
+from scene_envs.scene_types import Camera, FixedObject, SceneType, get_scene_type, list_scene_types, union_scene_type
 
 BUILT_IN = list_scene_types()
 

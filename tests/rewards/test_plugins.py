@@ -44,6 +44,6 @@ def test_a_near_miss_offers_the_installed_name():
 
 
 def test_the_environment_takes_the_installed_name(cups):
-    from scene_envs.env_reward import RewardScorer
+    from scene_envs.envs.scoring import RewardScorer
 
     torch.testing.assert_close(RewardScorer("open_space")(cups).value, torch.tensor([0.2, 0.4]))

@@ -12,6 +12,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from scene_envs.assets.base import Asset, AssetLibrary
+from scene_envs.assets.built_in import class_colors
 from scene_envs.assets.importing.class_colors import distinct_colors
 from scene_envs.assets.importing.entries import (
     SUFFIXES,
@@ -176,8 +177,6 @@ def _named_files(path: Path) -> set[str]:
 
 def _colored(entries: list[AssetEntry]) -> tuple[AssetEntry, ...]:
     """Entries with a colour each, far from those of the built-in assets."""
-    from scene_envs.assets.library import class_colors
-
     chosen: list[Color] = [entry.color for entry in entries if entry.color is not None]
     fresh = iter(distinct_colors(len(entries) - len(chosen), (*class_colors(), *chosen)))
     return tuple(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from scene_envs.assets.base import ConvexPart
-from scene_envs.assets.library import Model, asset_recipe
+from scene_envs.assets.recipe import Model, asset_recipe
 from scene_envs.assets.shapes import Profile, ring, solid
 from scene_envs.assets.surfaces import Color, lathe
 

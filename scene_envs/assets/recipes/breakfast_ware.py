@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from scene_envs.assets.base import Array
-from scene_envs.assets.library import Model, asset_recipe
+from scene_envs.assets.recipe import Model, asset_recipe
 from scene_envs.assets.recipes.painted import Cells, revolve
 from scene_envs.assets.shapes import hull_of, ring, rods, solid
 from scene_envs.assets.surfaces import Color, arc, join, lathe, tube

@@ -9,8 +9,8 @@ import numpy as np
 import trimesh
 
 from scene_envs.assets.base import Array, ConvexPart
-from scene_envs.assets.library import Model, asset_recipe
 from scene_envs.assets.panels import fan, loft, quad_faces
+from scene_envs.assets.recipe import Model, asset_recipe
 from scene_envs.assets.shapes import circle, convex_hull, hull_of
 from scene_envs.assets.surfaces import Color, join, surface
 

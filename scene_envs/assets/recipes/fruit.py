@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 
 from scene_envs.assets.base import Array
-from scene_envs.assets.library import Model, asset_recipe
+from scene_envs.assets.recipe import Model, asset_recipe
 from scene_envs.assets.recipes.painted import Cells, Paint, curve, revolve
 from scene_envs.assets.shapes import Profile, hull_of, solid
 from scene_envs.assets.surfaces import Color, join, tube

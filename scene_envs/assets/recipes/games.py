@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
-from scene_envs.assets.library import Model, asset_recipe
 from scene_envs.assets.panels import Face, Patch, lettering, painted_box
+from scene_envs.assets.recipe import Model, asset_recipe
 from scene_envs.assets.shapes import box
 from scene_envs.assets.surfaces import Color
 

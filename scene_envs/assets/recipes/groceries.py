@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 
 from scene_envs.assets.base import Array
-from scene_envs.assets.library import Model, asset_recipe
+from scene_envs.assets.recipe import Model, asset_recipe
 from scene_envs.assets.recipes.painted import loft, sheet
 from scene_envs.assets.shapes import box, circle, convex_hull
 from scene_envs.assets.surfaces import Color, join

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from scene_envs.assets.library import Model, asset_recipe
+from scene_envs.assets.recipe import Model, asset_recipe
 from scene_envs.assets.shapes import box, hull_of, ring, solid
 from scene_envs.assets.surfaces import Color, join, lathe
 

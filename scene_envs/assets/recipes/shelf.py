@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import trimesh
 
-from scene_envs.assets.library import Model, asset_recipe
 from scene_envs.assets.panels import Patch, lettering, loft, moved, painted_box
+from scene_envs.assets.recipe import Model, asset_recipe
 from scene_envs.assets.shapes import box, convex_hull, hull_of, solid
 from scene_envs.assets.surfaces import Color, join, lathe
 

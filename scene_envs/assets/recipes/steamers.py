@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from scene_envs.assets.library import Model, asset_recipe
+from scene_envs.assets.recipe import Model, asset_recipe
 from scene_envs.assets.shapes import hull_of, ring, solid
 from scene_envs.assets.surfaces import Color, join, lathe, planks
 

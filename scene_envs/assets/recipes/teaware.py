@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from scene_envs.assets.library import Model, asset_recipe
+from scene_envs.assets.recipe import Model, asset_recipe
 from scene_envs.assets.shapes import hull_of, ring, rods, solid
 from scene_envs.assets.surfaces import Color, arc, join, lathe, tube
 

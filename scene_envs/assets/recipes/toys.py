@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from scene_envs.assets.library import Model, asset_recipe
 from scene_envs.assets.panels import Patch, moved, painted_box
+from scene_envs.assets.recipe import Model, asset_recipe
 from scene_envs.assets.shapes import Profile, box, convex_hull, hull_of, solid
 from scene_envs.assets.surfaces import Color, join, lathe
 

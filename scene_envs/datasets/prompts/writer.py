@@ -24,7 +24,7 @@ from scene_envs.datasets.prompts.claims import (
 )
 from scene_envs.datasets.prompts.facts import LOOSE, NOMINAL, STRICT, SceneFacts, facts_under
 from scene_envs.datasets.prompts.language import Nouns
-from scene_envs.datasets.prompts.speaker import Speaker
+from scene_envs.datasets.prompts.referring import ReferringExpressions
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
@@ -67,7 +67,7 @@ def describe_all(batch: SceneBatch, rng: np.random.Generator, *, count: int = 3)
 def _writers(batch: SceneBatch, rng: np.random.Generator) -> list[_Writer]:
     nouns = Nouns(batch.scene_type)
     views = zip(*facts_under(batch, [STRICT, NOMINAL, LOOSE]), strict=True)
-    return [_Writer(seen, Speaker(seen), nouns, rng) for seen in views]
+    return [_Writer(scene, ReferringExpressions(scene), nouns, rng) for scene in views]
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class _Writer:
     """Writes about one scene, seen under strict, nominal and loose tolerances."""
 
     views: tuple[SceneFacts, ...]
-    speaker: Speaker
+    referring: ReferringExpressions
     nouns: Nouns
     rng: np.random.Generator
 
@@ -189,7 +189,7 @@ class _Writer:
 
     def _stay(self) -> Claim | None:
         name, unit, tier = self._pick(sorted(self._stays))
-        places = self.speaker.places(unit, tier)
+        places = self.referring.places(unit, tier)
         place = self._pick(places) if places else None
         return None if place is None else PlaceCount(name, self._stays[name, unit, tier], place)
 
@@ -220,7 +220,7 @@ class _Writer:
         return all(view.is_aside(side, first, second) for view in self.views)
 
     def _refer(self, index: int) -> Reference | None:
-        references = self.speaker.references(index)
+        references = self.referring.references(index)
         return self._pick(references) if references else None
 
     def _pick(self, items: Sequence[_T]) -> _T:

@@ -1,4 +1,4 @@
-"""Gymnasium face of the search MDP: choose among inpaintings of a scene until it is good."""
+"""The Gymnasium adapter of the search MDP: choose among inpaintings of a scene until it is good."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from scene_envs.env_errors import ResetNeededError
-from scene_envs.env_spaces import STATE_BOUND, check_render_mode, occupied, picture, scene_box
+from scene_envs.envs.errors import ResetNeededError
+from scene_envs.envs.search import SearchProblem, SearchState
+from scene_envs.envs.settings import SearchSettings, takes
+from scene_envs.envs.spaces import STATE_BOUND, check_render_mode, occupied, picture, scene_box
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import SceneType
-from scene_envs.search_problem import SearchProblem
-from scene_envs.search_state import SearchState
 
 Observation = dict[str, np.ndarray]
 
@@ -25,9 +24,10 @@ class SearchEnv(gym.Env[Any, Any]):
 
     ## Description
 
-    A state is a scene with a mask that says which of its slots are to be regenerated: the objects that the
-    objective blames, and the empty slots. An action chooses one of `branching` inpaintings of those slots by the
-    scene prior (Pfaff et al. 2025, inference-time search). Good choices keep what works and replace what does not.
+    A state is a scene with a mask that says which of its slots are to be regenerated: by default the fewest objects
+    whose removal ends all overlaps, those that fall or slide, and a few empty slots. An action chooses one of
+    `branching` inpaintings of those slots by the scene prior (Pfaff et al. 2025, inference-time search). Good choices
+    keep what works and replace what does not.
 
     Planners use the state directly. It is immutable and picklable and holds no simulator: `clone_state`,
     `restore_state`, `legal_actions`, `action_masks`, `expand`, `expand_batch`, `evaluate`, `best_state`. The random
@@ -87,7 +87,7 @@ class SearchEnv(gym.Env[Any, Any]):
     | `num_steps` | `50` | denoising steps per inpainting |
     | `prior` | `None` | name, path or prior; `None` is the shipped prior of the scene type |
     | `slots` | `None` | slots per scene; `None` is the scene type's number, more is allowed |
-    | `mask` | `"infeasible"` | mask generator: `"infeasible"` (blamed objects, empty slots), `"random"`, a function |
+    | `mask` | `"culprits"` | mask generator: also `"infeasible"`, `"random"`, a registered name, a function |
     | `objective_scale` | `None` | objective value at which Φ = 1; `None` is the number of free slots |
     | `workers` | `0` | processes for physics in the objective; 0 computes in this one |
     | `render_mode` | `None` | `"rgb_array"` renders the current scene |
@@ -106,48 +106,21 @@ class SearchEnv(gym.Env[Any, Any]):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012  (declared so by gym.Env)
 
-    def __init__(
-        self,
-        scene: str | SceneType = "dimsum_table",
-        objective: Any = "feasible_objects",
-        branching: int = 4,
-        max_depth: int = 10,
-        num_steps: int = 50,
-        prior: Any = None,
-        slots: int | None = None,
-        mask: Any = "infeasible",
-        objective_scale: float | None = None,
-        workers: int = 0,
-        render_mode: str | None = None,
-        prompt: str | None = None,
-        guidance: float = 0.0,
-    ) -> None:
+    @takes(SearchSettings)
+    def __init__(self, *, render_mode: str | None = None, **settings: Any) -> None:
         self.render_mode = check_render_mode(render_mode)
-        self.problem = SearchProblem(
-            scene=scene,
-            objective=objective,
-            branching=branching,
-            max_depth=max_depth,
-            num_steps=num_steps,
-            prior=prior,
-            slots=slots,
-            mask=mask,
-            objective_scale=objective_scale,
-            workers=workers,
-            prompt=prompt,
-            guidance=guidance,
-        )
+        self.problem = SearchProblem(**settings)
         slot_count = self.problem.slots
         self.observation_space = spaces.Dict(
             {
                 "scene": scene_box(STATE_BOUND, slot_count, self.problem.scene_type.features),
                 "object_mask": spaces.MultiBinary(slot_count),
                 "regenerate": spaces.MultiBinary(slot_count),
-                "depth": spaces.Box(0, max_depth, (1,), np.int64),
+                "depth": spaces.Box(0, self.problem.max_depth, (1,), np.int64),
                 "value": spaces.Box(0.0, 1.0, (1,), np.float32),
             }
         )
-        self.action_space = spaces.Discrete(branching)
+        self.action_space = spaces.Discrete(self.problem.branching)
         self._state: SearchState | None = None
         self._best: SearchState | None = None
         self._nfe_at_reset = 0

@@ -1,4 +1,4 @@
-"""Words that single out one thing or one place of a scene."""
+"""Referring expressions: words that single out one object or one place of a scene."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from scene_envs.datasets.prompts.claims import Place, Reference
 from scene_envs.datasets.prompts.facts import SIDES, SceneFacts
 
 _LAST_ORDINAL = 5
-"""Nobody counts further than the fifth."""
+"""The highest ordinal in use: "fifth"."""
 
 
 @dataclass(frozen=True, eq=False)
-class Speaker:
-    """Speaks of things so that they are found in every one of several views of a scene.
+class ReferringExpressions:
+    """Expressions that single out the same object in every one of several views of a scene.
 
     Attributes:
         views: the facts of one scene under several tolerances.
@@ -29,7 +29,7 @@ class Speaker:
         return self.views[0]
 
     def references(self, index: int) -> list[Reference]:
-        """The simplest ways to speak of one thing; empty when there are none.
+        """The simplest expressions for one object; empty when there are none.
 
         Its name alone; or its name and place; or its rank from the sides where that is lowest.
         """
@@ -38,7 +38,7 @@ class Speaker:
         return self._known[index]
 
     def places(self, unit: int, tier: int) -> list[Place]:
-        """Ways to speak of a thing as a place, or of one of its tiers, counted from the nearer end."""
+        """Expressions for an object as a place, or for one of its tiers, counted from the nearer end."""
         tiers = int(self.scene.tiers[unit])
         if tiers and tier < 0:
             return []

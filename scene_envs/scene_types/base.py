@@ -1,4 +1,4 @@
-"""Scene types: which assets, where, seen from where. Pure data, no torch."""
+"""A scene type: which assets, where, seen from where. Pure data, no torch."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.plugins import load_plugins
+from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from scene_envs.assets.base import AssetLibrary
@@ -77,6 +76,7 @@ class SceneType:
         InvalidInputError: an asset named twice, a welded asset that is not among the assets, a workspace whose corners
             are exchanged, or no slot for a free object.
 
+    >>> from scene_envs import get_scene_type
     >>> scene_type = get_scene_type("dimsum_table")
     >>> scene_type.num_assets, scene_type.slots, scene_type.features
     (7, 34, 20)
@@ -141,6 +141,7 @@ class SceneType:
 
         Without models there is no physics and there are no pictures; priors can be sampled all the same.
 
+        >>> from scene_envs import get_scene_type
         >>> get_scene_type("dimsum_table").has_geometry
         True
         """
@@ -161,149 +162,3 @@ class SceneType:
 def _tuples(value: Any) -> Any:
     """Lists as tuples, all the way down."""
     return tuple(_tuples(item) for item in value) if isinstance(value, list | tuple) else value
-
-
-_REGISTRY: dict[str, SceneType] = {}
-
-
-def register_scene_type(scene_type: SceneType) -> SceneType:
-    """Make ``scene_type`` available by name everywhere; the same name again replaces it."""
-    _REGISTRY[scene_type.name] = scene_type
-    return scene_type
-
-
-def get_scene_type(name: str | SceneType) -> SceneType:
-    """The scene type called ``name``; names joined by ``+`` are their union.
-
-    Raises:
-        UnknownNameError: no scene type has that name; says which is nearest.
-
-    >>> get_scene_type("dimsum_table+pantry_shelf").slots
-    61
-    """
-    if isinstance(name, SceneType):
-        return name
-    if name not in _REGISTRY:
-        load_plugins()
-    if name not in _REGISTRY and "+" in name:
-        from scene_envs.unions import union_scene_type
-
-        return union_scene_type(name.split("+"), name)
-    if name not in _REGISTRY:
-        raise unknown_name("scene type", name, _REGISTRY)
-    return _REGISTRY[name]
-
-
-def list_scene_types() -> list[str]:
-    """Names of all registered scene types, those of installed packages included, sorted."""
-    load_plugins()
-    return sorted(_REGISTRY)
-
-
-_BREAKFAST = (
-    "apple_gala", "bowl", "bread_slice", "breakfast_table", "cereal_box", "dinner_spoon", "fork", "knife", "mug",
-    "pear_bosc", "plate", "shared_plate", "teaspoon", "water_jug",
-)  # fmt: skip
-_LIVING_ROOM = (
-    "apple_gala", "board_game_l", "board_game_l2", "board_game_s", "board_game_xl", "book", "bread_slice", "fruit_bowl",
-    "game_case", "lamp", "pear_bosc", "shared_plate", "shelf", "soda_can", "speaker", "stacking_ring", "tea_bottle",
-    "toy_train",
-)  # fmt: skip
-_PANTRY = (
-    "apple_gala", "apple_golden", "apple_green", "apple_red", "avocado_a", "avocado_b", "avocado_c", "fruit_bowl",
-    "pear_anjou", "pear_bosc", "pear_red", "shelf", "soda_can", "tea_bottle",
-)  # fmt: skip
-_DIMSUM = ("cafe_table", "dinner_plate", "serving_dish", "steamer_bottom", "steamer_lid", "teacup", "teapot")
-_RESTAURANT = tuple(sorted((*_LIVING_ROOM, *_DIMSUM, "chair", "floor")))
-
-_TABLE_UP = (-1.0, 0.0, 0.0)
-_BREAKFAST_CAMERA = Camera((0.0, 0.0, 1.5), (0.0, 0.0, 0.0), _TABLE_UP)
-_BREAKFAST_SPACE = ((-0.3575, -0.7, -0.02), (0.3575, 0.7, 0.5))
-_SHELF_CAMERA = Camera((1.2, 0.0, 0.1), (0.0, 0.0, 0.1), (0.0, 0.0, 1.0))
-_SHELF_SPACE = ((-0.15, -0.30, -0.42), (0.15, 0.30, 0.62))
-_ROOM_CAMERA = Camera((0.0, 0.0, 13.0), (0.0, 0.0, 0.0), _TABLE_UP)
-_ROOM_SPACE = ((-5.0, -5.0, -0.8), (5.0, 5.0, 0.99))
-_ROOM = {
-    "assets": _RESTAURANT,
-    "workspace": _ROOM_SPACE,
-    "welded": ("cafe_table", "floor", "shelf"),
-    "fixed": (FixedObject("floor", (0.0, 0.0, -0.785)),),
-    "camera": _ROOM_CAMERA,
-}
-
-register_scene_type(
-    SceneType(
-        name="breakfast_table_low_clutter",
-        assets=tuple(sorted((*_BREAKFAST, "utensil_crock"))),
-        slots=26,
-        workspace=_BREAKFAST_SPACE,
-        welded=("breakfast_table",),
-        fixed=(FixedObject("breakfast_table"),),
-        camera=_BREAKFAST_CAMERA,
-        description="A table laid for two, with shared bread, fruit, cereal, jugs and a crock of cutlery.",
-    )
-)
-register_scene_type(
-    SceneType(
-        name="breakfast_table_high_clutter",
-        assets=_BREAKFAST,
-        slots=46,
-        workspace=_BREAKFAST_SPACE,
-        welded=("breakfast_table",),
-        fixed=(FixedObject("breakfast_table"),),
-        camera=_BREAKFAST_CAMERA,
-        description="A table laid for up to six, with shared plates, bowls, cereal and jugs.",
-    )
-)
-register_scene_type(
-    SceneType(
-        name="dimsum_table",
-        assets=_DIMSUM,
-        slots=34,
-        workspace=((-0.49, -0.49, -0.02), (0.49, 0.49, 0.99)),
-        welded=("cafe_table",),
-        fixed=(FixedObject("cafe_table"),),
-        camera=Camera(position=(0.0, 0.0, 1.7), target=(0.0, 0.0, 0.0), up=_TABLE_UP),
-        description="A round table with four places, teapots, dishes and stacks of dim sum steamers.",
-    )
-)
-register_scene_type(
-    SceneType(
-        name="living_room_shelf",
-        assets=_LIVING_ROOM,
-        slots=23,
-        workspace=_SHELF_SPACE,
-        welded=("shelf",),
-        fixed=(FixedObject("shelf"),),
-        camera=_SHELF_CAMERA,
-        description="A shelf of four tiers with board games, books, toys, drinks and lamps.",
-    )
-)
-register_scene_type(
-    SceneType(
-        name="pantry_shelf",
-        assets=_PANTRY,
-        slots=61,
-        workspace=_SHELF_SPACE,
-        welded=("shelf",),
-        fixed=(FixedObject("shelf"),),
-        camera=_SHELF_CAMERA,
-        description="A shelf of four tiers packed with cans, bottles and fruit.",
-    )
-)
-register_scene_type(
-    SceneType(
-        name="restaurant_high_clutter",
-        slots=125,
-        description="A room with three or more laid dim sum tables, their chairs, and shelves along a wall.",
-        **_ROOM,  # type: ignore[arg-type]
-    )
-)
-register_scene_type(
-    SceneType(
-        name="restaurant_low_clutter",
-        slots=107,
-        description="A room with one or more dim sum tables, their chairs, and shelves along a wall.",
-        **_ROOM,  # type: ignore[arg-type]
-    )
-)

@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import itertools
+from importlib.metadata import EntryPoint
+from typing import Any
+from unittest.mock import patch
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from toy_prior import ToyPrior
 
-from agents.planning.mask_generators import CulpritsMask, cover, search_mask
+from agents.planning.search_run import SearchConfig
 from rewards import RewardOutput
-from scene_envs.env_reward import RewardScorer, Score
-from scene_envs.errors import UnknownNameError
+from scene_envs.envs import masks, register_mask
+from scene_envs.envs.masks import CulpritsMask, MaskGenerator, cover, infeasible_mask, list_masks, resolve_mask
+from scene_envs.envs.scoring import RewardScorer, Score
+from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.scene import SceneBatch
-from scene_envs.search_masks import MaskGenerator, infeasible_mask
+
+ID = "scene_envs:SceneEnvs/Search-v0"
 
 
 def table_with(*objects: tuple[str, float, float, float]) -> SceneBatch:
@@ -93,7 +101,37 @@ def test_covers_touch_every_pair_and_spare_the_fixed() -> None:
 
 
 def test_names_are_resolved_and_unknown_ones_get_an_offer() -> None:
-    assert search_mask("culprits") == CulpritsMask()
-    assert search_mask("infeasible") is infeasible_mask
+    assert resolve_mask("culprits") == CulpritsMask()
+    assert resolve_mask("infeasible") is infeasible_mask
     with pytest.raises(UnknownNameError, match="did you mean 'culprits'"):
-        search_mask("culprit")
+        resolve_mask("culprit")
+    with pytest.raises(InvalidInputError, match="culprits, infeasible, random"):
+        resolve_mask(3)
+
+
+def test_a_registered_mask_works_by_name_in_the_environment(prior: ToyPrior, free_objects: Any) -> None:
+    with patch.dict(masks._MASKS):
+
+        @register_mask("odd_slots")
+        def odd_slots(scene: SceneBatch, score: Score, rng: np.random.Generator) -> torch.Tensor:
+            return torch.arange(scene.tensor.shape[1]) % 2 == 1
+
+        env = gym.make(ID, prior=prior, objective=free_objects, num_steps=1, mask="odd_slots").unwrapped
+        observation, _ = env.reset(seed=0)
+    welded = env.scene().is_welded[0].numpy()
+    assert observation["regenerate"].tolist() == ((np.arange(34) % 2 == 1) & ~welded).tolist()
+    with pytest.raises(InvalidInputError, match="mask name"):
+        register_mask("odd slots")
+
+
+def test_a_mask_of_an_installed_package_works_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    point = EntryPoint("everything", "torch:ones_like", "scene_envs.masks")
+    monkeypatch.setattr(masks, "plugin_entry_points", lambda group: {"everything": point})
+    with patch.dict(masks._MASKS):
+        assert "everything" in list_masks()
+        assert resolve_mask("everything") is torch.ones_like
+
+
+def test_the_environment_and_the_search_run_have_one_default(prior: ToyPrior, free_objects: Any) -> None:
+    env = gym.make(ID, prior=prior, objective=free_objects, num_steps=1).unwrapped
+    assert env.problem.mask_generator == resolve_mask(SearchConfig().mask) == CulpritsMask()

@@ -1,4 +1,4 @@
-"""The denoising MDP (Black et al. 2024, Sec. 4.2): one batched pure-torch core, which every face wraps.
+"""The denoising MDP (Black et al. 2024, Sec. 4.2): one batched pure-torch core, which every adapter wraps.
 
 State (x_t, t, prompt), action x_{t-1}, transition the identity, reward at t = 0 only. In ``noise`` mode the action is
 the noise of the prior's own reverse step instead, so that actions from N(0, I) reproduce the prior.
@@ -7,17 +7,17 @@ the noise of the prior's own reverse step instead, so that actions from N(0, I) 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from scene_envs.env_errors import ResetNeededError
-from scene_envs.env_prompts import EnvPrompts
-from scene_envs.env_reward import RewardScorer, Score
-from scene_envs.env_spaces import (
+from scene_envs.envs.errors import ResetNeededError
+from scene_envs.envs.prompts import EnvPrompts
+from scene_envs.envs.scoring import RewardScorer
+from scene_envs.envs.settings import DenoisingSettings, takes
+from scene_envs.envs.spaces import (
     STATE_BOUND,
     check_action,
     check_slots,
@@ -27,60 +27,9 @@ from scene_envs.env_spaces import (
     prior_features,
     resolve_scene_and_prior,
 )
-from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.envs.trajectories import BoolArray, IntArray, StepResult, Trajectories
+from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import SceneType
-
-ACTION_MODES = ("next_sample", "noise")
-
-BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
-IntArray = np.ndarray[Any, np.dtype[np.int64]]
-
-
-@dataclass(frozen=True)
-class StepResult:
-    """What one step gave the B episodes of a core.
-
-    Attributes:
-        reward: (B,) float32; 0 before the last step and where ``valid`` is False.
-        valid: (B,) bool; False where the reward could not score the finished scene.
-        terminated: (B,) bool, on the CPU.
-        terms: named (B,) float32 of the reward; 0 before the last step.
-        score: the full verdict, when all B episodes ended in this step; else None.
-        batch: the B finished scenes, likewise.
-    """
-
-    reward: Tensor
-    valid: Tensor
-    terminated: BoolArray
-    terms: dict[str, Tensor]
-    score: Score | None = None
-    batch: SceneBatch | None = None
-
-
-@dataclass(frozen=True)
-class Trajectories:
-    """B whole episodes of S steps.
-
-    Attributes:
-        scenes: (S + 1, B, N, D) float32 normalised, from x_T to x_0.
-        actions: (S, B, N, D) float32 as given by the policy.
-        timesteps: (S,) int64; ``scenes[i]`` is at ``timesteps[i]``, the last scene at 0.
-        reward: (B,) float32; 0 where not valid.
-        valid: (B,) bool.
-        score: value, terms, credit and flags per object, on the prior's device.
-        batch: the finished scenes x_0, on the CPU.
-        prompts: one per scene, or None without prompts.
-    """
-
-    scenes: Tensor
-    actions: Tensor
-    timesteps: Tensor
-    reward: Tensor
-    valid: Tensor
-    score: Score
-    batch: SceneBatch
-    prompts: tuple[str, ...] | None = None
 
 
 class DenoisingCore:
@@ -92,66 +41,35 @@ class DenoisingCore:
 
     Args:
         num_envs: B.
-        scene: scene type or its name.
-        reward: name, mapping, function or reward object.
-        num_steps: S, denoising steps per episode.
-        prior: name, path or prior; None means the shipped prior of the scene type.
-        slots: N; None means the scene type's.
-        action_mode: ``"next_sample"`` or ``"noise"``.
-        max_action: actions are clipped to ±max_action.
-        workers: physics worker processes.
-        prompt, guidance: as for :class:`~scene_envs.env_prompts.EnvPrompts`.
+        **settings: fields of :class:`~scene_envs.envs.settings.DenoisingSettings`; ``prompt`` and ``guidance`` as for
+            :class:`~scene_envs.envs.prompts.EnvPrompts`.
 
     Raises:
         InvalidInputError, UnknownNameError: an argument is outside what is accepted.
 
-    >>> from agents.prior import tiny_prior
-    >>> core = DenoisingCore(2, prior=tiny_prior(), num_steps=1, action_mode="noise")
+    >>> core = DenoisingCore(2, num_steps=1, action_mode="noise")
     >>> core.reset([np.random.default_rng(seed) for seed in (0, 1)])
     >>> result = core.step(torch.zeros(2, 34, 20))
     >>> result.terminated.tolist(), tuple(result.reward.shape), result.batch
     ([True, True], (2,), SceneBatch('dimsum_table', (2, 34, 20)))
     """
 
-    def __init__(
-        self,
-        num_envs: int,
-        *,
-        scene: str | SceneType = "dimsum_table",
-        reward: Any = "object_count",
-        num_steps: int = 50,
-        prior: Any = None,
-        slots: int | None = None,
-        action_mode: str = "next_sample",
-        max_action: float = 10.0,
-        workers: int = 0,
-        prompt: Any = None,
-        guidance: float = 0.0,
-    ) -> None:
+    @takes(DenoisingSettings)
+    def __init__(self, num_envs: int, **settings: Any) -> None:
         if not isinstance(num_envs, int) or num_envs < 1:
             raise InvalidInputError(f"num_envs={num_envs!r}: at least one environment is needed")
-        if action_mode not in ACTION_MODES:
-            raise unknown_name("action mode", str(action_mode), ACTION_MODES)
-        if not (np.isfinite(max_action) and max_action > 0):
-            raise InvalidInputError(f"max_action={max_action!r} must be positive and finite")
-        if not isinstance(num_steps, int) or num_steps < 1:
-            raise InvalidInputError(f"num_steps={num_steps!r} must be a whole number of at least 1")
+        chosen = DenoisingSettings(**settings)
         self.num_envs = num_envs
-        self.scene_type, self.prior = resolve_scene_and_prior(scene, prior)
-        self.slots = check_slots(self.scene_type, slots)
+        self.scene_type, self.prior = resolve_scene_and_prior(chosen.scene, chosen.prior)
+        self.slots = check_slots(self.scene_type, chosen.slots)
         self._features = prior_features(self.prior)
-        self.action_mode = action_mode
-        self.max_action = float(max_action)
-        self.table = self.prior.step_table(num_steps)
+        self.action_mode = chosen.action_mode
+        self.max_action = float(chosen.max_action)
+        self.table = self.prior.step_table(chosen.num_steps)
         self.num_steps = len(self.table)
         self.device = prior_device(self.prior)
-        if guidance and action_mode != "noise":
-            raise InvalidInputError(
-                f"guidance={guidance:g} acts on the prior's own steps, and action_mode={action_mode!r} takes none; "
-                "use action_mode='noise', or guide the policy"
-            )
-        self.prompting = EnvPrompts(self.prior, prompt, guidance, self.slots)
-        self.scorer = RewardScorer(reward, workers)
+        self.prompting = EnvPrompts(self.prior, chosen.prompt, chosen.guidance, self.slots)
+        self.scorer = RewardScorer(chosen.reward, chosen.workers)
         self.term_names = self.scorer.probe(
             SceneBatch.empty(self.scene_type, 1, self.slots), [""] if self.prompting.given else None
         )

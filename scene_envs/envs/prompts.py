@@ -41,8 +41,8 @@ class EnvPrompts:
         InvalidInputError: a prompt for a prior that reads none, guidance without a prompt, or a prompt that cannot be
             followed.
 
-    >>> from agents.prior import tiny_prior
-    >>> prompts = EnvPrompts(tiny_prior(process="mixed", text=True), ["A scene with two cups.", "A scene."], 0.0, 34)
+    >>> from scene_envs.envs.resolvers import resolve_prior
+    >>> prompts = EnvPrompts(resolve_prior("dimsum_table"), ["A scene with two cups.", "A scene."], 0.0, 34)
     >>> prompts.draw(np.random.default_rng(0))
     'A scene.'
     """

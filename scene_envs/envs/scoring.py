@@ -1,17 +1,16 @@
-"""How the environments ask a reward for its verdict: one object, shared by denoising and search."""
+"""Scoring of scenes by a reward, with physics workers, for denoising and search."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import import_module
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from scene_envs.envs.resolvers import resolve_reward
 from scene_envs.errors import InvalidInputError
-from scene_envs.protocols import resolve_reward, reward_context
 from scene_envs.scene import SceneBatch
 
 
@@ -70,14 +69,13 @@ class RewardScorer:
     def __init__(self, reward: Any, workers: int = 0) -> None:
         if not isinstance(workers, int) or workers < 0:
             raise InvalidInputError(f"workers={workers!r}: give a number of processes, 0 for none")
-        self.reward = resolve_reward(reward)
+        self._score = resolve_reward(reward)
         self.workers = workers
         self._pool: Any = None
 
     def __call__(self, batch: SceneBatch, prompts: Sequence[str] | None = None) -> Score:
         """Score ``batch``, made for ``prompts`` if any; rows that cannot be scored come back invalid with value 0."""
-        context = reward_context(pool=self._physics_pool(), prompts=None if prompts is None else tuple(prompts))
-        output = import_module("rewards").evaluate_reward(self.reward, batch, context)
+        output = self._score(batch, prompts=None if prompts is None else tuple(prompts), pool=self._physics_pool())
         valid = output.is_valid
         value = torch.where(valid, output.value, torch.zeros_like(output.value)).float()
         terms = {name: torch.nan_to_num(term.float(), 0.0, 0.0, 0.0) for name, term in output.terms.items()}
@@ -85,13 +83,14 @@ class RewardScorer:
 
     def probe(self, empty: SceneBatch, prompts: Sequence[str] | None = None) -> tuple[str, ...]:
         """Names of the terms this reward reports, found by scoring one empty scene in this process."""
-        context = reward_context(pool=None, prompts=None if prompts is None else tuple(prompts))
-        output = import_module("rewards").evaluate_reward(self.reward, empty, context)
+        output = self._score(empty, prompts=None if prompts is None else tuple(prompts))
         return tuple(sorted(output.terms))
 
     def _physics_pool(self) -> Any:
         if self._pool is None and self.workers > 0:
-            self._pool = import_module("scene_envs.physics").PhysicsPool(workers=self.workers)
+            from scene_envs.physics import PhysicsPool
+
+            self._pool = PhysicsPool(workers=self.workers)
         return self._pool
 
     def close(self) -> None:

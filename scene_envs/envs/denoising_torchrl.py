@@ -1,4 +1,4 @@
-"""The torchrl face of the denoising MDP: batched tensors in and out. Training uses this one."""
+"""The torchrl adapter of the denoising MDP: batched tensors in and out. Training uses this one."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from scene_envs.denoising import DenoisingCore, StepResult, Trajectories
-from scene_envs.env_spaces import STATE_BOUND
-from scene_envs.scene_types import SceneType
+from scene_envs.envs.denoising import DenoisingCore
+from scene_envs.envs.settings import DenoisingSettings, takes
+from scene_envs.envs.spaces import STATE_BOUND
+from scene_envs.envs.trajectories import StepResult, Trajectories
 
 
 class DenoisingTorchRLEnv(EnvBase):
@@ -30,42 +31,16 @@ class DenoisingTorchRLEnv(EnvBase):
 
     Args:
         num_envs: B.
-        scene, reward, num_steps, prior, slots, action_mode, max_action, workers, prompt, guidance: as for
-            ``DenoisingEnv``.
+        **settings: fields of :class:`~scene_envs.envs.settings.DenoisingSettings`.
 
-    >>> from agents.prior import tiny_prior
-    >>> env = DenoisingTorchRLEnv(2, prior=tiny_prior(), reward="object_count", num_steps=3)
+    >>> env = DenoisingTorchRLEnv(2, reward="object_count", num_steps=3)
     >>> env.rollout(3)["next", "terminated"].squeeze(-1).tolist()
     [[False, False, True], [False, False, True]]
     """
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        scene: str | SceneType = "dimsum_table",
-        reward: Any = "object_count",
-        num_steps: int = 50,
-        prior: Any = None,
-        slots: int | None = None,
-        action_mode: str = "next_sample",
-        max_action: float = 10.0,
-        workers: int = 0,
-        prompt: Any = None,
-        guidance: float = 0.0,
-    ) -> None:
-        core = DenoisingCore(
-            num_envs,
-            scene=scene,
-            reward=reward,
-            num_steps=num_steps,
-            prior=prior,
-            slots=slots,
-            action_mode=action_mode,
-            max_action=max_action,
-            workers=workers,
-            prompt=prompt,
-            guidance=guidance,
-        )
+    @takes(DenoisingSettings)
+    def __init__(self, num_envs: int = 1, **settings: Any) -> None:
+        core = DenoisingCore(num_envs, **settings)
         super().__init__(device=core.device, batch_size=torch.Size([num_envs]))
         self.core = core
         self._rngs = [seeding.np_random()[0] for _ in range(num_envs)]
@@ -132,9 +107,7 @@ class DenoisingTorchRLEnv(EnvBase):
             policy: ``(x_t (B, N, D), step) -> action (B, N, D)``. Called without gradients.
             prompts: one per episode, in place of drawn ones; an environment made without ``prompt`` ignores them.
 
-        >>> from agents.prior import tiny_prior
-        >>> prior = tiny_prior()
-        >>> env = DenoisingTorchRLEnv(2, prior=prior, reward="object_count", num_steps=3, action_mode="noise")
+        >>> env = DenoisingTorchRLEnv(2, reward="object_count", num_steps=3, action_mode="noise")
         >>> trajectories = env.collect(lambda x, step: torch.randn_like(x))
         >>> tuple(trajectories.scenes.shape), tuple(trajectories.reward.shape)
         ((4, 2, 34, 20), (2,))

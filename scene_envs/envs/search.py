@@ -1,22 +1,85 @@
-"""The search MDP as pure functions of states: roots, children, values. No episode, no Gymnasium."""
+"""The search MDP: its states, and their roots, children and values as pure functions. No episode, no Gymnasium."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from scene_envs.env_prompts import EnvPrompts
-from scene_envs.env_reward import RewardScorer, Score
-from scene_envs.env_spaces import check_slots, prior_device, resolve_scene_and_prior
+from scene_envs.envs.masks import resolve_mask
+from scene_envs.envs.prompts import EnvPrompts
+from scene_envs.envs.scoring import RewardScorer, Score
+from scene_envs.envs.settings import SearchSettings, takes
+from scene_envs.envs.spaces import check_slots, prior_device, resolve_scene_and_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import SceneType
-from scene_envs.search_masks import resolve_mask_generator
-from scene_envs.search_state import NodeRandomness, SearchState
+
+
+@dataclass(frozen=True, eq=False)
+class SearchState:
+    """A partial scene: what is there, what will be regenerated, and how it came about. Immutable and picklable.
+
+    Attributes:
+        scene: (N, D) float32 raw scene; never write into it.
+        mask: (N,) bool, the slots that the next action regenerates.
+        depth: actions taken since the root.
+        path: those actions.
+        seed: of the root; with ``path`` it fixes all random numbers of this state and of those below it.
+        value: Φ in [0, 1]; the parent's where ``valid`` is False.
+        objective: the objective's raw value; 0 where not valid.
+        valid: whether the objective could score this scene.
+
+    Two states are equal when they are the same node: same seed, path and scene.
+    """
+
+    scene: Tensor
+    mask: Tensor
+    depth: int
+    path: tuple[int, ...]
+    seed: int
+    value: float
+    objective: float
+    valid: bool
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, SearchState):
+            return NotImplemented
+        same_node = (self.seed, self.path) == (other.seed, other.path)
+        return same_node and torch.equal(self.scene, other.scene) and torch.equal(self.mask, other.mask)
+
+    def __hash__(self) -> int:
+        return hash((self.seed, self.path))
+
+
+@dataclass(frozen=True)
+class NodeRandomness:
+    """The two independent sources of random numbers of one node of the tree.
+
+    Attributes:
+        noise: torch generator for the diffusion that makes the node's scene.
+        mask: NumPy generator for its mask.
+    """
+
+    noise: torch.Generator
+    mask: np.random.Generator
+
+    @classmethod
+    def at(cls, seed: int, path: tuple[int, ...]) -> NodeRandomness:
+        """The sources of the node at ``path`` below the root of ``seed``: a function of these two alone.
+
+        >>> a, b = NodeRandomness.at(7, (0, 2)), NodeRandomness.at(7, (0, 2))
+        >>> a.noise.initial_seed() == b.noise.initial_seed()
+        True
+        """
+        noise, mask = np.random.SeedSequence(entropy=seed, spawn_key=path).spawn(2)
+        return cls(
+            torch.Generator().manual_seed(int(noise.generate_state(1, np.uint64)[0] >> np.uint64(1))),
+            np.random.default_rng(mask),
+        )
 
 
 class SearchProblem:
@@ -27,54 +90,33 @@ class SearchProblem:
     rounding by about 1e-6, never the random numbers.
 
     Args:
-        scene, objective, branching, max_depth, num_steps, prior, slots, mask, objective_scale, workers, prompt,
-            guidance: as for ``SearchEnv``.
+        **settings: fields of :class:`~scene_envs.envs.settings.SearchSettings`.
 
     Attributes:
         evaluations: denoiser evaluations (NFE) spent so far, ``num_steps`` per generated scene and twice that many with
             guidance.
 
-    >>> from agents.prior import tiny_prior
-    >>> problem = SearchProblem(prior=tiny_prior(), objective="object_count", num_steps=2, max_depth=1)
+    >>> problem = SearchProblem(objective="object_count", num_steps=2, max_depth=1)
     >>> root = problem.root(seed=0)
     >>> children = problem.expand_batch([(root, action) for action in problem.legal_actions(root)])
     >>> [child.path for child in children], problem.evaluations
     ([(0,), (1,), (2,), (3,)], 10)
     """
 
-    def __init__(
-        self,
-        *,
-        scene: str | SceneType = "dimsum_table",
-        objective: Any = "feasible_objects",
-        branching: int = 4,
-        max_depth: int = 10,
-        num_steps: int = 50,
-        prior: Any = None,
-        slots: int | None = None,
-        mask: Any = "infeasible",
-        objective_scale: float | None = None,
-        workers: int = 0,
-        prompt: str | None = None,
-        guidance: float = 0.0,
-    ) -> None:
-        for name, number in (("branching", branching), ("max_depth", max_depth), ("num_steps", num_steps)):
-            if not isinstance(number, int) or number < 1:
-                raise InvalidInputError(f"{name}={number!r} must be a whole number of at least 1")
-        self.scene_type, self.prior = resolve_scene_and_prior(scene, prior)
-        self.slots = check_slots(self.scene_type, slots)
+    @takes(SearchSettings)
+    def __init__(self, **settings: Any) -> None:
+        chosen = SearchSettings(**settings)
+        self.scene_type, self.prior = resolve_scene_and_prior(chosen.scene, chosen.prior)
+        self.slots = check_slots(self.scene_type, chosen.slots)
         self.device = prior_device(self.prior)
-        self.branching, self.max_depth, self.num_steps = branching, max_depth, num_steps
-        self.prior.step_table(num_steps)  # says now, not later, that num_steps is more than the prior has
-        self.scale = float(self.slots - len(self.scene_type.fixed)) if objective_scale is None else objective_scale
-        if not (np.isfinite(self.scale) and self.scale > 0):
-            raise InvalidInputError(f"objective_scale={objective_scale!r} must be positive and finite")
-        if prompt is not None and not isinstance(prompt, str):
-            raise InvalidInputError(f"prompt={prompt!r}: a search follows one text, or None")
-        self.prompting = EnvPrompts(self.prior, prompt, guidance, self.slots)
+        self.branching, self.max_depth, self.num_steps = chosen.branching, chosen.max_depth, chosen.num_steps
+        self.prior.step_table(self.num_steps)  # says now, not later, that num_steps is more than the prior has
+        free_slots = self.slots - len(self.scene_type.fixed)
+        self.scale = float(free_slots) if chosen.objective_scale is None else chosen.objective_scale
+        self.prompting = EnvPrompts(self.prior, chosen.prompt, chosen.guidance, self.slots)
         self.prompt = self.prompting.draw(np.random.default_rng(0)) if self.prompting.given else None
-        self.mask_generator = resolve_mask_generator(mask)
-        self.scorer = RewardScorer(objective, workers)
+        self.mask_generator = resolve_mask(chosen.mask)
+        self.scorer = RewardScorer(chosen.objective, chosen.workers)
         self.evaluations = 0
 
     # -- states ---------------------------------------------------------------------------------

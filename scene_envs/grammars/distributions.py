@@ -1,4 +1,4 @@
-"""Where children would like to stand, and how they are turned: distributions in the frame of a support."""
+"""Distributions of positions and of turns about the vertical, in the frame of a support."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-class Wish(Protocol):
+class PositionDistribution(Protocol):
     """A distribution over places (x, y) in the frame of a support, m."""
 
     def draw(self, rng: np.random.Generator) -> tuple[float, float]:
@@ -25,7 +25,7 @@ class Wish(Protocol):
 
 @dataclass(frozen=True)
 class Gaussian:
-    """Where a child would like to stand: a normal distribution in the plane of its support.
+    """A normal distribution of positions in the plane of a support.
 
     Attributes:
         x, y: mean, m, in the support's frame.
@@ -109,7 +109,7 @@ class Line:
 class Moved:
     """A distribution in a frame of its own, which stands at (``x``, ``y``) m, turned by ``yaw`` rad."""
 
-    wish: Wish
+    distribution: PositionDistribution
     x: float
     y: float
     yaw: float
@@ -117,14 +117,14 @@ class Moved:
     def draw(self, rng: np.random.Generator) -> tuple[float, float]:
         """One position (x, y), m."""
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
-        x, y = self.wish.draw(rng)
+        x, y = self.distribution.draw(rng)
         return self.x + cos * x - sin * y, self.y + sin * x + cos * y
 
     def log_density(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """(P,) log density up to a constant, at ``points`` (P, 2)."""
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         dx, dy = points[:, 0] - self.x, points[:, 1] - self.y
-        return self.wish.log_density(np.stack([cos * dx + sin * dy, cos * dy - sin * dx], axis=1))
+        return self.distribution.log_density(np.stack([cos * dx + sin * dy, cos * dy - sin * dx], axis=1))
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -11,8 +10,9 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
+from scene_envs.envs.resolvers import resolve_prior
 from scene_envs.errors import InvalidInputError
-from scene_envs.protocols import EncodedPriorLike, PriorLike, resolve_prior
+from scene_envs.protocols import EncodedPriorLike, PriorLike
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
@@ -25,7 +25,7 @@ def resolve_scene_and_prior(scene: str | SceneType, prior: Any) -> tuple[SceneTy
     scene_type = get_scene_type(scene)
     resolved = resolve_prior(scene_type.name if prior is None else prior)
     if not isinstance(resolved, PriorLike):
-        raise InvalidInputError(f"prior={prior!r} is not a prior; give a name, a path or a ScenePrior")
+        raise InvalidInputError(f"prior={prior!r} is not a prior; give a name, a path or a prior object")
     if resolved.scene_type.name != scene_type.name:
         raise InvalidInputError(
             f"the prior makes scenes of {resolved.scene_type.name!r}, the environment asks for {scene_type.name!r}; "
@@ -122,4 +122,6 @@ def check_reset_mask(options: dict[str, Any] | None, count: int) -> np.ndarray:
 
 def picture(batch: SceneBatch) -> np.ndarray:
     """(B, H, W, 3) uint8 pictures (loads the renderer)."""
-    return import_module("scene_envs.render").render(batch, style="picture")  # type: ignore[no-any-return]
+    from scene_envs.render import render
+
+    return render(batch, style="picture")

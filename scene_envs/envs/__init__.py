@@ -1,0 +1,55 @@
+"""The denoising and search environments, their adapters, and the masks of the search.
+
+``gym.make("scene_envs:SceneEnvs/Denoising-v0")`` and ``…/Search-v0`` need no import from here.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from scene_envs.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from scene_envs.envs.denoising import DenoisingCore
+    from scene_envs.envs.denoising_gymnasium import DenoisingEnv
+    from scene_envs.envs.denoising_torchrl import DenoisingTorchRLEnv
+    from scene_envs.envs.denoising_vector import DenoisingVectorEnv
+    from scene_envs.envs.errors import ResetNeededError
+    from scene_envs.envs.masks import MaskGenerator, list_masks, register_mask
+    from scene_envs.envs.scoring import Score
+    from scene_envs.envs.search import SearchProblem, SearchState
+    from scene_envs.envs.search_gymnasium import SearchEnv
+    from scene_envs.envs.trajectories import StepResult, Trajectories
+
+__all__ = [
+    "DenoisingCore",
+    "DenoisingEnv",
+    "DenoisingTorchRLEnv",
+    "DenoisingVectorEnv",
+    "MaskGenerator",
+    "ResetNeededError",
+    "Score",
+    "SearchEnv",
+    "SearchProblem",
+    "SearchState",
+    "StepResult",
+    "Trajectories",
+    "list_masks",
+    "register_mask",
+]
+
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "scene_envs.envs.denoising": ["DenoisingCore"],
+        "scene_envs.envs.denoising_gymnasium": ["DenoisingEnv"],
+        "scene_envs.envs.denoising_torchrl": ["DenoisingTorchRLEnv"],
+        "scene_envs.envs.denoising_vector": ["DenoisingVectorEnv"],
+        "scene_envs.envs.errors": ["ResetNeededError"],
+        "scene_envs.envs.masks": ["MaskGenerator", "list_masks", "register_mask"],
+        "scene_envs.envs.scoring": ["Score"],
+        "scene_envs.envs.search": ["SearchProblem", "SearchState"],
+        "scene_envs.envs.search_gymnasium": ["SearchEnv"],
+        "scene_envs.envs.trajectories": ["StepResult", "Trajectories"],
+    },
+)

@@ -1,0 +1,48 @@
+"""Rewards and priors by name: the packages that know them are asked when an environment is built."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from scene_envs.errors import MissingDependencyError
+from scene_envs.plugins import plugin_entry_points
+from scene_envs.protocols import PriorLike, SceneScorer
+
+ENTRY_POINT_GROUP = "scene_envs.resolvers"
+"""``reward = "module:function"`` names a function from whatever names a reward to a
+:class:`~scene_envs.protocols.SceneScorer`, ``prior`` one from a name or path to a
+:class:`~scene_envs.protocols.PriorLike`."""
+
+
+def resolve_reward(reward: Any) -> SceneScorer:
+    """What scores scenes by ``reward``: a registered name, a mapping with settings, a function or a reward object.
+
+    Raises:
+        UnknownNameError: no reward has that name; the nearest known one is offered.
+        MissingDependencyError: no installed package resolves rewards.
+    """
+    scorer: SceneScorer = _resolver("reward")(reward)
+    return scorer
+
+
+def resolve_prior(prior: Any) -> PriorLike:
+    """A prior from a name or a path; anything else comes back as it is.
+
+    Raises:
+        UnknownNameError: no shipped prior has that name; the nearest known one is offered.
+        MissingDependencyError: no installed package resolves priors.
+    """
+    resolved: PriorLike = _resolver("prior")(prior) if isinstance(prior, str) else prior
+    return resolved
+
+
+@cache
+def _resolver(kind: str) -> Any:
+    points = plugin_entry_points(ENTRY_POINT_GROUP)
+    if kind not in points:
+        raise MissingDependencyError(
+            f"no installed package resolves a {kind}: none has the entry point {kind!r} in the group "
+            f"{ENTRY_POINT_GROUP!r}; reinstall SceneEnvs (in a checkout: `pip install -e .`)"
+        )
+    return points[kind].load()

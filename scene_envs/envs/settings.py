@@ -1,0 +1,126 @@
+"""Keyword arguments of the environments: their names, defaults and checks, once for all adapters."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.scene_types import SceneType
+
+ACTION_MODES = ("next_sample", "noise")
+
+Init = TypeVar("Init", bound=Callable[..., None])
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvSettings:
+    """What every environment takes.
+
+    Attributes:
+        scene: scene type or its name.
+        prior: name, path or prior; None means the shipped prior of the scene type.
+        num_steps: denoising steps: of an episode of denoising, of each scene of a search.
+        slots: N, slots per scene; None means the scene type's.
+        workers: physics worker processes; 0 computes in this process.
+        prompt: what scenes should hold, for priors that read prompts; None for none.
+        guidance: weight of classifier-free guidance in the prior's own steps; needs a prompt.
+
+    Raises:
+        InvalidInputError: a number is outside what is accepted.
+    """
+
+    scene: str | SceneType = "dimsum_table"
+    prior: Any = None
+    num_steps: int = 50
+    slots: int | None = None
+    workers: int = 0
+    prompt: Any = None
+    guidance: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._check_at_least_one("num_steps")
+
+    def _check_at_least_one(self, name: str) -> None:
+        number = getattr(self, name)
+        if not isinstance(number, int) or number < 1:
+            raise InvalidInputError(f"{name}={number!r} must be a whole number of at least 1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DenoisingSettings(EnvSettings):
+    """What the denoising environments take.
+
+    Attributes:
+        reward: name, mapping, function or reward object.
+        action_mode: ``"next_sample"`` or ``"noise"``.
+        max_action: actions are clipped to ±max_action.
+
+    Raises:
+        InvalidInputError, UnknownNameError: a value is outside what is accepted.
+    """
+
+    reward: Any = "object_count"
+    action_mode: str = "next_sample"
+    max_action: float = 10.0
+
+    def __post_init__(self) -> None:
+        if self.action_mode not in ACTION_MODES:
+            raise unknown_name("action mode", str(self.action_mode), ACTION_MODES)
+        if not (np.isfinite(self.max_action) and self.max_action > 0):
+            raise InvalidInputError(f"max_action={self.max_action!r} must be positive and finite")
+        super().__post_init__()
+        if self.guidance and self.action_mode != "noise":
+            raise InvalidInputError(
+                f"guidance={self.guidance:g} acts on the prior's own steps, and action_mode={self.action_mode!r} takes "
+                "none; use action_mode='noise', or guide the policy"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchSettings(EnvSettings):
+    """What the search environment takes.
+
+    Attributes:
+        objective: any reward: name, mapping, function or reward object.
+        branching: B, inpaintings to choose from.
+        max_depth: actions per episode.
+        mask: name of a mask generator, or a function; see :mod:`scene_envs.envs.masks`.
+        objective_scale: objective at which Φ is 1; None means the number of free slots.
+
+    Raises:
+        InvalidInputError: a value is outside what is accepted.
+    """
+
+    objective: Any = "feasible_objects"
+    branching: int = 4
+    max_depth: int = 10
+    mask: Any = "culprits"
+    objective_scale: float | None = None
+
+    def __post_init__(self) -> None:
+        self._check_at_least_one("branching")
+        self._check_at_least_one("max_depth")
+        super().__post_init__()
+        scale = self.objective_scale
+        if scale is not None and not (np.isfinite(scale) and scale > 0):
+            raise InvalidInputError(f"objective_scale={scale!r} must be positive and finite")
+        if self.prompt is not None and not isinstance(self.prompt, str):
+            raise InvalidInputError(f"prompt={self.prompt!r}: a search follows one text, or None")
+
+
+def takes(settings: type[EnvSettings]) -> Callable[[Init], Init]:
+    """Decorator of an ``__init__`` with ``**settings``: its signature shows the fields of ``settings``."""
+
+    def decorate(init: Init) -> Init:
+        own = inspect.signature(init).parameters.values()
+        fields = inspect.signature(settings).parameters.values()
+        shown = [*(p for p in own if p.kind is not p.VAR_KEYWORD), *fields]
+        init.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
+        return init
+
+    return decorate

@@ -1,0 +1,61 @@
+"""Records of the denoising MDP: what one step gave, and whole trajectories."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from scene_envs.envs.scoring import Score
+from scene_envs.scene import SceneBatch
+
+BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
+IntArray = np.ndarray[Any, np.dtype[np.int64]]
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What one step gave the B episodes of a core.
+
+    Attributes:
+        reward: (B,) float32; 0 before the last step and where ``valid`` is False.
+        valid: (B,) bool; False where the reward could not score the finished scene.
+        terminated: (B,) bool, on the CPU.
+        terms: named (B,) float32 of the reward; 0 before the last step.
+        score: the full verdict, when all B episodes ended in this step; else None.
+        batch: the B finished scenes, likewise.
+    """
+
+    reward: Tensor
+    valid: Tensor
+    terminated: BoolArray
+    terms: dict[str, Tensor]
+    score: Score | None = None
+    batch: SceneBatch | None = None
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """B whole episodes of S steps.
+
+    Attributes:
+        scenes: (S + 1, B, N, D) float32 normalised, from x_T to x_0.
+        actions: (S, B, N, D) float32 as given by the policy.
+        timesteps: (S,) int64; ``scenes[i]`` is at ``timesteps[i]``, the last scene at 0.
+        reward: (B,) float32; 0 where not valid.
+        valid: (B,) bool.
+        score: value, terms, credit and flags per object, on the prior's device.
+        batch: the finished scenes x_0, on the CPU.
+        prompts: one per scene, or None without prompts.
+    """
+
+    scenes: Tensor
+    actions: Tensor
+    timesteps: Tensor
+    reward: Tensor
+    valid: Tensor
+    score: Score
+    batch: SceneBatch
+    prompts: tuple[str, ...] | None = None

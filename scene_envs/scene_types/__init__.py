@@ -1,0 +1,19 @@
+"""Scene types: which assets, where, seen from where; by name."""
+
+from scene_envs.scene_types.base import Camera, FixedObject, SceneType
+from scene_envs.scene_types.registry import (
+    get_scene_type,
+    list_scene_types,
+    register_scene_type,
+    union_scene_type,
+)
+
+__all__ = [
+    "Camera",
+    "FixedObject",
+    "SceneType",
+    "get_scene_type",
+    "list_scene_types",
+    "register_scene_type",
+    "union_scene_type",
+]

@@ -1,0 +1,74 @@
+"""Scene types by name: the built-in ones, those of installed packages, yours, and unions of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.plugins import load_plugins
+from scene_envs.scene_types.base import SceneType
+from scene_envs.scene_types.built_in import BUILT_IN
+from scene_envs.scene_types.unions import union_of
+
+PLUGINS = "scene_envs.scene_types"
+"""Entry-point group of modules that register scene types and their grammars when they are imported."""
+
+_REGISTRY: dict[str, SceneType] = {scene_type.name: scene_type for scene_type in BUILT_IN}
+
+
+def register_scene_type(scene_type: SceneType) -> SceneType:
+    """Make ``scene_type`` available by name everywhere; the same name again replaces it."""
+    _REGISTRY[scene_type.name] = scene_type
+    return scene_type
+
+
+def get_scene_type(name: str | SceneType) -> SceneType:
+    """The scene type called ``name``; names joined by ``+`` are their union.
+
+    Raises:
+        UnknownNameError: no scene type has that name; says which is nearest.
+
+    >>> get_scene_type("dimsum_table+pantry_shelf").slots
+    61
+    """
+    if isinstance(name, SceneType):
+        return name
+    if name not in _REGISTRY:
+        load_plugins(PLUGINS)
+    if name not in _REGISTRY and "+" in name:
+        return union_scene_type(name.split("+"), name)
+    if name not in _REGISTRY:
+        raise unknown_name("scene type", name, _REGISTRY)
+    return _REGISTRY[name]
+
+
+def list_scene_types() -> list[str]:
+    """Names of all registered scene types, those of installed packages included, sorted."""
+    load_plugins(PLUGINS)
+    return sorted(_REGISTRY)
+
+
+def union_scene_type(types: Sequence[str | SceneType], name: str | None = None) -> SceneType:
+    """The scene type that holds the scenes of all ``types``.
+
+    Its assets are all of theirs by name, its slots the most of any, its workspace the box around theirs. Assets that
+    are welded in one type are welded in the union; its folders of users' assets are those of all. Only objects that
+    are fixed in the same pose in *every* type stay fixed; the others are objects like any other, in any slot.
+
+    Args:
+        types: at least one scene type or name.
+        name: of the union; the names joined by ``+`` when None, by which it is known everywhere. Another name is not
+            registered: files that hold it need :func:`~scene_envs.scene_types.register_scene_type`.
+
+    Raises:
+        InvalidInputError: no types given.
+        UnknownNameError: a name that is no scene type.
+
+    >>> union = union_scene_type(["dimsum_table", "pantry_shelf"])
+    >>> union.name, union.num_assets, union.slots, union.fixed
+    ('dimsum_table+pantry_shelf', 21, 61, ())
+    """
+    members = [get_scene_type(member) for member in types]
+    if not members:
+        raise InvalidInputError("a union needs at least one scene type, got none")
+    return union_of(members, name or "+".join(dict.fromkeys(member.name for member in members)))

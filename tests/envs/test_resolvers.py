@@ -1,0 +1,56 @@
+"""Names of rewards and priors are resolved by packages that the environments do not import."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib.metadata import EntryPoints
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+
+from scene_envs import plugins
+from scene_envs.envs import resolvers
+from scene_envs.errors import MissingDependencyError, UnknownNameError
+
+ID = "scene_envs:SceneEnvs/Denoising-v0"
+
+
+def test_gym_make_needs_no_other_import() -> None:
+    code = (
+        "import sys, gymnasium as gym; "
+        "import scene_envs.envs.denoising; "
+        "upper = {'rewards', 'agents'} & set(sys.modules); "
+        "assert not upper, upper; "
+        f"gym.make('{ID}', reward='object_count', num_steps=1).reset(seed=0)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_unknown_names_offer_the_nearest() -> None:
+    with pytest.raises(UnknownNameError, match="did you mean 'feasible_objects'"):
+        gym.make(ID, reward="feasible_object")
+    with pytest.raises(UnknownNameError, match="did you mean 'dimsum_table'"):
+        gym.make(ID, prior="dimsum_tabel")
+
+
+def test_entry_points_of_a_checkout_do_not_depend_on_installed_metadata(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An editable install keeps the metadata of the day it was made."""
+    monkeypatch.setattr(plugins, "entry_points", lambda group: EntryPoints())
+    assert set(plugins.plugin_entry_points(resolvers.ENTRY_POINT_GROUP)) == {"prior", "reward"}
+
+
+def test_the_pyproject_of_another_project_is_not_ours(tmp_path: Path) -> None:
+    page = tmp_path / "pyproject.toml"
+    page.write_text('[project]\nname = "other"\n[project.entry-points."scene_envs.resolvers"]\nreward = "x:y"\n')
+    assert plugins._checkout_entry_points(page) == {}
+    assert plugins._checkout_entry_points(tmp_path / "missing.toml") == {}
+
+
+def test_without_a_resolver_the_error_says_how_to_get_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resolvers, "plugin_entry_points", lambda group: {})
+    resolvers._resolver.cache_clear()
+    with pytest.raises(MissingDependencyError, match=r"resolves a reward.*pip install -e"):
+        resolvers.resolve_reward("object_count")
+    resolvers._resolver.cache_clear()
