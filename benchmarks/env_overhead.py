@@ -154,7 +154,7 @@ def main() -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     if arguments.prior == "tiny":
-        from agents.prior import tiny_prior
+        from agents.priors.testing import tiny_prior
 
         given: object = tiny_prior()
     else:

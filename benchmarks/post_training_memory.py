@@ -25,7 +25,8 @@ from torch import Tensor
 
 from agents.diffusion import gaussian_log_prob
 from agents.post_training import DDPOSFLoss, DenoisingPolicy, gradient_weights
-from agents.prior import ScenePrior, tiny_prior
+from agents.priors.base import ScenePrior
+from agents.priors.testing import tiny_prior
 
 MEBIBYTE = 2**20
 

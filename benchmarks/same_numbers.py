@@ -27,13 +27,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import torch
 from torch import Tensor
 
-from agents.checkpoint_import import import_checkpoint
 from agents.planning import SearchConfig, run_search
 from agents.post_training import PostTrainConfig, post_train
-from agents.pretrain_config import PretrainConfig
-from agents.pretraining import pretrain
-from agents.prior import ScenePrior
-from agents.prior_files import list_priors
+from agents.pretraining.config import PretrainConfig
+from agents.pretraining.trainer import pretrain
+from agents.priors.base import ScenePrior
+from agents.priors.checkpoint_import import import_checkpoint
+from agents.priors.files import list_priors
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.scene import SceneBatch
 from tests.agents.authors_flux import random_state, write_checkpoint

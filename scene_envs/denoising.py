@@ -105,7 +105,7 @@ class DenoisingCore:
     Raises:
         InvalidInputError, UnknownNameError: an argument is outside what is accepted.
 
-    >>> from agents.prior import tiny_prior
+    >>> from agents.priors.testing import tiny_prior
     >>> core = DenoisingCore(2, prior=tiny_prior(), num_steps=1, action_mode="noise")
     >>> core.reset([np.random.default_rng(seed) for seed in (0, 1)])
     >>> result = core.step(torch.zeros(2, 34, 20))

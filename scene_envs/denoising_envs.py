@@ -204,7 +204,7 @@ class DenoisingVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
     ``info`` values are (B,) arrays, each with its ``_key`` mask. In ``SameStep`` mode the step that ends an
     episode also gives ``final_obs`` ((B,) objects, each the dict of one environment) and ``final_info``.
 
-    >>> from agents.prior import tiny_prior
+    >>> from agents.priors.testing import tiny_prior
     >>> env = DenoisingVectorEnv(3, prior=tiny_prior(), num_steps=1)
     >>> observation, info = env.reset(seed=0)
     >>> observation["scene"].shape, info["timestep"].tolist()

@@ -33,7 +33,7 @@ class DenoisingTorchRLEnv(EnvBase):
         scene, reward, num_steps, prior, slots, action_mode, max_action, workers, prompt, guidance: as for
             ``DenoisingEnv``.
 
-    >>> from agents.prior import tiny_prior
+    >>> from agents.priors.testing import tiny_prior
     >>> env = DenoisingTorchRLEnv(2, prior=tiny_prior(), reward="object_count", num_steps=3)
     >>> env.rollout(3)["next", "terminated"].squeeze(-1).tolist()
     [[False, False, True], [False, False, True]]
@@ -132,7 +132,7 @@ class DenoisingTorchRLEnv(EnvBase):
             policy: ``(x_t (B, N, D), step) -> action (B, N, D)``. Called without gradients.
             prompts: one per episode, in place of drawn ones; an environment made without ``prompt`` ignores them.
 
-        >>> from agents.prior import tiny_prior
+        >>> from agents.priors.testing import tiny_prior
         >>> prior = tiny_prior()
         >>> env = DenoisingTorchRLEnv(2, prior=prior, reward="object_count", num_steps=3, action_mode="noise")
         >>> trajectories = env.collect(lambda x, step: torch.randn_like(x))

@@ -41,7 +41,7 @@ class EnvPrompts:
         InvalidInputError: a prompt for a prior that reads none, guidance without a prompt, or a prompt that cannot be
             followed.
 
-    >>> from agents.prior import tiny_prior
+    >>> from agents.priors.testing import tiny_prior
     >>> prompts = EnvPrompts(tiny_prior(process="mixed", text=True), ["A scene with two cups.", "A scene."], 0.0, 34)
     >>> prompts.draw(np.random.default_rng(0))
     'A scene.'

@@ -52,7 +52,7 @@ class StepTableLike(Protocol):
 
 @runtime_checkable
 class PriorLike(Protocol):
-    """A trained denoiser with its schedule, layout and normalizer; see ``agents.prior.ScenePrior``.
+    """A trained denoiser with its schedule, layout and normalizer; see ``agents.priors.base.ScenePrior``.
 
     All tensors are normalised scenes x (B, N, D).
     """
@@ -112,7 +112,7 @@ class EncodedPriorLike(PriorLike, Protocol):
 
 
 class PromptedPriorLike(PriorLike, Protocol):
-    """A prior whose ``conditional`` is True: it reads prompts; see ``agents.prompt_reading.PromptReader``."""
+    """A prior whose ``conditional`` is True: it reads prompts; see ``agents.priors.text.PromptReader``."""
 
     @property
     def prompt_space(self) -> tuple[int, int]:
@@ -160,5 +160,5 @@ def reward_context(**fields: Any) -> Any:
 def resolve_prior(prior: Any) -> PriorLike:
     """A prior from a name, a path or a prior (loads the ``agents`` package)."""
     if isinstance(prior, str):
-        return import_module("agents.prior").ScenePrior.load(prior)  # type: ignore[no-any-return]
+        return import_module("agents.priors.base").ScenePrior.load(prior)  # type: ignore[no-any-return]
     return prior  # type: ignore[no-any-return]

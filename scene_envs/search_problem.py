@@ -34,7 +34,7 @@ class SearchProblem:
         evaluations: denoiser evaluations (NFE) spent so far, ``num_steps`` per generated scene and twice that many with
             guidance.
 
-    >>> from agents.prior import tiny_prior
+    >>> from agents.priors.testing import tiny_prior
     >>> problem = SearchProblem(prior=tiny_prior(), objective="object_count", num_steps=2, max_depth=1)
     >>> root = problem.root(seed=0)
     >>> children = problem.expand_batch([(root, action) for action in problem.legal_actions(root)])

@@ -64,3 +64,12 @@ def loss_weights(
     snr = alpha_bar / (1.0 - alpha_bar)
     over = {"epsilon": snr, "v": snr + 1.0, "x0": torch.ones_like(snr)}[prediction]
     return (snr.clamp(max=gamma) / over).float().to(t.device)
+
+
+def timestep_law(timesteps: str | None, prediction: str) -> str:
+    """The law of training timesteps: the given one, or that which was published with ``prediction``.
+
+    >>> timestep_law(None, "epsilon"), timestep_law(None, "karras"), timestep_law("lognormal", "v")
+    ('uniform', 'lognormal', 'lognormal')
+    """
+    return timesteps or ("lognormal" if prediction == "karras" else "uniform")

@@ -3,7 +3,6 @@
 from agents.evaluation.classifier import classifier_accuracy
 from agents.evaluation.frechet import frechet_scene_distance
 from agents.evaluation.inception import frechet_inception_distance
-from agents.evaluation.judging import Accuracy, JudgeConfig
 from agents.evaluation.measure import evaluate_prior, grammar_scenes, layout_figures, measure_samples
 from agents.evaluation.metrics import (
     category_distribution,
@@ -25,6 +24,7 @@ from agents.evaluation.prompt_following import own_prompts, prompt_chance, promp
 from agents.evaluation.render_classifier import render_classifier_accuracy
 from agents.evaluation.report import figure_table, how_to_read
 from agents.evaluation.supports import CONTAINERS, SUPPORTS, Container, Support
+from agents.evaluation.two_sample_test import Accuracy, JudgeConfig
 
 __all__ = [
     "CONTAINERS",

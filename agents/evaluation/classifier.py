@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from agents.evaluation.judging import FEWEST, Accuracy, Forward, JudgeConfig, Split, check_classes, judge
 from agents.evaluation.scene_tokens import (
     NEIGHBOUR_FEATURES,
     POSE_FEATURES,
@@ -17,6 +16,7 @@ from agents.evaluation.scene_tokens import (
     scene_tokens,
 )
 from agents.evaluation.set_network import SetNetwork, SetNetworkConfig
+from agents.evaluation.two_sample_test import FEWEST, Accuracy, Forward, JudgeConfig, Split, check_classes, judge
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 

@@ -27,7 +27,7 @@ FLOOR_PREFIX = "floor_"
 
 
 class Sampler(Protocol):
-    """What :func:`evaluate_prior` needs of a prior; ``agents.prior.ScenePrior`` has it."""
+    """What :func:`evaluate_prior` needs of a prior; ``agents.priors.base.ScenePrior`` has it."""
 
     @property
     def scene_type(self) -> SceneType: ...
@@ -153,6 +153,6 @@ def layout_figures(batch: SceneBatch, reference: SceneBatch) -> dict[str, float]
 def _load(prior: Sampler | str) -> Sampler:
     if not isinstance(prior, str):
         return prior
-    from agents.prior import ScenePrior
+    from agents.priors.base import ScenePrior
 
     return ScenePrior.load(prior)

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from agents.evaluation.judging import Accuracy, Forward, JudgeConfig, Split, check_classes, judge
+from agents.evaluation.two_sample_test import Accuracy, Forward, JudgeConfig, Split, check_classes, judge
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 

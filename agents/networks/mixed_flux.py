@@ -16,13 +16,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from agents.networks.contacts import CHANNELS, Contacts, gated_displacement
+from agents.networks.count_conditioning import Requests
+from agents.networks.count_embedding import Tally
 from agents.networks.flux import timestep_embedding
 from agents.networks.flux_blocks import DoubleStreamBlock, SingleStreamBlock
 from agents.networks.mixed_flux_config import POSE, MixedFluxConfig
 from agents.networks.relations import FEATURES, Relations
-from agents.networks.requests import Requests
 from agents.networks.rotation_features import ROTATION_FEATURES, gated_rotation, nearest_rotations, rotation_features
-from agents.networks.tally import Tally
 from scene_envs.errors import InvalidInputError
 
 _TIME_WIDTH = 256

@@ -38,7 +38,8 @@ class MixedFluxConfig:
         text_reach: how far text goes: to the ``"double"``-stream blocks, or through ``"all"`` blocks, as the paper's.
         pooled_text: 1 to add the mean of the text tokens to the embedded time, which modulates every block (as Flux
             does with a pooled embedding), 0 as the paper.
-        tally: 1 to add what is counted in the scene as well (:class:`~agents.networks.tally.Tally`), 0 as the paper.
+        tally: 1 to add what is counted in the scene as well (:class:`~agents.networks.count_embedding.Tally`), 0 as
+            the paper.
         rotation_features: 1 to tell how far each rotation is off SO(3) and off upright in units of the noise
             (:func:`~agents.networks.rotation_features.rotation_features`), 0 as the paper.
         contacts: 1 for displacements along the gaps between objects (:class:`~agents.networks.contacts.Contacts`),
@@ -46,8 +47,8 @@ class MixedFluxConfig:
         rotations: what the nine normalised numbers of a rotation are multiplied by, and what is then added, to be that
             of an object, which ``rotation_features`` and ``contacts`` need.
         requests: where the first text tokens say what is asked of each kind of object, and last of all objects, and
-            that joins the logits (:class:`~agents.networks.requests.Requests`): the largest number told apart; 0 where
-            not, as the paper.
+            that joins the logits (:class:`~agents.networks.count_conditioning.Requests`): the largest number told
+            apart; 0 where not, as the paper.
         kinds: (K - 1,) the kind of each category, as prompts call it; empty where each is one of its own.
     """
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.steering import steer
-from agents.prior import ScenePrior
+from agents.priors.base import ScenePrior
 
 RECIPE = PostTrainConfig(
     prior="dimsum_table_continuous",

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Generator, Tensor, nn
 
-from agents.mixed_prior import MixedPrior
 from agents.post_training.losses import DDPOSFLoss
 from agents.post_training.rollouts import Rollout
-from agents.prior import ScenePrior
+from agents.priors.base import ScenePrior
+from agents.priors.mixed import MixedPrior
 from scene_envs.errors import InvalidInputError
 
 

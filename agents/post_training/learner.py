@@ -8,8 +8,6 @@ from typing import Any
 import torch
 from torch import Generator, Tensor, nn
 
-from agents.averaging import WeightAverage
-from agents.mixed_prior import MixedPrior
 from agents.post_training.advantages import compute_advantages
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.gradients import (
@@ -23,8 +21,10 @@ from agents.post_training.policy import DenoisingPolicy, gradient_weights
 from agents.post_training.prompts import PromptDeck, prompt_groups
 from agents.post_training.real_scenes import RealScenes
 from agents.post_training.rollouts import Rollout, collect, stream_seed
-from agents.prior import ScenePrior
-from agents.prompt_room import no_text
+from agents.priors.base import ScenePrior
+from agents.priors.mixed import MixedPrior
+from agents.priors.prompt_validation import no_text
+from agents.utils.weight_average import WeightAverage
 from scene_envs.denoising_torchrl import DenoisingTorchRLEnv
 
 

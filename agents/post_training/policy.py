@@ -30,7 +30,7 @@ class DenoisingPolicy(TensorDictModuleBase):
         chunk: scenes denoised at once, in sampling and in log-probabilities alike; None takes all.
         guidance: w of classifier-free guidance; the guided chain is the policy then.
 
-    >>> from agents.prior import tiny_prior
+    >>> from agents.priors.testing import tiny_prior
     >>> from scene_envs.denoising_torchrl import DenoisingTorchRLEnv
     >>> prior = tiny_prior()
     >>> env = DenoisingTorchRLEnv(2, prior=prior, num_steps=4)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Generator, Tensor
 
-from agents.prior import ScenePrior
+from agents.priors.base import ScenePrior
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.env_prompts import PROMPT_SOURCES, grammar_prompts
 from scene_envs.errors import InvalidInputError

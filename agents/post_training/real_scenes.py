@@ -10,7 +10,7 @@ import torch
 from torch import Generator, Tensor
 
 from agents.post_training.prompts import PromptSets
-from agents.prior import ScenePrior
+from agents.priors.base import ScenePrior
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 

@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from agents.checkpoints import load_checkpoint
 from agents.post_training.config import RESUMABLE, PostTrainConfig
+from agents.utils.checkpoints import load_checkpoint
 from scene_envs.errors import InvalidInputError, TrainingError
 
 CHECKPOINT_NAME = "checkpoint.pt"

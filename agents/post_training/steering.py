@@ -15,7 +15,7 @@ from agents.post_training.prompts import PromptDeck, prompts_beside
 from agents.post_training.rollouts import stream_seed
 from agents.post_training.run_files import SCENES_NAME
 from agents.post_training.trainer import post_train
-from agents.prior import ScenePrior
+from agents.priors.base import ScenePrior
 from rewards import reward_name
 from scene_envs.scene import SceneBatch
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import torch
 
-from agents.checkpoints import save_checkpoint
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.curves import draw_curve
 from agents.post_training.guard import Guard, realism
@@ -26,8 +25,9 @@ from agents.post_training.run_files import (
     write_log,
     write_metrics,
 )
-from agents.prior import ScenePrior
-from agents.prompt_room import check_room
+from agents.priors.base import ScenePrior
+from agents.priors.prompt_validation import check_room
+from agents.utils.checkpoints import save_checkpoint
 from rewards import reward_name
 from scene_envs.errors import TrainingError
 from scene_envs.scene import SceneBatch
@@ -63,7 +63,7 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> P
         InvalidInputError: a setting is wrong, or the directory holds a run of another configuration.
 
     >>> from tempfile import TemporaryDirectory
-    >>> from agents.prior import tiny_prior
+    >>> from agents.priors.testing import tiny_prior
     >>> with TemporaryDirectory() as output:
     ...     config = PostTrainConfig(output=output, iterations=2, batch_size=4, num_steps=4, gradient_steps=2,
     ...         bank_size=20, guard_scenes=8, regularisation_batch=4, progress="none")

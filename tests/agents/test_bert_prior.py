@@ -11,22 +11,21 @@ import numpy as np
 import pytest
 import torch
 
-from agents.checkpoint_import import import_checkpoint
-from agents.mixed_prior import MixedPrior
-from agents.model_card import PriorFacts, ship_prior
 from agents.networks.bert_files import FOLDER_VARIABLE, load_bert
-from agents.new_prior import build_prior
-from agents.pretrain_config import PretrainConfig
-from agents.pretraining import pretrain
-from agents.prior import ScenePrior
+from agents.pretraining.config import PretrainConfig
+from agents.pretraining.initial_prior import build_prior
+from agents.pretraining.trainer import pretrain
+from agents.priors.base import ScenePrior
+from agents.priors.card import PriorFacts, ship_prior
+from agents.priors.checkpoint_import import import_checkpoint
+from agents.priors.mixed import MixedPrior
 from scene_envs.datasets import SceneDataset
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.grammars import get_grammar
 from scene_envs.normalizer import Normalizer
-from tests.agents.authors_flux import random_state
+from tests.agents.authors_flux import random_state, write_checkpoint
 from tests.agents.small_bert import write_bert
-from tests.agents.test_checkpoint_import import write_checkpoint
 
 pytest.importorskip("transformers")
 

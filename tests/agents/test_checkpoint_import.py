@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from agents.checkpoint_import import import_checkpoint
-from agents.lightning_files import read_lightning
-from agents.prior import ScenePrior
+from agents.priors.base import ScenePrior
+from agents.priors.checkpoint_import import import_checkpoint
+from agents.priors.lightning_files import read_lightning
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, UnknownNameError
 from tests.agents.authors_flux import DIMSUM, forward, random_state, write_checkpoint
 

@@ -24,9 +24,10 @@ from agents.diffusion import (
     loss_weights,
     make_schedule,
 )
-from agents.mixed_prior import MixedPrior
 from agents.post_training import DenoisingPolicy
-from agents.prior import ScenePrior, tiny_prior
+from agents.priors.base import ScenePrior
+from agents.priors.mixed import MixedPrior
+from agents.priors.testing import tiny_prior
 from scene_envs.denoising import DenoisingCore
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.grammars import get_grammar

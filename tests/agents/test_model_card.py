@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from agents.cli import main
-from agents.model_card import OWN_LICENSE, PriorFacts, read_measures, ship_prior
-from agents.prior import ScenePrior, tiny_prior
+from agents.priors.base import ScenePrior
+from agents.priors.card import OWN_LICENSE, PriorFacts, read_measures, ship_prior
+from agents.priors.testing import tiny_prior
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
 
 FIGURES = {

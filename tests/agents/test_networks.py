@@ -29,8 +29,8 @@ from agents.networks import (
     network_config,
     parameter_count,
 )
-from agents.networks.requests import Requests, still_to_come
-from agents.networks.tally import count_states
+from agents.networks.count_conditioning import Requests, still_to_come
+from agents.networks.count_embedding import count_states
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 FEATURES, CATEGORIES, TEXT = 20, 8, 12

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from agents.mixed_prior import MixedPrior
-from agents.new_prior import build_prior
-from agents.pretrain_config import PretrainConfig
-from agents.reading import learn_counts
-from agents.training_data import SceneTable
+from agents.pretraining.config import PretrainConfig
+from agents.pretraining.data import SceneTable
+from agents.pretraining.initial_prior import build_prior
+from agents.pretraining.text_warmup import learn_counts
+from agents.priors.mixed import MixedPrior
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.grammars import get_grammar
 from scene_envs.normalizer import Normalizer

@@ -15,7 +15,8 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from torchrl.envs.utils import check_env_specs
 
 import scene_envs.env_spaces as env_spaces
-from agents.prior import ScenePrior, tiny_prior
+from agents.priors.base import ScenePrior
+from agents.priors.testing import tiny_prior
 from scene_envs.datasets.prompts import parse_prompt
 from scene_envs.denoising_torchrl import DenoisingTorchRLEnv
 from scene_envs.env_prompts import grammar_prompts

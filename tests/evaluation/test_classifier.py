@@ -8,9 +8,9 @@ import torch
 
 from agents.evaluation import grammar_scenes
 from agents.evaluation.classifier import classifier_accuracy
-from agents.evaluation.judging import Accuracy, JudgeConfig
 from agents.evaluation.scene_tokens import blurred, scene_tokens
 from agents.evaluation.set_network import SetNetwork, SetNetworkConfig
+from agents.evaluation.two_sample_test import Accuracy, JudgeConfig
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 

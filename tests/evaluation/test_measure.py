@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from agents.evaluation import evaluate_prior, figure_table, grammar_scenes, measure_samples, stable_fraction
-from agents.prior import tiny_prior
+from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.physics import feasibility
 from scene_envs.scene import SceneBatch

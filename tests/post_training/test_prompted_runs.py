@@ -9,12 +9,13 @@ import torch
 from small_runs import count_objects, small_config
 from torch import Generator
 
-from agents.mixed_prior import MixedPrior
 from agents.post_training import DDPOSFLoss, DenoisingPolicy, PostTrainer, compute_advantages, post_train, steer
 from agents.post_training.doctor import diagnose
 from agents.post_training.prompts import PromptDeck, prompt_groups
 from agents.post_training.rollouts import collect
-from agents.prior import ScenePrior, tiny_prior
+from agents.priors.base import ScenePrior
+from agents.priors.mixed import MixedPrior
+from agents.priors.testing import tiny_prior
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.datasets import SceneDataset, generate
 from scene_envs.datasets.prompts import parse_prompt, scene_facts

@@ -1,0 +1,1 @@
+"""Pretraining of scene priors on datasets or on a grammar."""

@@ -1,0 +1,1 @@
+"""Scene priors: trained denoisers that sample, complete and rearrange scenes."""
