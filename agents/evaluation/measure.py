@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from agents.evaluation.metrics import (
 from agents.evaluation.novelty import duplicates
 from agents.evaluation.physics_figures import physics_figures, ready_figures
 from scene_envs.errors import InvalidInputError
+from scene_envs.protocols import resolve_prior
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
 
@@ -153,6 +154,4 @@ def layout_figures(batch: SceneBatch, reference: SceneBatch) -> dict[str, float]
 def _load(prior: Sampler | str) -> Sampler:
     if not isinstance(prior, str):
         return prior
-    from agents.priors.base import ScenePrior
-
-    return ScenePrior.load(prior)
+    return cast(Sampler, resolve_prior(prior))

@@ -16,7 +16,7 @@ from agents.networks.bert import BertEncoder
 from agents.networks.denoiser import autocast
 from agents.networks.mixed_flux_config import POSE
 from agents.networks.packing import run_packed, take_slots
-from agents.networks.text import TextEncoder
+from agents.networks.text import Text, TextEncoder
 from scene_envs.errors import InvalidInputError, unknown_name
 
 EMPTY_SLOTS = ("attended", "dropped")
@@ -24,9 +24,6 @@ EMPTY_SLOTS = ("attended", "dropped")
 
 _CERTAIN = 30.0
 """How far, in nats, other categories are behind one that is known."""
-
-Text = tuple[Tensor, Tensor]
-"""Tokens (B, L, W) and their mask (B, L)."""
 
 
 @dataclass(frozen=True)

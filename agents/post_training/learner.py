@@ -19,10 +19,9 @@ from agents.post_training.gradients import (
 from agents.post_training.losses import DDPOSFLoss
 from agents.post_training.policy import DenoisingPolicy, gradient_weights
 from agents.post_training.prompts import PromptDeck, prompt_groups
-from agents.post_training.real_scenes import RealScenes
 from agents.post_training.rollouts import Rollout, collect, stream_seed
+from agents.post_training.scene_bank import SceneBank
 from agents.priors.base import ScenePrior
-from agents.priors.mixed import MixedPrior
 from agents.priors.prompt_validation import no_text
 from agents.utils.weight_average import WeightAverage
 from scene_envs.denoising_torchrl import DenoisingTorchRLEnv
@@ -49,8 +48,7 @@ class Learner:
         self.prior = deepcopy(prior).to(config.device).eval()
         if config.prompt is not None and not self.prior.conditional:
             raise no_text(self.prior.scene_type, config.prompt)
-        if isinstance(self.prior, MixedPrior):
-            self.prior.freeze_text()
+        self.prior.freeze_text()
         self.slots = self.prior.config.slots if config.slots is None else config.slots
         self.policy = DenoisingPolicy(self.prior, config.num_steps, chunk=config.chunk, guidance=config.guidance)
         self.stds = self.policy.stds(self.slots).cpu()
@@ -81,7 +79,7 @@ class Learner:
         """Stop physics workers, if any."""
         self.env.close()
 
-    def deal_prompts(self, scenes: RealScenes) -> None:
+    def deal_prompts(self, scenes: SceneBank) -> None:
         """Make the deck from which the prompts of batches come; nothing without prompts."""
         config = self.config
         if config.prompt is not None and scenes.prompts is not None:
@@ -103,7 +101,7 @@ class Learner:
         groups = None if rollout.prompts is None else prompt_groups(rollout.prompts).to(reward.device)
         return compute_advantages(reward, valid, baseline=config.baseline, clip=config.advantage_clip, groups=groups)
 
-    def accumulate(self, rollout: Rollout, advantage: Tensor, scenes: RealScenes, index: int) -> dict[str, float]:
+    def accumulate(self, rollout: Rollout, advantage: Tensor, scenes: SceneBank, index: int) -> dict[str, float]:
         """Put both gradients into ``.grad`` and measure them apart.
 
         Args:
@@ -131,7 +129,7 @@ class Learner:
             "clip_fraction": policy.clip_fraction,
         }
 
-    def update(self, rollout: Rollout, advantage: Tensor, scenes: RealScenes, index: int) -> dict[str, float]:
+    def update(self, rollout: Rollout, advantage: Tensor, scenes: SceneBank, index: int) -> dict[str, float]:
         """One optimiser step.
 
         Raises:

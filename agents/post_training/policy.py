@@ -10,11 +10,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Generator, Tensor
 
 from agents.diffusion import ReverseStep, concatenate_steps
+from agents.networks.text import Text
 from scene_envs.errors import InvalidInputError
 from scene_envs.protocols import PriorLike, PromptedPriorLike, StepTableLike
-
-Text = tuple[Tensor, Tensor]
-"""What a network attends to: tokens (B, L, W) and their mask (B, L)."""
 
 
 class DenoisingPolicy(TensorDictModuleBase):

@@ -10,7 +10,8 @@ import torch
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
-from agents.post_training.policy import DenoisingPolicy, Text
+from agents.networks.text import Text
+from agents.post_training.policy import DenoisingPolicy
 from scene_envs.denoising_torchrl import DenoisingTorchRLEnv
 from scene_envs.errors import TrainingError
 from scene_envs.scene import SceneBatch

@@ -15,7 +15,6 @@ from agents.post_training.guard import Guard, realism
 from agents.post_training.learner import Learner, NonFiniteGradient, is_finite
 from agents.post_training.progress import Progress
 from agents.post_training.prompts import PROMPTS_NAME, PromptSets, prompts_beside, save_prompts
-from agents.post_training.real_scenes import RealScenes, real_scenes
 from agents.post_training.rollouts import Rollout, stream_seed
 from agents.post_training.run_files import (
     CHECKPOINT_NAME,
@@ -25,6 +24,7 @@ from agents.post_training.run_files import (
     write_log,
     write_metrics,
 )
+from agents.post_training.scene_bank import SceneBank, real_scenes
 from agents.priors.base import ScenePrior
 from agents.priors.prompt_validation import check_room
 from agents.utils.checkpoints import save_checkpoint
@@ -87,7 +87,7 @@ class PostTrainer:
     """
 
     guard: Guard
-    scenes: RealScenes
+    scenes: SceneBank
 
     def __init__(self, config: PostTrainConfig, *, prior: ScenePrior | None = None) -> None:
         self.config = config
@@ -152,7 +152,7 @@ class PostTrainer:
                 large = torch.nonzero(batch.counts > self.learner.slots)[:, 0].tolist()
                 check_room([text for i in large for text in prompts(i)], self.prior.scene_type, self.learner.slots)
         x0 = self.prior.encode(batch.to(config.device))
-        self.scenes = RealScenes.split(x0, config.guard_scenes, prompts)
+        self.scenes = SceneBank.split(x0, config.guard_scenes, prompts)
         asked = self.scenes.heldout_prompts()
         self.guard = Guard(self.scenes.heldout, config.guard_limit, stream_seed(config.seed, "guard"), asked)
         self.learner.deal_prompts(self.scenes)

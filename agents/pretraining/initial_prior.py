@@ -12,15 +12,13 @@ from torch import Tensor
 from agents.diffusion import CategoryMoments, Preconditioning
 from agents.networks import MixedFluxConfig, TextConfig
 from agents.networks.registry import NetworkConfig, network_config
-from agents.networks.text import TextEncoder, warn_unknown
 from agents.networks.text_encoders import VOCABULARY, AnyTextConfig, text_config
 from agents.pretraining.config import PretrainConfig
 from agents.priors.base import ScenePrior
-from agents.priors.config import MixedPriorConfig, PriorConfig
+from agents.priors.config import PROCESSES, MixedPriorConfig, PriorConfig
 from agents.priors.continuous import ContinuousPrior
 from agents.priors.mixed import MixedPrior
 from agents.priors.rotation_codes import SceneCode
-from agents.priors.storage import PROCESSES
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import POSE
@@ -73,9 +71,7 @@ def _started(config: PretrainConfig, raw: Tensor, prompts: Sequence[Sequence[str
         wrong = ", ".join(f"{n} {f!r}, not {a!r}" for n, f, a in zip(names, found, asked, strict=True) if f != a)
         raise InvalidInputError(f"the prior {config.prior!r} cannot be trained further on this data: it has {wrong}")
     _check_constants(prior, raw[:FITTED_ON, len(prior.scene_type.fixed) :], config.prior)
-    encoder = prior.denoiser.text_encoder if isinstance(prior, MixedPrior) else None
-    if isinstance(encoder, TextEncoder):
-        warn_unknown(encoder.unknown_words(prompt for group in prompts for prompt in group))
+    prior.warn_unknown_words(prompt for group in prompts for prompt in group)
     return prior
 
 

@@ -9,10 +9,9 @@ import numpy as np
 import torch
 from torch import Generator, nn
 
-from agents.networks.mixed_flux import MixedFlux
 from agents.networks.mixed_flux_config import POSE
 from agents.pretraining.data import TrainingData
-from agents.priors.mixed import MixedPrior
+from agents.priors.base import ScenePrior
 
 logger = logging.getLogger(__name__)
 
@@ -20,7 +19,7 @@ _RATE, _RISE = 3e-3, 0.2
 """Peak learning rate, and the share of the steps in which it rises."""
 
 
-def learn_counts(prior: MixedPrior, data: TrainingData, steps: int, batch_size: int, seed: int) -> float | None:
+def learn_counts(prior: ScenePrior, data: TrainingData, steps: int, batch_size: int, seed: int) -> float | None:
     """Train the text encoder, and what reads numbers from it, on prompts and the counts of their scenes alone.
 
     No scene is denoised, so that hundreds of such steps take a minute, and the run that follows starts with numbers it
@@ -36,11 +35,10 @@ def learn_counts(prior: MixedPrior, data: TrainingData, steps: int, batch_size: 
     Returns:
         Mean loss of the last tenth of the steps, in nats per kind of object; None where there was nothing to learn.
     """
-    network, encoder = prior.denoiser.network, prior.denoiser.text_encoder
-    if not isinstance(network, MixedFlux) or network.requests is None or encoder is None or steps < 1:
+    requests = prior.count_conditioning
+    if requests is None or steps < 1:
         return None
-    requests = network.requests
-    parameters = [*encoder.parameters(), *requests.counts_out.parameters()]
+    parameters = [*prior.denoiser.text_encoder.parameters(), *requests.counts_out.parameters()]
     optimizer = torch.optim.AdamW(parameters, lr=_RATE, weight_decay=0.01)
     losses = []
     for step in range(steps):

@@ -23,7 +23,6 @@ from agents.pretraining.optimizers import build_optimizer
 from agents.pretraining.setup import prepare
 from agents.pretraining.text_warmup import learn_counts
 from agents.priors.base import ScenePrior
-from agents.priors.mixed import MixedPrior
 from agents.utils.checkpoints import load_checkpoint, save_checkpoint
 from agents.utils.process_group import World
 from agents.utils.weight_average import Averaged, WeightAverage
@@ -104,8 +103,8 @@ class Pretrainer:
         self.directory.mkdir(parents=True, exist_ok=True)
         if self.checkpoint_path.exists():
             self._load()
-        elif not self.config.prior and isinstance(self.prior, MixedPrior):
-            self._learn_to_read(self.prior)
+        elif not self.config.prior:
+            self._warm_up_text()
         if self.config.compile:
             self.prior.denoiser.network.compile()
         for row in self._steps():
@@ -118,10 +117,10 @@ class Pretrainer:
         self.prior.denoiser.precision = torch.float32
         return self.save_prior()
 
-    def _learn_to_read(self, prior: MixedPrior) -> None:
+    def _warm_up_text(self) -> None:
         """Every process learns the same, and begins with the weights of the first."""
         steps = min(self.config.text_warmup, self.config.iterations)
-        if learn_counts(prior, self.data, steps, self.config.batch_size, self.config.seed) is not None:
+        if learn_counts(self.prior, self.data, steps, self.config.batch_size, self.config.seed) is not None:
             self.world.share(self.network.parameters())
             self.average = WeightAverage(self.network, self.config.ema)
 
@@ -175,7 +174,7 @@ class Pretrainer:
         reads = self.prior.conditional
         scenes, prompts = self.data.draw(count, generator, prompts=reads)
         x0 = scenes.to(self.config.device)
-        if not reads or not isinstance(self.prior, MixedPrior):
+        if not reads:
             return self.prior.pretraining_loss(x0, generator)
         choice = torch.rand(2, count, generator=generator).tolist()
         texts = [

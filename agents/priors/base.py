@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,34 +19,46 @@ from agents.diffusion import (
     ReverseStep,
     StepTable,
 )
-from agents.priors.inpainting import inpaint
-from agents.priors.prompt_validation import check_prompts
-from agents.priors.storage import load_prior, save_prior
-from scene_envs.errors import InvalidInputError
+from agents.networks.count_conditioning import Requests
+from agents.networks.text import Text
+from agents.priors.inpainting import Inpainting
+from agents.priors.prompt_validation import check_prompts, no_text
+from agents.priors.storage import StoredPrior, explained, read_stored, write_stored
+from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
 from scene_envs.scene import TRANSLATION, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
+_CLASSES: dict[str, type[ScenePrior]] = {}
+"""Classes of priors by the name of their process."""
 
-class ScenePrior(nn.Module, ABC):
+
+class ScenePrior(Inpainting, nn.Module, ABC):
     """A trained denoiser with its schedule, layout and normalizer. Tensors x are normalised scenes (B, N, D).
 
     Fixed welded objects and constant features are *known*: clamped to their values while sampling and left
     out of the loss and of every log-probability. The two kinds are
     :class:`~agents.priors.continuous.ContinuousPrior` and :class:`~agents.priors.mixed.MixedPrior`.
 
+    >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior("dimsum_table")
     >>> prior.sample(2, num_steps=3, seed=0)
     SceneBatch('dimsum_table', (2, 34, 20))
     """
 
     process_name = ""
+    """Name of the process in configuration files; a subclass that sets it can be loaded by :meth:`load`."""
     denoiser: Any
     """The network inside its process, a module with ``.network``."""
     process: GaussianProcess
     """The process of what is continuous."""
     _timestep_weights: Tensor
+
+    def __init_subclass__(cls, **settings: Any) -> None:
+        super().__init_subclass__(**settings)
+        if cls.process_name:
+            _CLASSES[cls.process_name] = cls
 
     def _keep(
         self,
@@ -67,11 +79,6 @@ class ScenePrior(nn.Module, ABC):
         fixed = SceneBatch.empty(self.scene_type, 1, len(self.scene_type.fixed) or 1)
         self.register_buffer("_fixed", self.normalised(fixed)[0], persistent=False)
 
-    @property
-    def conditional(self) -> bool:
-        """Whether the prior reads prompts."""
-        return False
-
     def config_state(self) -> dict[str, Any]:
         """The ``prior`` entry of the configuration file."""
         return asdict(self.config)
@@ -80,6 +87,27 @@ class ScenePrior(nn.Module, ABC):
     def device(self) -> torch.device:
         """Where the prior computes."""
         return self._fixed.device
+
+    # -- text -----------------------------------------------------------------------------------
+
+    def encode_prompts(self, prompts: Sequence[str]) -> Text:
+        """Tokens (B, L, W) and mask (B, L) of prompts.
+
+        Raises:
+            InvalidInputError: the prior reads no prompts, or one is too long.
+        """
+        raise no_text(self.scene_type, next(iter(prompts), ""))
+
+    def warn_unknown_words(self, prompts: Iterable[str]) -> None:
+        """Warn of words in ``prompts`` that the prior cannot read; does nothing for a prior without prompts."""
+
+    def freeze_text(self) -> None:
+        """Keep the text encoder, if there is one, as it is in any training that follows."""
+
+    @property
+    def count_conditioning(self) -> Requests | None:
+        """The part of the network that is told how many objects a prompt asks for; None where there is none."""
+        return None
 
     # -- files ----------------------------------------------------------------------------------
 
@@ -96,16 +124,23 @@ class ScenePrior(nn.Module, ABC):
         """From the ``prior`` entry of a configuration file."""
 
     @classmethod
-    @abstractmethod
-    def tiny(cls, scene_type: SceneType, slots: int, normalizer: Normalizer, text: bool = False) -> ScenePrior:
-        """A very small prior with fresh weights; with ``text``, one that reads prompts."""
-
-    @classmethod
     def load(cls, name: str | os.PathLike[str] | ScenePrior) -> ScenePrior:
-        """A shipped prior by name, or one from a prior or run directory; in evaluation mode."""
+        """A shipped prior by name, or one from a prior or run directory; in evaluation mode.
+
+        Raises:
+            UnknownNameError: no shipped prior has that name.
+            CorruptFileError: its files are not those of a prior, or do not fit each other.
+        """
         if isinstance(name, ScenePrior):
             return name
-        return load_prior(name)
+        stored = read_stored(name)
+        with explained(name):
+            kind = prior_class(stored.process)
+            prior = kind.from_state(
+                stored.fields, stored.normalizer, stored.preconditioning, stored.card, stored.residual
+            )
+            prior.load_weights(stored.tensors)
+        return prior.eval()
 
     def save(self, directory: str | os.PathLike[str], precision: str = "float32") -> Path:
         """Write ``config.json`` and ``model.safetensors`` into ``directory``.
@@ -114,7 +149,17 @@ class ScenePrior(nn.Module, ABC):
             directory: folder, made if need be.
             precision: of the weights in the file, ``"float32"`` or ``"float16"``; loaded weights are float32 again.
         """
-        return save_prior(self, directory, precision)
+        stored = StoredPrior(
+            self.process_name,
+            self.config_state(),
+            self.scene_type,
+            self.normalizer,
+            self.preconditioning,
+            self.card,
+            self.residual,
+            self.weights(),
+        )
+        return write_stored(directory, stored, precision)
 
     def weights(self) -> dict[str, Tensor]:
         """Trained tensors by name, as a prior's file holds them."""
@@ -167,19 +212,6 @@ class ScenePrior(nn.Module, ABC):
         :meth:`sample`.
         """
 
-    @abstractmethod
-    def regenerate(
-        self,
-        batch: SceneBatch,
-        mask: Tensor,
-        table: StepTable,
-        generators: Sequence[Generator],
-        resample: int,
-        prompts: Sequence[str] | None = None,
-        guidance: float = 0.0,
-    ) -> Tensor:
-        """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; used by :meth:`inpaint`."""
-
     @torch.no_grad()
     def sample_tensor(
         self,
@@ -226,7 +258,10 @@ class ScenePrior(nn.Module, ABC):
         """
         if count < 1:
             raise InvalidInputError(f"count={count}: ask for at least one scene")
-        prompts = check_prompts(self, prompt, guidance, count, self.config.slots if slots is None else slots)
+        wide = self.config.slots if slots is None else slots
+        prompts = check_prompts(
+            prompt, guidance, count, scene_type=self.scene_type, slots=wide, conditional=self.conditional
+        )
         generator = Generator(str(self._fixed.device)).manual_seed(seed)
         chunks, done = [], 0
         for size in _chunk_sizes(count, batch_size):
@@ -273,71 +308,6 @@ class ScenePrior(nn.Module, ABC):
         """(B, N, D) scenes as this process sees them, before known entries are clamped."""
         return batch.to_tensor(normalised=self.normalizer)
 
-    def inpaint(
-        self,
-        batch: SceneBatch,
-        mask: Tensor,
-        *,
-        prompt: str | Sequence[str] | None = None,
-        guidance: float = 0.0,
-        num_steps: int = 50,
-        generators: Sequence[Generator] | None = None,
-        seed: int = 0,
-        resample: int = 1,
-    ) -> SceneBatch:
-        """Regenerate what ``mask`` (B, N) or (B, N, 2) says; see :func:`agents.priors.inpainting.inpaint`."""
-        return inpaint(
-            self,
-            batch,
-            mask,
-            prompt=prompt,
-            guidance=guidance,
-            num_steps=num_steps,
-            generators=generators,
-            seed=seed,
-            resample=resample,
-        )
-
-    def complete(
-        self,
-        batch: SceneBatch,
-        *,
-        prompt: str | Sequence[str] | None = None,
-        guidance: float = 0.0,
-        slots: int | None = None,
-        num_steps: int = 50,
-        seed: int = 0,
-    ) -> SceneBatch:
-        """Fill the empty slots of ``batch``, keeping its objects.
-
-        Args:
-            batch: scenes.
-            prompt: what the completed scenes should hold, one text for all or one per scene; None for anything.
-            guidance: w of classifier-free guidance, as in :meth:`sample`.
-            slots: slots of the result, at least those of ``batch``; None keeps them.
-            num_steps: denoiser evaluations per scene.
-            seed: of the noise; scene i uses ``seed + i``.
-        """
-        wide = batch if slots is None else batch.with_slots(slots)
-        return self.inpaint(wide, wide.is_empty, prompt=prompt, guidance=guidance, num_steps=num_steps, seed=seed)
-
-    def rearrange(
-        self,
-        batch: SceneBatch,
-        *,
-        prompt: str | Sequence[str] | None = None,
-        guidance: float = 0.0,
-        num_steps: int = 50,
-        seed: int = 0,
-    ) -> SceneBatch:
-        """New poses for the free objects of ``batch``; what is there, and what is welded, stays.
-
-        Arguments as in :meth:`complete`.
-        """
-        free = batch.is_free
-        mask = torch.stack([free, torch.zeros_like(free)], dim=-1)
-        return self.inpaint(batch, mask, prompt=prompt, guidance=guidance, num_steps=num_steps, seed=seed)
-
     # -- the training loss ----------------------------------------------------------------------
 
     def draw_timesteps(self, count: int, generator: Generator | None = None) -> Tensor:
@@ -346,7 +316,12 @@ class ScenePrior(nn.Module, ABC):
 
     @abstractmethod
     def pretraining_loss(
-        self, x0: Tensor, generator: Generator | None = None, reduction: str = "mean", t: Tensor | None = None
+        self,
+        x0: Tensor,
+        generator: Generator | None = None,
+        reduction: str = "mean",
+        t: Tensor | None = None,
+        text: Text | None = None,
     ) -> Tensor:
         """The training loss of scenes ``x0`` (B, N, D) as :meth:`encode` gives them, on entries that are not known.
 
@@ -355,6 +330,7 @@ class ScenePrior(nn.Module, ABC):
             generator: source of timesteps and noise (CPU).
             reduction: ``"mean"`` over scenes, or ``"none"`` for (B,); always the mean over entries.
             t: (B,) timesteps, drawn when None.
+            text: tokens (B, L, W) and their mask (B, L), as :meth:`encode_prompts` gives them; None without prompts.
         """
 
     @abstractmethod
@@ -372,3 +348,10 @@ def _chunk_sizes(total: int, size: int) -> Iterator[int]:
     while total > 0:
         yield min(size, total)
         total -= size
+
+
+def prior_class(process: str) -> type[ScenePrior]:
+    """The class of priors of a process, ``"continuous"`` or ``"mixed"`` or that of a class of your own."""
+    if process not in _CLASSES:
+        raise unknown_name("process", process, _CLASSES)
+    return _CLASSES[process]

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from agents.networks.registry import ContinuousNetworkConfig, MixedNetworkConfig
 from agents.networks.text_encoders import AnyTextConfig
 
+PROCESSES = ("continuous", "mixed")
+"""Diffusion processes: categories as numbers, or as discrete states."""
+
 
 @dataclass(frozen=True)
 class PriorConfig:

@@ -21,18 +21,19 @@ from agents.diffusion import (
     timestep_weights,
 )
 from agents.diffusion.weighting import timestep_law
-from agents.networks import FluxConfig
 from agents.networks.denoiser import Denoiser
 from agents.networks.registry import build_network, config_from_state, config_state
+from agents.networks.text import Text
 from agents.priors.base import ScenePrior
 from agents.priors.config import PriorConfig
-from agents.priors.inpainting import chain_with_noised
+from agents.priors.inpainting import draw_noise
+from agents.priors.prompt_validation import no_text
 from agents.priors.rotation_codes import SceneCode
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import SceneType, get_scene_type
+from scene_envs.scene_types import get_scene_type
 
 SCENE_MOMENTS = ("feature", "scene")
 """Whose mean and standard deviation precondition the network of a continuous prior."""
@@ -116,15 +117,6 @@ class ContinuousPrior(ScenePrior):
         """The ``prior`` entry of the configuration file."""
         return {**asdict(self.config), "network": config_state(self.config.network)}
 
-    @classmethod
-    def tiny(cls, scene_type: SceneType, slots: int, normalizer: Normalizer, text: bool = False) -> ContinuousPrior:
-        """A very small prior with fresh weights."""
-        if text:
-            raise InvalidInputError("text=True needs process='mixed': the continuous prior reads no prompts")
-        features = scene_type.features
-        config = PriorConfig(scene_type.name, slots, FluxConfig(features=features, hidden=32, depth=2, heads=2))
-        return cls(config, normalizer, Preconditioning(torch.zeros(features), torch.full((features,), 0.5)))
-
     # -- scenes and numbers ---------------------------------------------------------------------
 
     @property
@@ -180,10 +172,30 @@ class ContinuousPrior(ScenePrior):
         x0 = self.encode(batch)
         widths = torch.tensor([self.code.pose_width, x0.shape[-1] - self.code.pose_width], device=mask.device)
         keep = ~mask.repeat_interleave(widths, dim=-1)
-        return chain_with_noised(self, x0, keep, table, generators, resample)
+        return self._chain_with_noised(x0, keep, table, generators, resample)
+
+    def _chain_with_noised(
+        self, x0: Tensor, keep: Tensor, table: StepTable, generators: Sequence[Generator], resample: int
+    ) -> Tensor:
+        """x_0 from a chain in which entries ``keep`` (B, N, D) of ``x0`` are put in with each level's noise."""
+        x = self.clamp(draw_noise(x0, generators))
+        for step in range(len(table)):
+            level, after = table.timesteps[step], int(table.previous[step])
+            for again in range(resample if after > 0 else 1):
+                if again:
+                    x = self.process.renoise(x, after, int(level), draw_noise(x0, generators))
+                noised = self.process.add_noise(x0, level, draw_noise(x0, generators))
+                x = self.clamp(torch.where(keep, noised, x))
+                x = self.transition(x, step, table).from_noise(draw_noise(x0, generators))
+        return torch.where(keep, x0, x)
 
     def pretraining_loss(
-        self, x0: Tensor, generator: Generator | None = None, reduction: str = "mean", t: Tensor | None = None
+        self,
+        x0: Tensor,
+        generator: Generator | None = None,
+        reduction: str = "mean",
+        t: Tensor | None = None,
+        text: Text | None = None,
     ) -> Tensor:
         """Weighted mean square of the network's error, over entries that are not known.
 
@@ -194,7 +206,10 @@ class ContinuousPrior(ScenePrior):
             generator: source of timesteps and noise (CPU).
             reduction: ``"mean"`` over scenes, or ``"none"`` for (B,); always the mean over entries.
             t: (B,) timesteps, drawn when None.
+            text: must be None: the prior reads no prompts.
         """
+        if text is not None:
+            raise no_text(self.scene_type, "")
         if t is None:
             t = self.draw_timesteps(x0.shape[0], generator).to(x0.device)
         noise = torch.randn(x0.shape, generator=generator).to(x0.device)

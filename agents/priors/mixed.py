@@ -28,28 +28,25 @@ from agents.diffusion import (
 )
 from agents.diffusion.reverse_steps import state_of
 from agents.diffusion.unmasking import UNMASKINGS
-from agents.networks.mixed_denoiser import Given, MixedDenoiser, Text
+from agents.networks.mixed_denoiser import Given, MixedDenoiser
 from agents.networks.mixed_flux_config import POSE, MixedFluxConfig
 from agents.networks.registry import build_network, config_from_state, config_state
-from agents.networks.text import TextConfig
+from agents.networks.text import Text
 from agents.networks.text_encoders import text_config_from_state, text_encoder
-from agents.priors.base import ScenePrior
 from agents.priors.config import MixedPriorConfig
-from agents.priors.mixed_loss import mixed_loss
-from agents.priors.text import PromptReader, prompt_words
+from agents.priors.inpainting import draw_noise
+from agents.priors.mixed_training import TrainableMixedPrior
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import SceneType, get_scene_type
+from scene_envs.scene_types import get_scene_type
 
 CATEGORY_LOSSES = ("cross_entropy", "bound")
 _TEXT = "text_encoder."
-_AT_ONCE = 32
-"""Scenes whose residual is measured at once: features of all pairs of slots of 512 rooms would be gigabytes."""
 
 
-class MixedPrior(PromptReader, ScenePrior):
+class MixedPrior(TrainableMixedPrior):
     """A :class:`~agents.priors.base.ScenePrior` whose categories are discrete.
 
     Args:
@@ -122,23 +119,6 @@ class MixedPrior(PromptReader, ScenePrior):
     def config_state(self) -> dict[str, Any]:
         """The ``prior`` entry of the configuration file."""
         return {**asdict(self.mixed), "network": config_state(self.mixed.network)}
-
-    @classmethod
-    def tiny(cls, scene_type: SceneType, slots: int, normalizer: Normalizer, text: bool = False) -> MixedPrior:
-        """A very small prior with fresh weights; with ``text``, one that reads prompts."""
-        reader = TextConfig(prompt_words(scene_type), width=16, depth=1, heads=2, latents=4) if text else None
-        network = MixedFluxConfig(
-            scene_type.num_assets + 1,
-            hidden=32,
-            double_blocks=1,
-            single_blocks=2,
-            heads=2,
-            embedding=32,
-            pose_head=16,
-            text_width=0 if reader is None else reader.width,
-        )
-        moments = Preconditioning(torch.zeros(POSE), torch.full((POSE,), 0.5))
-        return cls(MixedPriorConfig(scene_type.name, slots, network, text=reader), normalizer, moments)
 
     def weights(self) -> dict[str, Tensor]:
         """Tensors of the network, and those of the text encoder under ``text_encoder.``."""
@@ -336,48 +316,3 @@ class MixedPrior(PromptReader, ScenePrior):
         text = None if prompts is None else self.encode_prompts(prompts)
         start = self.initial(count, self.mixed.slots if slots is None else slots, generator)
         return self.run_chain(start, self.step_table(num_steps), generator, text=text, guidance=guidance, eta=eta)
-
-    # -- the training loss ----------------------------------------------------------------------
-
-    def pretraining_loss(
-        self, x0: Tensor, generator: Generator | None = None, reduction: str = "mean", t: Tensor | None = None,
-        text: Text | None = None,
-    ) -> Tensor:  # fmt: skip
-        """Mean square of the pose output plus ``category_weight`` times the category loss, on entries not given.
-
-        Args:
-            x0: (B, N, D) scenes as :meth:`encode` gives them.
-            generator: source of timesteps, noise and given entries (CPU).
-            reduction: ``"mean"`` over scenes, or ``"none"`` for (B,); always the mean over entries.
-            t: (B,) timesteps, drawn when None.
-            text: tokens and their mask.
-        """
-        per_scene = mixed_loss(self, x0, generator, t, text)
-        return per_scene.mean() if reduction == "mean" else per_scene
-
-    @torch.no_grad()
-    def fit_residual(self, x0: Tensor, levels: int = 40, seed: int = 0) -> ResidualVariance:
-        """Measure the error of the denoised pose on scenes ``x0`` (B, N, D) at ``levels`` timesteps, and keep it."""
-        generator = Generator().manual_seed(seed)
-        timesteps = StepTable.spaced(self.mixed.num_timesteps, levels).timesteps.flip(0)
-        present = (x0[..., POSE:].argmax(dim=-1) != self.num_categories - 1).float()
-        present[:, : len(self.scene_type.fixed)] = 0.0
-        rows = []
-        for t in timesteps:
-            noise = torch.randn(x0.shape, generator=generator).to(x0.device)
-            level = t.to(x0.device).expand(len(x0))
-            poses = [
-                self.denoiser(part, level[: len(part)], self.seen(part), self.unconditional(len(part)))[0]
-                for part in self.add_noise(x0, level, noise).split(_AT_ONCE)
-            ]
-            error = (torch.cat(poses) - x0[..., :POSE]).square() * present[..., None]
-            rows.append((error.sum(dim=(0, 1)) / present.sum()).cpu())
-        self.residual = ResidualVariance(timesteps, torch.stack(rows))
-        return self.residual
-
-
-def draw_noise(like: Tensor, noises: Sequence[Generator] | Generator | None) -> Tensor:
-    """Standard normal noise shaped as ``like`` (B, N, D), from one generator or one per scene."""
-    if noises is None or isinstance(noises, Generator):
-        return torch.randn(like.shape, generator=noises, device=like.device)
-    return torch.stack([torch.randn(like.shape[1:], generator=g) for g in noises]).to(like.device)

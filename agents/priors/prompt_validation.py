@@ -1,31 +1,30 @@
-"""Whether a prompt can be followed: by this prior, with this guidance, in a scene of this size."""
+"""Validation of prompts: whether a prior, with some guidance, can follow them in scenes of some size."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from scene_envs.datasets.prompts import parse_prompt
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene_types import SceneType
 
-if TYPE_CHECKING:
-    from agents.priors.base import ScenePrior
-
 Prompt = str | Sequence[str] | None
 """One text for all scenes, one per scene, or None for anything."""
 
 
-def check_prompts(prior: ScenePrior, prompt: Prompt, guidance: float, count: int, slots: int) -> list[str] | None:
+def check_prompts(
+    prompt: Prompt, guidance: float, count: int, *, scene_type: SceneType, slots: int, conditional: bool
+) -> list[str] | None:
     """One prompt per scene, or None for scenes without.
 
     Args:
-        prior: what is to follow them.
         prompt: one text for all scenes, one per scene, or None.
         guidance: w of classifier-free guidance.
         count: scenes.
+        scene_type: of the scenes.
         slots: slots per scene.
+        conditional: whether the prior reads prompts.
 
     Raises:
         InvalidInputError: a prior that reads no prompts, not one prompt per scene, guidance without a prompt, or more
@@ -39,10 +38,10 @@ def check_prompts(prior: ScenePrior, prompt: Prompt, guidance: float, count: int
     prompts = [prompt] * count if isinstance(prompt, str) else list(prompt)
     if len(prompts) != count:
         raise InvalidInputError(f"{len(prompts)} prompts for {count} scenes; give one text, or one per scene")
-    if not prior.conditional:
-        raise no_text(prior.scene_type, next(iter(prompts), ""))
+    if not conditional:
+        raise no_text(scene_type, next(iter(prompts), ""))
     check_guidance("".join(prompts), guidance)
-    check_room(prompts, prior.scene_type, slots)
+    check_room(prompts, scene_type, slots)
     return prompts
 
 

@@ -1,15 +1,15 @@
-"""How a prior with a text encoder reads prompts."""
+"""Text of a prior: how prompts become tokens that its network attends to."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from agents.networks.mixed_denoiser import Text
-from agents.networks.text import PADDING, vocabulary, warn_unknown
+from agents.networks.count_conditioning import Requests
+from agents.networks.text import PADDING, Text, TextEncoder, vocabulary, warn_unknown
 from agents.priors.prompt_validation import check_room, no_text
 from scene_envs.datasets.prompts.facts import SIDES
 from scene_envs.datasets.prompts.language import NUMBERS, ORDINALS, SIDE_PHRASES, Nouns
@@ -88,8 +88,18 @@ class PromptReader:
         tokens, mask = self.encode_prompts([""])
         return tokens.expand(count, -1, -1), mask.expand(count, -1)
 
+    def warn_unknown_words(self, prompts: Iterable[str]) -> None:
+        """Warn of words in ``prompts`` that the vocabulary of the prior lacks."""
+        if isinstance(self.denoiser.text_encoder, TextEncoder):
+            warn_unknown(self.denoiser.text_encoder.unknown_words(prompts))
+
+    @property
+    def count_conditioning(self) -> Requests | None:
+        """The part of the network that is told how many objects a prompt asks for; None where there is none."""
+        return getattr(self.denoiser.network, "requests", None) if self.conditional else None
+
     def freeze_text(self) -> None:
-        """Keep the text encoder as it is in any training that follows."""
+        """Keep the text encoder, if there is one, as it is in any training that follows."""
         if self.conditional:
             self.denoiser.text_encoder.requires_grad_(False)
 

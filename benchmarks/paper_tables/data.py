@@ -81,7 +81,7 @@ def trained_numbers(prior: ScenePrior) -> int:
 
 
 @dataclass(frozen=True)
-class RealScenes:
+class HeldoutScenes:
     """Real scenes that no row was trained on.
 
     Attributes:
@@ -95,7 +95,7 @@ class RealScenes:
     prompts: tuple[str, ...]
 
     @classmethod
-    def of(cls, data: RowData, settings: TablesConfig) -> RealScenes:
+    def of(cls, data: RowData, settings: TablesConfig) -> HeldoutScenes:
         """Held-out scenes, at most ``count`` of each.
 
         Raises:

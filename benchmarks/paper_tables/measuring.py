@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from benchmarks.paper_tables.data import RealScenes
+from benchmarks.paper_tables.data import HeldoutScenes
 from benchmarks.paper_tables.settings import TablesConfig
 from scene_envs.errors import InvalidInputError
 
@@ -20,7 +20,7 @@ logger = logging.getLogger(__name__)
 
 
 def sample_and_measure(
-    prior: ScenePrior, real: RealScenes, settings: TablesConfig, *, prompted: bool, pool: PhysicsPool | None
+    prior: ScenePrior, real: HeldoutScenes, settings: TablesConfig, *, prompted: bool, pool: PhysicsPool | None
 ) -> dict[str, float]:
     """Figures of ``prior``: of samples without prompts, or of those that were given the prompts of real scenes."""
     if prompted and not real.prompts:
@@ -35,7 +35,7 @@ def sample_and_measure(
     return measure(samples, real.reference, real.prompts if prompted else (), settings, pool)
 
 
-def measure_real(real: RealScenes, settings: TablesConfig, pool: PhysicsPool | None) -> dict[str, float]:
+def measure_real(real: HeldoutScenes, settings: TablesConfig, pool: PhysicsPool | None) -> dict[str, float]:
     """Figures of real scenes against other real scenes: no sampler can be expected to do better.
 
     With prompts, ``chance_prompt_counts`` and so on are those of real scenes that were given the prompts of others.
@@ -110,7 +110,7 @@ def _prompts(samples: SceneBatch, prompts: Sequence[str]) -> Mapping[str, float]
     return {**prompt_following(samples, prompts), "prompt_following_number": float(len(prompts))}
 
 
-def _chance(real: RealScenes) -> Mapping[str, float]:
+def _chance(real: HeldoutScenes) -> Mapping[str, float]:
     from agents.evaluation import prompt_chance
 
     return prompt_chance(real.others, real.prompts)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.paper_tables.catalogue import list_rows, make_tables
-from benchmarks.paper_tables.data import RealScenes, RowData
+from benchmarks.paper_tables.data import HeldoutScenes, RowData
 from benchmarks.paper_tables.measuring import measure_real, sample_and_measure
 from benchmarks.paper_tables.rows import Row, Table
 from benchmarks.paper_tables.settings import TablesConfig
@@ -74,7 +74,7 @@ def _run_tables(settings: TablesConfig, say: Say) -> dict[str, Any]:
     say(f"{len(rows)} rows for {len(tables)} tables; reading {settings.data}")
     check_runs(rows, settings)
     data = RowData.load(settings)
-    real, sizes = RealScenes.of(data, settings), Sizes(settings, data)
+    real, sizes = HeldoutScenes.of(data, settings), Sizes(settings, data)
     results = {row.name: RowResult({}, pending=True) for row in rows}
     with PhysicsPool(workers=settings.workers) as pool:
         floor = _measured_once(
@@ -130,7 +130,7 @@ def write_tables(
     results: dict[str, RowResult],
     floor: dict[str, float],
     settings: TablesConfig,
-    real: RealScenes,
+    real: HeldoutScenes,
 ) -> None:
     """``tables.md``, ``tables.csv``, ``plot.png`` and, with the precision table, ``precision.md``."""
     from benchmarks.paper_tables.plot import draw
@@ -149,7 +149,7 @@ def _run_row(
     row: Row,
     tables: Sequence[Table],
     sizes: Sizes,
-    real: RealScenes,
+    real: HeldoutScenes,
     pool: PhysicsPool,
 ) -> tuple[RowResult, bool]:
     """The row's result, and whether it took work; a row that fails says why and stops nothing."""
@@ -192,7 +192,7 @@ def _measured_once(path: Path, asked: dict[str, Any], compute: Callable[[], dict
     return figures
 
 
-def _evaluation(settings: TablesConfig, real: RealScenes, prompted: bool | None = None) -> dict[str, Any]:
+def _evaluation(settings: TablesConfig, real: HeldoutScenes, prompted: bool | None = None) -> dict[str, Any]:
     """What figures depend on beside the prior; ``prompted`` is None for real scenes."""
     asked: dict[str, Any] = {
         "count": settings.measured,
@@ -229,7 +229,7 @@ def _chance(floor: dict[str, float]) -> str:
     return f" Real scenes that were given the prompts of others follow {', '.join(found)}." if found else ""
 
 
-def _lead(settings: TablesConfig, real: RealScenes) -> str:
+def _lead(settings: TablesConfig, real: HeldoutScenes) -> str:
     """What holds for all tables."""
     common = settings.common()
     return (

@@ -19,7 +19,7 @@ _WITHHELD = 0.1
 
 
 @dataclass(frozen=True)
-class RealScenes:
+class SceneBank:
     """Normalised real scenes, split once and for all.
 
     Attributes:
@@ -33,7 +33,7 @@ class RealScenes:
     prompts: PromptSets | None = None
 
     @classmethod
-    def split(cls, x0: Tensor, heldout: int, prompts: PromptSets | None = None) -> RealScenes:
+    def split(cls, x0: Tensor, heldout: int, prompts: PromptSets | None = None) -> SceneBank:
         """The last ``heldout`` scenes of ``x0`` (M, N, D) are held out."""
         if not 0 < heldout < len(x0):
             raise InvalidInputError(f"{len(x0)} real scenes cannot spare {heldout} for the guard; give more scenes")
