@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
-import math
-import os
 import sys
 import time
 from collections.abc import Mapping
@@ -14,7 +11,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from agents.utils.process_group import is_first_process
 from scene_envs.errors import InvalidInputError
+from scene_envs.files import write_json, write_text
 
 _PACKAGES = ("scene_envs", "rewards", "agents")
 
@@ -37,7 +36,7 @@ class Run:
         self.command = command
         self.settings = settings
         self.directory = Path(settings.output)
-        self._leads = int(os.environ.get("RANK", "0")) == 0
+        self._leads = is_first_process()
         self._handlers: list[logging.Handler] = []
 
     def __enter__(self) -> Run:
@@ -82,19 +81,15 @@ class Run:
 
     def write_metrics(self, metrics: Mapping[str, Any]) -> None:
         """``metrics.json``, whole or not at all; numbers that JSON lacks become null."""
-        self._replace("metrics.json", json.dumps(_json_able(metrics), indent=1) + "\n")
+        if self._leads:
+            write_json(self.directory / "metrics.json", metrics)
 
     def _write_config(self) -> None:
         import yaml
 
-        self._replace("config.yaml", yaml.safe_dump(dataclasses.asdict(self.settings), sort_keys=False))
-
-    def _replace(self, name: str, text: str) -> None:
-        if not self._leads:
-            return
-        partial = self.directory / (name + ".partial")
-        partial.write_text(text, encoding="utf-8")
-        os.replace(partial, self.directory / name)
+        if self._leads:
+            text = yaml.safe_dump(dataclasses.asdict(self.settings), sort_keys=False)
+            write_text(self.directory / "config.yaml", text)
 
     def _start_logging(self) -> None:
         screen = logging.StreamHandler(sys.stderr)
@@ -117,13 +112,3 @@ def fresh_directory(command: str) -> str:
         number += 1
         directory = base.with_name(f"{base.name}-{number}")
     return str(directory)
-
-
-def _json_able(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _json_able(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_json_able(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from copy import deepcopy
 from typing import Any
 
@@ -23,7 +24,7 @@ from agents.post_training.rollouts import Rollout, collect, stream_seed
 from agents.post_training.scene_bank import SceneBank
 from agents.priors.base import ScenePrior
 from agents.priors.prompt_validation import no_text
-from agents.utils.weight_average import WeightAverage
+from agents.utils.weight_average import AveragedWeights, WeightAverage
 from scene_envs.denoising_torchrl import DenoisingTorchRLEnv
 
 
@@ -167,34 +168,14 @@ class Learner:
             self.average.tensors, self.average.updates = state["average"], state["average_updates"]
         torch.set_rng_state(state["random"])
 
-    def judged(self) -> JudgedWeights:
-        """Context in which the prior holds the weights that are judged and saved: the average, when there is one."""
-        return JudgedWeights(self.prior, self.average)
+    def averaged(self) -> AveragedWeights[ScenePrior]:
+        """Context in which the prior holds the weights that are evaluated and saved: the average, when there is one."""
+        return AveragedWeights(self.prior, self.average)
 
     def _generator(self, stream: str, index: int) -> Generator:
         return Generator().manual_seed(stream_seed(self.config.seed, stream, index))
 
 
-class JudgedWeights:
-    """Swaps averaged weights in, and the training weights back in afterwards."""
-
-    def __init__(self, prior: ScenePrior, average: WeightAverage | None) -> None:
-        self.prior, self.average = prior, average
-        self._own: dict[str, Tensor] = {}
-
-    def __enter__(self) -> ScenePrior:
-        if self.average is not None:
-            self._own = {name: p.detach().clone() for name, p in self.prior.named_parameters()}
-            self.average.copy_to(self.prior)
-        return self.prior
-
-    def __exit__(self, *_: object) -> None:
-        with torch.no_grad():
-            for name, parameter in self.prior.named_parameters():
-                if name in self._own:
-                    parameter.copy_(self._own[name])
-
-
 def is_finite(value: float) -> bool:
     """Neither NaN nor infinite."""
-    return value == value and abs(value) != float("inf")
+    return math.isfinite(value)

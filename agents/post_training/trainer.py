@@ -190,7 +190,7 @@ class PostTrainer:
         since = self.guard.readings[-1].iteration if self.guard.readings else 0
         recent = [row["reward"] for row in self.history[since:] if is_finite(row["reward"])]
         reward = sum(recent) / len(recent) if recent else float("nan")
-        with self.learner.judged() as prior:
+        with self.learner.averaged() as prior:
             reading = self.guard.check(prior, self.iteration, reward, realism(rollout.batch))
             if reading.kept:
                 self._save_prior()
@@ -237,7 +237,7 @@ class PostTrainer:
         self.learner.restore(state["learner"])
 
     def _save_prior(self) -> None:
-        """The judged weights, with a card that says how they were made."""
+        """The evaluated weights, with a card that says how they were made."""
         self.prior.card = {
             **self.prior.card,
             "post_training": {

@@ -7,11 +7,12 @@ import math
 
 import numpy as np
 import torch
-from torch import Generator, nn
+from torch import nn
 
 from agents.networks.mixed_flux_config import POSE
 from agents.pretraining.data import TrainingData
 from agents.priors.base import ScenePrior
+from agents.utils.seeds import derived_generator
 
 logger = logging.getLogger(__name__)
 
@@ -42,8 +43,7 @@ def learn_counts(prior: ScenePrior, data: TrainingData, steps: int, batch_size: 
     optimizer = torch.optim.AdamW(parameters, lr=_RATE, weight_decay=0.01)
     losses = []
     for step in range(steps):
-        words = np.random.SeedSequence([seed, step, steps]).generate_state(1, np.uint64)
-        generator = Generator().manual_seed(int(words[0]) >> 1)
+        generator = derived_generator(seed, step, steps)
         scenes, prompts = data.draw(batch_size, generator, prompts=True)
         picks = torch.rand(len(prompts), generator=generator).tolist()
         texts = [group[int(pick * len(group))] for group, pick in zip(prompts, picks, strict=True)]

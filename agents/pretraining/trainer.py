@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
-import os
 import time
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Generator, Tensor, nn
 
@@ -25,8 +22,10 @@ from agents.pretraining.text_warmup import learn_counts
 from agents.priors.base import ScenePrior
 from agents.utils.checkpoints import load_checkpoint, save_checkpoint
 from agents.utils.process_group import World
-from agents.utils.weight_average import Averaged, WeightAverage
+from agents.utils.seeds import derived_generator
+from agents.utils.weight_average import AveragedWeights, WeightAverage
 from scene_envs.errors import InvalidInputError, MissingDependencyError, TrainingError, unknown_name
+from scene_envs.files import write_json
 
 logger = logging.getLogger(__name__)
 
@@ -189,8 +188,8 @@ class Pretrainer:
         self.evaluations.append({"step": self.step, "heldout": value})
         return value
 
-    def _averaged(self) -> Averaged:
-        return Averaged(self.network, self.average)
+    def _averaged(self) -> AveragedWeights[nn.Module]:
+        return AveragedWeights(self.network, self.average)
 
     def _draw_samples(self) -> None:
         """A gallery of samples of the averaged prior, ``samples-STEP.png``; left out without PyBullet."""
@@ -272,8 +271,7 @@ class Pretrainer:
 
 def part_generator(seed: int, step: int, part: int) -> Generator:
     """The generator of one part of one step of a run."""
-    words = np.random.SeedSequence([seed, step, part]).generate_state(2, np.uint64)
-    return Generator().manual_seed(int(words[0]) >> 1)
+    return derived_generator(seed, step, part)
 
 
 def pretrain(config: PretrainConfig) -> dict[str, Any]:
@@ -288,7 +286,5 @@ def pretrain(config: PretrainConfig) -> dict[str, Any]:
     metrics = {**trained.card, "evaluations": trainer.evaluations, "config": asdict(config)}
     if not trainer.world.leads:
         return metrics
-    partial = trainer.directory / "metrics.json.partial"
-    partial.write_text(json.dumps(metrics, indent=1))
-    os.replace(partial, trainer.directory / "metrics.json")
+    write_json(trainer.directory / "metrics.json", metrics)
     return metrics

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from agents.priors.files import WEIGHTS_NAME, count_parameters, find_prior, read_config, write_config
 from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.files import write_text
 
 if TYPE_CHECKING:
     from agents.priors.base import ScenePrior
@@ -153,7 +154,7 @@ def ship_prior(
     try:
         folder = prior.save(output, precision=precision)
         write_config(folder, _without_folders(read_config(folder)))
-        (folder / README).write_text(card_page(folder.name, prior, PriorFacts.of(folder)), encoding="utf-8")
+        write_text(folder / README, card_page(folder.name, prior, PriorFacts.of(folder)))
     finally:
         prior.card = kept
     return folder

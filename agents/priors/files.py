@@ -16,6 +16,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
+from scene_envs.files import replacing, write_json
 
 SHIPPED = Path(__file__).parent / "shipped"
 CONFIG_NAME = "config.json"
@@ -71,20 +72,16 @@ def to_precision(weights: Mapping[str, Tensor], precision: str) -> dict[str, Ten
 def write_prior(directory: str | os.PathLike[str], config: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Path:
     """Write a prior's configuration and weights, each file atomically."""
     directory = Path(directory)
-    directory.mkdir(parents=True, exist_ok=True)
-    weights = directory / (WEIGHTS_NAME + ".partial")
-    save_file({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, weights)
-    weights.chmod(0o644)
-    os.replace(weights, directory / WEIGHTS_NAME)
+    with replacing(directory / WEIGHTS_NAME) as weights:
+        save_file({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, weights)
+        weights.chmod(0o644)
     write_config(directory, config)
     return directory
 
 
 def write_config(directory: Path, config: Mapping[str, Any]) -> None:
     """Replace a prior's configuration atomically."""
-    partial = directory / (CONFIG_NAME + ".partial")
-    partial.write_text(json.dumps(config, indent=1) + "\n")
-    os.replace(partial, directory / CONFIG_NAME)
+    write_json(directory / CONFIG_NAME, config)
 
 
 def read_config(name: str | os.PathLike[str]) -> dict[str, Any]:

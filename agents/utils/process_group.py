@@ -1,4 +1,4 @@
-"""Several processes on one training run, as ``torchrun`` starts them: the same gradient on all of them."""
+"""Process group of a training run on several processes, as ``torchrun`` starts them."""
 
 from __future__ import annotations
 
@@ -65,3 +65,18 @@ class World:
         """Go on when all processes are here."""
         if self.size > 1:
             torch.distributed.barrier()
+
+
+def gather_rows(x: Tensor) -> Tensor:
+    """``x`` (B, ...) of every worker, stacked along rows; ``x`` itself without ``torch.distributed``."""
+    distributed = torch.distributed
+    if not (distributed.is_available() and distributed.is_initialized()) or distributed.get_world_size() == 1:
+        return x
+    parts = [torch.empty_like(x) for _ in range(distributed.get_world_size())]
+    distributed.all_gather(parts, x.contiguous())
+    return torch.cat(parts)
+
+
+def is_first_process() -> bool:
+    """Whether this process, of those that ``torchrun`` started, is the one that writes files and speaks."""
+    return int(os.environ.get("RANK", "0")) == 0

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Generic, TypeVar
+
 import torch
-from torch import nn
+from torch import Tensor, nn
+
+Module = TypeVar("Module", bound=nn.Module)
 
 
 class WeightAverage:
@@ -37,17 +41,26 @@ class WeightAverage:
             parameter.copy_(self.tensors[name])
 
 
-class Averaged:
-    """Context in which a network holds its averaged weights."""
+class AveragedWeights(Generic[Module]):
+    """Context in which a module holds its averaged weights, and in the end its own again.
 
-    def __init__(self, network: nn.Module, average: WeightAverage) -> None:
-        self.network, self.average = network, average
+    Args:
+        module: whose parameters are exchanged.
+        average: of its parameters; None leaves them as they are.
+    """
 
-    def __enter__(self) -> None:
-        self.saved = {name: p.detach().clone() for name, p in self.network.named_parameters()}
-        self.average.copy_to(self.network)
+    def __init__(self, module: Module, average: WeightAverage | None) -> None:
+        self.module, self.average = module, average
+        self._own: dict[str, Tensor] = {}
+
+    def __enter__(self) -> Module:
+        if self.average is not None:
+            self._own = {name: p.detach().clone() for name, p in self.module.named_parameters()}
+            self.average.copy_to(self.module)
+        return self.module
 
     def __exit__(self, *_: object) -> None:
         with torch.no_grad():
-            for name, parameter in self.network.named_parameters():
-                parameter.copy_(self.saved[name])
+            for name, parameter in self.module.named_parameters():
+                if name in self._own:
+                    parameter.copy_(self._own[name])

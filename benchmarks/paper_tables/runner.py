@@ -16,8 +16,9 @@ from benchmarks.paper_tables.measuring import measure_real, sample_and_measure
 from benchmarks.paper_tables.rows import Row, Table
 from benchmarks.paper_tables.settings import TablesConfig
 from benchmarks.paper_tables.tables import REAL, FilledTable, Line, csv_text, markdown
-from benchmarks.paper_tables.training import Sizes, check_runs, read_json, target_parameters, train, write_json
+from benchmarks.paper_tables.training import Sizes, check_runs, read_json, target_parameters, train
 from scene_envs.errors import InvalidInputError, SceneEnvsError, TrainingError
+from scene_envs.files import write_json, write_text
 
 if TYPE_CHECKING:
     from scene_envs.physics import PhysicsPool
@@ -137,11 +138,11 @@ def write_tables(
 
     filled = [_fill(table, results, floor, settings) for table in tables]
     directory, lead = Path(settings.output), _lead(settings, real)
-    _write(directory / "tables.md", markdown(filled, f"Priors of {settings.scene}", lead))
-    _write(directory / "tables.csv", csv_text(filled))
+    write_text(directory / "tables.md", markdown(filled, f"Priors of {settings.scene}", lead))
+    write_text(directory / "tables.csv", csv_text(filled))
     precision = [one for one in filled if one.table.name == "precision"]
     if precision:
-        _write(directory / "precision.md", markdown(precision, f"Precision of priors of {settings.scene}", lead))
+        write_text(directory / "precision.md", markdown(precision, f"Precision of priors of {settings.scene}", lead))
     draw(filled, directory / "plot.png")
 
 
@@ -255,10 +256,3 @@ def _duration(seconds: float) -> str:
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
-
-
-def _write(path: Path, text: str) -> None:
-    """Whole or not at all."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(path)

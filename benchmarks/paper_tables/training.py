@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, fields, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from benchmarks.paper_tables.data import RowData, trained_numbers
 from benchmarks.paper_tables.rows import Row
 from benchmarks.paper_tables.settings import TablesConfig
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
+from scene_envs.files import write_json
 
 CONFIG_NAME, METRICS_NAME = "row.json", "metrics.json"
 _RUN_ONLY = ("output", "device", "log_every", "evaluate_every", "checkpoint_every", "pictures_every", "tensorboard")
@@ -152,16 +152,8 @@ def train(config: PretrainConfig, target: int, data: RowData) -> dict[str, Any]:
     return metrics
 
 
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    os.replace(partial, path)
-
-
 def read_json(path: Path) -> dict[str, Any] | None:
-    """What :func:`write_json` wrote, None where there is nothing; raises CorruptFileError."""
+    """What :func:`~scene_envs.files.write_json` wrote, None where there is nothing; raises CorruptFileError."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

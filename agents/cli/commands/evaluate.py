@@ -79,6 +79,7 @@ def run(settings: EvaluateConfig, run: Run) -> None:
     from agents.evaluation.real_scenes import RealScenes
     from agents.priors.base import ScenePrior
     from scene_envs.errors import InvalidInputError, MissingDependencyError
+    from scene_envs.files import write_text
     from scene_envs.physics import PhysicsPool
 
     groups = choose_groups(settings.measures, project=settings.project)
@@ -125,7 +126,7 @@ def run(settings: EvaluateConfig, run: Run) -> None:
                 results.add(name, {"prompt_guidance": settings.guidance, **figures} if name == "prompts" else figures)
                 run.log(f"{name} measured in {time.perf_counter() - started:.1f} s")
     report = results.report(groups)
-    (run.directory / "metrics.md").write_text(report + "\n", encoding="utf-8")
+    write_text(run.directory / "metrics.md", report + "\n")
     run.say(report)
 
 
