@@ -1,10 +1,10 @@
-"""What the environment faces cost over a bare sampling loop with the same prior.
+"""What the environment adapters cost over a bare sampling loop with the same prior.
 
     python benchmarks/env_overhead.py [--prior dimsum_table] [--batch 128] [--steps 10] [--rounds 3]
 
-Every face runs the same chain as the bare loop: the prior's posterior, one normal draw a step, and the decoding and
+Every adapter runs the same chain as the bare loop: the prior's posterior, one normal draw a step, and the decoding and
 counting of the finished scenes. Times are CPU seconds of one thread, which a busy machine disturbs little; the bare
-loop is timed again in every round, and the table gives the median over rounds of face / bare. The single
+loop is timed again in every round, and the table gives the median over rounds of adapter / bare. The single
 environment is compared with a bare loop of one scene. Freed memory is kept by the process: how often glibc gives it
 back to the kernel depends on what else is alive, and would swamp the differences that are looked for.
 """
@@ -125,18 +125,18 @@ def cpu_seconds(run: Callable[[], None]) -> float:
     return time.process_time() - start
 
 
-def compare(bare: Callable[[], None], faces: Sequence[tuple[str, Callable[[], None]]], rounds: int) -> list[str]:
-    """One row per face: median CPU seconds, median ratio to the bare loop of the same round."""
-    times: dict[str, list[float]] = {name: [] for name, _ in faces}
+def compare(bare: Callable[[], None], adapters: Sequence[tuple[str, Callable[[], None]]], rounds: int) -> list[str]:
+    """One row per adapter: median CPU seconds, median ratio to the bare loop of the same round."""
+    times: dict[str, list[float]] = {name: [] for name, _ in adapters}
     base: list[float] = []
-    for _, run in (("bare", bare), *faces):
+    for _, run in (("bare", bare), *adapters):
         run()  # warm up
     for _ in range(rounds):
         base.append(cpu_seconds(bare))
-        for name, run in faces:
+        for name, run in adapters:
             times[name].append(cpu_seconds(run))
     rows = [f"| bare loop | {statistics.median(base):.3f} | 1.000 |"]
-    for name, _ in faces:
+    for name, _ in adapters:
         ratio = statistics.median(np.array(times[name]) / np.array(base))
         rows.append(f"| {name} | {statistics.median(times[name]):.3f} | {ratio:.3f} |")
     return rows
@@ -144,7 +144,7 @@ def compare(bare: Callable[[], None], faces: Sequence[tuple[str, Callable[[], No
 
 def main() -> None:
     """Parse the arguments, run, print a Markdown table."""
-    parser = argparse.ArgumentParser(description="Overhead of the environment faces over a bare sampling loop.")
+    parser = argparse.ArgumentParser(description="Overhead of the environment adapters over a bare sampling loop.")
     parser.add_argument("--prior", default="dimsum_table_continuous", help="name or path; 'tiny' for an untrained one")
     parser.add_argument("--batch", type=int, default=128)
     parser.add_argument("--steps", type=int, default=10)
@@ -167,7 +167,7 @@ def main() -> None:
         ("gymnasium vector", gymnasium_vector(prior, batch, steps)),
     )
     print(f"B = {batch}, {steps} steps, prior {arguments.prior}, one thread, median of {rounds} rounds\n")
-    header = ["| face | CPU s per batch of episodes | ratio to bare loop |", "|---|---|---|"]
+    header = ["| adapter | CPU s per batch of episodes | ratio to bare loop |", "|---|---|---|"]
     print("\n".join([*header, *compare(bare_loop(prior, batch, steps), batched, rounds)]))
     single = (("gymnasium single, B = 1", gymnasium_single(prior, steps)),)
     print("\n".join(compare(bare_loop(prior, 1, steps), single, 5 * rounds)))

@@ -40,7 +40,7 @@ import torch
 from torch import Tensor
 
 import scene_envs  # noqa: F401  (registers the environments)
-from agents.priors.base import ScenePrior
+from agents import ScenePrior
 from agents.priors.continuous import ContinuousPrior
 from scene_envs.grammars import get_grammar
 

@@ -88,8 +88,10 @@ def compose(command: str, config: type, words: Sequence[str]) -> Any:
     from omegaconf.errors import OmegaConfBaseException
 
     name = command.replace("-", "_")
-    hints = get_type_hints(config)
-    overrides = [_override(command, word, hints) for word in words]
+    known = get_type_hints(config)
+    hints = {field.name: known[field.name] for field in dataclasses.fields(config)}
+    renamed: dict[str, str] = getattr(config, "RENAMED", {})
+    overrides = [_override(command, word, hints, renamed) for word in words]
     keys = OmegaConf.structured(config)
     OmegaConf.set_readonly(keys, False)  # a frozen dataclass starts out read-only
     packaged = (resources.files("configs") / f"{name}.yaml").is_file()
@@ -104,11 +106,13 @@ def compose(command: str, config: type, words: Sequence[str]) -> Any:
     return config(**{str(key): value for key, value in values.items()})
 
 
-def _override(command: str, word: str, hints: dict[str, Any]) -> str:
+def _override(command: str, word: str, hints: dict[str, Any], renamed: dict[str, str]) -> str:
     """The word as Hydra reads it, text quoted so that any character may stand in it."""
     key, equals, value = word.partition("=")
     if not equals or not key:
         raise InvalidInputError(f"{command}: expected key=value, got {word!r}; --help lists the keys")
+    if key in renamed:
+        raise InvalidInputError(f"the {command} key {key!r} has another name now: {renamed[key]}")
     if key not in hints:
         raise unknown_name(f"{command} key", key, hints)
     if hints[key] is str or (hints[key] == (str | None) and value != "null"):

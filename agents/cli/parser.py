@@ -14,7 +14,7 @@ from dataclasses import replace
 from importlib import import_module
 from types import ModuleType
 
-from agents.cli.commands import COMMANDS
+from agents.cli.commands import COMMANDS, RENAMED
 from agents.cli.keys import compose, describe_fields, format_rows
 from scene_envs import __version__
 from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError, UnknownNameError, unknown_name
@@ -86,6 +86,8 @@ def _dispatch(words: list[str]) -> int:
         print(f"scene-envs {__version__}")
         return DONE
     command, *rest = words
+    if command in RENAMED:
+        raise InvalidInputError(f"the command {command!r} has another name now: {RENAMED[command]}")
     if command not in COMMANDS:
         raise unknown_name("command", command, COMMANDS)
     module = import_module(f"agents.cli.commands.{command.replace('-', '_')}")

@@ -36,7 +36,7 @@ class Run:
         self.command = command
         self.settings = settings
         self.directory = Path(settings.output)
-        self._leads = is_first_process()
+        self._is_first = is_first_process()
         self._handlers: list[logging.Handler] = []
 
     def __enter__(self) -> Run:
@@ -44,7 +44,7 @@ class Run:
             self.directory.mkdir(parents=True, exist_ok=True)
         except (FileExistsError, NotADirectoryError):
             raise InvalidInputError(f"output={str(self.directory)!r} is a file, not a folder; give another") from None
-        if not self._leads:
+        if not self._is_first:
             return self
         if not (self.directory / "config.yaml").exists():
             self._write_config()
@@ -66,13 +66,13 @@ class Run:
 
     def say(self, text: str) -> None:
         """Tell the user on stdout, and keep it in the log."""
-        if self._leads:
+        if self._is_first:
             print(text, flush=True)
         self.log(text)
 
     def log(self, text: str) -> None:
         """One line into ``log.txt`` alone."""
-        if self._leads:
+        if self._is_first:
             self._append(text)
 
     def _append(self, text: str) -> None:
@@ -81,13 +81,13 @@ class Run:
 
     def write_metrics(self, metrics: Mapping[str, Any]) -> None:
         """``metrics.json``, whole or not at all; numbers that JSON lacks become null."""
-        if self._leads:
+        if self._is_first:
             write_json(self.directory / "metrics.json", metrics)
 
     def _write_config(self) -> None:
         import yaml
 
-        if self._leads:
+        if self._is_first:
             text = yaml.safe_dump(dataclasses.asdict(self.settings), sort_keys=False)
             write_text(self.directory / "config.yaml", text)
 

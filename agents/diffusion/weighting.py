@@ -66,10 +66,12 @@ def loss_weights(
     return (snr.clamp(max=gamma) / over).float().to(t.device)
 
 
-def timestep_law(timesteps: str | None, prediction: str) -> str:
-    """The law of training timesteps: the given one, or that which was published with ``prediction``.
+def timestep_distribution(timesteps: str | None, prediction: str) -> str:
+    """The distribution of training timesteps: the given one, or that which was published with ``prediction``.
 
-    >>> timestep_law(None, "epsilon"), timestep_law(None, "karras"), timestep_law("lognormal", "v")
-    ('uniform', 'lognormal', 'lognormal')
+    >>> timestep_distribution(None, "epsilon"), timestep_distribution(None, "karras")
+    ('uniform', 'lognormal')
+    >>> timestep_distribution("lognormal", "v")
+    'lognormal'
     """
     return timesteps or ("lognormal" if prediction == "karras" else "uniform")

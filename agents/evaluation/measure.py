@@ -28,7 +28,7 @@ FLOOR_PREFIX = "floor_"
 
 
 class Sampler(Protocol):
-    """What :func:`evaluate_prior` needs of a prior; ``agents.priors.base.ScenePrior`` has it."""
+    """What :func:`evaluate` needs of a prior; ``agents.priors.base.ScenePrior`` has it."""
 
     @property
     def scene_type(self) -> SceneType: ...
@@ -80,7 +80,7 @@ def measure_samples(
     return figures
 
 
-def evaluate_prior(
+def evaluate(
     prior: Sampler | str,
     count: int = 500,
     reference: SceneBatch | None = None,

@@ -44,7 +44,7 @@ class Accuracy:
 
 
 @dataclass(frozen=True)
-class JudgeConfig:
+class ClassifierConfig:
     """How a classifier is trained and tested.
 
     Attributes:
@@ -111,7 +111,9 @@ def check_classes(real: int, fake: int, seeds: int) -> None:
         raise InvalidInputError(f"seeds must be at least 1, got {seeds}")
 
 
-def judge(real: int, fake: int, prepare: Prepare, *, seeds: int, seed: int, config: JudgeConfig) -> Accuracy:
+def two_sample_accuracy(
+    real: int, fake: int, prepare: Prepare, *, seeds: int, seed: int, config: ClassifierConfig
+) -> Accuracy:
     """Train and test one classifier per seed.
 
     Rows 0 … real - 1 are real scenes, the following ``fake`` rows are samples; of the larger class as many as the
@@ -139,7 +141,7 @@ def judge(real: int, fake: int, prepare: Prepare, *, seeds: int, seed: int, conf
     return Accuracy.of(scores)
 
 
-def _split(real: int, fake: int, config: JudgeConfig) -> Split:
+def _split(real: int, fake: int, config: ClassifierConfig) -> Split:
     count = min(real, fake)
     rows = [torch.randperm(real)[:count], real + torch.randperm(fake)[:count]]
     train = min(round(config.train_fraction * count), config.most_train)
@@ -148,7 +150,7 @@ def _split(real: int, fake: int, config: JudgeConfig) -> Split:
     return Split(*(torch.cat([of_class[part] for of_class in rows]) for part in parts))
 
 
-def _train(network: nn.Module, forward: Forward, labels: Tensor, split: Split, config: JudgeConfig) -> None:
+def _train(network: nn.Module, forward: Forward, labels: Tensor, split: Split, config: ClassifierConfig) -> None:
     """Leave the network with the weights of the epoch whose validation loss is lowest."""
     steps = math.ceil(len(split.train) / config.batch_size)
     optimizer = torch.optim.AdamW(network.parameters(), config.learning_rate, weight_decay=config.weight_decay)
@@ -175,6 +177,6 @@ def _train(network: nn.Module, forward: Forward, labels: Tensor, split: Split, c
 
 
 @torch.no_grad()
-def _logits(network: nn.Module, forward: Forward, rows: Tensor, config: JudgeConfig) -> Tensor:
+def _logits(network: nn.Module, forward: Forward, rows: Tensor, config: ClassifierConfig) -> Tensor:
     network.eval()
     return torch.cat([forward(network, part) for part in rows.split(4 * config.batch_size)])

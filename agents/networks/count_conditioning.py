@@ -14,7 +14,7 @@ _DELTA = 0.02
 """Objects that may always still come, so that logarithms are finite."""
 
 
-class Requests(nn.Module):
+class CountConditioning(nn.Module):
     """Logits (B, K) that are added to those of every slot: how much of each category is still wanted.
 
     A prompt asks for numbers: of objects, of cups, of whatever is named. Attention takes averages and learns exact
@@ -34,8 +34,8 @@ class Requests(nn.Module):
     Attributes:
         things: G + 1, kinds and all objects.
 
-    >>> requests = Requests(kinds=(0, 1, 1, 2), text_width=16, hidden=32, most=5)
-    >>> requests(torch.randint(6, (2, 5)), torch.randn(2, 4, 16)).shape
+    >>> count_conditioning = CountConditioning(kinds=(0, 1, 1, 2), text_width=16, hidden=32, most=5)
+    >>> count_conditioning(torch.randint(6, (2, 5)), torch.randn(2, 4, 16)).shape
     torch.Size([2, 5])
     """
 

@@ -27,7 +27,7 @@ def count_states(states: Tensor, categories: int, slot_mask: Tensor | None = Non
     return torch.cat([counts[:, : categories - 1], counts[:, categories:]], dim=1)
 
 
-class Tally(nn.Module):
+class CountEmbedding(nn.Module):
     """Counts of what is seen, beside what the prompt says, to one vector (B, H) that joins the condition.
 
     Args:
@@ -35,8 +35,8 @@ class Tally(nn.Module):
         text_width: width of the text tokens; 0 for none.
         hidden: H.
 
-    >>> tally = Tally(categories=8, text_width=16, hidden=32)
-    >>> tally(torch.randint(9, (2, 5)), torch.randn(2, 16)).shape
+    >>> count_embedding = CountEmbedding(categories=8, text_width=16, hidden=32)
+    >>> count_embedding(torch.randint(9, (2, 5)), torch.randn(2, 16)).shape
     torch.Size([2, 32])
     """
 

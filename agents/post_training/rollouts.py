@@ -81,7 +81,7 @@ def collect(
     """Run ``policy`` to the end of one episode in each of the environment's rows.
 
     Args:
-        env: the torchrl face, in ``next_sample`` mode.
+        env: the torchrl adapter, in ``next_sample`` mode.
         policy: draws x_{t-1}; must have the environment's number of steps.
         seed: of the run; x_T and the chain's noise hang on it and on ``iteration`` alone.
         iteration: which batch of the run this is.

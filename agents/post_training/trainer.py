@@ -26,7 +26,7 @@ from agents.post_training.run_files import (
 )
 from agents.post_training.scene_bank import SceneBank, real_scenes
 from agents.priors.base import ScenePrior
-from agents.priors.prompt_validation import check_room
+from agents.priors.prompt_validation import check_object_count
 from agents.utils.checkpoints import save_checkpoint
 from rewards import reward_name
 from scene_envs.errors import TrainingError
@@ -150,7 +150,9 @@ class PostTrainer:
             prompts = prompts_beside(self.directory, batch, seed)
             if config.prompt == "data":
                 large = torch.nonzero(batch.counts > self.learner.slots)[:, 0].tolist()
-                check_room([text for i in large for text in prompts(i)], self.prior.scene_type, self.learner.slots)
+                check_object_count(
+                    [text for i in large for text in prompts(i)], self.prior.scene_type, self.learner.slots
+                )
         x0 = self.prior.encode(batch.to(config.device))
         self.scenes = SceneBank.split(x0, config.guard_scenes, prompts)
         asked = self.scenes.heldout_prompts()

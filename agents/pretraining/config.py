@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 
 @dataclass
@@ -51,8 +52,8 @@ class PretrainConfig:
         noise_mean: mean of ln(noise-to-signal) over training timesteps. Rooms, whose normalised unit is metres, need
             less noise than tables: about -2.6, with a floor of 0.0004.
         noise_std: its standard deviation.
-        timesteps: law of training timesteps, ``lognormal`` (of the noise-to-signal ratio), ``uniform``, or ``both`` in
-            equal parts: categories are decided at high noise, which the first rarely draws.
+        timesteps: distribution of training timesteps, ``lognormal`` (of the noise-to-signal ratio), ``uniform``, or
+            ``both`` in equal parts: categories are decided at high noise, which the first rarely draws.
         loss_weighting: of the loss by timestep, ``none`` or ``min_snr``.
         moments: whose mean and spread scale what the network says: those of each ``category`` (of each feature, where
             the process is continuous), of each ``feature``, or of the ``scene`` as a whole.
@@ -82,11 +83,12 @@ class PretrainConfig:
         text_reach: of the mixed flux network: text meets slots in its ``double``-stream blocks alone, which is quicker,
             or in ``all``, as in the paper's.
         pooled_text: whether the mean of the text tokens also modulates every block of the mixed flux network.
-        tally: whether the mixed flux network is told how many slots it sees of each category, and how many are masked.
+        count_embedding: whether the mixed flux network is told how many slots it sees of each category, and how many
+            are masked.
         text_window: of the small text encoder: words that are read together before they attend to each other, odd; 1
             reads each by itself.
-        text_requests: whether the small text encoder also says what is asked of each kind of object, which joins the
-            logits of the mixed flux network beside what it sees; needs text_latents.
+        text_count_conditioning: whether the small text encoder also says what is asked of each kind of object, which
+            joins the logits of the mixed flux network beside what it sees; needs text_latents.
         text_warmup: steps in which the text encoder learns how many of each kind its prompts ask for, before a fresh
             prior takes the first of its own; at most iterations.
         text_numbers: of the small text encoder: whether words that are numbers say how many they are, so that counts
@@ -100,6 +102,9 @@ class PretrainConfig:
         tensorboard: also log for TensorBoard.
         device: torch device.
     """
+
+    RENAMED: ClassVar[dict[str, str]] = {"tally": "count_embedding", "text_requests": "text_count_conditioning"}
+    """Keys of earlier versions, and their names."""
 
     scene: str = "dimsum_table"
     data: str = "data/dimsum_table"
@@ -156,9 +161,9 @@ class PretrainConfig:
     text_learning_rate: float = 0.5
     text_reach: str = "double"
     pooled_text: bool = True
-    tally: bool = True
+    count_embedding: bool = True
     text_window: int = 3
-    text_requests: bool = True
+    text_count_conditioning: bool = True
     text_warmup: int = 400
     text_numbers: bool = True
     prompt_dropout: float = 0.1

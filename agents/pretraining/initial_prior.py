@@ -9,7 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from agents.diffusion import CategoryMoments, Preconditioning
+from agents.diffusion import Preconditioning
+from agents.diffusion.moments import CategoryMoments
 from agents.networks import MixedFluxConfig, TextConfig
 from agents.networks.registry import NetworkConfig, network_config
 from agents.networks.text_encoders import VOCABULARY, AnyTextConfig, text_config
@@ -151,7 +152,7 @@ def _text(config: PretrainConfig, prompts: Sequence[Sequence[str]]) -> AnyTextCo
             latents=config.text_latents,
             window=config.text_window,
             numbers=config.text_numbers,
-            asked=max(_kinds(config.scene)) + 2 if _requests(config) else 0,
+            asked=max(_kinds(config.scene)) + 2 if _conditions_counts(config) else 0,
         )
     return encoder
 
@@ -182,9 +183,9 @@ def _network(
         rotations=_rotations(normalizer),
         text_reach=config.text_reach,
         pooled_text=int(config.pooled_text),
-        tally=int(config.tally),
-        requests=slots if _requests(config) else 0,
-        kinds=_kinds(config.scene) if _requests(config) else (),
+        count_embedding=int(config.count_embedding),
+        count_conditioning=slots if _conditions_counts(config) else 0,
+        kinds=_kinds(config.scene) if _conditions_counts(config) else (),
     )
 
 
@@ -195,10 +196,10 @@ def _kinds(scene: str) -> tuple[int, ...]:
     return tuple(order[name] for name in names)
 
 
-def _requests(config: PretrainConfig) -> bool:
+def _conditions_counts(config: PretrainConfig) -> bool:
     """Whether the network is told what a prompt asks of each kind of object."""
     return (
-        config.text_requests
+        config.text_count_conditioning
         and config.network == "flux"
         and config.text_encoder == VOCABULARY
         and config.text_latents > 0

@@ -20,14 +20,14 @@ _RATE, _RISE = 3e-3, 0.2
 """Peak learning rate, and the share of the steps in which it rises."""
 
 
-def learn_counts(prior: ScenePrior, data: TrainingData, steps: int, batch_size: int, seed: int) -> float | None:
+def warm_up_text(prior: ScenePrior, data: TrainingData, steps: int, batch_size: int, seed: int) -> float | None:
     """Train the text encoder, and what reads numbers from it, on prompts and the counts of their scenes alone.
 
     No scene is denoised, so that hundreds of such steps take a minute, and the run that follows starts with numbers it
     can subtract from.
 
     Args:
-        prior: changed in place; one whose network does not read requests is left alone.
+        prior: changed in place; one whose network has no count conditioning is left alone.
         data: scenes and their prompts.
         steps: optimiser steps.
         batch_size: scenes per step.
@@ -36,10 +36,10 @@ def learn_counts(prior: ScenePrior, data: TrainingData, steps: int, batch_size: 
     Returns:
         Mean loss of the last tenth of the steps, in nats per kind of object; None where there was nothing to learn.
     """
-    requests = prior.count_conditioning
-    if requests is None or steps < 1:
+    conditioning = prior.count_conditioning
+    if conditioning is None or steps < 1:
         return None
-    parameters = [*prior.denoiser.text_encoder.parameters(), *requests.counts_out.parameters()]
+    parameters = [*prior.denoiser.text_encoder.parameters(), *conditioning.counts_out.parameters()]
     optimizer = torch.optim.AdamW(parameters, lr=_RATE, weight_decay=0.01)
     losses = []
     for step in range(steps):
@@ -47,9 +47,9 @@ def learn_counts(prior: ScenePrior, data: TrainingData, steps: int, batch_size: 
         scenes, prompts = data.draw(batch_size, generator, prompts=True)
         picks = torch.rand(len(prompts), generator=generator).tolist()
         texts = [group[int(pick * len(group))] for group, pick in zip(prompts, picks, strict=True)]
-        asked = prior.encode_prompts(texts)[0][:, : requests.things]
+        asked = prior.encode_prompts(texts)[0][:, : conditioning.things]
         states = scenes[..., POSE:].argmax(dim=-1).to(asked.device)
-        loss = requests.count_loss(asked, states).mean()
+        loss = conditioning.count_loss(asked, states).mean()
         loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(parameters, 1.0)
         for group in optimizer.param_groups:

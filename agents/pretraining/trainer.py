@@ -18,10 +18,10 @@ from agents.pretraining.data import TrainingData
 from agents.pretraining.log import TrainingLog
 from agents.pretraining.optimizers import build_optimizer
 from agents.pretraining.setup import prepare
-from agents.pretraining.text_warmup import learn_counts
+from agents.pretraining.text_warmup import warm_up_text
 from agents.priors.base import ScenePrior
 from agents.utils.checkpoints import load_checkpoint, save_checkpoint
-from agents.utils.process_group import World
+from agents.utils.process_group import ProcessGroup
 from agents.utils.seeds import derived_generator
 from agents.utils.weight_average import AveragedWeights, WeightAverage
 from scene_envs.errors import InvalidInputError, MissingDependencyError, TrainingError, unknown_name
@@ -67,12 +67,12 @@ class Pretrainer:
     def __init__(self, config: PretrainConfig, data: TrainingData, heldout: Tensor, prior: ScenePrior) -> None:
         self.config = config
         self.data, self.heldout_data = data, heldout
-        self.world = World.join(config.device)
-        self.parts = self.world.size * config.accumulate
+        self.processes = ProcessGroup.join(config.device)
+        self.parts = self.processes.size * config.accumulate
         if config.batch_size % self.parts:
             raise InvalidInputError(
                 f"batch_size={config.batch_size} is not a multiple of {self.parts}, "
-                f"the {self.world.size} process(es) times accumulate={config.accumulate}"
+                f"the {self.processes.size} process(es) times accumulate={config.accumulate}"
             )
         if not 0.0 <= config.decay_share <= 1.0:
             raise InvalidInputError(f"decay_share={config.decay_share} is outside 0..1: it is a share of the steps")
@@ -89,7 +89,7 @@ class Pretrainer:
         self.step = 0
         self.seconds = 0.0
         self.directory = Path(config.output)
-        self.log = TrainingLog(self.directory, config.tensorboard and self.world.leads)
+        self.log = TrainingLog(self.directory, config.tensorboard and self.processes.is_first)
         self.evaluations: list[dict[str, float]] = []
 
     @property
@@ -107,9 +107,9 @@ class Pretrainer:
         if self.config.compile:
             self.prior.denoiser.network.compile()
         for row in self._steps():
-            if self.world.leads:
+            if self.processes.is_first:
                 self.log.write(row, self.config.iterations)
-        if self.world.leads:
+        if self.processes.is_first:
             logger.info("measuring the error that is left at 40 noise levels, for the samplers")
         with self._averaged():
             self.prior.fit_residual(self.heldout_data[:512].to(self.config.device))
@@ -119,8 +119,8 @@ class Pretrainer:
     def _warm_up_text(self) -> None:
         """Every process learns the same, and begins with the weights of the first."""
         steps = min(self.config.text_warmup, self.config.iterations)
-        if learn_counts(self.prior, self.data, steps, self.config.batch_size, self.config.seed) is not None:
-            self.world.share(self.network.parameters())
+        if warm_up_text(self.prior, self.data, steps, self.config.batch_size, self.config.seed) is not None:
+            self.processes.share(self.network.parameters())
             self.average = WeightAverage(self.network, self.config.ema)
 
     def _steps(self) -> Iterator[dict[str, float]]:
@@ -149,17 +149,17 @@ class Pretrainer:
         config = self.config
         total = torch.zeros((), device=config.device)
         for part in range(config.accumulate):
-            generator = part_generator(config.seed, self.step, self.world.rank * config.accumulate + part)
+            generator = part_generator(config.seed, self.step, self.processes.rank * config.accumulate + part)
             loss = self._part_loss(config.batch_size // self.parts, generator) / self.parts
             loss.backward()  # type: ignore[no-untyped-call]
             total += loss.detach()
-        value = float(self.world.sum(total))
+        value = float(self.processes.sum(total))
         if not math.isfinite(value):
             raise TrainingError(
                 f"the pretraining loss became {value} at step {self.step}; the last good state is "
                 f"{str(self.checkpoint_path)!r}: lower learning_rate (now {config.learning_rate}) and run again"
             )
-        self.world.sum_gradients(self.network.parameters())
+        self.processes.sum_gradients(self.network.parameters())
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), config.clip)
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate_at(self.step, config) * group["rate"]
@@ -193,7 +193,7 @@ class Pretrainer:
 
     def _draw_samples(self) -> None:
         """A gallery of samples of the averaged prior, ``samples-STEP.png``; left out without PyBullet."""
-        if not self.world.leads:
+        if not self.processes.is_first:
             return
         from scene_envs.render import gallery, render
 
@@ -211,7 +211,7 @@ class Pretrainer:
     # -- files ----------------------------------------------------------------------------------
 
     def _save(self) -> None:
-        if self.world.leads:
+        if self.processes.is_first:
             self._save_checkpoint()
         self.save_prior()
 
@@ -263,9 +263,9 @@ class Pretrainer:
                 "seconds": round(self.seconds),
                 "heldout_loss": self.evaluations[-1]["heldout"] if self.evaluations else None,
             }
-            if self.world.leads:
+            if self.processes.is_first:
                 self.prior.save(self.directory / "prior")
-        self.world.wait()
+        self.processes.wait()
         return ScenePrior.load(self.directory)
 
 
@@ -284,7 +284,7 @@ def pretrain(config: PretrainConfig) -> dict[str, Any]:
     trainer = Pretrainer(config, data, heldout, prior)
     trained = trainer.run()
     metrics = {**trained.card, "evaluations": trainer.evaluations, "config": asdict(config)}
-    if not trainer.world.leads:
+    if not trainer.processes.is_first:
         return metrics
     write_json(trainer.directory / "metrics.json", metrics)
     return metrics

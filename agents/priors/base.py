@@ -19,7 +19,7 @@ from agents.diffusion import (
     ReverseStep,
     StepTable,
 )
-from agents.networks.count_conditioning import Requests
+from agents.networks.count_conditioning import CountConditioning
 from agents.networks.text import Text
 from agents.priors.inpainting import Inpainting
 from agents.priors.prompt_validation import check_prompts, no_text
@@ -105,7 +105,7 @@ class ScenePrior(Inpainting, nn.Module, ABC):
         """Keep the text encoder, if there is one, as it is in any training that follows."""
 
     @property
-    def count_conditioning(self) -> Requests | None:
+    def count_conditioning(self) -> CountConditioning | None:
         """The part of the network that is told how many objects a prompt asks for; None where there is none."""
         return None
 

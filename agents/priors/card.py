@@ -1,4 +1,4 @@
-"""What is told of a prior: a line in a listing, and a model card in a folder that can be shipped."""
+"""What is told of a prior: a line in a listing, and a model card in a folder to give away."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def headlines(measures: Mapping[str, float]) -> list[tuple[str, str, str]]:
     return rows
 
 
-def ship_prior(
+def package_prior(
     source: str | os.PathLike[str] | ScenePrior,
     output: str | os.PathLike[str],
     *,
@@ -124,7 +124,7 @@ def ship_prior(
     machine: str = "",
     limits: str = "",
 ) -> Path:
-    """Write a prior as a folder to ship: ``config.json``, ``model.safetensors`` and the model card ``README.md``.
+    """Write a prior as a folder to give away: ``config.json``, ``model.safetensors`` and the model card ``README.md``.
 
     Args:
         source: name, prior directory or run directory; a run's metrics tell how it was trained.

@@ -26,7 +26,7 @@ class PriorConfig:
         noise_std: its standard deviation.
         translation_weight: weight of x, y, z in the pretraining loss, other features having 1.
         rotation: what is diffused as rotation, ``"matrix"``, ``"quaternion"`` or ``"axis_angle"``.
-        timesteps: law of training timesteps, ``"lognormal"`` (of the noise-to-signal ratio), ``"uniform"`` or
+        timesteps: distribution of training timesteps, ``"lognormal"`` (of the noise-to-signal ratio), ``"uniform"`` or
             ``"both"`` in equal parts; None is what was published with the prediction, lognormal for ``"karras"`` and
             uniform for the others.
         loss_weighting: of the loss by timestep, ``"none"`` or ``"min_snr"``.
@@ -74,7 +74,7 @@ class MixedPriorConfig:
         text: kind and size of the text encoder; None for a prior that reads no prompts.
         noise_floor: lowest noise-to-signal ratio of the ``"karras"`` schedule, in normalised units.
         noise_ceiling: highest.
-        timesteps: law of training timesteps, ``"lognormal"`` (of the noise-to-signal ratio), ``"uniform"`` or
+        timesteps: distribution of training timesteps, ``"lognormal"`` (of the noise-to-signal ratio), ``"uniform"`` or
             ``"both"`` in equal parts.
         loss_weighting: of the pose loss by timestep, ``"none"`` or ``"min_snr"``.
         empty_slots: ``"dropped"`` leaves slots that are known to be empty out of the network, which saves most of the

@@ -9,18 +9,10 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from agents.diffusion import (
-    GaussianProcess,
-    GaussianStep,
-    Preconditioning,
-    ResidualVariance,
-    StepTable,
-    check_weighting,
-    loss_weights,
-    make_schedule,
-    timestep_weights,
-)
-from agents.diffusion.weighting import timestep_law
+from agents.diffusion import GaussianProcess, GaussianStep, Preconditioning, ResidualVariance, StepTable
+from agents.diffusion.gaussian import timestep_weights
+from agents.diffusion.schedules import make_schedule
+from agents.diffusion.weighting import check_weighting, loss_weights, timestep_distribution
 from agents.networks.denoiser import Denoiser
 from agents.networks.registry import build_network, config_from_state, config_state
 from agents.networks.text import Text
@@ -78,8 +70,8 @@ class ContinuousPrior(ScenePrior):
         schedule = make_schedule(config.schedule, config.num_timesteps, config.noise_floor, config.noise_ceiling)
         self.process = GaussianProcess(schedule, config.prediction, preconditioning)
         self.denoiser = Denoiser(build_network(config.network), self.process)
-        law = timestep_law(config.timesteps, config.prediction)
-        self._timestep_weights = timestep_weights(law, schedule, config.noise_mean, config.noise_std)
+        distribution = timestep_distribution(config.timesteps, config.prediction)
+        self._timestep_weights = timestep_weights(distribution, schedule, config.noise_mean, config.noise_std)
 
     @classmethod
     def fitted(

@@ -21,15 +21,15 @@ from agents.diffusion import (
     Preconditioning,
     ResidualVariance,
     StepTable,
-    check_weighting,
-    make_categorical_schedule,
-    make_schedule,
-    timestep_weights,
 )
+from agents.diffusion.categorical import make_categorical_schedule
+from agents.diffusion.gaussian import timestep_weights
 from agents.diffusion.reverse_steps import state_of
+from agents.diffusion.schedules import make_schedule
 from agents.diffusion.unmasking import UNMASKINGS
+from agents.diffusion.weighting import check_weighting
 from agents.networks.mixed_denoiser import Given, MixedDenoiser
-from agents.networks.mixed_flux_config import POSE, MixedFluxConfig
+from agents.networks.mixed_flux_config import POSE, MixedFluxConfig, current_name
 from agents.networks.registry import build_network, config_from_state, config_state
 from agents.networks.text import Text
 from agents.networks.text_encoders import text_config_from_state, text_encoder
@@ -131,7 +131,7 @@ class MixedPrior(TrainableMixedPrior):
         """Inverse of :meth:`weights`; raises RuntimeError when names or shapes differ."""
         text = {name.removeprefix(_TEXT): value for name, value in tensors.items() if name.startswith(_TEXT)}
         self.denoiser.network.load_state_dict(
-            {name: value for name, value in tensors.items() if not name.startswith(_TEXT)}
+            {current_name(name): value for name, value in tensors.items() if not name.startswith(_TEXT)}
         )
         if self.denoiser.text_encoder is not None:
             self.denoiser.text_encoder.load_state_dict(text)

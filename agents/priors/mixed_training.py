@@ -8,8 +8,9 @@ import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
-from agents.diffusion import CategoricalProcess, ResidualVariance, StepTable, loss_weights
+from agents.diffusion import CategoricalProcess, ResidualVariance, StepTable
 from agents.diffusion.reverse_steps import state_of
+from agents.diffusion.weighting import loss_weights
 from agents.networks.mixed_denoiser import Given, MixedDenoiser
 from agents.networks.mixed_flux_config import POSE
 from agents.networks.text import Text
@@ -99,9 +100,9 @@ class TrainableMixedPrior(PromptReader, ScenePrior):
             losses = F.cross_entropy(logits.flatten(0, 1), category0.flatten(), reduction="none").view_as(drawn)
         category_loss = (losses * drawn).sum(dim=1) / drawn.sum(dim=1).clamp(min=1.0)
         loss = pose_loss + config.category_weight * category_loss
-        requests = getattr(self.denoiser.network, "requests", None)
-        if requests is not None and text is not None:
-            loss = loss + _COUNT_WEIGHT * requests.count_loss(text[0][:, : requests.things], category0)
+        conditioning = self.count_conditioning
+        if conditioning is not None and text is not None:
+            loss = loss + _COUNT_WEIGHT * conditioning.count_loss(text[0][:, : conditioning.things], category0)
         return loss
 
     def draw_given(self, x0: Tensor, generator: Generator | None) -> Given:

@@ -41,7 +41,7 @@ def check_prompts(
     if not conditional:
         raise no_text(scene_type, next(iter(prompts), ""))
     check_guidance("".join(prompts), guidance)
-    check_room(prompts, scene_type, slots)
+    check_object_count(prompts, scene_type, slots)
     return prompts
 
 
@@ -62,7 +62,7 @@ def no_text(scene_type: SceneType, prompt: str) -> InvalidInputError:
     )
 
 
-def check_room(prompts: Sequence[str], scene_type: SceneType, slots: int) -> None:
+def check_object_count(prompts: Sequence[str], scene_type: SceneType, slots: int) -> None:
     """Refuse prompts that ask for more objects than a scene has slots; free text is not looked into.
 
     Raises:

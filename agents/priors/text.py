@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from agents.networks.count_conditioning import Requests
+from agents.networks.count_conditioning import CountConditioning
 from agents.networks.text import PADDING, Text, TextEncoder, vocabulary, warn_unknown
-from agents.priors.prompt_validation import check_room, no_text
+from agents.priors.prompt_validation import check_object_count, no_text
 from scene_envs.datasets.prompts.facts import SIDES
 from scene_envs.datasets.prompts.language import NUMBERS, ORDINALS, SIDE_PHRASES, Nouns
 from scene_envs.scene_types import SceneType
@@ -56,7 +56,7 @@ class PromptReader:
                 ``slots``.
         """
         encoder = self._encoder(prompts[0])
-        check_room(prompts, self.scene_type, slots)
+        check_object_count(prompts, self.scene_type, slots)
         indices, unknown = encoder.tokenize(prompts)
         warn_unknown(unknown)
         longest = encoder.token_space[0]
@@ -94,9 +94,9 @@ class PromptReader:
             warn_unknown(self.denoiser.text_encoder.unknown_words(prompts))
 
     @property
-    def count_conditioning(self) -> Requests | None:
+    def count_conditioning(self) -> CountConditioning | None:
         """The part of the network that is told how many objects a prompt asks for; None where there is none."""
-        return getattr(self.denoiser.network, "requests", None) if self.conditional else None
+        return getattr(self.denoiser.network, "count_conditioning", None) if self.conditional else None
 
     def freeze_text(self) -> None:
         """Keep the text encoder, if there is one, as it is in any training that follows."""

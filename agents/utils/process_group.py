@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 
 @dataclass(frozen=True)
-class World:
+class ProcessGroup:
     """The processes of a run.
 
     Attributes:
@@ -23,8 +23,8 @@ class World:
     size: int = 1
 
     @classmethod
-    def join(cls, device: str = "cpu") -> World:
-        """The world that ``torchrun`` set up, joined on first use; this process alone without it."""
+    def join(cls, device: str = "cpu") -> ProcessGroup:
+        """The group that ``torchrun`` set up, joined on first use; this process alone without it."""
         size = int(os.environ.get("WORLD_SIZE", "1"))
         if size == 1:
             return cls()
@@ -35,7 +35,7 @@ class World:
         return cls(torch.distributed.get_rank(), size)
 
     @property
-    def leads(self) -> bool:
+    def is_first(self) -> bool:
         """Whether this process writes files and logs."""
         return self.rank == 0
 

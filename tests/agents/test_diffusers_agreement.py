@@ -15,15 +15,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from agents.diffusion import (
-    GaussianProcess,
-    Preconditioning,
-    ResidualVariance,
-    StepTable,
-    check_weighting,
-    loss_weights,
-    make_schedule,
-)
+from agents.diffusion import GaussianProcess, Preconditioning, ResidualVariance, StepTable
+from agents.diffusion.schedules import make_schedule
+from agents.diffusion.weighting import check_weighting, loss_weights
 from agents.post_training import DenoisingPolicy
 from agents.priors.base import ScenePrior
 from agents.priors.mixed import MixedPrior

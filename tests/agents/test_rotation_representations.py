@@ -11,7 +11,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from agents.diffusion import GaussianStep, gaussian_log_prob
+from agents.diffusion import GaussianStep
+from agents.diffusion.reverse_steps import gaussian_log_prob
 from agents.networks import FluxConfig, MixedFluxConfig
 from agents.networks.registry import network_config
 from agents.post_training import DDPOSFLoss, DenoisingPolicy

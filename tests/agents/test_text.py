@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from agents.networks import MixedFluxConfig, TextConfig, TextEncoder, vocabulary
-from agents.networks.text import number_features
+from agents.networks import MixedFluxConfig, TextConfig, TextEncoder
+from agents.networks.text import number_features, vocabulary
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.initial_prior import build_prior
 from agents.priors.base import ScenePrior

@@ -11,7 +11,7 @@ from types import ModuleType
 import pytest
 import torch
 
-from agents.diffusion import gaussian_log_prob
+from agents.diffusion.reverse_steps import gaussian_log_prob
 from agents.post_training import compute_advantages
 from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior

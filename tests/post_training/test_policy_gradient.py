@@ -8,8 +8,9 @@ from tensordict import TensorDict
 from torch.distributions import Normal
 from toy_chain import LinearChain
 
-from agents.diffusion import gaussian_log_prob
-from agents.post_training import DDPOSFLoss, DenoisingPolicy, gradient_weights
+from agents.diffusion.reverse_steps import gaussian_log_prob
+from agents.post_training import DDPOSFLoss, DenoisingPolicy
+from agents.post_training.policy import gradient_weights
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError
 

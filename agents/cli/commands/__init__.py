@@ -19,10 +19,16 @@ COMMANDS = {
     "view": "write a page that shows scenes in a browser: a dataset, samples, a prior or a grammar",
     "evaluate": "measure the samples of a prior against real scenes",
     "priors": "list the priors that ship with the package",
-    "ship": "write a prior as a folder to give away, in half precision and with a model card",
+    "package-prior": "write a prior as a folder to give away, in half precision and with a model card",
     "rewards": "list the rewards, those of installed packages included",
     "import-checkpoint": "make a prior of a checkpoint of the paper's authors",
     "check-reward": "check that a reward keeps its contract",
     "demo": "post-train the shipped prior, compare before and after, write a report",
 }
 """What each command does, in the order of the listing."""
+
+RENAMED = {
+    "ship": "scene-envs package-prior",
+    "tables": "python -m benchmarks.paper_tables, in the repository",
+}
+"""Commands of earlier versions, and what does their work now."""

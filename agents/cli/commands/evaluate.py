@@ -75,14 +75,14 @@ def config() -> type[EvaluateConfig]:
 
 def run(settings: EvaluateConfig, run: Run) -> None:
     """Sample, measure group by group, tabulate."""
-    from agents.evaluation.groups import Material, choose_groups, measure_group
+    from agents.evaluation.measures import EvaluationInputs, choose_measures, compute_measure
     from agents.evaluation.real_scenes import RealScenes
     from agents.priors.base import ScenePrior
     from scene_envs.errors import InvalidInputError, MissingDependencyError
     from scene_envs.files import write_text
     from scene_envs.physics import PhysicsPool
 
-    groups = choose_groups(settings.measures, project=settings.project)
+    groups = choose_measures(settings.measures, project=settings.project)
     if settings.prompt_count is not None and not 2 <= settings.prompt_count <= settings.count:
         raise InvalidInputError(
             f"prompt_count={settings.prompt_count} must be from 2 to count={settings.count}, whose scenes the prompts "
@@ -103,7 +103,7 @@ def run(settings: EvaluateConfig, run: Run) -> None:
     _draw(samples, settings.pictures, run)
     optional = settings.measures in ("all", ["all"])
     with PhysicsPool(workers=settings.workers) as pool:
-        material = Material(
+        inputs = EvaluationInputs(
             samples,
             real,
             (lambda prompts: results.scenes(_PROMPTED, lambda: _sample(prior, settings, prompts)))
@@ -117,7 +117,7 @@ def run(settings: EvaluateConfig, run: Run) -> None:
         for name in missing:
             started = time.perf_counter()
             try:
-                figures = measure_group(name, material)
+                figures = compute_measure(name, inputs)
             except (InvalidInputError, MissingDependencyError) as error:
                 if not optional:
                     raise

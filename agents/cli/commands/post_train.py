@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
-from agents.post_training import PostTrainConfig, post_train, steer
+from agents.post_training import PostTrainConfig, post_train, post_train_and_compare
 from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def config() -> type[PostTrainKeys]:
 def run(settings: PostTrainKeys, run: Run) -> None:
     """Post-train and report; the trainer and the report write the metrics."""
     if settings.report_scenes:
-        metrics = steer(settings.run_config, scenes=settings.report_scenes)
+        metrics = post_train_and_compare(settings.run_config, scenes=settings.report_scenes)
         say_change(metrics, run)
         run.say(f"open {run.directory / 'report.html'}")
     else:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from agents.evaluation import grammar_scenes
-from agents.evaluation.groups import GROUPS, Material, choose_groups, measure_group
+from agents.evaluation.measures import MEASURES, EvaluationInputs, choose_measures, compute_measure
 from agents.evaluation.real_scenes import RealScenes
 from scene_envs.datasets import SceneDataset, union_scene_type
 from scene_envs.errors import InvalidInputError, UnknownNameError
@@ -34,38 +34,38 @@ def scenes() -> SceneBatch:
 
 
 def test_groups_are_chosen_by_name_in_their_order() -> None:
-    assert choose_groups("all") == list(GROUPS)
-    assert choose_groups("all", project=False) == [name for name in GROUPS if name != "ready"]
-    assert choose_groups(["physics", "layout"]) == ["layout", "physics"]
+    assert choose_measures("all") == list(MEASURES)
+    assert choose_measures("all", project=False) == [name for name in MEASURES if name != "ready"]
+    assert choose_measures(["physics", "layout"]) == ["layout", "physics"]
     with pytest.raises(UnknownNameError, match="did you mean 'physics'"):
-        choose_groups("phisics")
+        choose_measures("phisics")
 
 
 def test_samples_that_follow_every_prompt_score_as_real_scenes_do(scenes: SceneBatch) -> None:
     real = RealScenes(scenes[:12], scenes[12:24])
-    figures = measure_group("prompts", Material(scenes, real, follow=lambda prompts: real.floor))
+    figures = compute_measure("prompts", EvaluationInputs(scenes, real, follow=lambda prompts: real.floor))
     assert figures["prompt_following"] == figures["floor_prompt_following"] == 1.0
     assert figures["chance_prompt_following"] < 1.0
 
 
 def test_fewer_prompts_than_samples_can_be_followed(scenes: SceneBatch) -> None:
     real = RealScenes(scenes[:12], scenes[12:24])
-    material = Material(scenes, real, follow=lambda prompts: real.floor[: len(prompts)], prompts=6)
-    figures = measure_group("prompts", material)
+    inputs = EvaluationInputs(scenes, real, follow=lambda prompts: real.floor[: len(prompts)], prompts=6)
+    figures = compute_measure("prompts", inputs)
     assert sum(figures[f"prompt_{kind}_number"] for kind in ("counts", "names", "relations")) == 6
     assert figures["prompt_following"] == figures["floor_prompt_following"] == 1.0
 
 
 def test_samples_that_ignore_their_prompts_score_as_chance_does(scenes: SceneBatch) -> None:
     real = RealScenes(scenes[:20], scenes[20:])
-    ignored = measure_group("prompts", Material(scenes, real, follow=lambda prompts: real.reference))
+    ignored = compute_measure("prompts", EvaluationInputs(scenes, real, follow=lambda prompts: real.reference))
     assert ignored["prompt_following"] < 0.5
     assert ignored["floor_prompt_following"] == 1.0
 
 
 def test_novelty_of_copies_and_of_real_scenes(scenes: SceneBatch) -> None:
     real = RealScenes(scenes[:10], scenes[10:20], scenes[20:])
-    copies = measure_group("novelty", Material(scenes[20:30], real))
+    copies = compute_measure("novelty", EvaluationInputs(scenes[20:30], real))
     assert copies["novelty"] == copies["nearest_training_cm"] == 0.0
     assert copies["copied_fraction"] == 1.0
     assert copies["floor_novelty"] == pytest.approx(1.0, abs=0.4)

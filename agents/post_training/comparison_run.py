@@ -26,7 +26,7 @@ _PHYSICS_TIMEOUT = 300.0
 """Seconds for a chunk of scenes: on a busy machine a slow scene must not become an invalid one."""
 
 
-def steer(
+def post_train_and_compare(
     config: PostTrainConfig, *, scenes: int = 256, num_steps: int = 50, prior: ScenePrior | None = None
 ) -> dict[str, Any]:
     """Post-train, measure the base and the post-trained prior on fresh samples, and write the report.

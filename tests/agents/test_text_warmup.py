@@ -9,7 +9,7 @@ import torch
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.data import SceneTable
 from agents.pretraining.initial_prior import build_prior
-from agents.pretraining.text_warmup import learn_counts
+from agents.pretraining.text_warmup import warm_up_text
 from agents.priors.mixed import MixedPrior
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.grammars import get_grammar
@@ -29,14 +29,14 @@ def fresh(**keys: object) -> tuple[MixedPrior, SceneTable]:
 
 def read_numbers(prior: MixedPrior, prompt: str) -> torch.Tensor:
     """The likeliest number of each kind of object, and of all objects."""
-    requests = prior.denoiser.network.requests
+    conditioning = prior.denoiser.network.count_conditioning
     with torch.no_grad():
-        return requests.count_logits(prior.encode_prompts([prompt])[0][:, : requests.things]).argmax(dim=-1)[0]  # type: ignore[no-any-return]
+        return conditioning.count_logits(prior.encode_prompts([prompt])[0][:, : conditioning.things]).argmax(dim=-1)[0]  # type: ignore[no-any-return]
 
 
 def test_numbers_of_objects_are_read_from_prompts() -> None:
     prior, data = fresh()
-    assert learn_counts(prior, data, 250, 48, seed=0) is not None
+    assert warm_up_text(prior, data, 250, 48, seed=0) is not None
     assert [int(read_numbers(prior, f"A scene with {n} objects.")[-1]) for n in (4, 6, 8)] == [4, 6, 8]
     kinds = list(dict.fromkeys(asset.display_name for asset in prior.scene_type.library))
     games = [
@@ -50,22 +50,24 @@ def test_assets_of_one_name_are_one_kind_to_a_prompt() -> None:
     prior, _ = fresh()
     names = [asset.display_name for asset in prior.scene_type.library]
     assert len(set(names)) < len(names)
-    assert prior.denoiser.network.requests.things == len(set(names)) + 1
+    assert prior.denoiser.network.count_conditioning.things == len(set(names)) + 1
 
 
 def test_the_same_seed_learns_the_same_and_nothing_else_changes() -> None:
     priors = [fresh()[0] for _ in range(2)]
     before = {name: value.clone() for name, value in priors[0].denoiser.state_dict().items()}
     for prior in priors:
-        learn_counts(prior, SceneTable(prior.encode(SCENES), PROMPTS), 3, 16, seed=5)
+        warm_up_text(prior, SceneTable(prior.encode(SCENES), PROMPTS), 3, 16, seed=5)
     states = [prior.denoiser.state_dict() for prior in priors]
     changed = {name for name in before if not torch.equal(states[0][name], before[name])}
     assert all(torch.equal(states[0][name], states[1][name]) for name in before)
     assert changed
-    assert all(name.startswith(("text_encoder.", "network.requests.counts_out.")) for name in changed)
+    assert all(name.startswith(("text_encoder.", "network.count_conditioning.counts_out.")) for name in changed)
 
 
-@pytest.mark.parametrize("keys", [{"text_requests": False}, {"network": "midiffusion", "empty_slots": "attended"}])
-def test_a_network_that_reads_no_requests_has_nothing_to_learn(keys: dict[str, object]) -> None:
+@pytest.mark.parametrize(
+    "keys", [{"text_count_conditioning": False}, {"network": "midiffusion", "empty_slots": "attended"}]
+)
+def test_a_network_without_count_conditioning_has_nothing_to_learn(keys: dict[str, object]) -> None:
     prior, data = fresh(**keys)
-    assert learn_counts(prior, data, 3, 16, seed=0) is None
+    assert warm_up_text(prior, data, 3, 16, seed=0) is None

@@ -21,7 +21,7 @@ Figures = dict[str, float]
 
 
 @dataclass(frozen=True)
-class Material:
+class EvaluationInputs:
     """What an evaluation works on.
 
     Attributes:
@@ -34,7 +34,7 @@ class Material:
         prompts: real scenes whose prompts are followed; None for all of them.
 
     >>> empty = SceneBatch.empty("dimsum_table", 2)
-    >>> measure_group("layout", Material(empty, RealScenes(empty, empty)))["floor_objects_mean"]
+    >>> compute_measure("layout", EvaluationInputs(empty, RealScenes(empty, empty)))["floor_objects_mean"]
     1.0
     """
 
@@ -47,20 +47,20 @@ class Material:
     prompts: int | None = None
 
 
-def measure_group(name: str, material: Material) -> Figures:
+def compute_measure(name: str, inputs: EvaluationInputs) -> Figures:
     """The figures of one group, each with its floor: the same of real scenes against other real scenes.
 
     Raises:
         UnknownNameError: no such group.
-        InvalidInputError: the group needs what the material lacks.
+        InvalidInputError: the group needs what the inputs lacks.
         MissingDependencyError: it needs a package that is not installed.
     """
-    if name not in GROUPS:
-        raise unknown_name("measure", name, GROUPS)
-    return GROUPS[name](material)
+    if name not in MEASURES:
+        raise unknown_name("measure", name, MEASURES)
+    return MEASURES[name](inputs)
 
 
-def choose_groups(measures: str | Iterable[str], *, project: bool = True) -> list[str]:
+def choose_measures(measures: str | Iterable[str], *, project: bool = True) -> list[str]:
     """Names of groups, in their order.
 
     Args:
@@ -70,92 +70,92 @@ def choose_groups(measures: str | Iterable[str], *, project: bool = True) -> lis
     Raises:
         UnknownNameError: a name that is no group.
 
-    >>> choose_groups("novelty, layout")
+    >>> choose_measures("novelty, layout")
     ['layout', 'novelty']
     """
     names = [name.strip() for name in measures.split(",")] if isinstance(measures, str) else [*map(str, measures)]
     if names == ["all"]:
-        return [name for name in GROUPS if project or name != "ready"]
+        return [name for name in MEASURES if project or name != "ready"]
     for name in names:
-        if name not in GROUPS:
-            raise unknown_name("measure", name, ["all", *GROUPS])
-    return [name for name in GROUPS if name in names]
+        if name not in MEASURES:
+            raise unknown_name("measure", name, ["all", *MEASURES])
+    return [name for name in MEASURES if name in names]
 
 
-def _beside_floor(measure: Callable[[SceneBatch], Figures], material: Material) -> Figures:
+def _beside_floor(measure: Callable[[SceneBatch], Figures], inputs: EvaluationInputs) -> Figures:
     """Figures of the samples, and of other real scenes as floor."""
-    real = {FLOOR_PREFIX + name: value for name, value in measure(material.real.floor).items()}
-    return {**measure(material.samples), **real}
+    real = {FLOOR_PREFIX + name: value for name, value in measure(inputs.real.floor).items()}
+    return {**measure(inputs.samples), **real}
 
 
-def _layout(material: Material) -> Figures:
-    return _beside_floor(lambda batch: layout_figures(batch, material.real.reference), material)
+def _layout(inputs: EvaluationInputs) -> Figures:
+    return _beside_floor(lambda batch: layout_figures(batch, inputs.real.reference), inputs)
 
 
-def _physics(material: Material) -> Figures:
-    return _beside_floor(lambda batch: physics_figures(batch, material.pool), material)
+def _physics(inputs: EvaluationInputs) -> Figures:
+    return _beside_floor(lambda batch: physics_figures(batch, inputs.pool), inputs)
 
 
-def _ready(material: Material) -> Figures:
-    return _beside_floor(lambda batch: ready_figures(batch, material.pool), material)
+def _ready(inputs: EvaluationInputs) -> Figures:
+    return _beside_floor(lambda batch: ready_figures(batch, inputs.pool), inputs)
 
 
-def _classifier(material: Material) -> Figures:
+def _classifier(inputs: EvaluationInputs) -> Figures:
     from agents.evaluation.classifier import classifier_accuracy
 
     def measure(batch: SceneBatch) -> Figures:
-        accuracy = classifier_accuracy(material.real.reference, batch, seed=material.seed)
+        accuracy = classifier_accuracy(inputs.real.reference, batch, seed=inputs.seed)
         return {"classifier_accuracy": accuracy.mean, "classifier_accuracy_std": accuracy.std}
 
-    return _beside_floor(measure, material)
+    return _beside_floor(measure, inputs)
 
 
-def _renders(material: Material) -> Figures:
+def _renders(inputs: EvaluationInputs) -> Figures:
     from agents.evaluation.render_classifier import render_classifier_accuracy
 
     def measure(batch: SceneBatch) -> Figures:
-        accuracy = render_classifier_accuracy(material.real.reference, batch, seed=material.seed)
+        accuracy = render_classifier_accuracy(inputs.real.reference, batch, seed=inputs.seed)
         return {"render_accuracy": accuracy.mean, "render_accuracy_std": accuracy.std}
 
-    return _beside_floor(measure, material)
+    return _beside_floor(measure, inputs)
 
 
-def _fsd(material: Material) -> Figures:
+def _fsd(inputs: EvaluationInputs) -> Figures:
     from agents.evaluation.frechet import frechet_scene_distance
 
     return _beside_floor(
-        lambda batch: {"frechet_scene_distance": frechet_scene_distance(batch, material.real.reference)}, material
+        lambda batch: {"frechet_scene_distance": frechet_scene_distance(batch, inputs.real.reference)}, inputs
     )
 
 
-def _fid(material: Material) -> Figures:
+def _fid(inputs: EvaluationInputs) -> Figures:
     from agents.evaluation.inception import frechet_inception_distance
 
-    if not material.fid_weights:
+    if not inputs.fid_weights:
         raise InvalidInputError("FID needs fid_weights=, the path of an Inception-v3's weights")
 
     def measure(batch: SceneBatch) -> Figures:
-        distance = frechet_inception_distance(batch, material.real.reference, material.fid_weights)
+        distance = frechet_inception_distance(batch, inputs.real.reference, inputs.fid_weights)
         return {"frechet_inception_distance": distance}
 
-    return _beside_floor(measure, material)
+    return _beside_floor(measure, inputs)
 
 
-def _prompts(material: Material) -> Figures:
-    if material.follow is None:
+def _prompts(inputs: EvaluationInputs) -> Figures:
+    if inputs.follow is None:
         raise InvalidInputError("prompt-following needs a prior that reads prompts, and this one was trained without")
-    scenes = material.real.floor[: material.prompts]
-    prompts = own_prompts(scenes, material.seed)
-    figures = prompt_following(material.follow(prompts), prompts)
+    scenes = inputs.real.floor[: inputs.prompts]
+    prompts = own_prompts(scenes, inputs.seed)
+    figures = prompt_following(inputs.follow(prompts), prompts)
     real = {FLOOR_PREFIX + name: value for name, value in prompt_following(scenes, prompts).items()}
-    return {**figures, **real, **prompt_chance(scenes, prompts, material.seed)}
+    return {**figures, **real, **prompt_chance(scenes, prompts, inputs.seed)}
 
 
-def _novelty(material: Material) -> Figures:
-    training = material.real.training
+def _novelty(inputs: EvaluationInputs) -> Figures:
+    training = inputs.real.training
     if training is None:
         raise InvalidInputError("novelty needs data=, the dataset that the prior was trained on")
-    held_out = nearest_scenes(material.real.reference, training)
+    held_out = nearest_scenes(inputs.real.reference, training)
 
     def figures(found: Neighbors) -> Figures:
         return {
@@ -164,10 +164,10 @@ def _novelty(material: Material) -> Figures:
             "copied_fraction": float(found.copied.double().mean()),
         }
 
-    return _beside_floor(lambda batch: figures(nearest_scenes(batch, training)), material)
+    return _beside_floor(lambda batch: figures(nearest_scenes(batch, training)), inputs)
 
 
-GROUPS: dict[str, Callable[[Material], Figures]] = {
+MEASURES: dict[str, Callable[[EvaluationInputs], Figures]] = {
     "layout": _layout,
     "physics": _physics,
     "ready": _ready,

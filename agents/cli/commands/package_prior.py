@@ -1,4 +1,4 @@
-"""``scene-envs ship``."""
+"""``scene-envs package-prior``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ WRITES = False
 
 
 @dataclass
-class ShipConfig:
+class PackagePriorConfig:
     """A prior as a folder to give away: configuration, weights in half precision, model card.
 
     Attributes:
@@ -32,19 +32,21 @@ class ShipConfig:
     limits: str = ""
 
 
-def config() -> type[ShipConfig]:
+def config() -> type[PackagePriorConfig]:
     """The keys of this command."""
-    return ShipConfig
+    return PackagePriorConfig
 
 
-def run(settings: ShipConfig) -> None:
+def run(settings: PackagePriorConfig) -> None:
     """Write the folder; it is the prior itself, so that no log goes into it."""
-    from agents.priors.card import PriorFacts, ship_prior
+    from agents.priors.card import PriorFacts, package_prior
     from scene_envs.errors import InvalidInputError
 
     if not settings.prior or not settings.output:
-        raise InvalidInputError("ship: name the prior and its new folder, as in prior=runs/mine output=priors/mine")
-    folder = ship_prior(
+        raise InvalidInputError(
+            "package-prior: name the prior and its new folder, as in prior=runs/mine output=priors/mine"
+        )
+    folder = package_prior(
         settings.prior,
         settings.output,
         evaluation=settings.evaluation or None,
