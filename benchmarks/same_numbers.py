@@ -27,13 +27,17 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import torch
 from torch import Tensor
 
-from agents.planning import SearchConfig, run_search
-from agents.post_training import PostTrainConfig, post_train
-from agents.pretraining.config import PretrainConfig
-from agents.pretraining.trainer import pretrain
-from agents.priors.base import ScenePrior
-from agents.priors.checkpoint_import import import_checkpoint
-from agents.priors.files import list_priors
+from agents import (
+    PostTrainConfig,
+    PretrainConfig,
+    ScenePrior,
+    SearchConfig,
+    list_priors,
+    post_train,
+    pretrain,
+    run_search,
+)
+from agents.priors import import_checkpoint
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.scene import SceneBatch
 from tests.agents.authors_flux import random_state, write_checkpoint
