@@ -1,1 +1,53 @@
-"""What learns and what plans: priors, post-training, planning, evaluation, the command line."""
+"""What learns and what plans: priors, post-training, planning, evaluation, the command line.
+
+The names below load their modules, and torch with them, when they are first used.
+
+>>> from agents import ScenePrior, run_search
+>>> ScenePrior.__name__, run_search.__name__
+('ScenePrior', 'run_search')
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from agents.evaluation import evaluate
+    from agents.planning import SearchConfig, SearchOutcome, run_search
+    from agents.post_training import PostTrainConfig, PostTrainResult, post_train
+    from agents.pretraining import PretrainConfig, pretrain
+    from agents.priors import ScenePrior, list_priors
+
+__all__ = [
+    "PostTrainConfig",
+    "PostTrainResult",
+    "PretrainConfig",
+    "ScenePrior",
+    "SearchConfig",
+    "SearchOutcome",
+    "evaluate",
+    "list_priors",
+    "post_train",
+    "pretrain",
+    "run_search",
+]
+
+_ROOMS = {
+    "agents.evaluation": ("evaluate",),
+    "agents.planning": ("SearchConfig", "SearchOutcome", "run_search"),
+    "agents.post_training": ("PostTrainConfig", "PostTrainResult", "post_train"),
+    "agents.pretraining": ("PretrainConfig", "pretrain"),
+    "agents.priors": ("ScenePrior", "list_priors"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for room, names in _ROOMS.items():
+        if name in names:
+            return getattr(import_module(room), name)
+    raise AttributeError(f"module 'agents' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

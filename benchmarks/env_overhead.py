@@ -1,4 +1,4 @@
-"""What the environment faces cost over a bare sampling loop with the same prior.
+"""What the environment adapters cost over a bare sampling loop with the same prior.
 
     python benchmarks/env_overhead.py [--prior dimsum_table] [--batch 128] [--steps 10] [--rounds 3]
 
@@ -125,18 +125,18 @@ def cpu_seconds(run: Callable[[], None]) -> float:
     return time.process_time() - start
 
 
-def compare(bare: Callable[[], None], faces: Sequence[tuple[str, Callable[[], None]]], rounds: int) -> list[str]:
+def compare(bare: Callable[[], None], adapters: Sequence[tuple[str, Callable[[], None]]], rounds: int) -> list[str]:
     """One row per adapter: median CPU seconds, median ratio to the bare loop of the same round."""
-    times: dict[str, list[float]] = {name: [] for name, _ in faces}
+    times: dict[str, list[float]] = {name: [] for name, _ in adapters}
     base: list[float] = []
-    for _, run in (("bare", bare), *faces):
+    for _, run in (("bare", bare), *adapters):
         run()  # warm up
     for _ in range(rounds):
         base.append(cpu_seconds(bare))
-        for name, run in faces:
+        for name, run in adapters:
             times[name].append(cpu_seconds(run))
     rows = [f"| bare loop | {statistics.median(base):.3f} | 1.000 |"]
-    for name, _ in faces:
+    for name, _ in adapters:
         ratio = statistics.median(np.array(times[name]) / np.array(base))
         rows.append(f"| {name} | {statistics.median(times[name]):.3f} | {ratio:.3f} |")
     return rows
@@ -144,7 +144,7 @@ def compare(bare: Callable[[], None], faces: Sequence[tuple[str, Callable[[], No
 
 def main() -> None:
     """Parse the arguments, run, print a Markdown table."""
-    parser = argparse.ArgumentParser(description="Overhead of the environment faces over a bare sampling loop.")
+    parser = argparse.ArgumentParser(description="Overhead of the environment adapters over a bare sampling loop.")
     parser.add_argument("--prior", default="dimsum_table_continuous", help="name or path; 'tiny' for an untrained one")
     parser.add_argument("--batch", type=int, default=128)
     parser.add_argument("--steps", type=int, default=10)
@@ -154,7 +154,7 @@ def main() -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     if arguments.prior == "tiny":
-        from agents.prior import tiny_prior
+        from agents.priors.testing import tiny_prior
 
         given: object = tiny_prior()
     else:

@@ -59,9 +59,9 @@ from rich.table import Table
 
 from scene_envs.assets.base import Asset
 from scene_envs.export import PlacedScene, place
-from scene_envs.physics.constants import FRICTION
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import FeasibilityResult, PhysicsPool, feasibility
+from scene_envs.physics.constants import FRICTION
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import list_scene_types
 
@@ -213,7 +213,7 @@ def drake_verdicts(batch: SceneBatch, friction: float, contact: str) -> Verdicts
 def scenes_of(name: str, kind: str, count: int, seed: int) -> SceneBatch:
     """Scenes of a type and kind."""
     if kind == "prior":
-        from agents.prior import ScenePrior
+        from agents import ScenePrior
 
         return ScenePrior.load(name).sample(count, num_steps=50, seed=seed)
     clean = get_grammar(name).sample(np.random.default_rng([seed, list(NOISE).index(kind)]), count)

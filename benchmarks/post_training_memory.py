@@ -23,9 +23,11 @@ from rich.table import Table
 from tensordict import TensorDict
 from torch import Tensor
 
-from agents.diffusion import gaussian_log_prob
-from agents.post_training import DDPOSFLoss, DenoisingPolicy, gradient_weights
-from agents.prior import ScenePrior, tiny_prior
+from agents.diffusion.reverse_steps import gaussian_log_prob
+from agents.post_training import DDPOSFLoss, DenoisingPolicy
+from agents.post_training.policy import gradient_weights
+from agents.priors.base import ScenePrior
+from agents.priors.testing import tiny_prior
 
 MEBIBYTE = 2**20
 

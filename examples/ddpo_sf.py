@@ -40,8 +40,8 @@ import torch
 from torch import Tensor
 
 import scene_envs  # noqa: F401  (registers the environments)
-from agents.continuous_prior import ContinuousPrior
-from agents.prior import ScenePrior
+from agents import ScenePrior
+from agents.priors.continuous import ContinuousPrior
 from scene_envs.grammars import get_grammar
 
 

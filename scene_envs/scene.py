@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.files import replacing
 from scene_envs.normalizer import Normalizer
 from scene_envs.rotations import project_to_so3
 from scene_envs.scene_types import SceneType, get_scene_type
@@ -206,10 +207,8 @@ class SceneBatch:
         from safetensors.torch import save_file
 
         path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(path.name + ".partial")
-        save_file({"scenes": self._tensor.cpu().contiguous()}, partial, {"scene_type": self.scene_type.name})
-        os.replace(partial, path)
+        with replacing(path) as partial:
+            save_file({"scenes": self._tensor.cpu().contiguous()}, partial, {"scene_type": self.scene_type.name})
         return path
 
     @classmethod

@@ -152,25 +152,25 @@ class GaussianProcess:
         return self.preconditioning.mean.to(like), self.preconditioning.std.to(like)
 
 
-TIMESTEP_LAWS = ("lognormal", "uniform", "both")
+TIMESTEP_DISTRIBUTIONS = ("lognormal", "uniform", "both")
 """How training timesteps are drawn: a normal logarithm of the noise-to-signal ratio, all alike, or half each."""
 
 
-def timestep_weights(law: str, schedule: NoiseSchedule, mean: float, std: float) -> Tensor:
-    """(T + 1,) probabilities of drawing each timestep in training; ``mean`` and ``std`` as in the lognormal law."""
-    if law not in TIMESTEP_LAWS:
-        raise unknown_name("law of timesteps", law, TIMESTEP_LAWS)
-    if law == "lognormal":
+def timestep_weights(distribution: str, schedule: NoiseSchedule, mean: float, std: float) -> Tensor:
+    """(T + 1,) probabilities of drawing each timestep in training; ``mean`` and ``std`` are those of the lognormal."""
+    if distribution not in TIMESTEP_DISTRIBUTIONS:
+        raise unknown_name("distribution of timesteps", distribution, TIMESTEP_DISTRIBUTIONS)
+    if distribution == "lognormal":
         return lognormal_timesteps(schedule, mean, std)
     weight = torch.full((schedule.num_timesteps + 1,), 1.0 / schedule.num_timesteps, dtype=torch.float64)
     weight[0] = 0.0
-    return weight if law == "uniform" else 0.5 * (weight + lognormal_timesteps(schedule, mean, std))
+    return weight if distribution == "uniform" else 0.5 * (weight + lognormal_timesteps(schedule, mean, std))
 
 
 def lognormal_timesteps(schedule: NoiseSchedule, mean: float, std: float) -> Tensor:
     """(T + 1,) probabilities of drawing each timestep so that ln(noise-to-signal) ~ N(mean, std^2).
 
-    The law of Karras et al. (2022), Table 1, carried to a discrete schedule: the density at each level
+    The distribution of Karras et al. (2022), Table 1, carried to a discrete schedule: the density at each level
     times the width of the level. t = 0 has probability 0.
     """
     log_sigma = schedule.noise_to_signal[1:].log()

@@ -64,3 +64,14 @@ def loss_weights(
     snr = alpha_bar / (1.0 - alpha_bar)
     over = {"epsilon": snr, "v": snr + 1.0, "x0": torch.ones_like(snr)}[prediction]
     return (snr.clamp(max=gamma) / over).float().to(t.device)
+
+
+def timestep_distribution(timesteps: str | None, prediction: str) -> str:
+    """The distribution of training timesteps: the given one, or that which was published with ``prediction``.
+
+    >>> timestep_distribution(None, "epsilon"), timestep_distribution(None, "karras")
+    ('uniform', 'lognormal')
+    >>> timestep_distribution("lognormal", "v")
+    'lognormal'
+    """
+    return timesteps or ("lognormal" if prediction == "karras" else "uniform")

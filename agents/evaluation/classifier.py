@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from agents.evaluation.judging import FEWEST, Accuracy, Forward, JudgeConfig, Split, check_classes, judge
 from agents.evaluation.scene_tokens import (
     NEIGHBOUR_FEATURES,
     POSE_FEATURES,
@@ -17,6 +16,15 @@ from agents.evaluation.scene_tokens import (
     scene_tokens,
 )
 from agents.evaluation.set_network import SetNetwork, SetNetworkConfig
+from agents.evaluation.two_sample_test import (
+    FEWEST,
+    Accuracy,
+    ClassifierConfig,
+    Forward,
+    Split,
+    check_classes,
+    two_sample_accuracy,
+)
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
@@ -39,7 +47,7 @@ def classifier_accuracy(
     seeds: int = 10,
     seed: int = 0,
     resolution: tuple[float, float] = RESOLUTION,
-    config: JudgeConfig | None = None,
+    config: ClassifierConfig | None = None,
 ) -> Accuracy:
     """Accuracy, on held-out scenes, of a classifier trained to tell real scenes from samples.
 
@@ -93,11 +101,11 @@ def classifier_accuracy(
 
         return network, forward
 
-    config = _affordable(config or JudgeConfig(), tokens)
-    return judge(len(real), len(fake), prepare, seeds=seeds, seed=seed, config=config)
+    config = _affordable(config or ClassifierConfig(), tokens)
+    return two_sample_accuracy(len(real), len(fake), prepare, seeds=seeds, seed=seed, config=config)
 
 
-def _affordable(config: JudgeConfig, tokens: SceneTokens) -> JudgeConfig:
+def _affordable(config: ClassifierConfig, tokens: SceneTokens) -> ClassifierConfig:
     """The protocol with so few training scenes that they hold no more than ``MOST_OBJECTS``."""
     per_scene = float(tokens.present.sum()) / len(tokens)
     most = max(FEWEST, int(0.5 * MOST_OBJECTS / max(per_scene, 1.0)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from agents.evaluation.metrics import (
 )
 from agents.evaluation.novelty import duplicates
 from agents.evaluation.physics_figures import physics_figures, ready_figures
+from scene_envs.envs.resolvers import resolve_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
@@ -27,7 +28,7 @@ FLOOR_PREFIX = "floor_"
 
 
 class Sampler(Protocol):
-    """What :func:`evaluate_prior` needs of a prior; ``agents.prior.ScenePrior`` has it."""
+    """What :func:`evaluate` needs of a prior; ``agents.priors.base.ScenePrior`` has it."""
 
     @property
     def scene_type(self) -> SceneType: ...
@@ -79,7 +80,7 @@ def measure_samples(
     return figures
 
 
-def evaluate_prior(
+def evaluate(
     prior: Sampler | str,
     count: int = 500,
     reference: SceneBatch | None = None,
@@ -153,6 +154,4 @@ def layout_figures(batch: SceneBatch, reference: SceneBatch) -> dict[str, float]
 def _load(prior: Sampler | str) -> Sampler:
     if not isinstance(prior, str):
         return prior
-    from agents.prior import ScenePrior
-
-    return ScenePrior.load(prior)
+    return cast(Sampler, resolve_prior(prior))

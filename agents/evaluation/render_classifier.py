@@ -9,7 +9,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from agents.evaluation.judging import Accuracy, Forward, JudgeConfig, Split, check_classes, judge
+from agents.evaluation.two_sample_test import (
+    Accuracy,
+    ClassifierConfig,
+    Forward,
+    Split,
+    check_classes,
+    two_sample_accuracy,
+)
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
@@ -27,7 +34,7 @@ def render_classifier_accuracy(
     seed: int = 0,
     width: int = WIDTH,
     height: int = HEIGHT,
-    config: JudgeConfig | None = None,
+    config: ClassifierConfig | None = None,
 ) -> Accuracy:
     """Accuracy, on held-out scenes, of a CNN trained to tell renders of real scenes from renders of samples.
 
@@ -67,7 +74,8 @@ def render_classifier_accuracy(
 
         return _RenderNetwork(colors), forward
 
-    return judge(len(real), len(fake), prepare, seeds=seeds, seed=seed, config=config or JudgeConfig())
+    config = config or ClassifierConfig()
+    return two_sample_accuracy(len(real), len(fake), prepare, seeds=seeds, seed=seed, config=config)
 
 
 def class_images(batches: list[SceneBatch], width: int, height: int) -> tuple[Tensor, int]:

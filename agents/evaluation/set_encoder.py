@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from agents.evaluation.scene_tokens import WAVE_FEATURES, SceneTokens, scene_tokens
 from agents.evaluation.set_network import SetNetwork, SetNetworkConfig
 from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.files import replacing
 from scene_envs.scene import SceneBatch
 
 SHIPPED = Path(__file__).parent / "weights" / "set_encoder.safetensors"
@@ -98,13 +99,11 @@ class SetEncoder(nn.Module):
         from safetensors.torch import save_file
 
         path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
         weights = {name: value.detach().contiguous() for name, value in self.state_dict().items()}
         weights = {name: value.half() if name.startswith("network.") else value for name, value in weights.items()}
         metadata = {"vocabulary": json.dumps(self.vocabulary), "config": json.dumps(asdict(self.config)), "note": note}
-        partial = path.with_name(path.name + ".partial")
-        save_file(weights, partial, metadata)
-        os.replace(partial, path)
+        with replacing(path) as partial:
+            save_file(weights, partial, metadata)
         return path
 
     @classmethod

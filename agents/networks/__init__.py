@@ -5,16 +5,8 @@ from agents.networks.flux import FluxConfig, FluxDenoiser
 from agents.networks.midiffusion import MiDiffusion, MiDiffusionConfig, MixedMiDiffusion, MixedMiDiffusionConfig
 from agents.networks.mixed_flux import MixedFlux
 from agents.networks.mixed_flux_config import MixedFluxConfig
-from agents.networks.registry import (
-    NETWORKS,
-    build_network,
-    config_from_state,
-    config_state,
-    match_parameters,
-    network_config,
-    parameter_count,
-)
-from agents.networks.text import TextConfig, TextEncoder, vocabulary
+from agents.networks.registry import NETWORKS, build_network, match_parameters, network_config, parameter_count
+from agents.networks.text import TextConfig, TextEncoder
 
 __all__ = [
     "NETWORKS",
@@ -33,10 +25,7 @@ __all__ = [
     "TextConfig",
     "TextEncoder",
     "build_network",
-    "config_from_state",
-    "config_state",
     "match_parameters",
     "network_config",
     "parameter_count",
-    "vocabulary",
 ]

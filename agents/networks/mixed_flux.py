@@ -16,13 +16,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from agents.networks.contacts import CHANNELS, Contacts, gated_displacement
+from agents.networks.count_conditioning import CountConditioning
+from agents.networks.count_embedding import CountEmbedding
 from agents.networks.flux import timestep_embedding
 from agents.networks.flux_blocks import DoubleStreamBlock, SingleStreamBlock
 from agents.networks.mixed_flux_config import POSE, MixedFluxConfig
 from agents.networks.relations import FEATURES, Relations
-from agents.networks.requests import Requests
 from agents.networks.rotation_features import ROTATION_FEATURES, gated_rotation, nearest_rotations, rotation_features
-from agents.networks.tally import Tally
 from scene_envs.errors import InvalidInputError
 
 _TIME_WIDTH = 256
@@ -58,9 +58,10 @@ class MixedFlux(nn.Module):
         self.text_in = nn.Linear(config.text_width, hidden) if config.text_width else None
         pooled = config.text_width and config.pooled_text
         self.pooled_in = nn.Linear(config.text_width, hidden, bias=False) if pooled else None
-        self.tally = Tally(config.categories, config.text_width, hidden) if config.tally else None
-        requests = config.requests if config.text_width else 0
-        self.requests = Requests(config.kinds, config.text_width, hidden, requests) if requests else None
+        text_width = config.text_width
+        self.count_embedding = CountEmbedding(config.categories, text_width, hidden) if config.count_embedding else None
+        most = config.count_conditioning if text_width else 0
+        self.count_conditioning = CountConditioning(config.kinds, text_width, hidden, most) if most else None
         doubles = config.double_blocks if config.text_width else 0
         features = FEATURES if config.attention == "relative" else 0
         self.double_blocks = nn.ModuleList(
@@ -111,7 +112,8 @@ class MixedFlux(nn.Module):
             pose: (B, N, 12) noisy poses, as the process scales them.
             states: (B, N) int64 in 0..K, K being the mask token.
             time: (B,) what is embedded, times ``time_scale``: a timestep or a log noise level.
-            text: (B, L, W) text tokens; None for no text. With ``requests`` the first are of the kinds of objects.
+            text: (B, L, W) text tokens; None for no text. With ``count_conditioning`` the first are of the kinds of
+                objects.
             text_mask: (B, L) bool, True for real tokens.
             position: (B, N, 12) poses in signal units, for the features that are made of them; translations alone,
                 (B, N, 3), will do without ``rotation_features`` and ``contacts``.
@@ -123,15 +125,15 @@ class MixedFlux(nn.Module):
             pose output (B, N, 12) and logits (B, N, K) of the clean category.
         """
         asked = None
-        if self.requests is not None and text is not None:
-            asked, text = text[:, : self.requests.things], text[:, self.requests.things :]
-            text_mask = None if text_mask is None else text_mask[:, self.requests.things :]
+        if self.count_conditioning is not None and text is not None:
+            asked, text = text[:, : self.count_conditioning.things], text[:, self.count_conditioning.things :]
+            text_mask = None if text_mask is None else text_mask[:, self.count_conditioning.things :]
         condition = self.time_in(_embed(time * self.config.time_scale, pose.dtype))
         pooled = None if text is None else _mean_token(text, text_mask)
         if self.pooled_in is not None and pooled is not None:
             condition = condition + self.pooled_in(pooled)
-        if self.tally is not None:
-            condition = condition + self.tally(states, pooled, slot_mask)
+        if self.count_embedding is not None:
+            condition = condition + self.count_embedding(states, pooled, slot_mask)
         geometry = self._geometry(position, noise_level)
         turns = self._turns(geometry)
         features = self.pose_in(self._pose_features(pose, geometry, turns)) + self.category_in(states)
@@ -157,8 +159,8 @@ class MixedFlux(nn.Module):
         shift, scale = self.final_modulation(F.silu(condition)).unsqueeze(1).chunk(2, dim=-1)
         features = self.final((1 + scale) * F.layer_norm(scene, (self.config.hidden,), eps=1e-6) + shift)
         logits = self.logits_out(features)
-        if self.requests is not None and asked is not None:
-            logits = logits + self.requests(states, asked, slot_mask)[:, None]
+        if self.count_conditioning is not None and asked is not None:
+            logits = logits + self.count_conditioning(states, asked, slot_mask)[:, None]
         output = self.pose_out(features)
         if self.rotation_gates is not None and turns is not None:
             output = output + F.pad(gated_rotation(turns, self.rotation_gates(features)), (3, 0))

@@ -12,6 +12,9 @@ ATTENTIONS = ("plain", "relative")
 TEXT_REACHES = ("all", "double")
 """Blocks in which slots meet text."""
 
+RENAMED = {"tally": "count_embedding", "requests": "count_conditioning"}
+"""Fields and modules as files of earlier versions call them, and their names."""
+
 
 @dataclass(frozen=True)
 class MixedFluxConfig:
@@ -37,16 +40,17 @@ class MixedFluxConfig:
         text_reach: how far text goes: to the ``"double"``-stream blocks, or through ``"all"`` blocks, as the paper's.
         pooled_text: 1 to add the mean of the text tokens to the embedded time, which modulates every block (as Flux
             does with a pooled embedding), 0 as the paper.
-        tally: 1 to add what is counted in the scene as well (:class:`~agents.networks.tally.Tally`), 0 as the paper.
+        count_embedding: 1 to add what is counted in the scene as well
+            (:class:`~agents.networks.count_embedding.CountEmbedding`), 0 as the paper.
         rotation_features: 1 to tell how far each rotation is off SO(3) and off upright in units of the noise
             (:func:`~agents.networks.rotation_features.rotation_features`), 0 as the paper.
         contacts: 1 for displacements along the gaps between objects (:class:`~agents.networks.contacts.Contacts`),
             0 as the paper; without relative attention there are none.
         rotations: what the nine normalised numbers of a rotation are multiplied by, and what is then added, to be that
             of an object, which ``rotation_features`` and ``contacts`` need.
-        requests: where the first text tokens say what is asked of each kind of object, and last of all objects, and
-            that joins the logits (:class:`~agents.networks.requests.Requests`): the largest number told apart; 0 where
-            not, as the paper.
+        count_conditioning: where the first text tokens say what is asked of each kind of object, and last of all
+            objects, and that joins the logits (:class:`~agents.networks.count_conditioning.CountConditioning`): the
+            largest number told apart; 0 where not, as the paper.
         kinds: (K - 1,) the kind of each category, as prompts call it; empty where each is one of its own.
     """
 
@@ -67,8 +71,8 @@ class MixedFluxConfig:
     relation_blur: str = "largest"
     text_reach: str = "all"
     pooled_text: int = 0
-    tally: int = 0
-    requests: int = 0
+    count_embedding: int = 0
+    count_conditioning: int = 0
     kinds: tuple[int, ...] = ()
     rotation_features: int = 0
     contacts: int = 0
@@ -89,3 +93,13 @@ class MixedFluxConfig:
     def paper(cls, categories: int, text_width: int = 768) -> MixedFluxConfig:
         """The size and the details of the paper: 88.3 M parameters with text."""
         return cls(categories, 512, 5, 10, 16, 4.0, 256, POSE, text_width, 0, 1000.0, 0)
+
+
+def current_name(name: str) -> str:
+    """The name of a tensor of the network that a file, perhaps of an earlier version, calls ``name``.
+
+    >>> current_name("tally.out.weight"), current_name("scene_in.weight")
+    ('count_embedding.out.weight', 'scene_in.weight')
+    """
+    module, dot, rest = name.partition(".")
+    return RENAMED.get(module, module) + dot + rest

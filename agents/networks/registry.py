@@ -14,7 +14,7 @@ from agents.networks.diffuscene import DiffuScene, DiffuSceneConfig, MixedDiffuS
 from agents.networks.flux import FluxConfig, FluxDenoiser
 from agents.networks.midiffusion import MiDiffusion, MiDiffusionConfig, MixedMiDiffusion, MixedMiDiffusionConfig
 from agents.networks.mixed_flux import MixedFlux
-from agents.networks.mixed_flux_config import MixedFluxConfig
+from agents.networks.mixed_flux_config import RENAMED, MixedFluxConfig
 from scene_envs.errors import InvalidInputError, unknown_name
 
 NETWORKS = ("flux", "midiffusion", "diffuscene")
@@ -80,8 +80,8 @@ def network_config(
     unit: tuple[float, float, float] = (1.0, 1.0, 1.0),
     text_reach: str = "all",
     pooled_text: int = 0,
-    tally: int = 0,
-    requests: int = 0,
+    count_embedding: int = 0,
+    count_conditioning: int = 0,
     kinds: tuple[int, ...] = (),
     rotation_features: int = 0,
     contacts: int = 0,
@@ -102,7 +102,7 @@ def network_config(
         attention, relation_blur: read by the mixed ``flux`` alone, see :class:`~agents.networks.MixedFluxConfig`.
         frequencies: read by ``flux`` alone: the others are as published, unless their configuration is made by hand.
         unit: read by the mixed ``flux`` alone.
-        text_reach, pooled_text, tally, requests, kinds: read by the mixed ``flux`` alone.
+        text_reach, pooled_text, count_embedding, count_conditioning, kinds: read by the mixed ``flux`` alone.
         rotation_features, contacts, rotations: read by the mixed ``flux`` alone.
 
     Raises:
@@ -127,8 +127,8 @@ def network_config(
         sizes |= {"double_blocks": max(1, depth // 3), "single_blocks": depth, "embedding": hidden}
         sizes |= {"text_width": text_width, "frequencies": frequencies, "unit": unit}
         sizes |= {"attention": attention, "relation_blur": relation_blur}
-        sizes |= {"text_reach": text_reach, "pooled_text": pooled_text, "tally": tally}
-        sizes |= {"requests": requests if text_width else 0, "kinds": kinds}
+        sizes |= {"text_reach": text_reach, "pooled_text": pooled_text, "count_embedding": count_embedding}
+        sizes |= {"count_conditioning": count_conditioning if text_width else 0, "kinds": kinds}
         sizes |= {"rotation_features": rotation_features, "contacts": contacts, "rotations": rotations}
     config: NetworkConfig = entry.config(**sizes)
     return config
@@ -154,7 +154,7 @@ def config_from_state(state: Mapping[str, Any], process: str) -> NetworkConfig:
     """
     name = state.get("kind", "flux")
     kind = _entry(name, process).config
-    values = {key: value for key, value in state.items() if key != "kind"}
+    values = {RENAMED.get(key, key): value for key, value in state.items() if key != "kind"}
     strange = sorted(values.keys() - {field.name for field in fields(kind)})
     missing = sorted(
         field.name

@@ -17,6 +17,10 @@ from scene_envs.errors import InvalidInputError
 _LOGGER = logging.getLogger(__name__)
 
 _TOKEN = re.compile(r"[a-z]+|\d+|[^\sa-z\d]")
+
+Text = tuple[Tensor, Tensor]
+"""Tokens (B, L, W) and their mask (B, L), False on padding."""
+
 PADDING, UNKNOWN, START = 0, 1, 2
 """The first tokens: padding, a word outside the vocabulary, and the start of every prompt."""
 _SPECIAL = 3

@@ -2,7 +2,7 @@
 
 from agents.planning.planners import BestOfPlanner, PlanResult, Searchable, UCTPlanner
 from agents.planning.search_run import SearchConfig, SearchOutcome, run_search
-from agents.planning.tree import Node, Tree, ucb1
+from agents.planning.tree import Node, Tree
 
 __all__ = [
     "BestOfPlanner",
@@ -14,5 +14,4 @@ __all__ = [
     "Tree",
     "UCTPlanner",
     "run_search",
-    "ucb1",
 ]

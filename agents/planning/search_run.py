@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable
@@ -15,6 +14,7 @@ from agents.planning.search_report import draw_curve, draw_scene
 from scene_envs.envs import SearchEnv
 from scene_envs.envs.resolvers import resolve_prior
 from scene_envs.errors import InvalidInputError, SceneEnvsError
+from scene_envs.files import finite, write_json
 from scene_envs.scene import SceneBatch
 
 Progress = Callable[[str, int, int, float], None]
@@ -210,26 +210,21 @@ def _metrics(
             "path": list(search.best_path),
             "expansions": len(search.values),
             "invalid": sum(map(math.isnan, search.values)),
-            "curve": _jsonable(search.curve),
+            "curve": finite(search.curve),
         },
         "best_of": {
             "value": best_of.best_value,
             "objective": best_of.best_state.objective,
             "expansions": len(best_of.values),
             "invalid": sum(map(math.isnan, best_of.values)),
-            "curve": _jsonable(best_of.curve),
+            "curve": finite(best_of.curve),
         },
         "seconds": {name: round(value, 2) for name, value in seconds.items()},
     }
 
 
-def _jsonable(curve: list[float]) -> list[float | None]:
-    return [value if math.isfinite(value) else None for value in curve]
-
-
 def _write(outcome: SearchOutcome, config: SearchConfig, first: Any, best: Any, output: Path) -> None:
-    output.mkdir(parents=True, exist_ok=True)
-    (output / "metrics.json").write_text(json.dumps(outcome.metrics, indent=2) + "\n")
+    write_json(output / "metrics.json", outcome.metrics, indent=2)
     outcome.best.save(output / "best.safetensors")
     draw_curve(
         {"tree search": outcome.search.curve, "best of N": outcome.best_of.curve},

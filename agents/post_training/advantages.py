@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from agents.utils.process_group import gather_rows
 from scene_envs.errors import InvalidInputError
 
 BASELINES = ("leave_one_out", "mean")
@@ -57,16 +58,6 @@ def compute_advantages(
         elsewhere = all_groups == group
         advantage[rows] = _normalise(reward[rows], taken[rows], everywhere[elsewhere][mask[elsewhere]], baseline, clip)
     return advantage
-
-
-def gather_rows(x: Tensor) -> Tensor:
-    """``x`` (B, ...) of every worker, stacked along rows; ``x`` itself without ``torch.distributed``."""
-    distributed = torch.distributed
-    if not (distributed.is_available() and distributed.is_initialized()) or distributed.get_world_size() == 1:
-        return x
-    parts = [torch.empty_like(x) for _ in range(distributed.get_world_size())]
-    distributed.all_gather(parts, x.contiguous())
-    return torch.cat(parts)
 
 
 def _normalise(reward: Tensor, taken: Tensor, sample: Tensor, baseline: str, clip: float) -> Tensor:

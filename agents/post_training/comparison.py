@@ -12,7 +12,7 @@ from torch import Tensor
 from agents.post_training.report import Page, Picture, Section, Tile, write_report
 from agents.post_training.run_files import write_metrics
 from agents.post_training.trainer import PostTrainResult
-from agents.prior import ScenePrior
+from agents.priors.base import ScenePrior
 from rewards import PromptMatch, RewardContext, reward_name
 from scene_envs.scene import SceneBatch
 

@@ -59,7 +59,7 @@ class PostTrainConfig:
         warmup: updates over which the learning rate rises linearly.
         weight_decay: decoupled weight decay of AdamW.
         clip: largest norm of the summed gradient.
-        ema: decay of the weight average that is judged and saved; 0 takes the weights themselves.
+        ema: decay of the weight average that is evaluated and saved; 0 takes the weights themselves.
         slots: slots per scene; null means as many as the prior was trained on.
         chunk: scenes per forward and backward pass; null takes the whole batch at once.
         guard_every: iterations between guard checks.

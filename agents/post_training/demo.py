@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from agents.post_training.comparison_run import post_train_and_compare
 from agents.post_training.config import PostTrainConfig
-from agents.post_training.steering import steer
-from agents.prior import ScenePrior
+from agents.priors.base import ScenePrior
 
 RECIPE = PostTrainConfig(
     prior="dimsum_table_continuous",
@@ -39,7 +39,7 @@ def run_demo(
     recipe: PostTrainConfig | None = None,
     prior: ScenePrior | None = None,
 ) -> dict[str, Any]:
-    """Post-train, measure both priors on fresh samples, and write the report; see ``steer``.
+    """Post-train, measure both priors on fresh samples, and write the report; see ``post_train_and_compare``.
 
     Args:
         output: run directory; ``prior=<output>`` loads the result. An interrupted demonstration goes on there.
@@ -55,4 +55,4 @@ def run_demo(
         ``ready_objects``), ``change``, ``guard``.
     """
     config = replace(recipe or RECIPE, output=str(output), seed=seed, workers=workers)
-    return steer(config, scenes=scenes, num_steps=num_steps, prior=prior)
+    return post_train_and_compare(config, scenes=scenes, num_steps=num_steps, prior=prior)

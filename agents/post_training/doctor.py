@@ -14,7 +14,7 @@ from agents.post_training.config import PostTrainConfig
 from agents.post_training.gradients import accumulate_policy_gradient
 from agents.post_training.learner import Learner
 from agents.post_training.trainer import PostTrainer
-from agents.prior import ScenePrior
+from agents.priors.base import ScenePrior
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

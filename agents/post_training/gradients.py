@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Generator, Tensor, nn
 
-from agents.mixed_prior import MixedPrior
 from agents.post_training.losses import DDPOSFLoss
 from agents.post_training.rollouts import Rollout
-from agents.prior import ScenePrior
+from agents.priors.base import ScenePrior
 from scene_envs.errors import InvalidInputError
 
 
@@ -113,7 +112,7 @@ def add_regularisation_gradient(
 
 def prompted_loss(prior: ScenePrior, x0: Tensor, prompts: Sequence[str] | None, generator: Generator | None) -> Tensor:
     """(B,) pretraining losses of real scenes ``x0`` (B, N, D), given their prompts if there are any."""
-    if prompts is None or not isinstance(prior, MixedPrior):
+    if prompts is None or not prior.conditional:
         return prior.pretraining_loss(x0, generator, "none")
     with torch.no_grad():
         text = prior.encode_prompts(prompts)

@@ -10,7 +10,7 @@ import torch
 from torch import Generator, Tensor
 
 from agents.post_training.gradients import prompted_loss
-from agents.prior import ScenePrior
+from agents.priors.base import ScenePrior
 from scene_envs.scene import SceneBatch
 
 _CHUNK = 256
@@ -49,7 +49,7 @@ class Guard:
         seed: of the fixed timesteps and noise.
         prompts: one of each held-out scene; None measures without.
 
-    >>> from agents.prior import tiny_prior
+    >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior()
     >>> guard = Guard(prior.sample_tensor(4, num_steps=2), limit=1.5, seed=0)
     >>> guard.start(prior)
@@ -74,7 +74,7 @@ class Guard:
     @torch.no_grad()
     def loss(self, prior: ScenePrior) -> float:
         """Pretraining loss on the held-out scenes; the same timesteps and noise at every call."""
-        from agents.pretraining import heldout_loss
+        from agents.pretraining.trainer import heldout_loss
 
         device = next(prior.parameters()).device
         if self.prompts is not None:

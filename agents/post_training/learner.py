@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from copy import deepcopy
 from typing import Any
 
 import torch
 from torch import Generator, Tensor, nn
 
-from agents.averaging import WeightAverage
-from agents.mixed_prior import MixedPrior
 from agents.post_training.advantages import compute_advantages
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.gradients import (
@@ -21,10 +20,11 @@ from agents.post_training.gradients import (
 from agents.post_training.losses import DDPOSFLoss
 from agents.post_training.policy import DenoisingPolicy, gradient_weights
 from agents.post_training.prompts import PromptDeck, prompt_groups
-from agents.post_training.real_scenes import RealScenes
 from agents.post_training.rollouts import Rollout, collect, stream_seed
-from agents.prior import ScenePrior
-from agents.prompt_room import no_text
+from agents.post_training.scene_bank import SceneBank
+from agents.priors.base import ScenePrior
+from agents.priors.prompt_validation import no_text
+from agents.utils.weight_average import AveragedWeights, WeightAverage
 from scene_envs.envs import DenoisingTorchRLEnv
 
 
@@ -49,8 +49,7 @@ class Learner:
         self.prior = deepcopy(prior).to(config.device).eval()
         if config.prompt is not None and not self.prior.conditional:
             raise no_text(self.prior.scene_type, config.prompt)
-        if isinstance(self.prior, MixedPrior):
-            self.prior.freeze_text()
+        self.prior.freeze_text()
         self.slots = self.prior.config.slots if config.slots is None else config.slots
         self.policy = DenoisingPolicy(self.prior, config.num_steps, chunk=config.chunk, guidance=config.guidance)
         self.stds = self.policy.stds(self.slots).cpu()
@@ -81,7 +80,7 @@ class Learner:
         """Stop physics workers, if any."""
         self.env.close()
 
-    def deal_prompts(self, scenes: RealScenes) -> None:
+    def deal_prompts(self, scenes: SceneBank) -> None:
         """Make the deck from which the prompts of batches come; nothing without prompts."""
         config = self.config
         if config.prompt is not None and scenes.prompts is not None:
@@ -103,7 +102,7 @@ class Learner:
         groups = None if rollout.prompts is None else prompt_groups(rollout.prompts).to(reward.device)
         return compute_advantages(reward, valid, baseline=config.baseline, clip=config.advantage_clip, groups=groups)
 
-    def accumulate(self, rollout: Rollout, advantage: Tensor, scenes: RealScenes, index: int) -> dict[str, float]:
+    def accumulate(self, rollout: Rollout, advantage: Tensor, scenes: SceneBank, index: int) -> dict[str, float]:
         """Put both gradients into ``.grad`` and measure them apart.
 
         Args:
@@ -131,7 +130,7 @@ class Learner:
             "clip_fraction": policy.clip_fraction,
         }
 
-    def update(self, rollout: Rollout, advantage: Tensor, scenes: RealScenes, index: int) -> dict[str, float]:
+    def update(self, rollout: Rollout, advantage: Tensor, scenes: SceneBank, index: int) -> dict[str, float]:
         """One optimiser step.
 
         Raises:
@@ -169,34 +168,14 @@ class Learner:
             self.average.tensors, self.average.updates = state["average"], state["average_updates"]
         torch.set_rng_state(state["random"])
 
-    def judged(self) -> JudgedWeights:
-        """Context in which the prior holds the weights that are judged and saved: the average, when there is one."""
-        return JudgedWeights(self.prior, self.average)
+    def averaged(self) -> AveragedWeights[ScenePrior]:
+        """Context in which the prior holds the weights that are evaluated and saved: the average, when there is one."""
+        return AveragedWeights(self.prior, self.average)
 
     def _generator(self, stream: str, index: int) -> Generator:
         return Generator().manual_seed(stream_seed(self.config.seed, stream, index))
 
 
-class JudgedWeights:
-    """Swaps averaged weights in, and the training weights back in afterwards."""
-
-    def __init__(self, prior: ScenePrior, average: WeightAverage | None) -> None:
-        self.prior, self.average = prior, average
-        self._own: dict[str, Tensor] = {}
-
-    def __enter__(self) -> ScenePrior:
-        if self.average is not None:
-            self._own = {name: p.detach().clone() for name, p in self.prior.named_parameters()}
-            self.average.copy_to(self.prior)
-        return self.prior
-
-    def __exit__(self, *_: object) -> None:
-        with torch.no_grad():
-            for name, parameter in self.prior.named_parameters():
-                if name in self._own:
-                    parameter.copy_(self._own[name])
-
-
 def is_finite(value: float) -> bool:
     """Neither NaN nor infinite."""
-    return value == value and abs(value) != float("inf")
+    return math.isfinite(value)

@@ -55,7 +55,7 @@ class DDPOSFLoss(LossModule):
     Returns (``forward``): ``loss_objective`` (), and detached ``log_ratio`` (), the largest |log ratio|, and
     ``clip_fraction`` () when old log-probabilities are given.
 
-    >>> from agents.prior import tiny_prior
+    >>> from agents.priors.testing import tiny_prior
     >>> policy = DenoisingPolicy(tiny_prior(), num_steps=4)
     >>> scene = policy.prior.initial(2, 34)
     >>> action, log_prob = policy.draw(scene, 1)

@@ -9,12 +9,11 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Generator, Tensor
 
-from agents.diffusion import ReverseStep, concatenate_steps
+from agents.diffusion import ReverseStep
+from agents.diffusion.reverse_steps import concatenate_steps
+from agents.networks.text import Text
 from scene_envs.errors import InvalidInputError
 from scene_envs.protocols import PriorLike, PromptedPriorLike, StepTableLike
-
-Text = tuple[Tensor, Tensor]
-"""What a network attends to: tokens (B, L, W) and their mask (B, L)."""
 
 
 class DenoisingPolicy(TensorDictModuleBase):
@@ -30,7 +29,7 @@ class DenoisingPolicy(TensorDictModuleBase):
         chunk: scenes denoised at once, in sampling and in log-probabilities alike; None takes all.
         guidance: w of classifier-free guidance; the guided chain is the policy then.
 
-    >>> from agents.prior import tiny_prior
+    >>> from agents.priors.testing import tiny_prior
     >>> from scene_envs.envs import DenoisingTorchRLEnv
     >>> prior = tiny_prior()
     >>> env = DenoisingTorchRLEnv(2, prior=prior, num_steps=4)

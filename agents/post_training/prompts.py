@@ -13,10 +13,11 @@ import numpy as np
 import torch
 from torch import Generator, Tensor
 
-from agents.prior import ScenePrior
+from agents.priors.base import ScenePrior
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.envs.prompts import PROMPT_SOURCES, grammar_prompts
 from scene_envs.errors import InvalidInputError
+from scene_envs.files import write_text
 from scene_envs.scene import SceneBatch
 
 PROMPTS_NAME = "real_prompts.json"
@@ -126,7 +127,7 @@ def prompt_groups(prompts: Sequence[str]) -> Tensor:
 
 def save_prompts(path: Path, prompts: Sequence[Sequence[str]]) -> None:
     """The prompts of a dataset's scenes, beside the scenes themselves."""
-    path.write_text(json.dumps([list(texts) for texts in prompts]) + "\n", encoding="utf-8")
+    write_text(path, json.dumps([list(texts) for texts in prompts]) + "\n")
 
 
 def load_prompts(path: Path) -> PromptSets:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
-from agents.post_training.policy import DenoisingPolicy, Text
+from agents.networks.text import Text
+from agents.post_training.policy import DenoisingPolicy
+from agents.utils.seeds import derived_seed
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.errors import TrainingError
 from scene_envs.scene import SceneBatch
@@ -66,8 +67,7 @@ class Rollout:
 
 def stream_seed(seed: int, stream: str, iteration: int = 0) -> int:
     """A seed below 2^31 for one purpose in one iteration, so that a resumed run needs no generator's state."""
-    words = np.random.SeedSequence([seed, STREAMS.index(stream), iteration]).generate_state(1)
-    return int(words[0]) >> 1
+    return derived_seed(seed, STREAMS.index(stream), iteration)
 
 
 def collect(

@@ -5,14 +5,13 @@ from __future__ import annotations
 import csv
 import io
 import json
-import math
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from agents.checkpoints import load_checkpoint
 from agents.post_training.config import RESUMABLE, PostTrainConfig
+from agents.utils.checkpoints import load_checkpoint
+from scene_envs import files
 from scene_envs.errors import InvalidInputError, TrainingError
 
 CHECKPOINT_NAME = "checkpoint.pt"
@@ -27,13 +26,9 @@ def write_text(path: Path, text: str) -> None:
     Raises:
         TrainingError: the disk refused; what was there before is untouched.
     """
-    partial = path.with_name(path.name + ".partial")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(text, encoding="utf-8")
-        os.replace(partial, path)
+        files.write_text(path, text)
     except OSError as error:
-        partial.unlink(missing_ok=True)
         raise TrainingError(f"could not write {str(path)!r} ({error}); free some space and run again") from error
 
 
@@ -46,7 +41,7 @@ def write_config(directory: Path, config: PostTrainConfig) -> None:
 
 def write_metrics(directory: Path, metrics: Mapping[str, Any]) -> None:
     """``metrics.json``; numbers that JSON lacks become null."""
-    write_text(directory / METRICS_NAME, json.dumps(_json_able(metrics), indent=1, allow_nan=False) + "\n")
+    write_text(directory / METRICS_NAME, json.dumps(files.finite(metrics), indent=1, allow_nan=False) + "\n")
 
 
 def write_log(directory: Path, history: Sequence[Mapping[str, float]]) -> None:
@@ -79,13 +74,3 @@ def load_resumable(directory: Path, config: PostTrainConfig) -> dict[str, Any] |
             "give another output, or the same settings to resume it"
         )
     return state
-
-
-def _json_able(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _json_able(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_json_able(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

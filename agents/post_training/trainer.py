@@ -9,14 +9,12 @@ from typing import Any
 
 import torch
 
-from agents.checkpoints import save_checkpoint
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.curves import draw_curve
 from agents.post_training.guard import Guard, realism
 from agents.post_training.learner import Learner, NonFiniteGradient, is_finite
 from agents.post_training.progress import Progress
 from agents.post_training.prompts import PROMPTS_NAME, PromptSets, prompts_beside, save_prompts
-from agents.post_training.real_scenes import RealScenes, real_scenes
 from agents.post_training.rollouts import Rollout, stream_seed
 from agents.post_training.run_files import (
     CHECKPOINT_NAME,
@@ -26,8 +24,10 @@ from agents.post_training.run_files import (
     write_log,
     write_metrics,
 )
-from agents.prior import ScenePrior
-from agents.prompt_room import check_room
+from agents.post_training.scene_bank import SceneBank, real_scenes
+from agents.priors.base import ScenePrior
+from agents.priors.prompt_validation import check_object_count
+from agents.utils.checkpoints import save_checkpoint
 from rewards import reward_name
 from scene_envs.errors import TrainingError
 from scene_envs.scene import SceneBatch
@@ -63,7 +63,7 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> P
         InvalidInputError: a setting is wrong, or the directory holds a run of another configuration.
 
     >>> from tempfile import TemporaryDirectory
-    >>> from agents.prior import tiny_prior
+    >>> from agents.priors.testing import tiny_prior
     >>> with TemporaryDirectory() as output:
     ...     config = PostTrainConfig(output=output, iterations=2, batch_size=4, num_steps=4, gradient_steps=2,
     ...         bank_size=20, guard_scenes=8, regularisation_batch=4, progress="none")
@@ -87,7 +87,7 @@ class PostTrainer:
     """
 
     guard: Guard
-    scenes: RealScenes
+    scenes: SceneBank
 
     def __init__(self, config: PostTrainConfig, *, prior: ScenePrior | None = None) -> None:
         self.config = config
@@ -150,9 +150,11 @@ class PostTrainer:
             prompts = prompts_beside(self.directory, batch, seed)
             if config.prompt == "data":
                 large = torch.nonzero(batch.counts > self.learner.slots)[:, 0].tolist()
-                check_room([text for i in large for text in prompts(i)], self.prior.scene_type, self.learner.slots)
+                check_object_count(
+                    [text for i in large for text in prompts(i)], self.prior.scene_type, self.learner.slots
+                )
         x0 = self.prior.encode(batch.to(config.device))
-        self.scenes = RealScenes.split(x0, config.guard_scenes, prompts)
+        self.scenes = SceneBank.split(x0, config.guard_scenes, prompts)
         asked = self.scenes.heldout_prompts()
         self.guard = Guard(self.scenes.heldout, config.guard_limit, stream_seed(config.seed, "guard"), asked)
         self.learner.deal_prompts(self.scenes)
@@ -190,7 +192,7 @@ class PostTrainer:
         since = self.guard.readings[-1].iteration if self.guard.readings else 0
         recent = [row["reward"] for row in self.history[since:] if is_finite(row["reward"])]
         reward = sum(recent) / len(recent) if recent else float("nan")
-        with self.learner.judged() as prior:
+        with self.learner.averaged() as prior:
             reading = self.guard.check(prior, self.iteration, reward, realism(rollout.batch))
             if reading.kept:
                 self._save_prior()
@@ -237,7 +239,7 @@ class PostTrainer:
         self.learner.restore(state["learner"])
 
     def _save_prior(self) -> None:
-        """The judged weights, with a card that says how they were made."""
+        """The evaluated weights, with a card that says how they were made."""
         self.prior.card = {
             **self.prior.card,
             "post_training": {

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import errno
 import json
-import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError
+from scene_envs.files import replacing
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene_types import SceneType
 
@@ -143,12 +143,8 @@ def storage_error(path: Path, error: OSError) -> StorageError:
 @contextmanager
 def _replacing(path: Path) -> Iterator[Path]:
     """A place to write ``path`` at before it takes its name; one per process, so that two never mix."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        yield partial
-        os.replace(partial, path)
+        with replacing(path) as partial:
+            yield partial
     except OSError as error:
         raise storage_error(path, error) from error
-    finally:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)

@@ -14,6 +14,7 @@ from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.export.asset_files import AssetFiles
 from scene_envs.export.formats import get_format, resolve_formats
 from scene_envs.export.placed import identifier, place
+from scene_envs.files import write_json
 from scene_envs.physics.constants import FRICTION
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
@@ -125,9 +126,7 @@ def _claim(root: Path, batch: SceneBatch, friction: float) -> dict[str, Any]:
 
 
 def _write_manifest(root: Path, manifest: Mapping[str, Any]) -> None:
-    partial = root / f".{MANIFEST}.partial"
-    partial.write_text(json.dumps(manifest, indent=1) + "\n")
-    os.replace(partial, root / MANIFEST)
+    write_json(root / MANIFEST, manifest)
 
 
 def _digest(batch: SceneBatch) -> str:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from scene_envs.assets import Asset, ConvexPart
 from scene_envs.errors import InvalidInputError
+from scene_envs.files import write_text
 from scene_envs.render.framing import frame_scene_type
 from scene_envs.render.stage import vertex_colors
 from scene_envs.rotations import matrix_to_quaternion
@@ -66,10 +67,7 @@ def write_viewer(
     title = batch.scene_type.name.replace("_", " ") if title is None else title
     page = _page(title, _viewer_data(batch, captions))
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(page, encoding="utf-8")
-    os.replace(partial, path)
+    write_text(path, page)
     return path
 
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import math
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from scene_envs.scene_types import get_scene_type
+
 State = dict[str, Tensor]
+DIMSUM = get_scene_type("dimsum_table")
 
 
 def random_state(
@@ -138,3 +143,39 @@ def forward(state: State, pose: Tensor, category: Tensor, t: Tensor, text: Tenso
     noise = linear("to_continous_out.out_layer", silu(linear("to_continous_out.in_layer", out)))
     logits = linear("to_logits.1", norm(out, 1e-5) * s["to_logits.0.weight"] + s["to_logits.0.bias"])
     return noise, logits
+
+
+def _normalizer(features: int) -> dict[str, object]:
+    return {
+        "params": {
+            "scale": [2.0] * features,
+            "min": [0.0] * features,
+            "input_stats": {"min": [-0.5] * features, "max": [0.5] * features},
+        },
+        "is_fitted": True,
+    }
+
+
+def write_checkpoint(
+    folder: Path, state: dict[str, torch.Tensor], *, order: list[str] | None = None, **extra: object
+) -> tuple[Path, Path]:
+    """A checkpoint of ``state`` and the metadata of its dataset, written into ``folder``."""
+    names = order or list(DIMSUM.assets)
+    metadata = {
+        "model_paths": [f"package://some/models/{name}.sdf" for name in names],
+        "normalizer_state": _normalizer(13 + len(names)),
+        "welded_object_model_paths": ["package://some/models/cafe_table.sdf"],
+        "max_num_objects_per_scene": 34,
+    }
+    (folder / "metadata.json").write_text(json.dumps(metadata))
+    content = {
+        "state_dict": {f"model.{name}": 0.0 * tensor for name, tensor in state.items()}
+        | {f"ema.averaged_model.{name}": tensor for name, tensor in state.items()}
+        | {"ema.optimization_step": torch.tensor(7), "txt_encoder.weight": torch.zeros(2)},
+        "normalizer_state": _normalizer(12),
+        "global_step": 1234,
+        "optimizer_states": [{"state": {}}],
+        **extra,
+    }
+    torch.save(content, folder / "mixed.ckpt")
+    return folder / "mixed.ckpt", folder / "metadata.json"

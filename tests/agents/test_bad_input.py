@@ -17,17 +17,17 @@ from safetensors.torch import save_file
 
 from agents.cli import main
 from agents.diffusion import StepTable
-from agents.pretrain_config import PretrainConfig
-from agents.pretraining import pretrain
-from agents.prior import ScenePrior, tiny_prior
+from agents.pretraining.config import PretrainConfig
+from agents.pretraining.trainer import pretrain
+from agents.priors.base import ScenePrior
+from agents.priors.testing import tiny_prior
 from scene_envs.datasets import SceneDataset
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.grammars import get_grammar
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch
-from tests.agents.authors_flux import random_state
-from tests.agents.test_checkpoint_import import write_checkpoint
+from tests.agents.authors_flux import random_state, write_checkpoint
 
 NAN = float("nan")
 

@@ -11,22 +11,21 @@ import numpy as np
 import pytest
 import torch
 
-from agents.checkpoint_import import import_checkpoint
-from agents.mixed_prior import MixedPrior
-from agents.model_card import PriorFacts, ship_prior
 from agents.networks.bert_files import FOLDER_VARIABLE, load_bert
-from agents.new_prior import build_prior
-from agents.pretrain_config import PretrainConfig
-from agents.pretraining import pretrain
-from agents.prior import ScenePrior
+from agents.pretraining.config import PretrainConfig
+from agents.pretraining.initial_prior import build_prior
+from agents.pretraining.trainer import pretrain
+from agents.priors.base import ScenePrior
+from agents.priors.card import PriorFacts, package_prior
+from agents.priors.checkpoint_import import import_checkpoint
+from agents.priors.mixed import MixedPrior
 from scene_envs.datasets import SceneDataset
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.grammars import get_grammar
 from scene_envs.normalizer import Normalizer
-from tests.agents.authors_flux import random_state
+from tests.agents.authors_flux import random_state, write_checkpoint
 from tests.agents.small_bert import write_bert
-from tests.agents.test_checkpoint_import import write_checkpoint
 
 pytest.importorskip("transformers")
 
@@ -149,7 +148,7 @@ def test_the_configuration_names_the_model_and_its_digest(prior: MixedPrior, ber
 def test_a_shipped_prior_names_no_folder_and_finds_its_bert_all_the_same(
     prior: MixedPrior, bert: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = ship_prior(prior, tmp_path / "given")
+    folder = package_prior(prior, tmp_path / "given")
     assert str(bert.parent) not in (folder / "config.json").read_text() + (folder / "README.md").read_text()
     shipped = ScenePrior.load(folder)
     with pytest.raises(InvalidInputError, match=FOLDER_VARIABLE):

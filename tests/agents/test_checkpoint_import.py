@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import pickle
 import sys
@@ -11,49 +10,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from agents.checkpoint_import import import_checkpoint
-from agents.lightning_files import read_lightning
-from agents.prior import ScenePrior
+from agents.priors.base import ScenePrior
+from agents.priors.checkpoint_import import import_checkpoint
+from agents.priors.lightning_files import read_lightning
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, UnknownNameError
-from scene_envs.scene_types import get_scene_type
-from tests.agents.authors_flux import forward, random_state
-
-DIMSUM = get_scene_type("dimsum_table")
-
-
-def _normalizer(features: int) -> dict[str, object]:
-    return {
-        "params": {
-            "scale": [2.0] * features,
-            "min": [0.0] * features,
-            "input_stats": {"min": [-0.5] * features, "max": [0.5] * features},
-        },
-        "is_fitted": True,
-    }
-
-
-def write_checkpoint(
-    folder: Path, state: dict[str, torch.Tensor], *, order: list[str] | None = None, **extra: object
-) -> tuple[Path, Path]:
-    names = order or list(DIMSUM.assets)
-    metadata = {
-        "model_paths": [f"package://some/models/{name}.sdf" for name in names],
-        "normalizer_state": _normalizer(13 + len(names)),
-        "welded_object_model_paths": ["package://some/models/cafe_table.sdf"],
-        "max_num_objects_per_scene": 34,
-    }
-    (folder / "metadata.json").write_text(json.dumps(metadata))
-    content = {
-        "state_dict": {f"model.{name}": 0.0 * tensor for name, tensor in state.items()}
-        | {f"ema.averaged_model.{name}": tensor for name, tensor in state.items()}
-        | {"ema.optimization_step": torch.tensor(7), "txt_encoder.weight": torch.zeros(2)},
-        "normalizer_state": _normalizer(12),
-        "global_step": 1234,
-        "optimizer_states": [{"state": {}}],
-        **extra,
-    }
-    torch.save(content, folder / "mixed.ckpt")
-    return folder / "mixed.ckpt", folder / "metadata.json"
+from tests.agents.authors_flux import DIMSUM, forward, random_state, write_checkpoint
 
 
 @pytest.mark.parametrize("text", [0, 10])

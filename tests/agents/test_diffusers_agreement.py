@@ -15,18 +15,13 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from agents.diffusion import (
-    GaussianProcess,
-    Preconditioning,
-    ResidualVariance,
-    StepTable,
-    check_weighting,
-    loss_weights,
-    make_schedule,
-)
-from agents.mixed_prior import MixedPrior
+from agents.diffusion import GaussianProcess, Preconditioning, ResidualVariance, StepTable
+from agents.diffusion.schedules import make_schedule
+from agents.diffusion.weighting import check_weighting, loss_weights
 from agents.post_training import DenoisingPolicy
-from agents.prior import ScenePrior, tiny_prior
+from agents.priors.base import ScenePrior
+from agents.priors.mixed import MixedPrior
+from agents.priors.testing import tiny_prior
 from scene_envs.envs import DenoisingCore
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.grammars import get_grammar

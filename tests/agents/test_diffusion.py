@@ -6,14 +6,9 @@ import pytest
 import torch
 from diffusers import DDPMScheduler
 
-from agents.diffusion import (
-    GaussianProcess,
-    Preconditioning,
-    StepTable,
-    lognormal_timesteps,
-    make_schedule,
-    timestep_weights,
-)
+from agents.diffusion import GaussianProcess, Preconditioning, StepTable
+from agents.diffusion.gaussian import lognormal_timesteps, timestep_weights
+from agents.diffusion.schedules import make_schedule
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 D = 20

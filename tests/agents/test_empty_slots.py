@@ -8,11 +8,11 @@ import pytest
 import torch
 from torch import nn
 
-from agents.mixed_prior import MixedPrior
 from agents.networks import MixedFluxConfig
 from agents.networks.mixed_flux_config import ATTENTIONS
-from agents.packing import pack
-from agents.prior import tiny_prior
+from agents.networks.packing import pack
+from agents.priors.mixed import MixedPrior
+from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError
 
 

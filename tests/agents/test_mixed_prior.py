@@ -10,11 +10,12 @@ import torch
 
 from agents.diffusion import MixedStep
 from agents.diffusion.reverse_steps import state_of
-from agents.mixed_denoiser import Given
-from agents.mixed_prior import MixedPrior
+from agents.networks.mixed_denoiser import Given
 from agents.post_training import DDPOSFLoss, DenoisingPolicy
 from agents.post_training.rollouts import collect
-from agents.prior import ScenePrior, tiny_prior
+from agents.priors.base import ScenePrior
+from agents.priors.mixed import MixedPrior
+from agents.priors.testing import tiny_prior
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.grammars import get_grammar

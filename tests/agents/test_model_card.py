@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from agents.cli import main
-from agents.model_card import OWN_LICENSE, PriorFacts, read_measures, ship_prior
-from agents.prior import ScenePrior, tiny_prior
+from agents.priors.base import ScenePrior
+from agents.priors.card import OWN_LICENSE, PriorFacts, package_prior, read_measures
+from agents.priors.testing import tiny_prior
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
 
 FIGURES = {
@@ -44,7 +45,7 @@ def run_folder(tmp_path: Path) -> Path:
 
 
 def test_a_shipped_folder_is_a_prior_with_a_card(run_folder: Path, tmp_path: Path) -> None:
-    folder = ship_prior(
+    folder = package_prior(
         run_folder,
         tmp_path / "small_mixed",
         evaluation=run_folder / "evaluation",
@@ -93,7 +94,7 @@ def test_the_listing_shows_measures_beside_real_scenes(run_folder: Path, tmp_pat
     lines = PriorFacts.of(run_folder).lines()
     assert "reads no prompts" in lines[0]
     assert lines[-1].strip() == "not measured"
-    shipped = PriorFacts.of(ship_prior(run_folder, tmp_path / "x", evaluation=run_folder / "evaluation")).lines()
+    shipped = PriorFacts.of(package_prior(run_folder, tmp_path / "x", evaluation=run_folder / "evaluation")).lines()
     text = "\n".join(shipped)
     assert "not measured" not in text
     rows = {line.rsplit("  (")[0].rsplit("  ", 1)[0].strip(): line for line in shipped[2:]}
@@ -104,16 +105,25 @@ def test_the_listing_shows_measures_beside_real_scenes(run_folder: Path, tmp_pat
 
 
 def test_a_prior_that_reads_prompts_says_so(tmp_path: Path) -> None:
-    folder = ship_prior(tiny_prior(process="mixed", text=True), tmp_path / "words")
+    folder = package_prior(tiny_prior(process="mixed", text=True), tmp_path / "words")
     assert "a vocabulary of" in PriorFacts.of(folder).lines()[0]
     assert "prompt='A scene with 12 objects.'" in (folder / "README.md").read_text()
 
 
-def test_commands_ship_and_show(run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands_package_and_show(run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     evaluation = run_folder / "evaluation" / "metrics.json"
     output = tmp_path / "given"
     assert (
-        main(["ship", f"prior={run_folder}", f"output={output}", f"evaluation={evaluation}", "limits=None found."]) == 0
+        main(
+            [
+                "package-prior",
+                f"prior={run_folder}",
+                f"output={output}",
+                f"evaluation={evaluation}",
+                "limits=None found.",
+            ]
+        )
+        == 0
     )
     assert "81.2 %" in capsys.readouterr().out
     assert main(["priors", f"prior={output}"]) == 0
@@ -124,7 +134,7 @@ def test_commands_ship_and_show(run_folder: Path, tmp_path: Path, capsys: pytest
     assert "M parameters" in printed
     assert main(["priors", "prior=dimsum_tabel"]) == 2
     assert "did you mean 'dimsum_table'?" in capsys.readouterr().err
-    assert main(["ship", f"prior={run_folder}"]) == 2
+    assert main(["package-prior", f"prior={run_folder}"]) == 2
     assert "output=" in capsys.readouterr().err
 
 
@@ -137,4 +147,4 @@ def test_wrong_input_is_named(run_folder: Path, tmp_path: Path) -> None:
     with pytest.raises(CorruptFileError, match="not valid JSON"):
         read_measures(tmp_path / "broken.json")
     with pytest.raises(UnknownNameError, match="float16"):
-        ship_prior(run_folder, tmp_path / "y", precision="half")
+        package_prior(run_folder, tmp_path / "y", precision="half")

@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from agents.diffusion import CategoricalProcess, CategoryMoments, Preconditioning, make_categorical_schedule
-from agents.diffusion.categorical import sample_categorical
+from agents.diffusion import CategoricalProcess, Preconditioning
+from agents.diffusion.categorical import make_categorical_schedule, sample_categorical
+from agents.diffusion.moments import CategoryMoments
 
 
 def _data(count: int) -> tuple[torch.Tensor, torch.Tensor]:

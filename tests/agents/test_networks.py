@@ -23,14 +23,13 @@ from agents.networks import (
     MixedFluxConfig,
     MixedMiDiffusionConfig,
     build_network,
-    config_from_state,
-    config_state,
     match_parameters,
     network_config,
     parameter_count,
 )
-from agents.networks.requests import Requests, still_to_come
-from agents.networks.tally import count_states
+from agents.networks.count_conditioning import CountConditioning, still_to_come
+from agents.networks.count_embedding import count_states
+from agents.networks.registry import config_from_state, config_state
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 FEATURES, CATEGORIES, TEXT = 20, 8, 12
@@ -56,8 +55,8 @@ def make(name: str, process: str, text_width: int = TEXT, zero: bool = False, **
         contacts=1,
         attention="relative",
         pooled_text=1,
-        tally=1,
-        requests=9,
+        count_embedding=1,
+        count_conditioning=9,
     )
     torch.manual_seed(0)
     network = build_network(type(config)(**{**vars(config), **fields})).double()
@@ -95,13 +94,13 @@ def run(network: nn.Module, process: str, arguments: dict[str, Any]) -> Tensor:
     """What a network says, (B, N, numbers)."""
     if type(network).__name__ == "FluxDenoiser":
         arguments = {key: value for key, value in arguments.items() if not key.startswith("text")}
-    if getattr(network, "requests", None) is not None and arguments["text"] is not None:
+    if getattr(network, "count_conditioning", None) is not None and arguments["text"] is not None:
         generator = torch.Generator().manual_seed(2)
         asked = torch.randn(
-            (len(arguments["text"]), network.requests.things, TEXT), generator=generator, dtype=torch.float64
+            (len(arguments["text"]), network.count_conditioning.things, TEXT), generator=generator, dtype=torch.float64
         )
         arguments = {**arguments, "text": torch.cat([asked, arguments["text"]], dim=1)}
-        arguments["text_mask"] = F.pad(arguments["text_mask"], (network.requests.things, 0), value=True)
+        arguments["text_mask"] = F.pad(arguments["text_mask"], (network.count_conditioning.things, 0), value=True)
     result = network(**arguments)
     return torch.cat(result, dim=-1) if process == "mixed" else result
 
@@ -151,7 +150,7 @@ def test_any_number_of_slots_goes_through(name: str, process: str, slots: int) -
 def test_outputs_start_at_zero(name: str, process: str) -> None:
     network = make(name, process, zero=True)
     if isinstance(network, MixedFlux):
-        network.requests = None  # begins with the shares that a prompt asks for
+        network.count_conditioning = None  # begins with the shares that a prompt asks for
     assert (run(network, process, inputs(process, 6)) == 0).all()
 
 
@@ -195,11 +194,11 @@ def test_a_row_of_padding_alone_is_no_text(name: str, process: str) -> None:
 def test_gradients_reach_every_parameter(name: str, process: str, text: bool) -> None:
     network = make(name, process, text_width=TEXT if text else 0)
     loss = run(network, process, inputs(process, 9, text)).square().sum()
-    if isinstance(network, MixedFlux) and network.requests is not None:
+    if isinstance(network, MixedFlux) and network.count_conditioning is not None:
         loss = (
             loss
-            + network.requests.count_loss(
-                torch.randn(2, network.requests.things, TEXT).double(), torch.zeros(2, 9).long()
+            + network.count_conditioning.count_loss(
+                torch.randn(2, network.count_conditioning.things, TEXT).double(), torch.zeros(2, 9).long()
             ).sum()
         )
     loss.backward()
@@ -216,31 +215,31 @@ def test_a_tally_counts_what_is_seen_and_no_filling() -> None:
 
 def test_what_is_asked_of_a_category_moves_the_logits_of_all_slots_alike_and_filling_does_not() -> None:
     torch.manual_seed(0)
-    requests = Requests((0, 1, 2, 3, 3, 4, 5), TEXT, 16, most=9).double()
-    nn.init.normal_(requests.out.weight)
+    conditioning = CountConditioning((0, 1, 2, 3, 3, 4, 5), TEXT, 16, most=9).double()
+    nn.init.normal_(conditioning.out.weight)
     states = torch.tensor([[0, 3, 3, 7, 8, 8], [8, 8, 1, 1, 1, 2]])
     asked = torch.randn(2, 7, TEXT, dtype=torch.float64)
-    wanted = requests(states, asked)
+    wanted = conditioning(states, asked)
     other = asked.clone()
     other[:, 3] += 1.0
-    changed = (requests(states, other) - wanted).abs() > 1e-6
+    changed = (conditioning(states, other) - wanted).abs() > 1e-6
     assert changed.nonzero().tolist() == [[0, 3], [0, 4], [1, 3], [1, 4]]  # both are of kind 3
     filled = torch.cat([states, torch.full((2, 4), 3)], dim=1)
     mask = torch.arange(10).expand(2, -1) < 6
-    torch.testing.assert_close(requests(filled, asked, mask), wanted)
-    torch.testing.assert_close(requests(states.flip(1), asked), wanted)
+    torch.testing.assert_close(conditioning(filled, asked, mask), wanted)
+    torch.testing.assert_close(conditioning(states.flip(1), asked), wanted)
 
 
 def test_known_numbers_become_shares_of_the_masked_slots() -> None:
     """Two of category 0 and three objects in all are asked for; one of it is seen, and three slots are masked."""
     torch.manual_seed(0)
-    requests = Requests((0, 1), TEXT, 16, most=6)
+    conditioning = CountConditioning((0, 1), TEXT, 16, most=6)
     numbers = torch.full((1, 3, 7), -1e4)
     numbers[0, [0, 1, 2], [2, 1, 3]] = 0.0
-    requests.count_logits = lambda asked: numbers  # type: ignore[method-assign]
-    shares = requests(torch.tensor([[0, 3, 3, 3]]), torch.randn(1, 3, TEXT)).softmax(dim=-1)
+    conditioning.count_logits = lambda asked: numbers  # type: ignore[method-assign]
+    shares = conditioning(torch.tensor([[0, 3, 3, 3]]), torch.randn(1, 3, TEXT)).softmax(dim=-1)
     torch.testing.assert_close(shares, torch.full((1, 3), 1 / 3))
-    assert float(requests.count_loss(torch.randn(1, 3, TEXT), torch.tensor([[0, 0, 1, 2]]))) == pytest.approx(0.0)
+    assert float(conditioning.count_loss(torch.randn(1, 3, TEXT), torch.tensor([[0, 0, 1, 2]]))) == pytest.approx(0.0)
     assert float(still_to_come(numbers, torch.tensor([[5.0, 0.0, 3.0]]))[0, 0]) == 0.0  # more than asked: none to come
 
 
@@ -275,7 +274,7 @@ def test_text_that_ends_in_double_blocks_is_read_and_its_padding_is_not(attentio
     said = run(network, "mixed", arguments)
     said.square().sum().backward()
     dead = [name for name, p in network.named_parameters() if p.grad is None or not p.grad.any()]
-    assert all(name.startswith("requests.counts_out") for name in dead)
+    assert all(name.startswith("count_conditioning.counts_out") for name in dead)
     padded = torch.where(arguments["text_mask"][..., None], arguments["text"], 7.0)
     torch.testing.assert_close(run(network, "mixed", {**arguments, "text": padded}), said, atol=1e-12, rtol=0)
     assert (run(network, "mixed", {**arguments, "text": arguments["text"] + 0.5}) - said).abs().max() > 1e-3

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from agents.optimizers import MuonAdamW, build_optimizer, orthogonalised
+from agents.pretraining.optimizers import MuonAdamW, build_optimizer, orthogonalised
 from scene_envs.errors import UnknownNameError
 
 

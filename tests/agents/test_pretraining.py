@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from agents.averaging import WeightAverage
-from agents.new_prior import build_prior
-from agents.pretrain_config import PretrainConfig
-from agents.pretraining import Pretrainer, learning_rate_at, part_generator
-from agents.training_data import SceneTable
-from agents.training_setup import prepare
+from agents.pretraining.config import PretrainConfig
+from agents.pretraining.data import SceneTable
+from agents.pretraining.initial_prior import build_prior
+from agents.pretraining.setup import prepare
+from agents.pretraining.trainer import Pretrainer, learning_rate_at, part_generator
+from agents.utils.weight_average import WeightAverage
 from scene_envs.datasets import generate
 from scene_envs.errors import CorruptFileError, InvalidInputError, TrainingError, UnknownNameError
 from scene_envs.normalizer import Normalizer

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from agents.prior import ScenePrior, tiny_prior
+from agents.priors.base import ScenePrior
+from agents.priors.testing import tiny_prior
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
 from scene_envs.scene import SceneBatch
 

@@ -9,8 +9,9 @@ import pytest
 import torch
 from safetensors import safe_open
 
-from agents.prior import ScenePrior, tiny_prior
-from agents.prior_files import to_precision
+from agents.priors.base import ScenePrior
+from agents.priors.files import to_precision
+from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 HALF_ROUNDING = 2.0**-11

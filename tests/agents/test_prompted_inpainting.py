@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from agents.mixed_prior import MixedPrior
-from agents.prior import tiny_prior
+from agents.priors.mixed import MixedPrior
+from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch

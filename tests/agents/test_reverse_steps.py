@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch.distributions import Categorical, Normal
 
-from agents.diffusion import GaussianStep, MixedStep, concatenate_steps
-from agents.diffusion.reverse_steps import one_hot_state, state_of
+from agents.diffusion import GaussianStep, MixedStep
+from agents.diffusion.reverse_steps import concatenate_steps, one_hot_state, state_of
 
 
 def _mixed(batch: int = 1, slots: int = 2) -> MixedStep:

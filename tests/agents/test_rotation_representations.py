@@ -11,14 +11,16 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from agents.continuous_prior import ContinuousPrior
-from agents.diffusion import GaussianStep, gaussian_log_prob
+from agents.diffusion import GaussianStep
+from agents.diffusion.reverse_steps import gaussian_log_prob
 from agents.networks import FluxConfig, MixedFluxConfig
 from agents.networks.registry import network_config
 from agents.post_training import DDPOSFLoss, DenoisingPolicy
 from agents.post_training.rollouts import collect
-from agents.prior import ScenePrior, tiny_prior
-from agents.rotation_codes import ROTATION_WIDTHS, ROTATIONS, SceneCode, decode_rotations, encode_rotations
+from agents.priors.base import ScenePrior
+from agents.priors.continuous import ContinuousPrior
+from agents.priors.rotation_codes import ROTATION_WIDTHS, ROTATIONS, SceneCode, decode_rotations, encode_rotations
+from agents.priors.testing import tiny_prior
 from scene_envs.envs import DenoisingTorchRLEnv, DenoisingVectorEnv
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.grammars import get_grammar

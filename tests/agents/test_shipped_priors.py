@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
-import agents
-from agents.model_card import PriorFacts
-from agents.prior import ScenePrior
-from agents.prior_files import list_priors
+from agents.priors.base import ScenePrior
+from agents.priors.card import PriorFacts
+from agents.priors.files import SHIPPED, list_priors
 
-FOLDER = Path(agents.__file__).parent / "priors"
 READERS = [name for name in list_priors() if PriorFacts.of(name).text]
 
 
 def test_weights_of_all_priors_fit_into_64_mib() -> None:
-    assert sum(file.stat().st_size for file in FOLDER.rglob("*.safetensors")) <= 64 * 2**20
+    assert sum(file.stat().st_size for file in SHIPPED.rglob("*.safetensors")) <= 64 * 2**20
 
 
 @pytest.mark.parametrize("name", list_priors())
 def test_every_prior_has_a_card_with_figures_beside_those_of_real_scenes(name: str) -> None:
-    card = (FOLDER / name / "README.md").read_text()
+    card = (SHIPPED / name / "README.md").read_text()
     assert f"# Prior `{name}`" in card
 
 

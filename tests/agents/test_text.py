@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from agents.mixed_denoiser import MixedPriorConfig
-from agents.mixed_prior import MixedPrior
-from agents.networks import MixedFluxConfig, TextConfig, TextEncoder, vocabulary
-from agents.networks.text import number_features
-from agents.new_prior import build_prior
-from agents.pretrain_config import PretrainConfig
-from agents.prior import ScenePrior, tiny_prior
+from agents.networks import MixedFluxConfig, TextConfig, TextEncoder
+from agents.networks.text import number_features, vocabulary
+from agents.pretraining.config import PretrainConfig
+from agents.pretraining.initial_prior import build_prior
+from agents.priors.base import ScenePrior
+from agents.priors.config import MixedPriorConfig
+from agents.priors.mixed import MixedPrior
+from agents.priors.testing import tiny_prior
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar

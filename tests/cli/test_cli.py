@@ -3,14 +3,14 @@
 import subprocess
 import sys
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any
 
 import pytest
 
-from agents import cli
-from agents.cli import main
-from agents.cli_config import describe_fields
-from agents.commands import COMMANDS
+from agents.cli import main, parser
+from agents.cli.commands import COMMANDS
+from agents.cli.keys import describe_fields
 from scene_envs.errors import PhysicsError
 
 LIGHT = [name for name in COMMANDS if name not in ("pretrain", "post-train", "doctor", "search")]
@@ -28,7 +28,7 @@ def test_without_a_command_it_lists_all_of_them(capsys):
 def test_help_lists_every_key_with_its_meaning(command, capsys):
     assert main([command, "--help"]) == 0
     assert COMMANDS[command] in capsys.readouterr().out
-    config = cli.import_module(f"agents.commands.{command.replace('-', '_')}").config()
+    config = import_module(f"agents.cli.commands.{command.replace('-', '_')}").config()
     keys = describe_fields(config)
     assert all(key.meaning for key in keys), [key.name for key in keys if not key.meaning]
 
@@ -48,6 +48,10 @@ def test_help_loads_nothing_heavy():
     [
         (["smaple"], "unknown command 'smaple'; did you mean 'sample'?"),
         (["sample", "cuont=3"], "unknown sample key 'cuont'; did you mean 'count'?"),
+        (["ship", "prior=x"], "the command 'ship' has another name now: scene-envs package-prior"),
+        (["tables"], "the command 'tables' has another name now: python -m benchmarks.paper_tables"),
+        (["pretrain", "tally=true"], "the pretrain key 'tally' has another name now: count_embedding"),
+        (["pretrain", "text_requests=true"], "'text_requests' has another name now: text_count_conditioning"),
         (["sample", "count"], "expected key=value, got 'count'"),
         (["sample", "count=three"], "count=three is not a whole number"),
         (["sample", "count=1,2"], "count=1,2 is not a whole number"),
@@ -122,7 +126,7 @@ class EchoCommand:
 def echo(monkeypatch):
     """``scene-envs demo`` replaced by a command of our own."""
     command = EchoCommand()
-    monkeypatch.setattr(cli, "import_module", lambda name: command)
+    monkeypatch.setattr(parser, "import_module", lambda name: command)
     return command
 
 

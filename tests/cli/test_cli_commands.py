@@ -5,7 +5,7 @@ import json
 import pytest
 
 from agents.cli import main
-from agents.prior import tiny_prior
+from agents.priors.testing import tiny_prior
 from scene_envs import SceneBatch
 
 pytest.importorskip("pybullet")

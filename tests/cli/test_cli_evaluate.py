@@ -11,7 +11,7 @@ import torch
 
 from agents.cli import main
 from agents.evaluation import grammar_scenes
-from agents.prior import tiny_prior
+from agents.priors.testing import tiny_prior
 from scene_envs.datasets import SceneDataset
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch

@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from agents.cli import main
-from agents.prior import ScenePrior, tiny_prior
+from agents.priors.base import ScenePrior
+from agents.priors.testing import tiny_prior
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type
-from tests.agents.authors_flux import random_state
-from tests.agents.test_checkpoint_import import write_checkpoint
+from tests.agents.authors_flux import random_state, write_checkpoint
 
 
 @pytest.fixture(scope="module")

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from agents.cli_config import compose
-from agents.mixed_prior import MixedPrior
+from agents.cli.keys import compose
 from agents.networks.registry import parameter_count
-from agents.new_prior import build_prior
-from agents.pretrain_config import PretrainConfig
+from agents.pretraining.config import PretrainConfig
+from agents.pretraining.initial_prior import build_prior
+from agents.priors.mixed import MixedPrior
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
 from scene_envs.normalizer import Normalizer

@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode
 
 import scene_envs.envs.spaces as env_spaces
-from agents.prior import tiny_prior
+from agents.priors.testing import tiny_prior
 from scene_envs.envs import DenoisingEnv, ResetNeededError
 from scene_envs.errors import InvalidInputError, UnknownNameError
 

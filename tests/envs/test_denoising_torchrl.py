@@ -7,7 +7,7 @@ import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
-from agents.prior import tiny_prior
+from agents.priors.testing import tiny_prior
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.errors import InvalidInputError
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env, data_equivalence
 
-from agents.prior import tiny_prior
+from agents.priors.testing import tiny_prior
 from rewards.base import RewardOutput
 from scene_envs.envs import ResetNeededError, SearchEnv
 from scene_envs.envs.masks import infeasible_mask, random_mask

@@ -8,13 +8,13 @@ import torch
 
 from agents.evaluation import grammar_scenes
 from agents.evaluation.classifier import classifier_accuracy
-from agents.evaluation.judging import Accuracy, JudgeConfig
 from agents.evaluation.scene_tokens import blurred, scene_tokens
 from agents.evaluation.set_network import SetNetwork, SetNetworkConfig
+from agents.evaluation.two_sample_test import Accuracy, ClassifierConfig
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
-QUICK = JudgeConfig(epochs=12, patience=4, batch_size=16)
+QUICK = ClassifierConfig(epochs=12, patience=4, batch_size=16)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def test_the_same_seed_gives_the_same_accuracy_and_leaves_torch_alone(scenes: Sc
     torch.manual_seed(5)
     expected = torch.rand(3)
     torch.manual_seed(5)
-    short = JudgeConfig(epochs=1)
+    short = ClassifierConfig(epochs=1)
     first, again = (classifier_accuracy(scenes[:40], scenes[40:80], seeds=2, config=short) for _ in range(2))
     assert first == again
     assert torch.equal(torch.rand(3), expected)
@@ -132,6 +132,6 @@ def test_bad_input_is_refused(scenes: SceneBatch) -> None:
     with pytest.raises(InvalidInputError, match="neither negative"):
         classifier_accuracy(scenes, scenes, resolution=(-1e-3, 0.0))
     with pytest.raises(InvalidInputError, match="leave nothing to hold out"):
-        JudgeConfig(train_fraction=0.8, validation_fraction=0.2)
+        ClassifierConfig(train_fraction=0.8, validation_fraction=0.2)
     with pytest.raises(InvalidInputError, match="epochs must be at least 1, got 0"):
-        JudgeConfig(epochs=0)
+        ClassifierConfig(epochs=0)

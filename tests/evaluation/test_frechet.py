@@ -16,7 +16,7 @@ from agents.evaluation.frechet import feature_distance, frechet_scene_distance, 
 from agents.evaluation.inception import _Pooling, frechet_inception_distance, load_inception
 from agents.evaluation.scene_tokens import blurred
 from agents.evaluation.set_encoder import SHIPPED, SetEncoder
-from agents.evaluation.set_encoder_training import SetEncoderTraining, damage, train_set_encoder
+from benchmarks.set_encoder_training import SetEncoderTraining, damage, train_set_encoder
 from scene_envs.datasets import to_union
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
 from scene_envs.scene import SceneBatch

@@ -8,8 +8,8 @@ import math
 import pytest
 import torch
 
-from agents.evaluation import evaluate_prior, figure_table, grammar_scenes, measure_samples, stable_fraction
-from agents.prior import tiny_prior
+from agents.evaluation import evaluate, figure_table, grammar_scenes, measure_samples, stable_fraction
+from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.physics import feasibility
 from scene_envs.scene import SceneBatch
@@ -129,7 +129,7 @@ def test_the_floor_is_the_same_figures_of_real_scenes(real: SceneBatch) -> None:
 
 def test_a_prior_is_measured_on_its_own_samples(real: SceneBatch) -> None:
     prior = tiny_prior(slots=6)
-    figures = evaluate_prior(prior, 3, real, num_steps=2, seed=5, ready=False)
+    figures = evaluate(prior, 3, real, num_steps=2, seed=5, ready=False)
     samples = prior.sample(3, num_steps=2, seed=5)
     assert figures["num_steps"] == 2
     assert figures["objects_mean"] == pytest.approx(float(samples.counts.double().mean()))

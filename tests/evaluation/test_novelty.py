@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from agents.evaluation import duplicates, grammar_scenes, nearest_scenes, novelty, scene_distances
-from agents.evaluation.novelty import Neighbors, cutoff
+from agents.evaluation import grammar_scenes, nearest_scenes, novelty
+from agents.evaluation.novelty import Neighbors, cutoff, duplicates, scene_distances
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 

@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from agents.evaluation import grammar_scenes
-from agents.evaluation.judging import JudgeConfig
 from agents.evaluation.render_classifier import class_images, render_classifier_accuracy
+from agents.evaluation.two_sample_test import ClassifierConfig
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.render import render
 from scene_envs.render.stage import get_stage
 from scene_envs.scene import SceneBatch
 
-QUICK = JudgeConfig(epochs=5, batch_size=16)
+QUICK = ClassifierConfig(epochs=5, batch_size=16)
 SIZE = {"width": 48, "height": 36}
 
 

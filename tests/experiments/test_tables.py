@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from agents.experiments import ALL_TABLES, Entry, Row, Table, TablesConfig, list_rows, make_tables
-from agents.experiments.columns import COLUMNS, Column, error, expand, text
-from agents.experiments.plot import draw
-from agents.experiments.rows import PAPER
-from agents.experiments.tables import FilledTable, Line, csv_text, markdown, markdown_table
-from agents.experiments.training import match_width, run_config, target_parameters
-from agents.pretrain_config import PretrainConfig
+from agents.pretraining.config import PretrainConfig
+from benchmarks.paper_tables import ALL_TABLES, Entry, Row, Table, TablesConfig, list_rows, make_tables
+from benchmarks.paper_tables.columns import COLUMNS, Column, error, expand, text
+from benchmarks.paper_tables.plot import draw
+from benchmarks.paper_tables.rows import PAPER
+from benchmarks.paper_tables.tables import FilledTable, Line, csv_text, markdown, markdown_table
+from benchmarks.paper_tables.training import match_width, run_config, target_parameters
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 STANDARD = {key.name: key.default for key in fields(PretrainConfig)}

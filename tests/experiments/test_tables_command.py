@@ -1,4 +1,4 @@
-"""``scene-envs tables`` on a handful of scenes: resumed, failing, refused."""
+"""``python -m benchmarks.paper_tables`` on a handful of scenes: resumed, failing, refused."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from agents.cli import main
-from agents.experiments.data import RowData
-from agents.experiments.runner import _alone_in
-from agents.pretraining import Pretrainer
+from agents.pretraining.trainer import Pretrainer
+from benchmarks.paper_tables.__main__ import main
+from benchmarks.paper_tables.data import RowData
+from benchmarks.paper_tables.runner import _alone_in
 from scene_envs.datasets import generate
 
 pytest.importorskip("pybullet")
@@ -31,7 +31,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
 def tables(folders: tuple[str, str], output: Path, *words: str) -> int:
     data, heldout = folders
     base = [f"data={data}", f"heldout={heldout}", "tables=[objective]", f"rows=[{','.join(ROWS)}]", "size=tiny"]
-    return main(["tables", *base, "count=4", "workers=0", "pretraining={warmup: 2}", f"output={output}", *words])
+    return main([*base, "count=4", "workers=0", "pretraining={warmup: 2}", f"output={output}", *words])
 
 
 def records(output: Path) -> list[dict[str, str]]:

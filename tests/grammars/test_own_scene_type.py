@@ -16,9 +16,10 @@ import pytest
 import torch
 
 from agents.cli import main
-from agents.new_prior import build_prior
-from agents.pretrain_config import PretrainConfig
-from agents.prior import ScenePrior, tiny_prior
+from agents.pretraining.config import PretrainConfig
+from agents.pretraining.initial_prior import build_prior
+from agents.priors.base import ScenePrior
+from agents.priors.testing import tiny_prior
 from rewards import RewardContext, check_reward, resolve_reward
 from scene_envs import SceneBatch, get_scene_type, list_scene_types, plugins
 from scene_envs.datasets import SceneDataset, generate, judge_scenes, parse_prompt, scene_facts

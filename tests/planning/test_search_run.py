@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from agents.planning import SearchOutcome, UCTPlanner, run_search
-from agents.prior import ScenePrior, tiny_prior
+from agents.priors.base import ScenePrior
+from agents.priors.testing import tiny_prior
 from rewards import RewardContext, RewardOutput
 from scene_envs.envs import SearchEnv
 from scene_envs.errors import InvalidInputError, SceneEnvsError

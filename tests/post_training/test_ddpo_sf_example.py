@@ -11,9 +11,10 @@ from types import ModuleType
 import pytest
 import torch
 
-from agents.diffusion import gaussian_log_prob
+from agents.diffusion.reverse_steps import gaussian_log_prob
 from agents.post_training import compute_advantages
-from agents.prior import ScenePrior, tiny_prior
+from agents.priors.base import ScenePrior
+from agents.priors.testing import tiny_prior
 
 
 @pytest.fixture(scope="module")

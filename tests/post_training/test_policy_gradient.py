@@ -8,9 +8,10 @@ from tensordict import TensorDict
 from torch.distributions import Normal
 from toy_chain import LinearChain
 
-from agents.diffusion import gaussian_log_prob
-from agents.post_training import DDPOSFLoss, DenoisingPolicy, gradient_weights
-from agents.prior import tiny_prior
+from agents.diffusion.reverse_steps import gaussian_log_prob
+from agents.post_training import DDPOSFLoss, DenoisingPolicy
+from agents.post_training.policy import gradient_weights
+from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError
 
 THETA, SIGMAS, START = 0.8, (0.5, 0.3), 1.5

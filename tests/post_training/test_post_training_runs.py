@@ -15,7 +15,8 @@ from small_runs import count_objects, not_a_number, small_config
 
 from agents.post_training import PostTrainer, post_train
 from agents.post_training import learner as learner_module
-from agents.prior import ScenePrior, tiny_prior
+from agents.priors.base import ScenePrior
+from agents.priors.testing import tiny_prior
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.errors import CorruptFileError, InvalidInputError, TrainingError
 from scene_envs.scene import SceneBatch
@@ -99,7 +100,7 @@ import torch
 torch.set_num_threads(1)
 from small_runs import count_objects, small_config
 from agents.post_training import post_train
-from agents.prior import tiny_prior
+from agents.priors.testing import tiny_prior
 
 calls = 0
 def deadly(batch, context):

@@ -9,12 +9,20 @@ import torch
 from small_runs import count_objects, small_config
 from torch import Generator
 
-from agents.mixed_prior import MixedPrior
-from agents.post_training import DDPOSFLoss, DenoisingPolicy, PostTrainer, compute_advantages, post_train, steer
+from agents.post_training import (
+    DDPOSFLoss,
+    DenoisingPolicy,
+    PostTrainer,
+    compute_advantages,
+    post_train,
+    post_train_and_compare,
+)
 from agents.post_training.doctor import diagnose
 from agents.post_training.prompts import PromptDeck, prompt_groups
 from agents.post_training.rollouts import collect
-from agents.prior import ScenePrior, tiny_prior
+from agents.priors.base import ScenePrior
+from agents.priors.mixed import MixedPrior
+from agents.priors.testing import tiny_prior
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.datasets import SceneDataset, generate
 from scene_envs.datasets.prompts import parse_prompt, scene_facts
@@ -192,7 +200,7 @@ def test_the_doctor_examines_a_prompted_run(tmp_path: Path) -> None:
 def test_the_report_compares_samples_with_their_prompts(tmp_path: Path) -> None:
     pytest.importorskip("pybullet")
     prior = tiny_prior(process="mixed", text=True, slots=SLOTS)
-    metrics = steer(
+    metrics = post_train_and_compare(
         small_config(tmp_path, iterations=1, prompt="A scene with 14 objects.", slots=SLOTS + 2),
         scenes=2,
         num_steps=2,

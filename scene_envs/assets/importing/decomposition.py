@@ -11,7 +11,6 @@ import io
 import json
 import logging
 import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -22,6 +21,7 @@ from scene_envs.assets.base import Array, ConvexPart
 from scene_envs.assets.importing.hulls import MOST_CORNERS, concavity, few_cornered_hull, has_volume
 from scene_envs.assets.importing.mesh_files import bare
 from scene_envs.errors import InvalidInputError, MissingDependencyError
+from scene_envs.files import replacing
 
 if TYPE_CHECKING:
     import trimesh
@@ -200,14 +200,8 @@ def _read(path: Path) -> list[Array] | None:
 
 def _write(path: Path, pieces: Sequence[Array]) -> None:
     """Keep the pieces; a cache that cannot be written costs time, not the result."""
-    partial = ""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, partial = tempfile.mkstemp(dir=path.parent, suffix=".partial")
-        with os.fdopen(handle, "wb") as file:
+        with replacing(path) as partial, partial.open("wb") as file:
             np.savez(file, vertices=np.concatenate(pieces), counts=np.array([len(piece) for piece in pieces]))
-        os.replace(partial, path)
     except OSError as error:
         _LOGGER.warning("a decomposition could not be kept in %s: %s", path.parent, error)
-        if partial:
-            Path(partial).unlink(missing_ok=True)

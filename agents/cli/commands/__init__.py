@@ -1,0 +1,34 @@
+"""The commands of ``scene-envs``, one module each, imported when the command is called.
+
+A command module has ``config()``, which returns its dataclass of keys with a sentence per field under
+``Attributes:``, and ``run(settings, run)``, which does the work. A module with ``WRITES = False`` has no
+run folder.
+"""
+
+COMMANDS = {
+    "generate": "make a dataset of scenes from a grammar",
+    "pretrain": "train a prior on a dataset",
+    "post-train": "steer a prior with a reward (DDPO-SF with regularisation on real scenes)",
+    "doctor": "examine a post-training run before it starts",
+    "sample": "draw scenes and pictures from a prior",
+    "complete": "fill the empty slots of scenes, keeping their objects",
+    "rearrange": "give the objects of scenes new poses",
+    "search": "search for one scene that scores high, at inference time",
+    "project": "make scenes simulation-ready: project out of penetration, then settle",
+    "export": "write scenes for simulators and viewers: URDF, SDF, Drake, MJCF, USD, GLB, arrays",
+    "view": "write a page that shows scenes in a browser: a dataset, samples, a prior or a grammar",
+    "evaluate": "measure the samples of a prior against real scenes",
+    "priors": "list the priors that ship with the package",
+    "package-prior": "write a prior as a folder to give away, in half precision and with a model card",
+    "rewards": "list the rewards, those of installed packages included",
+    "import-checkpoint": "make a prior of a checkpoint of the paper's authors",
+    "check-reward": "check that a reward keeps its contract",
+    "demo": "post-train the shipped prior, compare before and after, write a report",
+}
+"""What each command does, in the order of the listing."""
+
+RENAMED = {
+    "ship": "scene-envs package-prior",
+    "tables": "python -m benchmarks.paper_tables, in the repository",
+}
+"""Commands of earlier versions, and what does their work now."""

@@ -1,0 +1,28 @@
+"""``scene-envs doctor``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from agents.cli.commands.post_train import PostTrainKeys
+
+if TYPE_CHECKING:
+    from agents.cli.run_folder import Run
+
+
+def config() -> type[PostTrainKeys]:
+    """The keys of this command: those of post-train."""
+    return PostTrainKeys
+
+
+def run(settings: PostTrainKeys, run: Run) -> None:
+    """Examine the run that ``post-train`` would make of these settings."""
+    from rich.console import Console
+
+    from agents.post_training.doctor import diagnose
+
+    report = diagnose(settings.run_config)
+    run.write_metrics(report.metrics())
+    Console().print(report)
+    for line in report.advice:
+        run.log(line)

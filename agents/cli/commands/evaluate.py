@@ -1,0 +1,242 @@
+"""``scene-envs evaluate``."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from agents.cli.run_folder import Run
+    from agents.priors.base import ScenePrior
+    from scene_envs.scene import SceneBatch
+
+_SAMPLES, _PROMPTED = "scenes.safetensors", "prompted.safetensors"
+_NOT_PART = ("measures", "project", "fid_weights", "pictures", "workers", "device", "output")
+"""Keys that change no figure of a group."""
+_OF_PROMPTS = {"prompt_count", "guidance"}
+"""Keys that change the figures of the group ``prompts`` alone."""
+
+
+@dataclass
+class EvaluateConfig:
+    """Measures of a prior's raw samples, each beside that of real scenes.
+
+    Attributes:
+        prior: a shipped name, or the folder of a prior or a run.
+        count: samples, and real scenes of each of two sets to compare with.
+        data: dataset folder that the prior was trained on, several joined by commas for a prior of their union;
+            empty compares with fresh scenes of the grammar, without novelty.
+        heldout: dataset folder of held-out scenes; empty takes the last scenes of data.
+        training_scenes: scenes of data among which novelty looks for the nearest, drawn at random.
+        prompt_count: samples with prompts, each of a held-out scene, at most count; null takes count.
+        num_steps: denoising steps per sample.
+        guidance: weight of classifier-free guidance for the samples with prompts, 0 for none.
+        seed: of the samples, the real scenes and the classifiers.
+        measures: all, or some of layout, physics, ready, fsd, novelty, prompts, classifier, renders, fid, as
+            layout or [layout, physics].
+        project: whether all includes ready, the measures after projection and settling.
+        fid_weights: path of the weights of an Inception-v3, for fid.
+        pictures: how many samples gallery.png shows; 0 draws none.
+        batch_size: scenes denoised at once.
+        workers: physics worker processes; 0 computes in this one.
+        device: torch device of the sampling.
+        output: folder for metrics.json, metrics.md, scenes.safetensors and gallery.png; with the same keys again,
+            groups that are measured already are not measured anew.
+    """
+
+    prior: str = "dimsum_table"
+    count: int = 200
+    data: str = ""
+    heldout: str = ""
+    training_scenes: int = 20_000
+    prompt_count: int | None = None
+    num_steps: int = 50
+    guidance: float = 0.0
+    seed: int = 0
+    measures: Any = "all"
+    project: bool = True
+    fid_weights: str = ""
+    pictures: int = 16
+    batch_size: int = 64
+    workers: int = 2
+    device: str = "cpu"
+    output: str = ""
+
+
+def config() -> type[EvaluateConfig]:
+    """The keys of this command."""
+    return EvaluateConfig
+
+
+def run(settings: EvaluateConfig, run: Run) -> None:
+    """Sample, measure group by group, tabulate."""
+    from agents.evaluation.measures import EvaluationInputs, choose_measures, compute_measure
+    from agents.evaluation.real_scenes import RealScenes
+    from agents.priors.base import ScenePrior
+    from scene_envs.errors import InvalidInputError, MissingDependencyError
+    from scene_envs.files import write_text
+    from scene_envs.physics import PhysicsPool
+
+    groups = choose_measures(settings.measures, project=settings.project)
+    if settings.prompt_count is not None and not 2 <= settings.prompt_count <= settings.count:
+        raise InvalidInputError(
+            f"prompt_count={settings.prompt_count} must be from 2 to count={settings.count}, whose scenes the prompts "
+            "are of; null takes all of them"
+        )
+    prior = ScenePrior.load(settings.prior).to(settings.device)
+    results = _Results.of(run, _identity(settings, prior))
+    missing = [name for name in groups if name not in results.groups]
+    real = RealScenes.load(
+        prior.scene_type,
+        settings.count,
+        data=settings.data,
+        heldout=settings.heldout,
+        training=settings.training_scenes,
+        seed=settings.seed,
+    )
+    samples = results.scenes(_SAMPLES, lambda: _sample(prior, settings, None))
+    _draw(samples, settings.pictures, run)
+    optional = settings.measures in ("all", ["all"])
+    with PhysicsPool(workers=settings.workers) as pool:
+        inputs = EvaluationInputs(
+            samples,
+            real,
+            (lambda prompts: results.scenes(_PROMPTED, lambda: _sample(prior, settings, prompts)))
+            if prior.conditional
+            else None,
+            pool,
+            settings.seed,
+            settings.fid_weights,
+            settings.prompt_count,
+        )
+        for name in missing:
+            started = time.perf_counter()
+            try:
+                figures = compute_measure(name, inputs)
+            except (InvalidInputError, MissingDependencyError) as error:
+                if not optional:
+                    raise
+                results.skip(name, str(error))
+            else:
+                results.add(name, {"prompt_guidance": settings.guidance, **figures} if name == "prompts" else figures)
+                run.log(f"{name} measured in {time.perf_counter() - started:.1f} s")
+    report = results.report(groups)
+    write_text(run.directory / "metrics.md", report + "\n")
+    run.say(report)
+
+
+class _Results:
+    """Figures by group, in ``metrics.json`` after each group, and the samples they are of.
+
+    Args:
+        run: whose folder they are in.
+        identity: what the figures depend on.
+        groups: figures measured already.
+    """
+
+    def __init__(self, run: Run, identity: dict[str, Any], groups: dict[str, dict[str, float]]) -> None:
+        self.run_, self.identity, self.groups = run, identity, groups
+        self.skipped: dict[str, str] = {}
+        self._steps = {"num_steps": float(identity["num_steps"])}
+
+    @classmethod
+    def of(cls, run: Run, identity: dict[str, Any]) -> _Results:
+        """Go on with what the folder holds, as far as it depends on the same."""
+        path = run.directory / "metrics.json"
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))["evaluation"]
+            known, groups = dict(found["identity"]), dict(found["groups"])
+        except (OSError, ValueError, KeyError, TypeError):
+            known, groups = {}, {}
+        changed = {key for key in {*known, *identity} if known.get(key) != identity.get(key)}
+        if known and not changed:
+            return cls(run, identity, groups)
+        stale = [_PROMPTED]
+        if known and changed <= _OF_PROMPTS:
+            if groups.pop("prompts", None) is not None:
+                run.say(f"{path} has other {' and '.join(sorted(changed))}: measuring the prompts anew")
+        else:
+            groups, stale = {}, [_SAMPLES, _PROMPTED]
+            if known:
+                run.say(f"{path} is of other settings or of another prior: measuring anew")
+        for name in stale:
+            (run.directory / name).unlink(missing_ok=True)
+        results = cls(run, identity, groups)
+        results.write()
+        return results
+
+    def scenes(self, name: str, draw: Callable[[], SceneBatch]) -> SceneBatch:
+        """The scenes in the file ``name``, drawn when it is not there."""
+        from scene_envs.scene import SceneBatch
+
+        path: Path = self.run_.directory / name
+        if path.is_file():
+            return SceneBatch.load(path)
+        batch = draw()
+        batch.save(path)
+        return batch
+
+    def add(self, name: str, figures: dict[str, float]) -> None:
+        """Keep the figures of a group."""
+        self.groups[name] = figures
+        self.write()
+
+    def skip(self, name: str, reason: str) -> None:
+        """Keep why a group was not measured."""
+        self.skipped[name] = reason
+        self.run_.log(f"{name} not measured: {reason}")
+
+    def write(self) -> None:
+        """``metrics.json``: all figures by name, then the same by group."""
+        flat = {name: value for figures in self.groups.values() for name, value in figures.items()}
+        evaluation = {"identity": self.identity, "groups": self.groups, "skipped": self.skipped}
+        self.run_.write_metrics({**self._steps, **flat, "evaluation": evaluation})
+
+    def report(self, groups: list[str]) -> str:
+        """The figures of ``groups`` as Markdown, and what was not measured."""
+        from agents.evaluation.report import figure_table
+
+        self.write()
+        measured = {k: v for name in groups for k, v in self.groups.get(name, {}).items() if v is not None}
+        figures = {**self._steps, **measured}
+        notes = [f"- {name} not measured: {reason}" for name, reason in self.skipped.items()]
+        return "\n".join([figure_table(figures), *(["", *notes] if notes else [])])
+
+
+def _identity(settings: EvaluateConfig, prior: ScenePrior) -> dict[str, Any]:
+    """The keys that figures depend on, and a digest of what the prior is made of and of its weights."""
+    import hashlib
+
+    digest = hashlib.sha256(json.dumps(prior.config_state(), sort_keys=True).encode())
+    for name, tensor in sorted(prior.weights().items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    keys = {key: value for key, value in vars(settings).items() if key not in _NOT_PART}
+    return {**keys, "digest": digest.hexdigest()[:16]}
+
+
+def _sample(prior: ScenePrior, settings: EvaluateConfig, prompts: list[str] | None) -> SceneBatch:
+    return prior.sample(
+        settings.count if prompts is None else len(prompts),
+        prompt=prompts,
+        guidance=0.0 if prompts is None else settings.guidance,
+        num_steps=settings.num_steps,
+        seed=settings.seed,
+        batch_size=settings.batch_size,
+    ).to("cpu")
+
+
+def _draw(samples: SceneBatch, count: int, run: Run) -> None:
+    """``gallery.png``, where pictures can be drawn."""
+    from agents.cli.commands.scenes import draw_scenes
+    from scene_envs.errors import MissingDependencyError
+
+    try:
+        draw_scenes(samples, count, run, "gallery.png")
+    except MissingDependencyError as error:
+        run.log(f"no gallery: {error}")

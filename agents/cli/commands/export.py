@@ -1,0 +1,122 @@
+"""``scene-envs export``."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from agents.cli.commands.scenes import load_scenes, make_ready
+
+if TYPE_CHECKING:
+    from agents.cli.run_folder import Run
+    from scene_envs.physics import PhysicsPool
+    from scene_envs.scene import SceneBatch
+
+_OVERLAP = 1e-3
+"""Overlap (m) that a simulator pushes apart visibly."""
+
+
+@dataclass
+class ExportConfig:
+    """Scenes for simulators and viewers.
+
+    Attributes:
+        scenes: a scene file, the folder of a sample or project run (its simulation-ready scenes if it has any), or
+            a dataset.
+        prior: draw the scenes from this prior instead, a shipped name or a folder.
+        formats: one or several of urdf, sdf, drake, mjcf, usd, glb, npz, pickle, as in [drake, mjcf]; all for all
+            that can be written here.
+        count: how many scenes; null for all of them, or 16 from a prior.
+        project: make the scenes simulation-ready first (project out of penetration, then settle).
+        friction: coefficient of friction of all surfaces.
+        num_steps: denoising steps per scene, from a prior.
+        seed: of the noise, from a prior.
+        workers: physics worker processes; 0 computes in this one.
+        output: folder for assets/ and scene_000/, scene_001/, ...
+    """
+
+    scenes: str = ""
+    prior: str = ""
+    formats: Any = "all"
+    count: int | None = None
+    project: bool = False
+    friction: float = 0.6
+    num_steps: int = 50
+    seed: int = 0
+    workers: int = 2
+    output: str = ""
+
+
+def config() -> type[ExportConfig]:
+    """The keys of this command."""
+    return ExportConfig
+
+
+def run(settings: ExportConfig, run: Run) -> None:
+    """Read or draw the scenes and write them."""
+    from scene_envs.export.formats import resolve_formats
+    from scene_envs.physics import PhysicsPool
+    from scene_envs.scene import SceneBatch
+
+    formats = resolve_formats(settings.formats)
+    batch = _scenes(settings, run)
+    metrics: dict[str, Any] = {}
+    with PhysicsPool(workers=settings.workers) as pool:
+        if settings.project:
+            metrics["ready"] = make_ready(batch, 0, pool, run)
+            batch = SceneBatch.load(run.directory / "ready.safetensors")
+        metrics |= export_scenes(batch, formats, run.directory, pool, run, friction=settings.friction)
+    run.write_metrics(metrics)
+
+
+def export_scenes(
+    batch: SceneBatch, formats: Sequence[str], output: Path, pool: PhysicsPool, run: Run, *, friction: float = 0.6
+) -> dict[str, Any]:
+    """Export into ``output`` and say so, and whether the scenes overlap; returns the figures."""
+    from scene_envs.export import export
+    from scene_envs.physics import penetration
+
+    started = time.perf_counter()
+    report = export(batch, output, formats, friction=friction)
+    seconds = time.perf_counter() - started
+    size = f"{report.size / 1e6:.1f} MB"
+    run.say(f"{len(batch)} scenes as {', '.join(report.formats)} in {output}: {size}, {seconds:.1f} s")
+    overlapping = int((penetration(batch, pool=pool).depth.amax(dim=1) > _OVERLAP).sum()) if len(batch) else 0
+    if overlapping:
+        run.say(
+            f"in {overlapping} of {len(batch)} scenes objects overlap by more than {_OVERLAP * 1e3:.0f} mm and will "
+            "jump apart in a simulator; project=true makes scenes simulation-ready"
+        )
+    return {
+        "scenes": len(batch),
+        "overlapping": overlapping,
+        "formats": list(report.formats),
+        "assets": list(report.assets),
+        "bytes": report.size,
+        "seconds": round(seconds, 3),
+    }
+
+
+def _scenes(settings: ExportConfig, run: Run) -> SceneBatch:
+    """The scenes that ``scenes`` or ``prior`` names, at most ``count``."""
+    from scene_envs.errors import InvalidInputError
+
+    if bool(settings.scenes) == bool(settings.prior):
+        raise InvalidInputError(
+            "export: name either a scene file, run or dataset, as in scenes=runs/mine, or a prior, as in "
+            "prior=dimsum_table"
+        )
+    if settings.count is not None and settings.count < 1:
+        raise InvalidInputError(f"count must be at least 1, or null for all, got {settings.count}")
+    if settings.prior:
+        from agents.priors.base import ScenePrior
+
+        prior = ScenePrior.load(settings.prior)
+        count = 16 if settings.count is None else settings.count
+        batch = prior.sample(count, num_steps=settings.num_steps, seed=settings.seed)
+        batch.save(run.directory / "scenes.safetensors")
+        return batch
+    return load_scenes(Path(settings.scenes), settings.count)

@@ -1,0 +1,73 @@
+"""``scene-envs import-checkpoint``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from agents.cli.run_folder import Run
+
+POSITIONAL = ("checkpoint", "metadata")
+"""Words without ``=`` fill these keys, in this order."""
+
+
+@dataclass
+class ImportCheckpointConfig:
+    """A prior from a checkpoint of the paper's authors: scene-envs import-checkpoint FILE metadata.json.
+
+    Attributes:
+        checkpoint: the Lightning .ckpt of a mixed Flux model; the first word without =.
+        metadata: the metadata.json of the data it was trained on; the second word without =.
+        scene: scene type whose assets its model paths name; empty makes one from the metadata.
+        aliases: model path or its stem to asset name, as in {their_cup: teacup}.
+        text_encoder: folder or hub name of the BERT that the checkpoint reads prompts with; empty takes BERT-base where
+            it is at hand, and else makes a prior without prompts.
+        count: scenes to sample as a trial; 0 for none.
+        num_steps: denoising steps of the trial.
+        seed: of the trial.
+        output: folder for prior/ and, with a trial, scenes.safetensors.
+    """
+
+    checkpoint: str = ""
+    metadata: str = ""
+    scene: str = ""
+    aliases: dict[str, str] = field(default_factory=dict)
+    text_encoder: str = ""
+    count: int = 4
+    num_steps: int = 50
+    seed: int = 0
+    output: str = ""
+
+
+def config() -> type[ImportCheckpointConfig]:
+    """The keys of this command."""
+    return ImportCheckpointConfig
+
+
+def run(settings: ImportCheckpointConfig, run: Run) -> None:
+    """Read, save, try."""
+    from agents.priors.checkpoint_import import import_checkpoint
+    from scene_envs.errors import InvalidInputError
+
+    if not settings.checkpoint or not settings.metadata:
+        raise InvalidInputError("name the two files: scene-envs import-checkpoint FILE metadata.json")
+    prior = import_checkpoint(
+        settings.checkpoint,
+        settings.metadata,
+        scene=settings.scene or None,
+        aliases=settings.aliases,
+        text_encoder=settings.text_encoder,
+    )
+    prior.save(run.directory / "prior")
+    parameters = sum(tensor.numel() for tensor in prior.weights().values())
+    run.say(f"{parameters / 1e6:.1f} M parameters, {prior.scene_type.num_assets} assets, {prior.config.slots} slots")
+    run.say("it reads prompts" if prior.conditional else "it is sampled without prompts")
+    metrics = {"parameters": parameters, "trained_steps": prior.card["trained_steps"]}
+    if settings.count > 0:
+        batch = prior.sample(settings.count, num_steps=settings.num_steps, seed=settings.seed)
+        batch.save(run.directory / "scenes.safetensors")
+        metrics["mean_objects"] = float(batch.counts.double().mean())
+        run.say(f"a trial of {len(batch)} scenes has {metrics['mean_objects']:.1f} objects on average")
+    run.write_metrics(metrics)
+    run.say(f"sample it: scene-envs sample prior={run.directory}")

@@ -1,0 +1,59 @@
+"""``scene-envs package-prior``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+WRITES = False
+
+
+@dataclass
+class PackagePriorConfig:
+    """A prior as a folder to give away: configuration, weights in half precision, model card.
+
+    Attributes:
+        prior: the folder of a run or of a prior, or a shipped name.
+        output: the new prior's folder, whose last part is its name, as agents/priors/shipped/dimsum_table.
+        evaluation: metrics.json of scene-envs evaluate, or the folder of that run; empty for a prior not measured.
+        precision: of the weights, float16 or float32.
+        data: what it was trained on, for the card.
+        license: of the data, for the card; empty means that of this package, unless the prior was imported.
+        machine: what it was trained on, for the card.
+        limits: what it is not good at, for the card.
+    """
+
+    prior: str = ""
+    output: str = ""
+    evaluation: str = ""
+    precision: str = "float16"
+    data: str = ""
+    license: str = ""
+    machine: str = ""
+    limits: str = ""
+
+
+def config() -> type[PackagePriorConfig]:
+    """The keys of this command."""
+    return PackagePriorConfig
+
+
+def run(settings: PackagePriorConfig) -> None:
+    """Write the folder; it is the prior itself, so that no log goes into it."""
+    from agents.priors.card import PriorFacts, package_prior
+    from scene_envs.errors import InvalidInputError
+
+    if not settings.prior or not settings.output:
+        raise InvalidInputError(
+            "package-prior: name the prior and its new folder, as in prior=runs/mine output=priors/mine"
+        )
+    folder = package_prior(
+        settings.prior,
+        settings.output,
+        evaluation=settings.evaluation or None,
+        precision=settings.precision,
+        data=settings.data,
+        license=settings.license,
+        machine=settings.machine,
+        limits=settings.limits,
+    )
+    print("\n".join(PriorFacts.of(folder).lines()))

@@ -1,0 +1,24 @@
+"""``scene-envs pretrain``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from agents.pretraining.config import PretrainConfig
+
+if TYPE_CHECKING:
+    from agents.cli.run_folder import Run
+
+
+def config() -> type[PretrainConfig]:
+    """The keys of this command."""
+    return PretrainConfig
+
+
+def run(settings: PretrainConfig, run: Run) -> None:
+    """Train the prior; the trainer writes its own metrics."""
+    from agents.pretraining.trainer import pretrain
+
+    metrics = pretrain(settings)
+    run.say(f"held-out loss {metrics['heldout_loss']:.4g} after {metrics['trained_steps']} steps")
+    run.say(f"sample it: scene-envs sample prior={run.directory}")

@@ -1,0 +1,40 @@
+"""``scene-envs priors``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+WRITES = False
+
+
+@dataclass
+class PriorsConfig:
+    """The priors that ship with the package, and how good they are.
+
+    Attributes:
+        prior: show the whole model card of this one, a shipped name or the folder of a prior or a run; empty lists
+            all that ship.
+    """
+
+    prior: str = ""
+
+
+def config() -> type[PriorsConfig]:
+    """The keys of this command."""
+    return PriorsConfig
+
+
+def run(settings: PriorsConfig) -> None:
+    """Print every shipped prior with its size and its figures, or one card."""
+    from agents.priors.card import README, PriorFacts
+    from agents.priors.files import find_prior, list_priors
+
+    if settings.prior:
+        page = find_prior(settings.prior) / README
+        print(page.read_text(encoding="utf-8") if page.is_file() else "\n".join(PriorFacts.of(settings.prior).lines()))
+        return
+    names = list_priors()
+    if not names:
+        print("no prior ships with this installation; train one with scene-envs pretrain")
+    for name in names:
+        print("\n".join(PriorFacts.of(name).lines()))

@@ -1,0 +1,48 @@
+"""``scene-envs project``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from agents.cli.commands.scenes import draw_scenes, make_ready
+
+if TYPE_CHECKING:
+    from agents.cli.run_folder import Run
+
+
+@dataclass
+class ProjectConfig:
+    """Scenes made simulation-ready.
+
+    Attributes:
+        scenes: a scene file, such as the scenes.safetensors that sample writes.
+        pictures: how many scenes the galleries show; 0 draws none.
+        workers: physics worker processes; 0 computes in this one.
+        output: folder for ready.safetensors, before.png and ready.png.
+    """
+
+    scenes: str = ""
+    pictures: int = 12
+    workers: int = 2
+    output: str = ""
+
+
+def config() -> type[ProjectConfig]:
+    """The keys of this command."""
+    return ProjectConfig
+
+
+def run(settings: ProjectConfig, run: Run) -> None:
+    """Project, settle, count what is ready."""
+    from scene_envs.errors import InvalidInputError
+    from scene_envs.physics import PhysicsPool
+    from scene_envs.scene import SceneBatch
+
+    if not settings.scenes:
+        raise InvalidInputError("project: name a scene file, as in scenes=runs/mine/scenes.safetensors")
+    batch = SceneBatch.load(settings.scenes)
+    with PhysicsPool(workers=settings.workers) as pool:
+        draw_scenes(batch, settings.pictures, run, "before.png")
+        run.write_metrics({"scenes": len(batch), "ready": make_ready(batch, settings.pictures, pool, run)})
+    run.say(f"written to {run.directory}")

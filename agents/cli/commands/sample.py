@@ -1,0 +1,122 @@
+"""``scene-envs sample``."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from agents.cli.commands.export import export_scenes
+from agents.cli.commands.scenes import draw_scenes, make_ready, reward_figures
+
+if TYPE_CHECKING:
+    from agents.cli.run_folder import Run
+    from scene_envs.scene_types import SceneType
+
+
+@dataclass
+class SampleConfig:
+    """Scenes from a prior.
+
+    Attributes:
+        prior: a shipped name, or the folder of a prior or a run.
+        count: scenes to draw.
+        prompt: what the scenes should hold, for priors that read prompts; null for anything.
+        guidance: weight of classifier-free guidance, 0 for none; needs a prompt.
+        num_steps: denoising steps per scene.
+        eta: scale of the noise of the Gaussian steps, 1 for the ancestral chain, 0 for a deterministic one (DDIM).
+        slots: slots per scene, more than trained is allowed; null means as trained.
+        seed: of the noise.
+        reward: scores the samples, for metrics.json; null for none.
+        project: also make the samples simulation-ready (project out of penetration, then settle).
+        export: formats to write the scenes in, as drake or [drake, mjcf], the simulation-ready ones with
+            project=true; null for none. See scene-envs export.
+        pictures: how many scenes the galleries show; 0 draws none.
+        batch_size: scenes denoised at once.
+        workers: physics worker processes; 0 computes in this one.
+        device: torch device.
+        output: folder for scenes.safetensors, gallery.png and, with project=true, ready.safetensors and ready.png;
+            exported scenes go to export/ in it.
+    """
+
+    prior: str = "dimsum_table"
+    count: int = 16
+    prompt: str | None = None
+    guidance: float = 0.0
+    num_steps: int = 50
+    eta: float = 1.0
+    slots: int | None = None
+    seed: int = 0
+    reward: Any = "feasible_objects"
+    project: bool = False
+    export: Any = None
+    pictures: int = 12
+    batch_size: int = 64
+    workers: int = 2
+    device: str = "cpu"
+    output: str = ""
+
+
+def config() -> type[SampleConfig]:
+    """The keys of this command."""
+    return SampleConfig
+
+
+def run(settings: SampleConfig, run: Run) -> None:
+    """Draw, score, save and picture the scenes."""
+    from agents.priors.base import ScenePrior
+    from rewards import resolve_reward
+    from scene_envs.export.formats import resolve_formats
+    from scene_envs.physics import PhysicsPool
+    from scene_envs.scene import SceneBatch
+
+    formats = None if settings.export is None else resolve_formats(settings.export)
+    reward = None if settings.reward is None else resolve_reward(settings.reward)
+    prior = ScenePrior.load(settings.prior).to(settings.device)
+    if not prior.scene_type.has_geometry:
+        settings = _without_geometry(settings, prior.scene_type, run)
+        reward = None if settings.reward is None else reward
+    started = time.perf_counter()
+    batch = prior.sample(
+        settings.count,
+        prompt=settings.prompt,
+        guidance=settings.guidance,
+        num_steps=settings.num_steps,
+        eta=settings.eta,
+        slots=settings.slots,
+        seed=settings.seed,
+        batch_size=settings.batch_size,
+    ).to("cpu")
+    seconds = time.perf_counter() - started
+    run.say(f"{len(batch)} scenes in {seconds:.1f} s, {batch.counts.double().mean():.1f} objects each on average")
+    batch.save(run.directory / "scenes.safetensors")
+    counts = batch.counts
+    metrics: dict[str, Any] = {
+        "scenes": len(batch),
+        "objects": {"mean": float(counts.double().mean()), "min": int(counts.min()), "max": int(counts.max())},
+        "sampling_seconds": round(seconds, 3),
+    }
+    with PhysicsPool(workers=settings.workers) as pool:
+        if reward is not None:
+            metrics["reward"] = reward_figures(reward, batch, pool, run)
+        draw_scenes(batch, settings.pictures, run, "gallery.png")
+        if settings.project:
+            metrics["ready"] = make_ready(batch, settings.pictures, pool, run)
+            batch = SceneBatch.load(run.directory / "ready.safetensors")
+        if formats is not None:
+            metrics["export"] = export_scenes(batch, formats, run.directory / "export", pool, run)
+    run.write_metrics(metrics)
+    run.say(f"written to {run.directory}")
+
+
+def _without_geometry(settings: SampleConfig, scene_type: SceneType, run: Run) -> SampleConfig:
+    """The settings for assets without models: pictures and the default reward are left out, physics is refused."""
+    from scene_envs.errors import InvalidInputError
+
+    if settings.project or settings.export is not None:
+        raise InvalidInputError(
+            f"project=true and export= need the geometry of the assets, and those of {scene_type.name!r} have none "
+            "here; import the checkpoint with scene= and aliases=, or leave both out"
+        )
+    run.say(f"the assets of {scene_type.name!r} have no geometry here: no pictures, and no reward that needs physics")
+    return replace(settings, pictures=0, reward=None if settings.reward == SampleConfig.reward else settings.reward)

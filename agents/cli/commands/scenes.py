@@ -1,0 +1,90 @@
+"""What several commands do with scenes: score them, make them ready, draw them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from agents.cli.run_folder import Run
+    from scene_envs.physics import PhysicsPool
+    from scene_envs.scene import SceneBatch
+
+SCENE_FILES = ("ready.safetensors", "scenes.safetensors")
+"""What is taken from the folder of a run, the first that is there."""
+_TILE = (400, 300)
+
+
+def load_scenes(path: Path, count: int | None = None) -> SceneBatch:
+    """Scenes from a scene file, the folder of a run that has one, a dataset folder or a parquet file.
+
+    Args:
+        path: file or folder.
+        count: at most so many, the first ones; None for all.
+
+    Raises:
+        InvalidInputError: ``count`` below 1, or nothing there.
+    """
+    from scene_envs.datasets import SceneDataset
+    from scene_envs.errors import InvalidInputError
+    from scene_envs.scene import SceneBatch
+
+    if count is not None and count < 1:
+        raise InvalidInputError(f"count must be at least 1, or null for all, got {count}")
+    if path.is_dir():
+        path = next((path / name for name in SCENE_FILES if (path / name).is_file()), path)
+    if path.is_dir() or path.suffix == ".parquet":
+        return SceneDataset.load(path, limit=count).batch()
+    batch = SceneBatch.load(path)
+    return batch if count is None else batch[:count]
+
+
+def reward_figures(reward: Any, batch: SceneBatch, pool: PhysicsPool | None, run: Run) -> dict[str, Any]:
+    """Mean, spread and validity of a reward over the scenes, and the means of its terms."""
+    from rewards import RewardContext, evaluate_reward, reward_name
+
+    output = evaluate_reward(reward, batch, RewardContext(pool=pool), strict=True)
+    valid = output.is_valid
+    value = output.value[valid].double()
+    figures: dict[str, Any] = {"name": reward_name(reward), "valid": int(valid.sum())}
+    if len(value):
+        figures |= {"mean": float(value.mean()), "std": float(value.std(unbiased=False)), "max": float(value.max())}
+        figures["terms"] = {name: float(term[valid].double().mean()) for name, term in output.terms.items()}
+        run.say(f"{figures['name']}: {figures['mean']:.4g} on average, {figures['max']:.4g} at best")
+    return figures
+
+
+def make_ready(batch: SceneBatch, pictures: int, pool: PhysicsPool | None, run: Run) -> dict[str, Any]:
+    """Project and settle the scenes into ``ready.safetensors`` and ``ready.png``; returns the figures."""
+    from scene_envs import physics
+
+    result = physics.make_ready(batch, pool=pool)
+    result.batch.save(run.directory / "ready.safetensors")
+    valid = result.valid
+    free = int(batch.is_free[valid].sum())
+    figures: dict[str, Any] = {"valid": int(valid.sum())}
+    if bool(valid.any()):
+        counts = result.counts[valid]
+        figures |= {"mean": float(counts.double().mean()), "fraction": float(counts.sum()) / max(free, 1)}
+        run.say(
+            f"simulation-ready: {figures['mean']:.1f} objects per scene, {figures['fraction']:.0%} of the free ones"
+        )
+    captions = [
+        f"{int(ready)} of {int(total)} ready"
+        for ready, total in zip(result.counts, batch.is_free.sum(dim=-1), strict=True)
+    ]
+    draw_scenes(result.batch, pictures, run, "ready.png", captions)
+    return figures
+
+
+def draw_scenes(batch: SceneBatch, count: int, run: Run, name: str, captions: list[str] | None = None) -> None:
+    """A gallery of the first ``count`` scenes."""
+    from scene_envs.render import gallery, render
+
+    if count < 1:
+        return
+    shown = batch[: min(count, len(batch))]
+    if captions is None:
+        captions = [f"{int(objects)} objects" for objects in shown.counts]
+    images = render(shown, width=_TILE[0], height=_TILE[1])
+    gallery(list(images), columns=4, captions=captions[: len(shown)]).save(run.directory / name)

@@ -1,0 +1,55 @@
+"""``scene-envs search``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+from agents.planning import SearchConfig, run_search
+
+if TYPE_CHECKING:
+    from agents.cli.run_folder import Run
+
+
+@dataclass(frozen=True)
+class SearchKeys(SearchConfig):
+    """What to search, and how.
+
+    Attributes:
+        prior: a shipped name, or the folder of a prior or a run.
+        objective: what the scene should score high on: any reward.
+        output: folder for best.safetensors, before.png, after.png and curve.png.
+    """
+
+    prior: str = "dimsum_table"
+    objective: Any = "feasible_objects"
+    output: str = ""
+
+
+def config() -> type[SearchKeys]:
+    """The keys of this command."""
+    return SearchKeys
+
+
+def run(settings: SearchKeys, run: Run) -> None:
+    """Search; the search writes its own metrics and pictures."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    search = SearchConfig(**{field.name: getattr(settings, field.name) for field in fields(SearchConfig)})
+    with Progress(console=Console(stderr=True)) as bar:
+        tasks: dict[str, Any] = {}
+
+        def show(planner: str, done: int, budget: int, best: float) -> None:
+            if planner not in tasks:
+                tasks[planner] = bar.add_task(planner, total=budget)
+            bar.update(tasks[planner], completed=done, description=f"{planner}, best {best:.3f}")
+
+        outcome = run_search(settings.prior, settings.objective, config=search, output=settings.output, progress=show)
+    metrics = outcome.metrics
+    found, best_of, first = (metrics[key]["objective"] for key in ("search", "best_of", "first_samples"))
+    run.say(
+        f"{metrics['objective']}: {found:.4g} by search, {best_of:.4g} by the best of {search.budget} samples, "
+        f"{first:.4g} by the best of the first {search.branching}"
+    )
+    run.say(f"written to {run.directory}")

@@ -1,0 +1,135 @@
+"""``scene-envs view``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from agents.cli.commands.scenes import SCENE_FILES
+
+if TYPE_CHECKING:
+    from agents.cli.run_folder import Run
+    from scene_envs.scene import SceneBatch
+
+
+@dataclass
+class ViewConfig:
+    """Scenes in a browser.
+
+    Attributes:
+        scenes: a scene file, the folder of a run that holds one, a dataset folder or a .parquet file.
+        prior: a shipped name, or the folder of a prior or a run, to draw samples from.
+        scene: scene type to draw from its grammar; with scenes=, the type of a dataset that names none.
+        count: scenes to show.
+        first: the first scene of scenes= to show, counted from 0.
+        num_steps: denoising steps per scene, with prior=.
+        seed: of the grammar or the prior.
+        title: heading of the page; null names where the scenes come from.
+        pictures: how many scenes gallery.png shows; 0 draws none.
+        open: also open the page in the browser.
+        device: torch device, with prior=.
+        output: folder for viewer.html and gallery.png.
+    """
+
+    scenes: str = ""
+    prior: str = ""
+    scene: str = ""
+    count: int = 16
+    first: int = 0
+    num_steps: int = 50
+    seed: int = 0
+    title: str | None = None
+    pictures: int = 12
+    open: bool = False
+    device: str = "cpu"
+    output: str = ""
+
+
+def config() -> type[ViewConfig]:
+    """The keys of this command."""
+    return ViewConfig
+
+
+def run(settings: ViewConfig, run: Run) -> None:
+    """Write the page, and say where it is."""
+    from agents.cli.commands.scenes import draw_scenes
+    from scene_envs.render import write_viewer
+
+    batch, captions, title = _gather(settings)
+    path = write_viewer(batch, run.directory / "viewer.html", captions=captions, title=settings.title or title)
+    draw_scenes(batch, settings.pictures, run, "gallery.png")
+    counts = batch.counts
+    run.write_metrics(
+        {
+            "scenes": len(batch),
+            "objects": {"mean": float(counts.double().mean()), "min": int(counts.min()), "max": int(counts.max())},
+            "bytes": path.stat().st_size,
+        }
+    )
+    run.say(f"{len(batch)} scenes, {path.stat().st_size / 1e6:.1f} MB; open in any browser: {path}")
+    if settings.open:
+        _open(path, run)
+
+
+def _gather(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str]:
+    """The scenes to show, their captions if they have any, and a title."""
+    from scene_envs.errors import InvalidInputError
+
+    if settings.count < 1 or settings.first < 0:
+        raise InvalidInputError(
+            f"view: count must be at least 1 and first at least 0, got count={settings.count}, first={settings.first}"
+        )
+    if settings.scenes and settings.prior:
+        raise InvalidInputError("view: give either scenes= or prior=, not both")
+    if settings.scenes:
+        return _read(settings)
+    if settings.prior and settings.scene:
+        raise InvalidInputError("view: give either prior= or scene=, not both; a prior knows its scene type")
+    if settings.prior:
+        from agents.priors.base import ScenePrior
+
+        prior = ScenePrior.load(settings.prior).to(settings.device)
+        batch = prior.sample(settings.count, num_steps=settings.num_steps, seed=settings.seed).to("cpu")
+        return batch, None, f"Samples of {Path(settings.prior).name}"
+    if settings.scene:
+        import numpy as np
+
+        from scene_envs.grammars import get_grammar
+
+        batch = get_grammar(settings.scene).sample(np.random.default_rng(settings.seed), settings.count)
+        return batch, None, f"Grammar {settings.scene}"
+    raise InvalidInputError(
+        "view: say what to show: scenes=FILE or FOLDER, prior=NAME, or scene=TYPE, as in view prior=dimsum_table"
+    )
+
+
+def _read(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str]:
+    """Scenes ``first`` to ``first + count`` of a scene file or a dataset, whose captions are its prompts."""
+    from scene_envs.errors import InvalidInputError
+    from scene_envs.scene import SceneBatch
+
+    path = Path(settings.scenes)
+    chosen = slice(settings.first, settings.first + settings.count)
+    held = next((path / name for name in SCENE_FILES if (path / name).is_file()), None)
+    if held is not None or path.suffix == ".safetensors":
+        path = held or path
+        batch = SceneBatch.load(path)
+        total, captions = len(batch), None
+        batch = batch[chosen]
+    else:
+        from scene_envs.datasets import SceneDataset
+
+        dataset = SceneDataset.load(path, scene_type=settings.scene or None, limit=chosen.stop)
+        total, captions = len(dataset), dataset.prompts[chosen]
+        batch = dataset.batch(chosen)
+    if len(batch) == 0:
+        raise InvalidInputError(f"view: first={settings.first} is beyond the {total} scenes of {str(path)!r}")
+    return batch, captions, path.name if path.suffix == ".parquet" or path.is_dir() else str(path.parent.name)
+
+
+def _open(path: Path, run: Run) -> None:
+    import webbrowser
+
+    if not webbrowser.open(path.resolve().as_uri()):
+        run.say("no browser was found to open it in")

@@ -1,0 +1,146 @@
+"""The command line: ``scene-envs COMMAND key=value …``.
+
+Exit status 0: done; 1: the work failed; 2: the input was wrong. An error is one paragraph on stderr, with a
+traceback only under ``--traceback`` or ``SCENE_ENVS_TRACEBACK=1``.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from importlib import import_module
+from types import ModuleType
+
+from agents.cli.commands import COMMANDS, RENAMED
+from agents.cli.keys import compose, describe_fields, format_rows
+from scene_envs import __version__
+from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError, UnknownNameError, unknown_name
+
+DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+_USAGE = """\
+usage: scene-envs COMMAND key=value ...
+
+{commands}
+
+scene-envs COMMAND --help lists the keys of a command; --traceback shows where an error came from.
+A command writes into output=FOLDER, by default runs/COMMAND-TIME.
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status.
+
+    Args:
+        argv: the words after ``scene-envs``; those of the process by default.
+    """
+    return _guarded(list(sys.argv[1:] if argv is None else argv), _dispatch)
+
+
+def main_of(command: str, meaning: str, module: ModuleType, argv: Sequence[str] | None = None) -> int:
+    """Run a program that is one command of its own, and return its exit status.
+
+    Args:
+        command: its name in messages and in the name of its folder.
+        meaning: what it does, in one phrase.
+        module: has ``config()`` and ``run(settings, run)``, as a module of :mod:`agents.cli.commands`.
+        argv: the words after the program; those of the process by default.
+    """
+    return _guarded(
+        list(sys.argv[1:] if argv is None else argv), lambda words: _run_or_help(command, meaning, module, words)
+    )
+
+
+def _guarded(words: list[str], work: Callable[[list[str]], int]) -> int:
+    """The exit status of ``work``, whose errors become one paragraph on stderr."""
+    show_traceback = os.environ.get("SCENE_ENVS_TRACEBACK", "") not in ("", "0")
+    if "--traceback" in words:
+        show_traceback = True
+        words.remove("--traceback")
+    try:
+        return work(words)
+    except KeyboardInterrupt:
+        return _complain("interrupted; where the output can be resumed, the same command goes on", INTERRUPTED)
+    except BrokenPipeError:  # the reader of our output has gone, as in `scene-envs rewards | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE
+    except Exception as error:
+        if show_traceback:
+            traceback.print_exc()
+        return _complain(*_verdict(error))
+
+
+def entry_point() -> None:
+    """Run as a program."""
+    sys.exit(main())
+
+
+def _dispatch(words: list[str]) -> int:
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(_USAGE.format(commands=format_rows(list(COMMANDS.items()))), end="")
+        return DONE if words else WRONG_INPUT
+    if words[0] == "--version":
+        print(f"scene-envs {__version__}")
+        return DONE
+    command, *rest = words
+    if command in RENAMED:
+        raise InvalidInputError(f"the command {command!r} has another name now: {RENAMED[command]}")
+    if command not in COMMANDS:
+        raise unknown_name("command", command, COMMANDS)
+    module = import_module(f"agents.cli.commands.{command.replace('-', '_')}")
+    return _run_or_help(f"scene-envs {command}", COMMANDS[command], module, rest)
+
+
+def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str]) -> int:
+    if any(word in ("-h", "--help") for word in words):
+        print(_help(program, meaning, module))
+        return DONE
+    return _run(program.removeprefix("scene-envs "), module, words)
+
+
+def _help(program: str, meaning: str, module: ModuleType) -> str:
+    rows = [(f"{field.name}={field.default}", field.meaning) for field in describe_fields(module.config())]
+    return f"{program}: {meaning}.\n\n{format_rows(rows) if rows else '  no keys'}"
+
+
+def _run(command: str, module: ModuleType, words: list[str]) -> int:
+    from agents.cli.run_folder import Run, fresh_directory
+
+    settings = compose(command, module.config(), _named(words, getattr(module, "POSITIONAL", ())))
+    if not getattr(module, "WRITES", True):
+        module.run(settings)
+        return DONE
+    if not settings.output:
+        settings = replace(settings, output=fresh_directory(command))
+    with Run(command, settings) as run:
+        module.run(settings, run)
+    return DONE
+
+
+def _named(words: Sequence[str], keys: Sequence[str]) -> list[str]:
+    """Words without ``=`` under the keys they stand for; those beyond the keys stay as they are."""
+    left = iter(keys)
+    return [word if "=" in word else f"{key}={word}" if (key := next(left, "")) else word for word in words]
+
+
+def _verdict(error: Exception) -> tuple[str, int]:
+    """What to tell, and the exit status."""
+    if isinstance(error, InvalidInputError | UnknownNameError | CorruptFileError):
+        return str(error), WRONG_INPUT
+    if isinstance(error, SceneEnvsError):
+        return str(error), FAILED
+    if isinstance(error, OSError):
+        return f"the operating system refused: {error}", FAILED
+    return (
+        f"something unexpected happened, {type(error).__name__}: {error}. "
+        "Run again with --traceback to see where, and please report it",
+        FAILED,
+    )
+
+
+def _complain(text: str, status: int) -> int:
+    print(f"scene-envs: {text}", file=sys.stderr)
+    return status

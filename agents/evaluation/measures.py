@@ -1,0 +1,181 @@
+"""Measures by group: what one evaluation computes, each group on its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from agents.evaluation.measure import FLOOR_PREFIX, layout_figures
+from agents.evaluation.novelty import Neighbors, nearest_scenes, novelty
+from agents.evaluation.physics_figures import physics_figures, ready_figures
+from agents.evaluation.prompt_following import own_prompts, prompt_chance, prompt_following
+from agents.evaluation.real_scenes import RealScenes
+from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.scene import SceneBatch
+
+if TYPE_CHECKING:
+    from scene_envs.physics import PhysicsPool
+
+Figures = dict[str, float]
+
+
+@dataclass(frozen=True)
+class EvaluationInputs:
+    """What an evaluation works on.
+
+    Attributes:
+        samples: raw samples of a prior.
+        real: real scenes.
+        follow: scenes of the prior for prompts, one each; None for a prior that reads none.
+        pool: physics workers; None computes in this process.
+        seed: of classifiers and prompts.
+        fid_weights: path of the weights of an Inception-v3; empty for none.
+        prompts: real scenes whose prompts are followed; None for all of them.
+
+    >>> empty = SceneBatch.empty("dimsum_table", 2)
+    >>> compute_measure("layout", EvaluationInputs(empty, RealScenes(empty, empty)))["floor_objects_mean"]
+    1.0
+    """
+
+    samples: SceneBatch
+    real: RealScenes
+    follow: Callable[[list[str]], SceneBatch] | None = None
+    pool: PhysicsPool | None = None
+    seed: int = 0
+    fid_weights: str = ""
+    prompts: int | None = None
+
+
+def compute_measure(name: str, inputs: EvaluationInputs) -> Figures:
+    """The figures of one group, each with its floor: the same of real scenes against other real scenes.
+
+    Raises:
+        UnknownNameError: no such group.
+        InvalidInputError: the group needs what the inputs lacks.
+        MissingDependencyError: it needs a package that is not installed.
+    """
+    if name not in MEASURES:
+        raise unknown_name("measure", name, MEASURES)
+    return MEASURES[name](inputs)
+
+
+def choose_measures(measures: str | Iterable[str], *, project: bool = True) -> list[str]:
+    """Names of groups, in their order.
+
+    Args:
+        measures: ``"all"``, a name, names joined by commas, or a list of names.
+        project: whether ``"all"`` includes ``ready``.
+
+    Raises:
+        UnknownNameError: a name that is no group.
+
+    >>> choose_measures("novelty, layout")
+    ['layout', 'novelty']
+    """
+    names = [name.strip() for name in measures.split(",")] if isinstance(measures, str) else [*map(str, measures)]
+    if names == ["all"]:
+        return [name for name in MEASURES if project or name != "ready"]
+    for name in names:
+        if name not in MEASURES:
+            raise unknown_name("measure", name, ["all", *MEASURES])
+    return [name for name in MEASURES if name in names]
+
+
+def _beside_floor(measure: Callable[[SceneBatch], Figures], inputs: EvaluationInputs) -> Figures:
+    """Figures of the samples, and of other real scenes as floor."""
+    real = {FLOOR_PREFIX + name: value for name, value in measure(inputs.real.floor).items()}
+    return {**measure(inputs.samples), **real}
+
+
+def _layout(inputs: EvaluationInputs) -> Figures:
+    return _beside_floor(lambda batch: layout_figures(batch, inputs.real.reference), inputs)
+
+
+def _physics(inputs: EvaluationInputs) -> Figures:
+    return _beside_floor(lambda batch: physics_figures(batch, inputs.pool), inputs)
+
+
+def _ready(inputs: EvaluationInputs) -> Figures:
+    return _beside_floor(lambda batch: ready_figures(batch, inputs.pool), inputs)
+
+
+def _classifier(inputs: EvaluationInputs) -> Figures:
+    from agents.evaluation.classifier import classifier_accuracy
+
+    def measure(batch: SceneBatch) -> Figures:
+        accuracy = classifier_accuracy(inputs.real.reference, batch, seed=inputs.seed)
+        return {"classifier_accuracy": accuracy.mean, "classifier_accuracy_std": accuracy.std}
+
+    return _beside_floor(measure, inputs)
+
+
+def _renders(inputs: EvaluationInputs) -> Figures:
+    from agents.evaluation.render_classifier import render_classifier_accuracy
+
+    def measure(batch: SceneBatch) -> Figures:
+        accuracy = render_classifier_accuracy(inputs.real.reference, batch, seed=inputs.seed)
+        return {"render_accuracy": accuracy.mean, "render_accuracy_std": accuracy.std}
+
+    return _beside_floor(measure, inputs)
+
+
+def _fsd(inputs: EvaluationInputs) -> Figures:
+    from agents.evaluation.frechet import frechet_scene_distance
+
+    return _beside_floor(
+        lambda batch: {"frechet_scene_distance": frechet_scene_distance(batch, inputs.real.reference)}, inputs
+    )
+
+
+def _fid(inputs: EvaluationInputs) -> Figures:
+    from agents.evaluation.inception import frechet_inception_distance
+
+    if not inputs.fid_weights:
+        raise InvalidInputError("FID needs fid_weights=, the path of an Inception-v3's weights")
+
+    def measure(batch: SceneBatch) -> Figures:
+        distance = frechet_inception_distance(batch, inputs.real.reference, inputs.fid_weights)
+        return {"frechet_inception_distance": distance}
+
+    return _beside_floor(measure, inputs)
+
+
+def _prompts(inputs: EvaluationInputs) -> Figures:
+    if inputs.follow is None:
+        raise InvalidInputError("prompt-following needs a prior that reads prompts, and this one was trained without")
+    scenes = inputs.real.floor[: inputs.prompts]
+    prompts = own_prompts(scenes, inputs.seed)
+    figures = prompt_following(inputs.follow(prompts), prompts)
+    real = {FLOOR_PREFIX + name: value for name, value in prompt_following(scenes, prompts).items()}
+    return {**figures, **real, **prompt_chance(scenes, prompts, inputs.seed)}
+
+
+def _novelty(inputs: EvaluationInputs) -> Figures:
+    training = inputs.real.training
+    if training is None:
+        raise InvalidInputError("novelty needs data=, the dataset that the prior was trained on")
+    held_out = nearest_scenes(inputs.real.reference, training)
+
+    def figures(found: Neighbors) -> Figures:
+        return {
+            "novelty": novelty(found, held_out),
+            "nearest_training_cm": 100 * float(found.distance.median()),
+            "copied_fraction": float(found.copied.double().mean()),
+        }
+
+    return _beside_floor(lambda batch: figures(nearest_scenes(batch, training)), inputs)
+
+
+MEASURES: dict[str, Callable[[EvaluationInputs], Figures]] = {
+    "layout": _layout,
+    "physics": _physics,
+    "ready": _ready,
+    "fsd": _fsd,
+    "novelty": _novelty,
+    "prompts": _prompts,
+    "classifier": _classifier,
+    "renders": _renders,
+    "fid": _fid,
+}
+"""Groups of measures, in the order in which they are computed: cheap ones first."""

@@ -1,0 +1,102 @@
+"""What a prompt asks of each kind of object, beside how many there are already."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from agents.networks.count_embedding import count_states
+
+_DELTA = 0.02
+"""Objects that may always still come, so that logarithms are finite."""
+
+
+class CountConditioning(nn.Module):
+    """Logits (B, K) that are added to those of every slot: how much of each category is still wanted.
+
+    A prompt asks for numbers: of objects, of cups, of whatever is named. Attention takes averages and learns exact
+    numbers very slowly, so they are taken by subtraction. The text says how likely each number of each kind of object
+    is (:meth:`count_logits`, trained on the counts of the scenes). Given what is seen, smaller numbers are ruled out,
+    and the mean of the rest is how many are still to come. Were slots independent but for these counts, a masked slot
+    would be of each kind with the share that is still to come of it among the masked slots. The logarithm of that share
+    is where this starts, and a small network, the same for all kinds, corrects it. Sums are over slots, so that the
+    network stays permutation-equivariant.
+
+    Args:
+        kinds: (C,) the kind 0..G-1 of each category but *empty*: prompts call several assets by one name.
+        text_width: W, of what the text encoder says of each kind, and last of all objects.
+        hidden: width inside.
+        most: largest number that is told apart; larger ones count as it.
+
+    Attributes:
+        things: G + 1, kinds and all objects.
+
+    >>> count_conditioning = CountConditioning(kinds=(0, 1, 1, 2), text_width=16, hidden=32, most=5)
+    >>> count_conditioning(torch.randint(6, (2, 5)), torch.randn(2, 4, 16)).shape
+    torch.Size([2, 5])
+    """
+
+    def __init__(self, kinds: Sequence[int], text_width: int, hidden: int, most: int) -> None:
+        super().__init__()
+        self.categories, self.things, self.most = len(kinds) + 1, max(kinds) + 2, most
+        self.kinds: Tensor
+        self.register_buffer("kinds", torch.tensor([*kinds, self.things - 1]), persistent=False)
+        self.thing = nn.Parameter(0.02 * torch.randn(self.things, hidden))
+        self.counts_out = nn.Sequential(nn.Linear(text_width, hidden), nn.SiLU(), nn.Linear(hidden, most + 1))
+        self.asked_in = nn.Linear(text_width, hidden)
+        self.seen_in = nn.Linear(8, hidden)
+        self.inner = nn.Linear(hidden, hidden)
+        self.out = nn.Linear(hidden, 1)
+        self.trust = nn.Parameter(torch.ones(()))
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+    def count_logits(self, asked: Tensor) -> Tensor:
+        """(B, G + 1, most + 1) logits of the numbers of each kind, and of all objects, from ``asked`` (B, G + 1, W)."""
+        result: Tensor = self.counts_out(asked)
+        return result
+
+    def count_loss(self, asked: Tensor, states: Tensor) -> Tensor:
+        """(B,) mean over kinds and objects of the cross-entropy of their numbers in scenes (B, N) of 0..K-1."""
+        numbers = self._numbers(count_states(states, self.categories)).long().clamp(max=self.most)
+        return F.cross_entropy(self.count_logits(asked).transpose(1, 2), numbers, reduction="none").mean(dim=1)
+
+    def forward(self, states: Tensor, asked: Tensor, slot_mask: Tensor | None = None) -> Tensor:
+        """Logits (B, K).
+
+        Args:
+            states: (B, N) int64 in 0..K, K being the mask token.
+            asked: (B, G + 1, W) what the text encoder says of each kind, and last of all objects.
+            slot_mask: (B, N) bool, False for filling; None where there is none.
+        """
+        counts = count_states(states, self.categories, slot_mask).to(asked.dtype)
+        seen, masked = self._numbers(counts), counts[:, -1:]  # (B, G + 1), (B, 1)
+        wanted = still_to_come(self.count_logits(asked).detach(), seen)
+        wanted = torch.cat([wanted[:, :-1], masked - wanted[:, -1:]], dim=1).clamp(min=0.0)  # last, empty slots
+        share = torch.log((wanted + _DELTA) / (masked + 1.0))
+        around = torch.cat([masked, seen[:, -1:]], dim=1)[:, None].expand(-1, self.things, -1)
+        facts = torch.cat([torch.stack([seen, wanted], dim=-1), around], dim=-1)  # (B, G + 1, 4)
+        inside = self.thing + self.asked_in(asked) + self.seen_in(torch.cat([facts / 8.0, facts.log1p()], dim=-1))
+        correction: Tensor = self.out(F.silu(self.inner(F.silu(inside))))
+        return (self.trust * share + correction[..., 0])[:, self.kinds]
+
+    def _numbers(self, counts: Tensor) -> Tensor:
+        """(B, G + 1) objects of each kind, and in all, from (B, K) slots in each category, whose last is not read."""
+        objects = counts[:, :-1]
+        kinds = objects.new_zeros(len(counts), self.things - 1).index_add_(1, self.kinds[:-1], objects)
+        return torch.cat([kinds, objects.sum(dim=1, keepdim=True)], dim=1)
+
+
+def still_to_come(logits: Tensor, seen: Tensor) -> Tensor:
+    """Expected number beyond what is seen: logits (..., M) of the numbers 0..M-1 and (...) seen to (...), 0 at least.
+
+    >>> still_to_come(torch.tensor([[0.0, 0.0, 0.0, 0.0]]), torch.tensor([1.0]))  # 1, 2 or 3, as likely
+    tensor([1.])
+    """
+    number = torch.arange(logits.shape[-1], device=logits.device, dtype=logits.dtype)
+    beyond = number - seen[..., None]
+    weight = logits.softmax(dim=-1) * (beyond >= 0)
+    return (weight * beyond).sum(dim=-1) / weight.sum(dim=-1).clamp(min=1e-9)

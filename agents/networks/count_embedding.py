@@ -1,0 +1,57 @@
+"""What a scene holds as a whole, counted: attention takes averages, and a prompt asks for numbers."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+
+def count_states(states: Tensor, categories: int, slot_mask: Tensor | None = None) -> Tensor:
+    """(B, K) slots in each category but *empty*, and in its place how many are masked.
+
+    Empty slots are not counted, so that leaving them out of the network's batch changes nothing.
+
+    Args:
+        states: (B, N) int64 in 0..K, K being the mask token and K - 1 *empty*.
+        categories: K.
+        slot_mask: (B, N) bool, False for filling; None where there is none.
+
+    >>> count_states(torch.tensor([[0, 0, 1, 2, 3, 3]]), 3).tolist()
+    [[2.0, 1.0, 2.0]]
+    """
+    counted = F.one_hot(states, categories + 1).float()
+    if slot_mask is not None:
+        counted = counted * slot_mask[..., None]
+    counts = counted.sum(dim=1)
+    return torch.cat([counts[:, : categories - 1], counts[:, categories:]], dim=1)
+
+
+class CountEmbedding(nn.Module):
+    """Counts of what is seen, beside what the prompt says, to one vector (B, H) that joins the condition.
+
+    Args:
+        categories: K = C + 1.
+        text_width: width of the text tokens; 0 for none.
+        hidden: H.
+
+    >>> count_embedding = CountEmbedding(categories=8, text_width=16, hidden=32)
+    >>> count_embedding(torch.randint(9, (2, 5)), torch.randn(2, 16)).shape
+    torch.Size([2, 32])
+    """
+
+    def __init__(self, categories: int, text_width: int, hidden: int) -> None:
+        super().__init__()
+        self.categories, self.text_width = categories, text_width
+        self.layers = nn.Sequential(
+            nn.Linear(2 * categories + text_width, 2 * hidden), nn.SiLU(), nn.Linear(2 * hidden, hidden)
+        )
+
+    def forward(self, states: Tensor, text: Tensor | None = None, slot_mask: Tensor | None = None) -> Tensor:
+        """As :func:`count_states`; ``text`` (B, W) is what the prompt says, zeros when None."""
+        counts = count_states(states, self.categories, slot_mask).to(next(self.parameters()).dtype)
+        inputs = [counts / 8.0, counts.log1p()]
+        if self.text_width:
+            inputs.append(counts.new_zeros(len(counts), self.text_width) if text is None else text)
+        result: Tensor = self.layers(torch.cat(inputs, dim=1))
+        return result

@@ -1,0 +1,91 @@
+"""Real scenes for the regularisation and for the guard: from a dataset, or from the grammar."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Generator, Tensor
+
+from agents.post_training.prompts import PromptSets
+from agents.priors.base import ScenePrior
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import SceneBatch
+
+_WITHHELD = 0.1
+"""Share of real scenes whose prompt is withheld, as in pretraining."""
+
+
+@dataclass(frozen=True)
+class SceneBank:
+    """Normalised real scenes, split once and for all.
+
+    Attributes:
+        train: (M, N, D) for the regularisation.
+        heldout: (K, N, D) for the guard.
+        prompts: all prompts of scene i of both, the held-out ones being last; None when they are not asked for.
+    """
+
+    train: Tensor
+    heldout: Tensor
+    prompts: PromptSets | None = None
+
+    @classmethod
+    def split(cls, x0: Tensor, heldout: int, prompts: PromptSets | None = None) -> SceneBank:
+        """The last ``heldout`` scenes of ``x0`` (M, N, D) are held out."""
+        if not 0 < heldout < len(x0):
+            raise InvalidInputError(f"{len(x0)} real scenes cannot spare {heldout} for the guard; give more scenes")
+        return cls(x0[:-heldout], x0[-heldout:], prompts)
+
+    def batch(self, count: int, generator: Generator) -> tuple[Tensor, list[str] | None]:
+        """(count, N, D) training scenes, drawn with replacement, and one of each one's prompts.
+
+        As in pretraining, the prompt is withheld (``""``) from one scene in ten.
+        """
+        index = torch.randint(len(self.train), (count,), generator=generator)
+        if self.prompts is None:
+            return self.train[index], None
+        choice, withheld = torch.rand(2, count, generator=generator).tolist()
+        texts = [
+            "" if drop < _WITHHELD else (group := self.prompts(i))[int(pick * len(group))]
+            for i, pick, drop in zip(index.tolist(), choice, withheld, strict=True)
+        ]
+        return self.train[index], texts
+
+    def heldout_prompts(self) -> list[str] | None:
+        """One prompt of each held-out scene, of all kinds in turn; None when they are not asked for."""
+        if self.prompts is None:
+            return None
+        first = len(self.train)
+        return [(group := self.prompts(first + i))[i % len(group)] for i in range(len(self.heldout))]
+
+
+def real_scenes(
+    prior: ScenePrior, source: str, count: int, *, seed: int, slots: int | None = None
+) -> tuple[SceneBatch, list[tuple[str, ...]] | None]:
+    """``count`` real scenes of the prior's scene type, and the prompts of each if they have any.
+
+    Args:
+        prior: whose scene type is wanted.
+        source: ``"grammar"``, or the directory of a dataset.
+        count: how many; a smaller dataset gives all it has.
+        seed: of the grammar, or of the choice of rows.
+        slots: slots per scene at least; None takes as many as the prior was trained on. Real scenes keep all
+            their slots: a prior reads any number.
+    """
+    slots = max(prior.scene_type.slots, prior.config.slots if slots is None else slots)
+    if source == "grammar":
+        from scene_envs.grammars import get_grammar
+
+        rng = np.random.default_rng(seed)
+        return get_grammar(prior.scene_type).sample(rng, count).with_slots(slots), None
+    from scene_envs.datasets import SceneDataset
+
+    if not Path(source).is_dir():
+        raise InvalidInputError(f"real_scenes={source!r} is neither 'grammar' nor the directory of a dataset")
+    dataset = SceneDataset.load(source)
+    rows = torch.randperm(len(dataset.tensor), generator=Generator().manual_seed(seed))[:count]
+    batch = SceneBatch(dataset.tensor[rows], prior.scene_type)
+    return batch.with_slots(max(slots, batch.tensor.shape[1])), [dataset.prompt_sets[i] for i in rows.tolist()]

@@ -1,0 +1,232 @@
+"""Fresh priors for a pretraining run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from agents.diffusion import Preconditioning
+from agents.diffusion.moments import CategoryMoments
+from agents.networks import MixedFluxConfig, TextConfig
+from agents.networks.registry import NetworkConfig, network_config
+from agents.networks.text_encoders import VOCABULARY, AnyTextConfig, text_config
+from agents.pretraining.config import PretrainConfig
+from agents.priors.base import ScenePrior
+from agents.priors.config import PROCESSES, MixedPriorConfig, PriorConfig
+from agents.priors.continuous import ContinuousPrior
+from agents.priors.mixed import MixedPrior
+from agents.priors.rotation_codes import SceneCode
+from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.normalizer import Normalizer
+from scene_envs.scene import POSE
+from scene_envs.scene_types import get_scene_type
+
+MOMENTS = ("category", "feature", "scene")
+"""Whose mean and standard deviation precondition a network."""
+
+FITTED_ON = 20_000
+"""Scenes to which moments are fitted."""
+
+
+def build_prior(
+    config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts: Sequence[Sequence[str]] = ()
+) -> ScenePrior:
+    """The prior that ``config`` starts from: a fresh one, its preconditioning fitted to raw scenes, or an older one.
+
+    Args:
+        config: the run.
+        raw: (M, N, D) scenes.
+        normalizer: of raw scenes.
+        prompts: prompts of every scene, from which a prior that reads them takes its vocabulary.
+    """
+    if config.prior:
+        return _started(config, raw, prompts)
+    if config.moments not in MOMENTS:
+        raise unknown_name("moments", config.moments, MOMENTS)
+    if config.process == "continuous":
+        return _continuous(config, raw, normalizer)
+    if config.process == "mixed":
+        return _mixed(config, raw, normalizer, prompts)
+    raise unknown_name("process", config.process, PROCESSES)
+
+
+def _started(config: PretrainConfig, raw: Tensor, prompts: Sequence[Sequence[str]]) -> ScenePrior:
+    """The prior that ``config`` names, for raw scenes (M, N, D) of its type, which keep its normalizer.
+
+    Its vocabulary stays as it is; words of ``prompts`` that it lacks are listed in a warning.
+
+    Raises:
+        InvalidInputError: its scene type, its slots or its reading of prompts are not those of the run, or what it
+            takes as constant varies in the scenes.
+    """
+    slots = raw.shape[1]
+    prior = ScenePrior.load(config.prior)
+    found = (prior.scene_type.name, prior.config.slots, prior.conditional)
+    asked = (config.scene, slots, config.text)
+    if found != asked:
+        names = ("scene type", "slots", "text")
+        wrong = ", ".join(f"{n} {f!r}, not {a!r}" for n, f, a in zip(names, found, asked, strict=True) if f != a)
+        raise InvalidInputError(f"the prior {config.prior!r} cannot be trained further on this data: it has {wrong}")
+    _check_constants(prior, raw[:FITTED_ON, len(prior.scene_type.fixed) :], config.prior)
+    prior.warn_unknown_words(prompt for group in prompts for prompt in group)
+    return prior
+
+
+def _check_constants(prior: ScenePrior, free: Tensor, name: str) -> None:
+    """Refuse scenes in which something varies that the prior would overwrite with a constant."""
+    normalizer = prior.normalizer
+    constant = normalizer.is_constant.cpu().clone()
+    if prior.process_name == "mixed":
+        constant[POSE.stop :] = False  # categories are states there
+    objects = free[free[..., -1] == 0]
+    off = ((objects - normalizer.input_min.cpu()).abs() > 1e-4).any(dim=0) & constant
+    if bool(off.any()):
+        raise InvalidInputError(
+            f"the prior {name!r} cannot be trained further on this data: of a slot, features "
+            f"{torch.nonzero(off)[:, 0].tolist()} never varied where it was trained, and do here; train a fresh prior"
+        )
+
+
+def _continuous(config: PretrainConfig, raw: Tensor, normalizer: Normalizer) -> ContinuousPrior:
+    if config.text:
+        raise InvalidInputError("text=true needs process=mixed: the continuous prior reads no prompts")
+    code = SceneCode(get_scene_type(config.scene), config.rotation, normalizer)
+    prior_config = PriorConfig(
+        config.scene,
+        raw.shape[1],
+        _network(config, code.features, normalizer, raw.shape[1]),  # type: ignore[arg-type]
+        rotation=config.rotation,
+        **_chain(config),
+    )
+    torch.manual_seed(config.seed)
+    moments = "feature" if config.moments == "category" else config.moments
+    return ContinuousPrior.fitted(prior_config, normalizer, raw[:FITTED_ON], moments)
+
+
+def _mixed(config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts: Sequence[Sequence[str]]) -> MixedPrior:
+    if config.rotation != "matrix":
+        raise InvalidInputError(
+            f"rotation={config.rotation!r} needs process=continuous: mixed priors diffuse rotation matrices"
+        )
+    scene_type = get_scene_type(config.scene)
+    text = _text(config, prompts)
+    network = _network(config, scene_type.features, normalizer, raw.shape[1], 0 if text is None else text.width)
+    prior_config = MixedPriorConfig(
+        config.scene,
+        raw.shape[1],
+        network,  # type: ignore[arg-type]
+        kernel=config.kernel,
+        category_loss=config.category_loss,
+        category_weight=config.category_weight,
+        given_share=config.given_share,
+        text=text,
+        empty_slots=config.empty_slots,
+        unmasking=config.unmasking,
+        **_chain(config),
+    )
+    torch.manual_seed(config.seed)
+    free = raw[:FITTED_ON, len(scene_type.fixed) :]
+    return MixedPrior(prior_config, normalizer, _pose_moments(config.moments, free, normalizer))
+
+
+def _chain(config: PretrainConfig) -> dict[str, Any]:
+    """What both kinds of prior are told of noise and loss."""
+    same = ("schedule", "prediction", "translation_weight", "timesteps", "loss_weighting")
+    noise = ("noise_floor", "noise_ceiling", "noise_mean", "noise_std")
+    return {key: getattr(config, key) for key in same + noise} | {"clip": config.denoised_clip}
+
+
+def _text(config: PretrainConfig, prompts: Sequence[Sequence[str]]) -> AnyTextConfig | None:
+    if not config.text:
+        return None
+    encoder = text_config(config.text_encoder, (prompt for group in prompts for prompt in group))
+    if isinstance(encoder, TextConfig):
+        return replace(
+            encoder,
+            width=config.text_width,
+            depth=config.text_depth,
+            latents=config.text_latents,
+            window=config.text_window,
+            numbers=config.text_numbers,
+            asked=max(_kinds(config.scene)) + 2 if _conditions_counts(config) else 0,
+        )
+    return encoder
+
+
+def _network(
+    config: PretrainConfig, features: int, normalizer: Normalizer, slots: int, text_width: int = 0
+) -> NetworkConfig:
+    categories = get_scene_type(config.scene).num_assets + 1
+    if config.network == "paper":
+        if config.process != "mixed":
+            raise InvalidInputError("network='paper' is mixed; with process=continuous take network=flux")
+        return MixedFluxConfig.paper(categories, text_width)
+    return network_config(
+        config.network,
+        config.process,
+        features=features,
+        categories=categories,
+        hidden=config.hidden,
+        depth=config.depth,
+        heads=config.heads,
+        text_width=text_width,
+        attention=config.attention,
+        relation_blur=config.relation_blur,
+        frequencies=config.frequencies,
+        rotation_features=int(config.rotation_features),
+        contacts=int(config.contacts),
+        unit=_unit(normalizer),
+        rotations=_rotations(normalizer),
+        text_reach=config.text_reach,
+        pooled_text=int(config.pooled_text),
+        count_embedding=int(config.count_embedding),
+        count_conditioning=slots if _conditions_counts(config) else 0,
+        kinds=_kinds(config.scene) if _conditions_counts(config) else (),
+    )
+
+
+def _kinds(scene: str) -> tuple[int, ...]:
+    """The kind of each asset: assets of one display name are one kind to a prompt."""
+    names = [asset.display_name for asset in get_scene_type(scene).library]
+    order = {name: number for number, name in enumerate(dict.fromkeys(names))}
+    return tuple(order[name] for name in names)
+
+
+def _conditions_counts(config: PretrainConfig) -> bool:
+    """Whether the network is told what a prompt asks of each kind of object."""
+    return (
+        config.text_count_conditioning
+        and config.network == "flux"
+        and config.text_encoder == VOCABULARY
+        and config.text_latents > 0
+    )
+
+
+def _pose_moments(kind: str, raw: Tensor, normalizer: Normalizer) -> Preconditioning:
+    """Moments of the normalised poses of all objects of raw scenes (M, N, D)."""
+    poses = normalizer.normalize(raw)[..., : POSE.stop]
+    moments = Preconditioning.fit(poses[raw[..., -1] == 0])
+    if kind == "scene":
+        return moments.pooled()
+    if kind == "feature":
+        return moments
+    categories = raw[..., POSE.stop :].argmax(dim=-1)
+    count = raw.shape[-1] - POSE.stop
+    return replace(moments, by_category=CategoryMoments.fit(poses.flatten(0, 1), categories.flatten(), count))
+
+
+def _unit(normalizer: Normalizer) -> tuple[float, float, float]:
+    """Metres per normalised unit along x, y, z; 0 along an axis that never varies."""
+    scale = normalizer.scale[:3]
+    x, y, z = torch.where(scale == 0, torch.zeros_like(scale), 1.0 / scale.clamp(min=1e-9)).tolist()
+    return x, y, z
+
+
+def _rotations(normalizer: Normalizer) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """What nine normalised numbers are multiplied by, and what is then added, to be a rotation matrix."""
+    low, high = normalizer.input_min[3 : POSE.stop], normalizer.input_max[3 : POSE.stop]
+    return tuple(((high - low) / 2).tolist()), tuple(((high + low) / 2).tolist())

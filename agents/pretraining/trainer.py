@@ -1,0 +1,290 @@
+"""Pretraining a scene prior on a dataset: one loop, exact resume, logs and cards."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Generator, Tensor, nn
+
+from agents.pretraining.config import PretrainConfig
+from agents.pretraining.data import TrainingData
+from agents.pretraining.log import TrainingLog
+from agents.pretraining.optimizers import build_optimizer
+from agents.pretraining.setup import prepare
+from agents.pretraining.text_warmup import warm_up_text
+from agents.priors.base import ScenePrior
+from agents.utils.checkpoints import load_checkpoint, save_checkpoint
+from agents.utils.process_group import ProcessGroup
+from agents.utils.seeds import derived_generator
+from agents.utils.weight_average import AveragedWeights, WeightAverage
+from scene_envs.errors import InvalidInputError, MissingDependencyError, TrainingError, unknown_name
+from scene_envs.files import write_json
+
+logger = logging.getLogger(__name__)
+
+_PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+_MATMUL_PRECISIONS = ("highest", "high", "medium")
+
+
+def learning_rate_at(step: int, config: PretrainConfig) -> float:
+    """Linear warm-up, the peak, and in the last ``decay_share`` of the steps a cosine to ``final_learning_rate``."""
+    if step < config.warmup:
+        return config.learning_rate * (step + 1) / config.warmup
+    start = max(config.warmup, config.iterations * (1.0 - config.decay_share))
+    progress = (step - start) / max(1.0, config.iterations - start)
+    cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, max(0.0, progress))))
+    return config.learning_rate * (config.final_learning_rate + (1 - config.final_learning_rate) * cosine)
+
+
+@torch.no_grad()
+def heldout_loss(prior: ScenePrior, x0: Tensor, seed: int = 1234, batch_size: int = 256) -> float:
+    """Pretraining loss on normalised scenes ``x0`` with timesteps and noise fixed by ``seed``."""
+    generator = Generator().manual_seed(seed)
+    losses = [prior.pretraining_loss(chunk, generator, "none") for chunk in x0.split(batch_size)]
+    return float(torch.cat(losses).mean())
+
+
+class Pretrainer:
+    """The state of one run: prior, average, optimiser, step.
+
+    What a step draws is a function of (seed, step, part) alone, where the parts of a step are those of all processes:
+    two processes take the same steps as one with twice the parts, and a killed run goes on bit for bit.
+
+    Args:
+        config: the run.
+        data: training scenes.
+        heldout: (K, N, D) held-out scenes as the prior encodes them.
+        prior: the prior to train, in place.
+    """
+
+    def __init__(self, config: PretrainConfig, data: TrainingData, heldout: Tensor, prior: ScenePrior) -> None:
+        self.config = config
+        self.data, self.heldout_data = data, heldout
+        self.processes = ProcessGroup.join(config.device)
+        self.parts = self.processes.size * config.accumulate
+        if config.batch_size % self.parts:
+            raise InvalidInputError(
+                f"batch_size={config.batch_size} is not a multiple of {self.parts}, "
+                f"the {self.processes.size} process(es) times accumulate={config.accumulate}"
+            )
+        if not 0.0 <= config.decay_share <= 1.0:
+            raise InvalidInputError(f"decay_share={config.decay_share} is outside 0..1: it is a share of the steps")
+        self.prior = prior.to(config.device).train()
+        self.network: nn.Module = prior.denoiser
+        if config.precision not in _PRECISIONS:
+            raise unknown_name("precision", config.precision, _PRECISIONS)
+        prior.denoiser.precision = _PRECISIONS[config.precision]
+        self.average = WeightAverage(self.network, config.ema)
+        self.optimizer = build_optimizer(config.optimizer, self.network, config.weight_decay, config.text_learning_rate)
+        if config.matmul_precision not in _MATMUL_PRECISIONS:
+            raise unknown_name("matmul_precision", config.matmul_precision, _MATMUL_PRECISIONS)
+        torch.set_float32_matmul_precision(config.matmul_precision)
+        self.step = 0
+        self.seconds = 0.0
+        self.directory = Path(config.output)
+        self.log = TrainingLog(self.directory, config.tensorboard and self.processes.is_first)
+        self.evaluations: list[dict[str, float]] = []
+
+    @property
+    def checkpoint_path(self) -> Path:
+        """Where the resumable state lives."""
+        return self.directory / "checkpoint.pt"
+
+    def run(self) -> ScenePrior:
+        """Train to ``config.iterations`` and return the averaged prior; writes it to ``output/prior``."""
+        self.directory.mkdir(parents=True, exist_ok=True)
+        if self.checkpoint_path.exists():
+            self._load()
+        elif not self.config.prior:
+            self._warm_up_text()
+        if self.config.compile:
+            self.prior.denoiser.network.compile()
+        for row in self._steps():
+            if self.processes.is_first:
+                self.log.write(row, self.config.iterations)
+        if self.processes.is_first:
+            logger.info("measuring the error that is left at 40 noise levels, for the samplers")
+        with self._averaged():
+            self.prior.fit_residual(self.heldout_data[:512].to(self.config.device))
+        self.prior.denoiser.precision = torch.float32
+        return self.save_prior()
+
+    def _warm_up_text(self) -> None:
+        """Every process learns the same, and begins with the weights of the first."""
+        steps = min(self.config.text_warmup, self.config.iterations)
+        if warm_up_text(self.prior, self.data, steps, self.config.batch_size, self.config.seed) is not None:
+            self.processes.share(self.network.parameters())
+            self.average = WeightAverage(self.network, self.config.ema)
+
+    def _steps(self) -> Iterator[dict[str, float]]:
+        config, started = self.config, time.perf_counter() - self.seconds
+        running: list[float] = []
+        while self.step < config.iterations:
+            loss, norm = self._update()
+            running.append(loss)
+            self.step += 1
+            self.seconds = time.perf_counter() - started
+            last = self.step == config.iterations
+            row: dict[str, float] = {}
+            if self.step % config.evaluate_every == 0 or last:
+                row["heldout"] = self._evaluate()
+            if self.step % config.log_every == 0 or row:
+                row |= {"step": self.step, "loss": sum(running) / len(running), "gradient_norm": norm}
+                row |= {"learning_rate": learning_rate_at(self.step - 1, config), "seconds": round(self.seconds, 1)}
+                running.clear()
+                yield row
+            if config.pictures_every and self.step % config.pictures_every == 0:
+                self._draw_samples()
+            if self.step % config.checkpoint_every == 0 or last:
+                self._save()
+
+    def _update(self) -> tuple[float, float]:
+        config = self.config
+        total = torch.zeros((), device=config.device)
+        for part in range(config.accumulate):
+            generator = part_generator(config.seed, self.step, self.processes.rank * config.accumulate + part)
+            loss = self._part_loss(config.batch_size // self.parts, generator) / self.parts
+            loss.backward()  # type: ignore[no-untyped-call]
+            total += loss.detach()
+        value = float(self.processes.sum(total))
+        if not math.isfinite(value):
+            raise TrainingError(
+                f"the pretraining loss became {value} at step {self.step}; the last good state is "
+                f"{str(self.checkpoint_path)!r}: lower learning_rate (now {config.learning_rate}) and run again"
+            )
+        self.processes.sum_gradients(self.network.parameters())
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), config.clip)
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate_at(self.step, config) * group["rate"]
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        self.average.update(self.network)
+        return value, float(norm)
+
+    def _part_loss(self, count: int, generator: Generator) -> Tensor:
+        """The loss of ``count`` scenes; of each scene's prompts one is read, or none where it is withheld."""
+        reads = self.prior.conditional
+        scenes, prompts = self.data.draw(count, generator, prompts=reads)
+        x0 = scenes.to(self.config.device)
+        if not reads:
+            return self.prior.pretraining_loss(x0, generator)
+        choice = torch.rand(2, count, generator=generator).tolist()
+        texts = [
+            "" if dropped < self.config.prompt_dropout else group[int(pick * len(group))]
+            for group, pick, dropped in zip(prompts, *choice, strict=True)
+        ]
+        return self.prior.pretraining_loss(x0, generator, text=self.prior.encode_prompts(texts))
+
+    def _evaluate(self) -> float:
+        with self._averaged():
+            value = heldout_loss(self.prior, self.heldout_data.to(self.config.device))
+        self.evaluations.append({"step": self.step, "heldout": value})
+        return value
+
+    def _averaged(self) -> AveragedWeights[nn.Module]:
+        return AveragedWeights(self.network, self.average)
+
+    def _draw_samples(self) -> None:
+        """A gallery of samples of the averaged prior, ``samples-STEP.png``; left out without PyBullet."""
+        if not self.processes.is_first:
+            return
+        from scene_envs.render import gallery, render
+
+        with self._averaged():
+            batch = self.prior.eval().sample(8, num_steps=50, seed=self.config.seed).to("cpu")
+        self.prior.train()
+        captions = [f"{int(count)} objects" for count in batch.counts]
+        try:
+            images = render(batch, width=400, height=300)
+        except MissingDependencyError as error:
+            logger.warning("no pictures of samples: %s", error)
+            return
+        gallery(list(images), columns=4, captions=captions).save(self.directory / f"samples-{self.step:07d}.png")
+
+    # -- files ----------------------------------------------------------------------------------
+
+    def _save(self) -> None:
+        if self.processes.is_first:
+            self._save_checkpoint()
+        self.save_prior()
+
+    def _save_checkpoint(self) -> None:
+        save_checkpoint(
+            self.checkpoint_path,
+            {
+                "config": asdict(self.config),
+                "network": self.network.state_dict(),
+                "average": self.average.tensors,
+                "average_updates": self.average.updates,
+                "optimizer": self.optimizer.state_dict(),
+                "step": self.step,
+                "seconds": self.seconds,
+                "evaluations": self.evaluations,
+            },
+        )
+
+    def _load(self) -> None:
+        state = load_checkpoint(self.checkpoint_path)
+        try:
+            self.network.load_state_dict(state["network"])
+            self.optimizer.load_state_dict(state["optimizer"])
+        except (RuntimeError, ValueError, KeyError) as error:
+            raise InvalidInputError(
+                f"the run in {str(self.directory)!r} cannot go on: it was started with {self._started_with(state)}; "
+                "give the same keys again, or another output"
+            ) from error
+        self.average.tensors = state["average"]
+        self.average.updates = state["average_updates"]
+        self.step, self.seconds = state["step"], state["seconds"]
+        self.evaluations = state["evaluations"]
+        logger.info("resumed at step %d", self.step)
+
+    def _started_with(self, state: dict[str, Any]) -> str:
+        """The keys of the run in a checkpoint that are not those of this one."""
+        now = asdict(self.config)
+        now |= {"iterations": state["config"]["iterations"], "output": state["config"]["output"]}  # may differ
+        keys = [f"{key}={value}" for key, value in state["config"].items() if value != now.get(key)]
+        return ", ".join(keys) or "another network or optimiser"
+
+    def save_prior(self) -> ScenePrior:
+        """Write the averaged prior to ``output/prior`` and return the prior holding the averaged weights."""
+        with self._averaged():
+            self.prior.card = {
+                "trained_steps": self.step,
+                "batch_size": self.config.batch_size,
+                "training_scenes": self.data.size or self.step * self.config.batch_size,
+                "seconds": round(self.seconds),
+                "heldout_loss": self.evaluations[-1]["heldout"] if self.evaluations else None,
+            }
+            if self.processes.is_first:
+                self.prior.save(self.directory / "prior")
+        self.processes.wait()
+        return ScenePrior.load(self.directory)
+
+
+def part_generator(seed: int, step: int, part: int) -> Generator:
+    """The generator of one part of one step of a run."""
+    return derived_generator(seed, step, part)
+
+
+def pretrain(config: PretrainConfig) -> dict[str, Any]:
+    """Train a prior as ``config`` says; resumes a run found in ``config.output``.
+
+    Returns:
+        The numbers of ``metrics.json``, which is written beside the prior.
+    """
+    prior, data, heldout = prepare(config)
+    trainer = Pretrainer(config, data, heldout, prior)
+    trained = trainer.run()
+    metrics = {**trained.card, "evaluations": trainer.evaluations, "config": asdict(config)}
+    if not trainer.processes.is_first:
+        return metrics
+    write_json(trainer.directory / "metrics.json", metrics)
+    return metrics

@@ -1,0 +1,357 @@
+"""A scene prior: a trained denoiser with its process, layout and normalizer."""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Generator, Tensor, nn
+
+from agents.diffusion import (
+    GaussianProcess,
+    Preconditioning,
+    ResidualVariance,
+    ReverseStep,
+    StepTable,
+)
+from agents.networks.count_conditioning import CountConditioning
+from agents.networks.text import Text
+from agents.priors.inpainting import Inpainting
+from agents.priors.prompt_validation import check_prompts, no_text
+from agents.priors.storage import StoredPrior, explained, read_stored, write_stored
+from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.normalizer import Normalizer
+from scene_envs.protocols import StepTableLike
+from scene_envs.scene import TRANSLATION, SceneBatch
+from scene_envs.scene_types import SceneType, get_scene_type
+
+_CLASSES: dict[str, type[ScenePrior]] = {}
+"""Classes of priors by the name of their process."""
+
+
+class ScenePrior(Inpainting, nn.Module, ABC):
+    """A trained denoiser with its schedule, layout and normalizer. Tensors x are normalised scenes (B, N, D).
+
+    Fixed welded objects and constant features are *known*: clamped to their values while sampling and left
+    out of the loss and of every log-probability. The two kinds are
+    :class:`~agents.priors.continuous.ContinuousPrior` and :class:`~agents.priors.mixed.MixedPrior`.
+
+    >>> from agents.priors.testing import tiny_prior
+    >>> prior = tiny_prior("dimsum_table")
+    >>> prior.sample(2, num_steps=3, seed=0)
+    SceneBatch('dimsum_table', (2, 34, 20))
+    """
+
+    process_name = ""
+    """Name of the process in configuration files; a subclass that sets it can be loaded by :meth:`load`."""
+    denoiser: Any
+    """The network inside its process, a module with ``.network``."""
+    process: GaussianProcess
+    """The process of what is continuous."""
+    _timestep_weights: Tensor
+
+    def __init_subclass__(cls, **settings: Any) -> None:
+        super().__init_subclass__(**settings)
+        if cls.process_name:
+            _CLASSES[cls.process_name] = cls
+
+    def _keep(
+        self,
+        config: Any,
+        normalizer: Normalizer,
+        preconditioning: Preconditioning,
+        card: dict[str, Any] | None,
+        residual: ResidualVariance | None,
+    ) -> None:
+        """What priors of every process have in common."""
+        self.config = config
+        self.scene_type: SceneType = get_scene_type(config.scene_type)
+        self.normalizer = normalizer
+        self.preconditioning = preconditioning
+        self.card = card or {}
+        self.residual = residual
+        self._fixed: Tensor
+        fixed = SceneBatch.empty(self.scene_type, 1, len(self.scene_type.fixed) or 1)
+        self.register_buffer("_fixed", self.normalised(fixed)[0], persistent=False)
+
+    def config_state(self) -> dict[str, Any]:
+        """The ``prior`` entry of the configuration file."""
+        return asdict(self.config)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the prior computes."""
+        return self._fixed.device
+
+    # -- text -----------------------------------------------------------------------------------
+
+    def encode_prompts(self, prompts: Sequence[str]) -> Text:
+        """Tokens (B, L, W) and mask (B, L) of prompts.
+
+        Raises:
+            InvalidInputError: the prior reads no prompts, or one is too long.
+        """
+        raise no_text(self.scene_type, next(iter(prompts), ""))
+
+    def warn_unknown_words(self, prompts: Iterable[str]) -> None:
+        """Warn of words in ``prompts`` that the prior cannot read; does nothing for a prior without prompts."""
+
+    def freeze_text(self) -> None:
+        """Keep the text encoder, if there is one, as it is in any training that follows."""
+
+    @property
+    def count_conditioning(self) -> CountConditioning | None:
+        """The part of the network that is told how many objects a prompt asks for; None where there is none."""
+        return None
+
+    # -- files ----------------------------------------------------------------------------------
+
+    @classmethod
+    @abstractmethod
+    def from_state(
+        cls,
+        fields: dict[str, Any],
+        normalizer: Normalizer,
+        preconditioning: Preconditioning,
+        card: dict[str, Any] | None,
+        residual: ResidualVariance | None,
+    ) -> ScenePrior:
+        """From the ``prior`` entry of a configuration file."""
+
+    @classmethod
+    def load(cls, name: str | os.PathLike[str] | ScenePrior) -> ScenePrior:
+        """A shipped prior by name, or one from a prior or run directory; in evaluation mode.
+
+        Raises:
+            UnknownNameError: no shipped prior has that name.
+            CorruptFileError: its files are not those of a prior, or do not fit each other.
+        """
+        if isinstance(name, ScenePrior):
+            return name
+        stored = read_stored(name)
+        with explained(name):
+            kind = prior_class(stored.process)
+            prior = kind.from_state(
+                stored.fields, stored.normalizer, stored.preconditioning, stored.card, stored.residual
+            )
+            prior.load_weights(stored.tensors)
+        return prior.eval()
+
+    def save(self, directory: str | os.PathLike[str], precision: str = "float32") -> Path:
+        """Write ``config.json`` and ``model.safetensors`` into ``directory``.
+
+        Args:
+            directory: folder, made if need be.
+            precision: of the weights in the file, ``"float32"`` or ``"float16"``; loaded weights are float32 again.
+        """
+        stored = StoredPrior(
+            self.process_name,
+            self.config_state(),
+            self.scene_type,
+            self.normalizer,
+            self.preconditioning,
+            self.card,
+            self.residual,
+            self.weights(),
+        )
+        return write_stored(directory, stored, precision)
+
+    def weights(self) -> dict[str, Tensor]:
+        """Trained tensors by name, as a prior's file holds them."""
+        return dict(self.denoiser.network.state_dict())
+
+    def load_weights(self, tensors: dict[str, Tensor]) -> None:
+        """Inverse of :meth:`weights`; raises RuntimeError when names or shapes differ."""
+        self.denoiser.network.load_state_dict(tensors)
+
+    # -- the reverse chain ----------------------------------------------------------------------
+
+    def step_table(self, num_steps: int) -> StepTable:
+        """The reverse steps of a chain of ``num_steps``, any number in 1..T."""
+        return StepTable.spaced(self.config.num_timesteps, num_steps)
+
+    @property
+    def features(self) -> int:
+        """D, numbers per slot of what is denoised."""
+        return self.scene_type.features
+
+    @property
+    def is_constant(self) -> Tensor:
+        """(D,) bool: features that never vary."""
+        return self.normalizer.is_constant
+
+    def known(self, slots: int) -> Tensor:
+        """(slots, D) bool: entries that are clamped (fixed welded slots, constant features)."""
+        known = self.is_constant.to(self._fixed.device).expand(slots, -1).clone()
+        known[: len(self.scene_type.fixed)] = True
+        return known
+
+    def clamp(self, x: Tensor) -> Tensor:
+        """``x`` (B, N, D) with its known entries set to their values."""
+        count = len(self.scene_type.fixed)
+        x = torch.where(self.is_constant.to(x.device), torch.zeros_like(x), x)
+        if count:
+            x = torch.cat([self._fixed[:count].to(x).expand(x.shape[0], -1, -1), x[:, count:]], dim=1)
+        return x
+
+    def initial(self, count: int, slots: int, generator: Generator | None = None) -> Tensor:
+        """x_T (count, slots, D): standard normal with the known entries clamped."""
+        noise = torch.randn(count, slots, self.features, generator=generator, device=self._fixed.device)
+        return self.clamp(noise)
+
+    @abstractmethod
+    def transition(self, x_t: Tensor, step: int, table: StepTableLike, *, eta: float = 1.0) -> ReverseStep:
+        """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters.
+
+        Known entries are certain; at the last step all are. ``eta`` scales the noise of what is continuous, as in
+        :meth:`sample`.
+        """
+
+    @torch.no_grad()
+    def sample_tensor(
+        self,
+        count: int,
+        *,
+        num_steps: int = 50,
+        slots: int | None = None,
+        generator: Generator | None = None,
+        eta: float = 1.0,
+    ) -> Tensor:
+        """``count`` denoised scenes x_0 (count, slots, D), normalised, from one batch."""
+        table = self.step_table(num_steps)
+        x = self.initial(count, self.config.slots if slots is None else slots, generator)
+        for step in range(len(table)):
+            noise = torch.randn(x.shape, generator=generator, device=x.device)
+            x = self.transition(x, step, table, eta=eta).from_noise(noise)
+        return x
+
+    def sample(
+        self,
+        count: int,
+        *,
+        prompt: str | Sequence[str] | None = None,
+        guidance: float = 0.0,
+        num_steps: int = 50,
+        slots: int | None = None,
+        seed: int = 0,
+        batch_size: int = 64,
+        eta: float = 1.0,
+    ) -> SceneBatch:
+        """``count`` scenes by ancestral sampling (Ho et al. 2020, Algorithm 2) over ``num_steps`` strides.
+
+        Args:
+            count: number of scenes.
+            prompt: what the scenes should hold, one text for all or one per scene; None for anything.
+            guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional (Ho and Salimans 2022); it
+                needs a prompt.
+            num_steps: denoiser evaluations per scene, 1..T.
+            slots: slots per scene; more than trained is allowed.
+            seed: of the torch generator; the same seed and batch size give the same scenes.
+            batch_size: scenes denoised at once.
+            eta: noise of the reverse steps of what is continuous (Song et al. 2021, Eq. 16): 1 is the ancestral chain,
+                0 makes all but x_T, and the discrete categories of a mixed prior, deterministic.
+        """
+        if count < 1:
+            raise InvalidInputError(f"count={count}: ask for at least one scene")
+        wide = self.config.slots if slots is None else slots
+        prompts = check_prompts(
+            prompt, guidance, count, scene_type=self.scene_type, slots=wide, conditional=self.conditional
+        )
+        generator = Generator(str(self._fixed.device)).manual_seed(seed)
+        chunks, done = [], 0
+        for size in _chunk_sizes(count, batch_size):
+            asked = None if prompts is None else prompts[done : done + size]
+            chunks.append(self._sample_chunk(size, asked, guidance, num_steps, slots, generator, eta))
+            done += size
+        return self.decode(torch.cat(chunks))
+
+    def _sample_chunk(
+        self,
+        count: int,
+        prompts: list[str] | None,
+        guidance: float,
+        num_steps: int,
+        slots: int | None,
+        generator: Generator,
+        eta: float,
+    ) -> Tensor:
+        """A chunk of :meth:`sample`; priors that read prompts override it."""
+        return self.sample_tensor(count, num_steps=num_steps, slots=slots, generator=generator, eta=eta)
+
+    def decode(self, x: Tensor) -> SceneBatch:
+        """Scenes from normalised x_0 (B, N, D); known entries take their exact values."""
+        return SceneBatch.from_tensor(self.clamp(x), self.scene_type, normalised=self.normalizer)
+
+    def encode(self, batch: SceneBatch) -> Tensor:
+        """Normalised x_0 (B, N, D) of scenes.
+
+        Raises:
+            InvalidInputError: the first slots do not hold the scene type's fixed welded objects.
+        """
+        expected = [self.scene_type.assets.index(fixed.asset) for fixed in self.scene_type.fixed]
+        found = batch.categories[:, : len(expected)]
+        wrong = (found != torch.tensor(expected, dtype=found.dtype, device=found.device)).any(dim=1)
+        if bool(wrong.any()):
+            scene = int(torch.nonzero(wrong)[0])
+            names = [fixed.asset for fixed in self.scene_type.fixed]
+            raise InvalidInputError(
+                f"scene {scene} does not begin with the fixed objects {names}; reorder its slots so that it does"
+            )
+        return self.clamp(self.normalised(batch))
+
+    def normalised(self, batch: SceneBatch) -> Tensor:
+        """(B, N, D) scenes as this process sees them, before known entries are clamped."""
+        return batch.to_tensor(normalised=self.normalizer)
+
+    # -- the training loss ----------------------------------------------------------------------
+
+    def draw_timesteps(self, count: int, generator: Generator | None = None) -> Tensor:
+        """(count,) int64 training timesteps, ln(noise-to-signal) being normal."""
+        return torch.multinomial(self._timestep_weights, count, replacement=True, generator=generator)
+
+    @abstractmethod
+    def pretraining_loss(
+        self,
+        x0: Tensor,
+        generator: Generator | None = None,
+        reduction: str = "mean",
+        t: Tensor | None = None,
+        text: Text | None = None,
+    ) -> Tensor:
+        """The training loss of scenes ``x0`` (B, N, D) as :meth:`encode` gives them, on entries that are not known.
+
+        Args:
+            x0: normalised scenes.
+            generator: source of timesteps and noise (CPU).
+            reduction: ``"mean"`` over scenes, or ``"none"`` for (B,); always the mean over entries.
+            t: (B,) timesteps, drawn when None.
+            text: tokens (B, L, W) and their mask (B, L), as :meth:`encode_prompts` gives them; None without prompts.
+        """
+
+    @abstractmethod
+    def fit_residual(self, x0: Tensor, levels: int = 40, seed: int = 0) -> ResidualVariance:
+        """Measure the denoiser's error on normalised scenes ``x0`` (B, N, D) at ``levels`` timesteps, and keep it."""
+
+    def loss_weight(self, slots: int) -> Tensor:
+        """(slots, D) weights of the pretraining loss; 0 on known entries."""
+        weight = (~self.known(slots)).float()
+        weight[:, TRANSLATION] *= self.config.translation_weight
+        return weight
+
+
+def _chunk_sizes(total: int, size: int) -> Iterator[int]:
+    while total > 0:
+        yield min(size, total)
+        total -= size
+
+
+def prior_class(process: str) -> type[ScenePrior]:
+    """The class of priors of a process, ``"continuous"`` or ``"mixed"`` or that of a class of your own."""
+    if process not in _CLASSES:
+        raise unknown_name("process", process, _CLASSES)
+    return _CLASSES[process]

@@ -1,0 +1,313 @@
+"""What is told of a prior: a line in a listing, and a model card in a folder to give away."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from agents.priors.files import WEIGHTS_NAME, count_parameters, find_prior, read_config, write_config
+from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.files import write_text
+
+if TYPE_CHECKING:
+    from agents.priors.base import ScenePrior
+
+README = "README.md"
+OWN_LICENSE = "MIT, as this package, whose grammars and assets made the scenes."
+"""Of the data of priors that were trained on what ``scene-envs generate`` makes."""
+HEADLINES = {
+    "feasible_fraction": "free objects feasible as sampled",
+    "ready_fraction": "after projection and settling",
+    "classifier_accuracy": "told from real scenes by a classifier",
+    "prompt_following": "prompts followed",
+    "novelty": "novelty",
+}
+"""The figures of :mod:`agents.evaluation` that a listing shows, and what it calls them."""
+_OPTIMIZERS = {"adamw": "AdamW", "muon": "Muon and AdamW"}
+_RATIOS = ("novelty",)
+_FLOOR = "floor_"
+
+
+@dataclass(frozen=True)
+class PriorFacts:
+    """What the files of a prior say of it.
+
+    Attributes:
+        name: as it was asked for.
+        scene_type: its scene type.
+        process: ``"continuous"`` or ``"mixed"``.
+        slots: that it was trained on.
+        text: what reads its prompts; empty for a prior without text.
+        parameters: trained numbers in its file.
+        megabytes: size of its weights on disk, MB.
+        card: facts about its training and, under ``measures``, its figures.
+    """
+
+    name: str
+    scene_type: str
+    process: str
+    slots: int
+    text: str
+    parameters: int
+    megabytes: float
+    card: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, name: str | os.PathLike[str]) -> PriorFacts:
+        """The facts of a shipped prior, or of one in a prior or run directory; weights are not read.
+
+        Raises:
+            UnknownNameError, InvalidInputError, CorruptFileError: as :func:`agents.priors.files.read_prior`.
+        """
+        folder, state = find_prior(name), read_config(name)
+        try:
+            made = state["prior"]
+            return cls(
+                name=str(name),
+                scene_type=made["scene_type"],
+                process=state.get("process", "continuous"),
+                slots=made["slots"],
+                text=_reader(made.get("text")),
+                parameters=count_parameters(name),
+                megabytes=(folder / WEIGHTS_NAME).stat().st_size / 1e6,
+                card=state.get("card") or {},
+            )
+        except (KeyError, TypeError, AttributeError) as error:
+            raise CorruptFileError(
+                f"the configuration of the prior {str(name)!r} is not one of ours: {error}"
+            ) from error
+
+    @property
+    def measures(self) -> dict[str, float]:
+        """The figures of its samples; empty when it was never measured."""
+        return dict(self.card.get("measures") or {})
+
+    def lines(self) -> list[str]:
+        """A few lines for a listing."""
+        prompts = f"reads prompts with {self.text}" if self.text else "reads no prompts"
+        head = f"{self.name}: scenes of {self.scene_type}, {self.slots} slots, {self.process} process, {prompts}"
+        rows = [f"{self.parameters / 1e6:.1f} M parameters, {self.megabytes:.1f} MB"]
+        shown = headlines(self.measures)
+        width = max((len(label) for label, _, _ in shown), default=0)
+        rows += [
+            f"{label:{width}}  {value:>6}{f'  (real scenes {real})' if real else ''}" for label, value, real in shown
+        ]
+        return [head, *(f"    {row}" for row in (rows if shown else [*rows, "not measured"]))]
+
+
+def headlines(measures: Mapping[str, float]) -> list[tuple[str, str, str]]:
+    """(label, samples, real scenes) of the figures that a listing shows; what was not measured is left out.
+
+    >>> headlines({"feasible_fraction": 0.81, "floor_feasible_fraction": 0.99, "novelty": 0.954})
+    [('free objects feasible as sampled', '81 %', '99 %'), ('novelty', '0.95', '')]
+    """
+    rows = []
+    for name, label in HEADLINES.items():
+        if name in measures:
+            rows.append((label, _figure(name, measures[name]), _figure(name, measures.get(_FLOOR + name))))
+    return rows
+
+
+def package_prior(
+    source: str | os.PathLike[str] | ScenePrior,
+    output: str | os.PathLike[str],
+    *,
+    evaluation: str | os.PathLike[str] | None = None,
+    precision: str = "float16",
+    data: str = "",
+    license: str = "",
+    machine: str = "",
+    limits: str = "",
+) -> Path:
+    """Write a prior as a folder to give away: ``config.json``, ``model.safetensors`` and the model card ``README.md``.
+
+    Args:
+        source: name, prior directory or run directory; a run's metrics tell how it was trained.
+        output: the folder; its name is the prior's. Files of an earlier prior in it are replaced.
+        evaluation: ``metrics.json`` of ``scene-envs evaluate``, or the folder it is in; None for a prior that was not
+            measured.
+        precision: of the weights, ``"float16"`` or ``"float32"``.
+        data: what it was trained on, a sentence.
+        license: of the data; empty for that of this package, unless the prior was imported.
+        machine: what it was trained on, as in ``"one NVIDIA H200"``.
+        limits: what it is not good at, in sentences.
+
+    Raises:
+        InvalidInputError: no such evaluation, or a weight that half precision cannot hold.
+        CorruptFileError: the evaluation is not what the command writes.
+    """
+    from agents.priors.base import ScenePrior
+
+    measures = {} if evaluation is None else read_measures(evaluation)
+    prior = ScenePrior.load(source)
+    told = {"data": data, "license": license or _license(prior.card), "machine": machine, "limits": limits}
+    trained = {} if isinstance(source, ScenePrior) else _training_of(Path(source))
+    kept = prior.card
+    prior.card = {**kept, **trained, **{key: text for key, text in told.items() if text}}
+    if measures:
+        prior.card["measures"] = measures
+    try:
+        folder = prior.save(output, precision=precision)
+        write_config(folder, _without_folders(read_config(folder)))
+        write_text(folder / README, card_page(folder.name, prior, PriorFacts.of(folder)))
+    finally:
+        prior.card = kept
+    return folder
+
+
+def read_measures(path: str | os.PathLike[str]) -> dict[str, float]:
+    """The figures of ``scene-envs evaluate``, those that are numbers.
+
+    Args:
+        path: ``metrics.json``, or the folder it is in.
+
+    Raises:
+        InvalidInputError: no such file, or no figure in it.
+        CorruptFileError: not JSON.
+    """
+    file = Path(path) / "metrics.json" if Path(path).is_dir() else Path(path)
+    content = _read_json(file)
+    figures = {
+        name: value for name, value in content.items() if isinstance(value, int | float) and not isinstance(value, bool)
+    }
+    if "scenes" not in figures:
+        raise InvalidInputError(
+            f"{str(file)!r} holds no figures of samples; give the metrics.json that scene-envs evaluate writes"
+        )
+    return {name: float(value) for name, value in figures.items() if math.isfinite(value)}
+
+
+def card_page(name: str, prior: ScenePrior, facts: PriorFacts) -> str:
+    """The model card, Markdown."""
+    card = facts.card
+    kind = "A text-conditioned" if facts.text else "An unconditional"
+    rows = {
+        "scene type": f"{facts.scene_type}: {prior.scene_type.num_assets} assets, {facts.slots} slots",
+        "network": _network(prior, facts),
+        "process": _process(prior, facts),
+        "prompts": facts.text or "none",
+        "data": _data(card),
+        "training": _training(card),
+        "licence of the data": str(card.get("license") or "not stated"),
+    }
+    table = "\n".join(["| | |", "|---|---|", *(f"| {key} | {text} |" for key, text in rows.items() if text)])
+    parts = [
+        f"# Prior `{name}`",
+        f"{kind} {facts.process} diffusion prior over scenes of type `{facts.scene_type}`.",
+        table,
+        "## How good it is",
+        _measured(card, facts.measures),
+        "## What it is not good at",
+        str(card.get("limits") or "Nothing was written down."),
+        "## Use",
+        f"```sh\nscene-envs sample prior={name}{_PROMPT if facts.text else ''} count=16 project=true\n```",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+_PROMPT = " prompt='A scene with 12 objects.'"
+
+
+def _measured(card: Mapping[str, Any], measures: Mapping[str, float]) -> str:
+    from agents.evaluation import figure_table
+
+    if not measures:
+        return "Not measured."
+    steps = f" at {measures['num_steps']:.0f} steps" if "num_steps" in measures else ""
+    intro = f"{measures['scenes']:.0f} raw samples{steps}, none selected. *Real* is the same figure of real scenes: "
+    return intro + "what a perfect sampler would score.\n\n" + figure_table(measures)
+
+
+def _network(prior: ScenePrior, facts: PriorFacts) -> str:
+    network = prior.denoiser.network
+    sizes = [
+        f"{field.name} {getattr(network.config, field.name)}"
+        for field in fields(network.config)
+        if field.name in ("hidden", "depth", "double_blocks", "single_blocks", "heads", "attention")
+    ]
+    return (
+        f"{type(network).__name__}, {facts.parameters / 1e6:.1f} M parameters ({facts.megabytes:.1f} MB): "
+        f"{', '.join(sizes)}"
+    )
+
+
+def _process(prior: ScenePrior, facts: PriorFacts) -> str:
+    config = getattr(prior, "mixed", prior.config)
+    text = f"{facts.process}, T = {config.num_timesteps}, schedule {config.schedule}, prediction {config.prediction}"
+    kernel = getattr(config, "kernel", "")
+    return f"{text}, categories {kernel}" if kernel else text
+
+
+def _data(card: Mapping[str, Any]) -> str:
+    scenes = card.get("training_scenes")
+    parts = [str(card.get("data") or ""), f"{scenes:,} training scenes" if isinstance(scenes, int) else ""]
+    return "; ".join(part.rstrip(".") for part in parts if part)
+
+
+def _training(card: Mapping[str, Any]) -> str:
+    run = card.get("training") or {}
+    parts = [
+        f"{card['trained_steps']:,} steps" + (f" of {card['batch_size']} scenes" if card.get("batch_size") else "")
+        if "trained_steps" in card
+        else "",
+        _OPTIMIZERS.get(run.get("optimizer", ""), ""),
+        f"peak learning rate {run['learning_rate']:g}, EMA {run['ema']:g}" if "learning_rate" in run else "",
+        f"{card['seconds'] / 60:.0f} minutes" if card.get("seconds") else "",
+        str(card.get("machine") or ""),
+        f"held-out loss {card['heldout_loss']:.4g}" if card.get("heldout_loss") else "",
+        f"imported from {card['imported_from']}" if "imported_from" in card else "",
+    ]
+    return ", ".join(part.rstrip(".") for part in parts if part)
+
+
+def _training_of(source: Path) -> dict[str, Any]:
+    """How a run was trained, from the metrics beside its prior."""
+    folder = source.parent if source.name == "prior" else source
+    if not (folder / "metrics.json").is_file():
+        return {}
+    config = _read_json(folder / "metrics.json").get("config")
+    wanted = ("optimizer", "learning_rate", "ema", "warmup", "weight_decay", "seed", "precision")
+    return {"training": {key: config[key] for key in wanted if key in config}} if isinstance(config, dict) else {}
+
+
+def _without_folders(state: dict[str, Any]) -> dict[str, Any]:
+    """A configuration in which no folder of this machine is named: of that of a BERT model the last part stays."""
+    text = state["prior"].get("text")
+    if not text or not os.path.isabs(text.get("model", "")):
+        return state
+    return {**state, "prior": {**state["prior"], "text": {**text, "model": os.path.basename(text["model"])}}}
+
+
+def _read_json(file: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InvalidInputError(f"no evaluation at {str(file)!r}; scene-envs evaluate writes one") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise CorruptFileError(f"{str(file)!r} is not valid JSON: {error}") from error
+    if not isinstance(content, dict):
+        raise CorruptFileError(f"{str(file)!r} is not a metrics.json: it holds no mapping")
+    return content
+
+
+def _reader(text: Mapping[str, Any] | None) -> str:
+    if text is None:
+        return ""
+    if text.get("kind") == "bert":
+        return f"BERT ({os.path.basename(text['model'])})"
+    return f"a vocabulary of {len(text['words'])} words"
+
+
+def _license(card: Mapping[str, Any]) -> str:
+    return str(card.get("license") or ("" if "imported_from" in card else OWN_LICENSE))
+
+
+def _figure(name: str, value: float | None) -> str:
+    if value is None:
+        return ""
+    return f"{value:.2f}" if name in _RATIOS else f"{100 * value:.3g} %"

@@ -1,0 +1,281 @@
+"""Checkpoints of others: the mixed Flux model of the paper's authors, as PyTorch Lightning wrote it."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from agents.diffusion import Preconditioning
+from agents.networks.bert import BertTextConfig
+from agents.networks.bert_files import BASE
+from agents.networks.mixed_flux_config import POSE, MixedFluxConfig
+from agents.priors.config import MixedPriorConfig
+from agents.priors.lightning_files import read_lightning
+from agents.priors.mixed import MixedPrior
+from scene_envs.datasets import DatasetInfo, read_metadata
+from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
+from scene_envs.normalizer import Normalizer
+from scene_envs.scene_types import Camera, SceneType, get_scene_type, register_scene_type
+
+_LOGGER = logging.getLogger(__name__)
+
+_AVERAGED, _RAW = "ema.averaged_model.", "model."
+_IGNORED = ("txt_encoder.", "discrete_diffusion.", "ema.optimization_step")
+
+_RULES: tuple[tuple[str, str], ...] = (
+    (r"continous_embedding\.in_layer\.", "pose_in.0."),
+    (r"continous_embedding\.out_layer\.", "pose_in.2."),
+    (r"object_model_emb\.", "category_in."),
+    (r"time_in\.in_layer\.", "time_in.0."),
+    (r"time_in\.out_layer\.", "time_in.2."),
+    (r"(scene_in|text_in)\.", r"\1."),
+    (r"double_blocks\.(\d+)\.scene_modality_embedding$", r"double_blocks.\1.scene.modality"),
+    (r"double_blocks\.(\d+)\.text_modality_embedding$", r"double_blocks.\1.text.modality"),
+    (r"double_blocks\.(\d+)\.(x|txt)_modulation\.lin\.", r"double_blocks.\1.<\2>.modulation."),
+    (r"double_blocks\.(\d+)\.(x|txt)_qkv_linear\.", r"double_blocks.\1.<\2>.qkv."),
+    (r"double_blocks\.(\d+)\.(x|txt)_qk_norm\.(query|key)_norm\.scale$", r"double_blocks.\1.<\2>.\3_norm.weight"),
+    (r"double_blocks\.(\d+)\.(x|txt)_post_att_linear\.", r"double_blocks.\1.<\2>.out."),
+    (r"double_blocks\.(\d+)\.(x|txt)_mlp\.", r"double_blocks.\1.<\2>.mlp."),
+    (r"single_blocks\.(\d+)\.modulation\.lin\.", r"single_blocks.\1.modulation."),
+    (r"single_blocks\.(\d+)\.(linear[12])\.", r"single_blocks.\1.\2."),
+    (r"single_blocks\.(\d+)\.norm\.(query|key)_norm\.scale$", r"single_blocks.\1.\2_norm.weight"),
+    (r"final_layer\.adaLN_modulation\.1\.", "final_modulation."),
+    (r"final_layer\.linear\.", "final."),
+    (r"to_continous_out\.in_layer\.", "pose_out.0."),
+    (r"to_continous_out\.out_layer\.", "pose_out.2."),
+    (r"to_logits\.", "logits_out."),
+)
+"""Names of their tensors, as patterns, and what ours are called."""
+
+
+def import_checkpoint(
+    file: str | os.PathLike[str],
+    metadata: str | os.PathLike[str],
+    *,
+    scene: str | SceneType | None = None,
+    aliases: Mapping[str, str] | None = None,
+    text_encoder: str = "",
+) -> MixedPrior:
+    """A prior from a Lightning checkpoint of the authors' mixed Flux model and the ``metadata.json`` of its data.
+
+    Averaged weights are preferred to raw ones, and the normalizer in the checkpoint to the one in the metadata.
+
+    Args:
+        file: the ``.ckpt``.
+        metadata: the ``metadata.json``.
+        scene: scene type of the prior; its assets are matched with the model paths by name. None makes a scene type
+            from the metadata, whose assets have names and no geometry: it samples, and knows no physics.
+        aliases: model path, or its stem, to asset name.
+        text_encoder: folder or hub name of the BERT that the checkpoint reads prompts with. Empty takes BERT-base where
+            it is at hand; where it is not, a checkpoint with text becomes a prior without prompts, and a warning says
+            so.
+
+    Raises:
+        MissingDependencyError: ``text_encoder`` is named and ``transformers`` is not installed.
+        InvalidInputError: no such file; no such text encoder, or not one of the checkpoint's width; or checkpoint,
+            metadata and scene type differ in their number of assets.
+        UnknownNameError: a model path that is no asset of ``scene``.
+        CorruptFileError: not such a checkpoint; missing, extra and misshapen tensors are named.
+    """
+    checkpoint = read_lightning(file)
+    info = read_metadata(Path(metadata))
+    tensors = rename(checkpoint["state_dict"], file)
+    config = sizes(tensors, file)
+    scene_type = scene_type_of(info, Path(file).stem) if scene is None else get_scene_type(scene)
+    numbers = {config.categories - 1, len(info.model_paths), scene_type.num_assets}
+    if len(numbers) > 1:
+        raise InvalidInputError(
+            f"the checkpoint {str(file)!r} knows {config.categories - 1} assets, {str(metadata)!r} lists "
+            f"{len(info.model_paths)}, the scene type {scene_type.name!r} has {scene_type.num_assets}; they must agree"
+        )
+    _reorder(tensors, info.categories_in(scene_type, aliases))
+    state = checkpoint.get("normalizer_state")
+    normalizer = Normalizer.from_state(state) if isinstance(state, dict) else info.normalizer
+    prior_config = MixedPriorConfig(
+        scene_type.name,
+        info.slots or scene_type.slots,
+        config,
+        schedule="linear",
+        prediction="epsilon",
+        category_loss="bound",
+        category_weight=1.0,
+        text=bert_of(config.text_width, text_encoder, file),
+        given_share=0.0,
+        clip=1.0,
+    )
+    moments = Preconditioning(torch.zeros(POSE), torch.ones(POSE))
+    card = {"imported_from": Path(file).name, "trained_steps": int(checkpoint.get("global_step", 0))}
+    prior = MixedPrior(prior_config, _with_categories(normalizer, scene_type), moments, card)
+    _fill(prior.denoiser.network, tensors, file)
+    return prior.eval()
+
+
+def bert_of(width: int, name: str, file: str | os.PathLike[str]) -> BertTextConfig | None:
+    """The BERT that a checkpoint reads prompts with; None for a prior without prompts.
+
+    Args:
+        width: of the checkpoint's text tokens; 0 for none.
+        name: folder or hub name; empty for BERT-base, if it is at hand.
+        file: the checkpoint, for messages.
+
+    Raises:
+        MissingDependencyError, InvalidInputError: ``name`` is given and cannot be used.
+    """
+    if not width:
+        if name:
+            raise InvalidInputError(f"{str(file)!r} was trained without text; leave text_encoder={name!r} out")
+        return None
+    try:
+        config = BertTextConfig.from_model(name or BASE, download=bool(name))
+        if config.width != width:
+            raise InvalidInputError(
+                f"{str(file)!r} reads text tokens of width {width}, and those of {config.model!r} have {config.width}"
+            )
+    except (MissingDependencyError, InvalidInputError) as error:
+        if name:
+            raise
+        _LOGGER.warning(
+            "%s reads prompts with BERT, and here it is imported without prompts: %s. Import it again with "
+            "text_encoder=FOLDER for prompts",
+            file,
+            error,
+        )
+        return None
+    return config
+
+
+def scene_type_of(info: DatasetInfo, name: str) -> SceneType:
+    """A scene type made from a dataset's metadata alone, registered as ``name``.
+
+    Its workspace is the range of the normalizer, its camera looks straight down on that.
+    """
+    low, high = (tuple(float(v) for v in bound[:3]) for bound in (info.normalizer.input_min, info.normalizer.input_max))
+    stems = dict(zip(info.model_paths, info.stems, strict=True))
+    welded = tuple(stems[path] for path in info.welded_model_paths if path in stems)
+    center = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2)
+    distance = high[2] + 1.5 * max(high[0] - low[0], high[1] - low[1], 0.5)
+    return register_scene_type(
+        SceneType(
+            name=name,
+            assets=info.stems,
+            slots=info.slots or 32,
+            workspace=((low[0], low[1], low[2]), (high[0], high[1], high[2])),
+            welded=welded,
+            fixed=(),
+            camera=Camera((*center, distance), (*center, low[2]), (-1.0, 0.0, 0.0)),
+            description=f"Made from {info.path.name}.",
+        )
+    )
+
+
+def _reorder(tensors: dict[str, Tensor], order: Tensor) -> None:
+    """Move category c of the file to ``order[c]``; the mask token stays last."""
+    rows = torch.empty_like(order)
+    rows[order] = torch.arange(len(order))
+    tensors["category_in.weight"] = tensors["category_in.weight"][torch.cat([rows, torch.tensor([len(order)])])]
+    for name in ("logits_out.1.weight", "logits_out.1.bias"):
+        if name in tensors:
+            tensors[name] = tensors[name][rows]
+
+
+def rename(state: Mapping[str, Any], file: str | os.PathLike[str]) -> dict[str, Tensor]:
+    """Tensors under our names; raises CorruptFileError that names what is not of this model."""
+    prefix = _AVERAGED if any(name.startswith(_AVERAGED) for name in state) else _RAW
+    tensors: dict[str, Tensor] = {}
+    extra: list[str] = []
+    for name, value in state.items():
+        if not name.startswith(prefix):
+            if not name.startswith((_RAW, _AVERAGED, *_IGNORED)):
+                extra.append(name)
+            continue
+        ours = _our_name(name.removeprefix(prefix))
+        if ours is None or not isinstance(value, Tensor):
+            extra.append(name)
+        else:
+            tensors[ours] = value
+    if extra or not tensors:
+        what = f"tensors that the mixed Flux model does not have: {_list(extra)}" if extra else "no weights of a model"
+        raise CorruptFileError(f"{str(file)!r} holds {what}; only the mixed Flux model of the paper can be imported")
+    return tensors
+
+
+def sizes(tensors: Mapping[str, Tensor], file: str | os.PathLike[str]) -> MixedFluxConfig:
+    """The size of the network, read from its tensors.
+
+    Raises:
+        CorruptFileError: a tensor that sizes are read from is missing.
+    """
+    try:
+        hidden, width = tensors["scene_in.weight"].shape
+        head = tensors["single_blocks.0.query_norm.weight"].shape[0]
+        mlp = tensors["single_blocks.0.linear2.weight"].shape[1] - hidden
+        return MixedFluxConfig(
+            categories=tensors["logits_out.1.weight"].shape[0],
+            hidden=hidden,
+            double_blocks=_count(tensors, "double_blocks"),
+            single_blocks=_count(tensors, "single_blocks"),
+            heads=hidden // head,
+            mlp_ratio=mlp / hidden,
+            embedding=width,
+            pose_head=tensors["pose_out.0.weight"].shape[0],
+            text_width=tensors["text_in.weight"].shape[1] if "text_in.weight" in tensors else 0,
+            frequencies=0,
+            time_scale=1000.0,
+            flags=0,
+        )
+    except (KeyError, ValueError, IndexError) as error:
+        raise CorruptFileError(f"{str(file)!r} lacks tensors of the mixed Flux model: {error}") from error
+
+
+def _fill(network: torch.nn.Module, tensors: dict[str, Tensor], file: str | os.PathLike[str]) -> None:
+    expected = network.state_dict()
+    for name in expected:
+        if name.endswith(".bias") and name not in tensors:
+            tensors[name] = torch.zeros_like(expected[name])
+            _LOGGER.info("%s has no %s; zeros take its place", file, name)
+    missing = [name for name in expected if name not in tensors]
+    extra = [name for name in tensors if name not in expected]
+    shapes = [
+        f"{name} {tuple(tensors[name].shape)} instead of {tuple(expected[name].shape)}"
+        for name in expected
+        if name in tensors and tensors[name].shape != expected[name].shape
+    ]
+    if missing or extra or shapes:
+        parts = [f"{what}: {_list(names)}" for what, names in
+                 (("missing", missing), ("extra", extra), ("of another shape", shapes)) if names]  # fmt: skip
+        raise CorruptFileError(f"{str(file)!r} does not fit the mixed Flux model (our names); {'; '.join(parts)}")
+    network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
+
+
+def _our_name(name: str) -> str | None:
+    for pattern, replacement in _RULES:
+        ours, count = re.subn(f"^{pattern}", replacement, name)
+        if count:
+            return ours.replace("<x>", "scene").replace("<txt>", "text")
+    return None
+
+
+def _count(tensors: Mapping[str, Tensor], prefix: str) -> int:
+    return len({name.split(".")[1] for name in tensors if name.startswith(f"{prefix}.")})
+
+
+def _list(names: list[str]) -> str:
+    shown = ", ".join(names[:8])
+    return shown if len(names) <= 8 else f"{shown} and {len(names) - 8} more"
+
+
+def _with_categories(normalizer: Normalizer, scene: SceneType) -> Normalizer:
+    """The normalizer over all D features; theirs covers poses, and may cover one-hots as well."""
+    low, high = (torch.zeros(scene.features), torch.ones(scene.features))
+    low[:POSE], high[:POSE] = normalizer.input_min[:POSE], normalizer.input_max[:POSE]
+    whole = Normalizer.from_range(low, high)
+    scale, offset = whole.scale.clone(), whole.min.clone()
+    scale[:POSE], offset[:POSE] = normalizer.scale[:POSE], normalizer.min[:POSE]
+    return Normalizer(scale, offset, whole.input_min, whole.input_max)

@@ -1,0 +1,245 @@
+"""A continuous prior: Gaussian diffusion on whole slots, categories being numbers in [-1, 1] that end in an arg-max."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import torch
+from torch import Generator, Tensor
+
+from agents.diffusion import GaussianProcess, GaussianStep, Preconditioning, ResidualVariance, StepTable
+from agents.diffusion.gaussian import timestep_weights
+from agents.diffusion.schedules import make_schedule
+from agents.diffusion.weighting import check_weighting, loss_weights, timestep_distribution
+from agents.networks.denoiser import Denoiser
+from agents.networks.registry import build_network, config_from_state, config_state
+from agents.networks.text import Text
+from agents.priors.base import ScenePrior
+from agents.priors.config import PriorConfig
+from agents.priors.inpainting import draw_noise
+from agents.priors.prompt_validation import no_text
+from agents.priors.rotation_codes import SceneCode
+from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.normalizer import Normalizer
+from scene_envs.protocols import StepTableLike
+from scene_envs.scene import SceneBatch
+from scene_envs.scene_types import get_scene_type
+
+SCENE_MOMENTS = ("feature", "scene")
+"""Whose mean and standard deviation precondition the network of a continuous prior."""
+
+
+class ContinuousPrior(ScenePrior):
+    """A :class:`~agents.priors.base.ScenePrior` whose categories are diffused as numbers.
+
+    What is denoised, x (B, N, D), is a scene in the representation of rotations that ``config.rotation`` names: in the
+    scene type's own layout for ``"matrix"``, narrower for the others. :meth:`encode` and :meth:`decode` go there and
+    back.
+
+    Args:
+        config: what it is made of.
+        normalizer: of raw scenes in the scene type's layout.
+        preconditioning: moments (D,) of encoded scenes.
+        card: facts about its training.
+        residual: (G, D) measured error of the denoised scene.
+
+    >>> from agents.priors.testing import tiny_prior
+    >>> prior = tiny_prior("dimsum_table", process="continuous")
+    >>> mean, std = prior.posterior(prior.initial(2, 34), 0, prior.step_table(4))
+    >>> mean.shape, bool((std[0] == 0).all())  # the table is known
+    (torch.Size([2, 34, 20]), True)
+    """
+
+    process_name = "continuous"
+
+    def __init__(
+        self,
+        config: PriorConfig,
+        normalizer: Normalizer,
+        preconditioning: Preconditioning,
+        card: dict[str, Any] | None = None,
+        residual: ResidualVariance | None = None,
+    ) -> None:
+        super().__init__()
+        self.code = SceneCode(get_scene_type(config.scene_type), config.rotation, normalizer)
+        _check_network(config, self.code)
+        check_weighting(config.loss_weighting, config.prediction)
+        self._keep(config, normalizer, preconditioning, card, residual)
+        schedule = make_schedule(config.schedule, config.num_timesteps, config.noise_floor, config.noise_ceiling)
+        self.process = GaussianProcess(schedule, config.prediction, preconditioning)
+        self.denoiser = Denoiser(build_network(config.network), self.process)
+        distribution = timestep_distribution(config.timesteps, config.prediction)
+        self._timestep_weights = timestep_weights(distribution, schedule, config.noise_mean, config.noise_std)
+
+    @classmethod
+    def fitted(
+        cls, config: PriorConfig, normalizer: Normalizer, raw: Tensor, moments: str = "feature"
+    ) -> ContinuousPrior:
+        """A fresh prior whose preconditioning is fitted to raw scenes (M, N, 3 + 9 + C + 1).
+
+        Args:
+            config: what it is made of.
+            normalizer: of raw scenes.
+            raw: scenes in the scene type's layout.
+            moments: one of :data:`SCENE_MOMENTS`: those of each feature, or one standard deviation for all.
+        """
+        if moments not in SCENE_MOMENTS:
+            raise unknown_name("moments of a continuous prior", moments, SCENE_MOMENTS)
+        scene_type = get_scene_type(config.scene_type)
+        code = SceneCode(scene_type, config.rotation, normalizer)
+        fitted = Preconditioning.fit(code.encode(SceneBatch(raw, scene_type))[:, len(scene_type.fixed) :])
+        return cls(config, normalizer, fitted if moments == "feature" else fitted.pooled())
+
+    @classmethod
+    def from_state(
+        cls,
+        fields: dict[str, Any],
+        normalizer: Normalizer,
+        preconditioning: Preconditioning,
+        card: dict[str, Any] | None,
+        residual: ResidualVariance | None,
+    ) -> ContinuousPrior:
+        """From the ``prior`` entry of a configuration file."""
+        fields = {**fields, "network": config_from_state(fields["network"], "continuous")}
+        return cls(PriorConfig(**fields), normalizer, preconditioning, card, residual)
+
+    def config_state(self) -> dict[str, Any]:
+        """The ``prior`` entry of the configuration file."""
+        return {**asdict(self.config), "network": config_state(self.config.network)}
+
+    # -- scenes and numbers ---------------------------------------------------------------------
+
+    @property
+    def features(self) -> int:
+        """D, numbers per slot of what is denoised."""
+        return self.code.features
+
+    @property
+    def is_constant(self) -> Tensor:
+        """(D,) bool: features that never vary."""
+        return self.code.normalizer.is_constant
+
+    def normalised(self, batch: SceneBatch) -> Tensor:
+        """(B, N, D) scenes as numbers, before known entries are clamped."""
+        return self.code.encode(batch)
+
+    def decode(self, x: Tensor) -> SceneBatch:
+        """Scenes from normalised x_0 (B, N, D); known entries take their exact values."""
+        return self.code.decode(self.clamp(x))
+
+    # -- the reverse chain ----------------------------------------------------------------------
+
+    def transition(self, x_t: Tensor, step: int, table: StepTableLike, *, eta: float = 1.0) -> GaussianStep:
+        """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters."""
+        return GaussianStep(*self.posterior(x_t, step, table, eta))
+
+    def posterior(self, x_t: Tensor, step: int, table: StepTableLike, eta: float = 1.0) -> tuple[Tensor, Tensor]:
+        """Mean (B, N, D) and std (N, D) of x_{t-1} given x_t; differentiable in the network's parameters.
+
+        The std is 0 on known entries, and everywhere at the last step, which is deterministic, or where ``eta`` is 0.
+        """
+        t, previous = int(table.timesteps[step]), int(table.previous[step])
+        self.process.check_stride(t, previous)
+        x0 = self.denoiser(x_t, torch.full((x_t.shape[0],), t, device=x_t.device))
+        if self.config.clip:
+            x0 = x0.clamp(-self.config.clip, self.config.clip)
+        residual = None if self.residual is None else self.residual.at(t)
+        mean, std = self.process.posterior(x_t, x0, t, previous, residual, eta)
+        std_map = std * (~self.known(x_t.shape[1])).to(x_t.dtype)
+        return self.clamp(mean), std_map
+
+    def regenerate(
+        self,
+        batch: SceneBatch,
+        mask: Tensor,
+        table: StepTable,
+        generators: Sequence[Generator],
+        resample: int,
+        prompts: Sequence[str] | None = None,
+        guidance: float = 0.0,
+    ) -> Tensor:
+        """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; used by :meth:`inpaint`."""
+        x0 = self.encode(batch)
+        widths = torch.tensor([self.code.pose_width, x0.shape[-1] - self.code.pose_width], device=mask.device)
+        keep = ~mask.repeat_interleave(widths, dim=-1)
+        return self._chain_with_noised(x0, keep, table, generators, resample)
+
+    def _chain_with_noised(
+        self, x0: Tensor, keep: Tensor, table: StepTable, generators: Sequence[Generator], resample: int
+    ) -> Tensor:
+        """x_0 from a chain in which entries ``keep`` (B, N, D) of ``x0`` are put in with each level's noise."""
+        x = self.clamp(draw_noise(x0, generators))
+        for step in range(len(table)):
+            level, after = table.timesteps[step], int(table.previous[step])
+            for again in range(resample if after > 0 else 1):
+                if again:
+                    x = self.process.renoise(x, after, int(level), draw_noise(x0, generators))
+                noised = self.process.add_noise(x0, level, draw_noise(x0, generators))
+                x = self.clamp(torch.where(keep, noised, x))
+                x = self.transition(x, step, table).from_noise(draw_noise(x0, generators))
+        return torch.where(keep, x0, x)
+
+    def pretraining_loss(
+        self,
+        x0: Tensor,
+        generator: Generator | None = None,
+        reduction: str = "mean",
+        t: Tensor | None = None,
+        text: Text | None = None,
+    ) -> Tensor:
+        """Weighted mean square of the network's error, over entries that are not known.
+
+        Scenes are weighted by their timestep as ``config.loss_weighting`` says.
+
+        Args:
+            x0: (B, N, D) normalised scenes.
+            generator: source of timesteps and noise (CPU).
+            reduction: ``"mean"`` over scenes, or ``"none"`` for (B,); always the mean over entries.
+            t: (B,) timesteps, drawn when None.
+            text: must be None: the prior reads no prompts.
+        """
+        if text is not None:
+            raise no_text(self.scene_type, "")
+        if t is None:
+            t = self.draw_timesteps(x0.shape[0], generator).to(x0.device)
+        noise = torch.randn(x0.shape, generator=generator).to(x0.device)
+        x_t = self.clamp(self.process.add_noise(x0, t, noise))
+        error = self.denoiser.output(x_t, t) - self.process.target(x0, x_t, t, noise)
+        weight = self.loss_weight(x0.shape[1])
+        per_scene = (error.square() * weight).sum(dim=(1, 2)) / weight.sum()
+        schedule, config = self.process.schedule, self.config
+        per_scene = per_scene * loss_weights(schedule, t, config.prediction, config.loss_weighting)
+        return per_scene.mean() if reduction == "mean" else per_scene
+
+    @torch.no_grad()
+    def fit_residual(self, x0: Tensor, levels: int = 40, seed: int = 0) -> ResidualVariance:
+        """Measure the denoiser's error on normalised scenes ``x0`` (B, N, D) at ``levels`` timesteps, and keep it."""
+        generator = Generator().manual_seed(seed)
+        timesteps = StepTable.spaced(self.config.num_timesteps, levels).timesteps.flip(0)
+        rows = []
+        for t in timesteps:
+            noise = torch.randn(x0.shape, generator=generator).to(x0.device)
+            x_t = self.clamp(self.process.add_noise(x0, t, noise))
+            error = self.denoiser(x_t, t.to(x0.device).expand(len(x0))) - x0
+            rows.append(error[:, len(self.scene_type.fixed) :].square().mean(dim=(0, 1)).cpu())
+        self.residual = ResidualVariance(timesteps, torch.stack(rows))
+        return self.residual
+
+
+def _check_network(config: PriorConfig, code: SceneCode) -> None:
+    """Raise InvalidInputError when the network does not fit what is denoised."""
+    features = getattr(config.network, "features", None)
+    if features is None:
+        raise InvalidInputError(
+            f"{type(config.network).__name__} is not the configuration of a continuous network; see "
+            "agents.networks.registry.network_config(name, 'continuous', ...)"
+        )
+    if features != code.features:
+        raise InvalidInputError(
+            f"the network reads {features} features, scenes of {config.scene_type!r} with rotation={config.rotation!r} "
+            f"have {code.features}; build it with features={code.features}"
+        )
+    if getattr(config.network, "text_width", 0):
+        raise InvalidInputError("text_width must be 0 in the network of a continuous prior, which reads no prompts")

@@ -1,0 +1,176 @@
+"""Inpainting: some slots, poses or categories are regenerated, the others guide them."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+
+import torch
+from torch import Generator, Tensor
+
+from agents.diffusion.step_tables import StepTable
+from agents.priors.prompt_validation import check_prompts
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import CATEGORY, POSE, SceneBatch
+from scene_envs.scene_types import SceneType
+
+
+class Inpainting:
+    """The part of a prior that regenerates some of a scene and keeps the rest: inpainting, completion, rearrangement.
+
+    A mixed prior sees what is kept without noise. A continuous prior sees it with the noise of every level (Lugmayr et
+    al. 2022, Eq. 8).
+    """
+
+    scene_type: SceneType
+
+    @property
+    def conditional(self) -> bool:
+        """Whether the prior reads prompts."""
+        return False
+
+    @property
+    def device(self) -> torch.device:
+        """Where the prior computes."""
+        raise NotImplementedError
+
+    @abstractmethod
+    def step_table(self, num_steps: int) -> StepTable:
+        """The reverse steps of a chain of ``num_steps``, any number in 1..T."""
+
+    @abstractmethod
+    def decode(self, x: Tensor) -> SceneBatch:
+        """Scenes from normalised x_0 (B, N, D); known entries take their exact values."""
+
+    @abstractmethod
+    def regenerate(
+        self,
+        batch: SceneBatch,
+        mask: Tensor,
+        table: StepTable,
+        generators: Sequence[Generator],
+        resample: int,
+        prompts: Sequence[str] | None = None,
+        guidance: float = 0.0,
+    ) -> Tensor:
+        """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; used by :meth:`inpaint`."""
+
+    @torch.no_grad()
+    def inpaint(
+        self,
+        batch: SceneBatch,
+        mask: Tensor,
+        *,
+        prompt: str | Sequence[str] | None = None,
+        guidance: float = 0.0,
+        num_steps: int = 50,
+        generators: Sequence[Generator] | None = None,
+        seed: int = 0,
+        resample: int = 1,
+    ) -> SceneBatch:
+        """Regenerate what is masked, given the rest.
+
+        Args:
+            batch: scenes to change.
+            mask: bool, True where something is regenerated: (B, N) for whole slots, or (B, N, 2) for the pose and the
+                category of each slot. Fixed welded slots never are.
+            prompt: what the whole scenes should hold in the end, one text for all or one per scene; None for anything.
+            guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional; it needs a prompt.
+            num_steps: denoiser evaluations of one pass, 1..T.
+            generators: one per scene, so that a scene's result does not depend on its neighbours' noise.
+            seed: used to make the generators when none are given.
+            resample: how often each step is taken, going back in between (Lugmayr et al. 2022, Algorithm 1); 1 is once.
+
+        Returns:
+            Scenes on the device of ``batch``, whose unmasked entries are bit-identical to its own. Where the category
+            alone is regenerated, an object stays an object and an empty slot stays empty, as the pose is kept.
+
+        Raises:
+            InvalidInputError: a mask of the wrong shape or type, not one generator per scene, ``resample`` below 1, a
+                prompt for a prior that reads none, or guidance without a prompt.
+        """
+        both = check_mask(batch, mask, generators, resample).to(batch.tensor.device)
+        both[:, : len(self.scene_type.fixed)] = False
+        slots = batch.tensor.shape[1]
+        prompts = check_prompts(
+            prompt, guidance, len(batch), scene_type=self.scene_type, slots=slots, conditional=self.conditional
+        )
+        if generators is None:
+            generators = [Generator().manual_seed(seed + i) for i in range(len(batch))]
+        device, table = self.device, self.step_table(num_steps)
+        x = self.regenerate(batch.to(device), both.to(device), table, generators, resample, prompts, guidance)
+        return merge(batch, self.decode(x).to(batch.tensor.device), both)
+
+    def complete(
+        self,
+        batch: SceneBatch,
+        *,
+        prompt: str | Sequence[str] | None = None,
+        guidance: float = 0.0,
+        slots: int | None = None,
+        num_steps: int = 50,
+        seed: int = 0,
+    ) -> SceneBatch:
+        """Fill the empty slots of ``batch``, keeping its objects.
+
+        Args:
+            batch: scenes.
+            prompt: what the completed scenes should hold, one text for all or one per scene; None for anything.
+            guidance: w of classifier-free guidance, as in :meth:`sample`.
+            slots: slots of the result, at least those of ``batch``; None keeps them.
+            num_steps: denoiser evaluations per scene.
+            seed: of the noise; scene i uses ``seed + i``.
+        """
+        wide = batch if slots is None else batch.with_slots(slots)
+        return self.inpaint(wide, wide.is_empty, prompt=prompt, guidance=guidance, num_steps=num_steps, seed=seed)
+
+    def rearrange(
+        self,
+        batch: SceneBatch,
+        *,
+        prompt: str | Sequence[str] | None = None,
+        guidance: float = 0.0,
+        num_steps: int = 50,
+        seed: int = 0,
+    ) -> SceneBatch:
+        """New poses for the free objects of ``batch``; what is there, and what is welded, stays.
+
+        Arguments as in :meth:`complete`.
+        """
+        free = batch.is_free
+        mask = torch.stack([free, torch.zeros_like(free)], dim=-1)
+        return self.inpaint(batch, mask, prompt=prompt, guidance=guidance, num_steps=num_steps, seed=seed)
+
+
+def check_mask(
+    batch: SceneBatch, mask: Tensor, generators: Sequence[Generator] | None = None, resample: int = 1
+) -> Tensor:
+    """The mask as (B, N, 2), a copy; raises InvalidInputError when an argument does not fit ``batch``."""
+    expected = tuple(batch.tensor.shape[:2])
+    if tuple(mask.shape) not in (expected, (*expected, 2)) or mask.dtype != torch.bool:
+        raise InvalidInputError(
+            f"mask must be bool of shape {expected}, or {(*expected, 2)} for pose and category, "
+            f"got {mask.dtype} {tuple(mask.shape)}"
+        )
+    if generators is not None and len(generators) != len(batch):
+        raise InvalidInputError(f"{len(generators)} generators for {len(batch)} scenes; give one per scene")
+    if resample < 1:
+        raise InvalidInputError(f"resample={resample}: every step is taken at least once")
+    return (mask if mask.ndim == 3 else torch.stack([mask, mask], dim=-1)).clone()
+
+
+def merge(batch: SceneBatch, new: SceneBatch, mask: Tensor) -> SceneBatch:
+    """``batch`` with the poses and categories of ``new`` where ``mask`` (B, N, 2) says so."""
+    empty = batch.scene_type.num_assets
+    taken = mask[..., 1] & (mask[..., 0] | (new.is_empty == batch.is_empty))  # a kept pose, or none, stays one
+    category = torch.where(taken[..., None], new.tensor[..., CATEGORY], batch.tensor[..., CATEGORY])
+    pose = torch.where(mask[..., :1], new.tensor[..., POSE], batch.tensor[..., POSE])
+    gone = category.argmax(dim=-1, keepdim=True) == empty
+    return SceneBatch(torch.cat([torch.where(gone, torch.zeros_like(pose), pose), category], dim=-1), batch.scene_type)
+
+
+def draw_noise(like: Tensor, generators: Sequence[Generator] | Generator | None) -> Tensor:
+    """Standard normal noise shaped as ``like`` (B, N, D), from one generator or one CPU generator per scene."""
+    if generators is None or isinstance(generators, Generator):
+        return torch.randn(like.shape, generator=generators, device=like.device)
+    return torch.stack([torch.randn(like.shape[1:], generator=g) for g in generators]).to(like.device)

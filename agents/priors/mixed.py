@@ -1,0 +1,318 @@
+"""A mixed discrete-continuous prior: D3PM on categories and DDPM on poses, each conditioned on the other.
+
+A scene x is (B, N, 12 + K): the normalised pose and the one-hot category of each slot, K = C + 1 with *empty* last.
+While a category is masked its K entries are zeros. (Pfaff et al., CoRL 2025; Hu et al. 2024)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import torch
+from torch import Generator, Tensor, nn
+from torch.nn import functional as F
+
+from agents.diffusion import (
+    CategoricalProcess,
+    GaussianProcess,
+    MixedStep,
+    Preconditioning,
+    ResidualVariance,
+    StepTable,
+)
+from agents.diffusion.categorical import make_categorical_schedule
+from agents.diffusion.gaussian import timestep_weights
+from agents.diffusion.reverse_steps import state_of
+from agents.diffusion.schedules import make_schedule
+from agents.diffusion.unmasking import UNMASKINGS
+from agents.diffusion.weighting import check_weighting
+from agents.networks.mixed_denoiser import Given, MixedDenoiser
+from agents.networks.mixed_flux_config import POSE, MixedFluxConfig, current_name
+from agents.networks.registry import build_network, config_from_state, config_state
+from agents.networks.text import Text
+from agents.networks.text_encoders import text_config_from_state, text_encoder
+from agents.priors.config import MixedPriorConfig
+from agents.priors.inpainting import draw_noise
+from agents.priors.mixed_training import TrainableMixedPrior
+from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.normalizer import Normalizer
+from scene_envs.protocols import StepTableLike
+from scene_envs.scene import SceneBatch
+from scene_envs.scene_types import get_scene_type
+
+CATEGORY_LOSSES = ("cross_entropy", "bound")
+_TEXT = "text_encoder."
+
+
+class MixedPrior(TrainableMixedPrior):
+    """A :class:`~agents.priors.base.ScenePrior` whose categories are discrete.
+
+    Args:
+        config: what it is made of.
+        normalizer: of raw scenes; only its pose features are used.
+        preconditioning: moments (12,) of normalised poses.
+        card: facts about its training.
+        residual: (G, 12) measured error of the denoised pose.
+
+    >>> from agents.priors.testing import tiny_prior
+    >>> prior = tiny_prior("dimsum_table", process="mixed")
+    >>> x, table = prior.initial(2, 34), prior.step_table(4)
+    >>> step = prior.transition(x, 0, table)
+    >>> step.from_noise(torch.randn_like(x)).shape, step.log_prob(x).shape
+    (torch.Size([2, 34, 20]), torch.Size([2, 34]))
+    """
+
+    process_name = "mixed"
+
+    def __init__(
+        self,
+        config: MixedPriorConfig,
+        normalizer: Normalizer,
+        preconditioning: Preconditioning,
+        card: dict[str, Any] | None = None,
+        residual: ResidualVariance | None = None,
+    ) -> None:
+        nn.Module.__init__(self)
+        scene_type = get_scene_type(config.scene_type)
+        if config.network.categories != scene_type.num_assets + 1:
+            raise InvalidInputError(
+                f"the network knows {config.network.categories} categories, {config.scene_type!r} has "
+                f"{scene_type.num_assets + 1} with empty"
+            )
+        if config.category_loss not in CATEGORY_LOSSES:
+            raise unknown_name("category loss", config.category_loss, CATEGORY_LOSSES)
+        if config.unmasking not in UNMASKINGS:
+            raise unknown_name("unmasking", config.unmasking, UNMASKINGS)
+        check_weighting(config.loss_weighting, config.prediction)
+        if config.empty_slots == "dropped" and not isinstance(config.network, MixedFluxConfig):
+            raise InvalidInputError("empty_slots='dropped' needs network='flux'; others take empty_slots='attended'")
+        self.mixed = config
+        self._keep(config, normalizer, preconditioning, card, residual)
+        schedule = make_schedule(config.schedule, config.num_timesteps, config.noise_floor, config.noise_ceiling)
+        self.process = GaussianProcess(schedule, config.prediction, preconditioning)
+        self.categories = CategoricalProcess(
+            make_categorical_schedule(config.kernel, config.num_timesteps), config.network.categories
+        )
+        self._together = config.unmasking == "even" and self.categories.only_absorbs
+        encoder = None if config.text is None else text_encoder(config.text)
+        self.denoiser = MixedDenoiser(
+            build_network(config.network), self.process, self.categories, encoder, config.empty_slots
+        )
+        self._timestep_weights = timestep_weights(config.timesteps, schedule, config.noise_mean, config.noise_std)
+
+    @classmethod
+    def from_state(
+        cls,
+        fields: dict[str, Any],
+        normalizer: Normalizer,
+        preconditioning: Preconditioning,
+        card: dict[str, Any] | None,
+        residual: ResidualVariance | None,
+    ) -> MixedPrior:
+        """From the ``prior`` entry of a configuration file."""
+        text = text_config_from_state(fields.get("text"))
+        fields = {**fields, "network": config_from_state(fields["network"], "mixed"), "text": text}
+        return cls(MixedPriorConfig(**fields), normalizer, preconditioning, card, residual)
+
+    def config_state(self) -> dict[str, Any]:
+        """The ``prior`` entry of the configuration file."""
+        return {**asdict(self.mixed), "network": config_state(self.mixed.network)}
+
+    def weights(self) -> dict[str, Tensor]:
+        """Tensors of the network, and those of the text encoder under ``text_encoder.``."""
+        tensors = dict(self.denoiser.network.state_dict())
+        if self.denoiser.text_encoder is not None:
+            tensors |= {f"{_TEXT}{name}": value for name, value in self.denoiser.text_encoder.state_dict().items()}
+        return tensors
+
+    def load_weights(self, tensors: dict[str, Tensor]) -> None:
+        """Inverse of :meth:`weights`; raises RuntimeError when names or shapes differ."""
+        text = {name.removeprefix(_TEXT): value for name, value in tensors.items() if name.startswith(_TEXT)}
+        self.denoiser.network.load_state_dict(
+            {current_name(name): value for name, value in tensors.items() if not name.startswith(_TEXT)}
+        )
+        if self.denoiser.text_encoder is not None:
+            self.denoiser.text_encoder.load_state_dict(text)
+
+    # -- what the network is told ---------------------------------------------------------------
+
+    def seen(self, x: Tensor, given: Given | None = None) -> Given | None:
+        """What the network is told to be exact in scenes ``x`` (B, N, D): ``given``, or else the fixed objects.
+
+        A prior trained with given entries has always been told of its fixed objects; one trained without is not.
+        """
+        if given is not None or self.mixed.given_share <= 0:
+            return given
+        fixed = torch.zeros(x.shape[:2], dtype=torch.bool, device=x.device)
+        fixed[:, : len(self.scene_type.fixed)] = True
+        return Given(x, fixed, fixed)
+
+    # -- scenes and states ----------------------------------------------------------------------
+
+    @property
+    def num_categories(self) -> int:
+        """K = C + 1."""
+        return self.mixed.network.categories
+
+    def known(self, slots: int) -> Tensor:
+        """(slots, D) bool: entries that are clamped (fixed welded slots, constant pose features)."""
+        constant = self.normalizer.is_constant.to(self._fixed.device).clone()
+        constant[POSE:] = False
+        known = constant.expand(slots, -1).clone()
+        known[: len(self.scene_type.fixed)] = True
+        return known
+
+    def clamp(self, x: Tensor) -> Tensor:
+        """``x`` (B, N, D) with its known entries set to their values."""
+        count = len(self.scene_type.fixed)
+        constant = self.normalizer.is_constant[:POSE].to(x.device)
+        x = torch.cat([torch.where(constant, torch.zeros_like(x[..., :POSE]), x[..., :POSE]), x[..., POSE:]], dim=-1)
+        if count:
+            x = torch.cat([self._fixed[:count].to(x).expand(x.shape[0], -1, -1), x[:, count:]], dim=1)
+        return x
+
+    def normalised(self, batch: SceneBatch) -> Tensor:
+        """(B, N, D): normalised pose, one-hot category as it is.
+
+        The pose of an empty slot means nothing; it takes the mean of poses, where it asks nothing of the network.
+        """
+        pose = batch.to_tensor(normalised=self.normalizer)[..., :POSE]
+        pose = torch.where(batch.is_empty[..., None], self.preconditioning.mean.to(pose), pose)
+        return torch.cat([pose, batch.tensor[..., POSE:]], dim=-1)
+
+    def initial(self, count: int, slots: int, generator: Generator | None = None) -> Tensor:
+        """x_T (count, slots, D): normal poses, categories from the end of their chain, known entries clamped."""
+        noise = torch.randn(count, slots, self.scene_type.features, generator=generator, device=self._fixed.device)
+        probs = self.categories.prior().to(noise).expand(count, slots, -1)
+        return self.clamp(self._with_states(noise[..., :POSE], probs, noise))
+
+    def add_noise(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
+        """A sample of q(x_t | x_0) from standard normal noise (B, N, D)."""
+        pose = self.process.add_noise(x0[..., :POSE], t, noise[..., :POSE])
+        category = x0[..., POSE:].argmax(dim=-1)
+        return self.clamp(self._with_states(pose, self.categories.marginal(category, t.expand(len(x0))), noise))
+
+    @staticmethod
+    def _with_states(pose: Tensor, probs: Tensor, noise: Tensor) -> Tensor:
+        """``pose`` (B, N, 12) beside states drawn from ``probs`` (B, N, K + 1) by ``noise`` (B, N, D)."""
+        random = torch.ones(pose.shape[1], dtype=torch.bool, device=pose.device)
+        return MixedStep(pose, torch.zeros_like(pose[0]), probs, random).from_noise(noise)
+
+    # -- the reverse chain ----------------------------------------------------------------------
+
+    def transition(
+        self,
+        x_t: Tensor,
+        step: int,
+        table: StepTableLike,
+        *,
+        given: Given | None = None,
+        text: Text | None = None,
+        guidance: float = 0.0,
+        free: Text | None = None,
+        eta: float = 1.0,
+    ) -> MixedStep:
+        """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters.
+
+        Args:
+            x_t: scenes at ``table.timesteps[step]``.
+            step: index in the table.
+            table: the chain.
+            given: entries that carry no noise; None for the fixed objects alone.
+            text: tokens (B, L, W) and their mask (B, L); None for no prompt.
+            guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional, on poses and logits.
+            free: what stands for no prompt, as :meth:`unconditional` gives it; encoded anew when None.
+            eta: noise of the pose, 1 for the ancestral step and 0 for a certain one; categories are drawn all the same.
+        """
+        t, previous = int(table.timesteps[step]), int(table.previous[step])
+        self.process.check_stride(t, previous)
+        levels = torch.full((x_t.shape[0],), t, device=x_t.device)
+        given = self.seen(x_t, given)
+        if free is None and (text is None or guidance):
+            free = self.unconditional(x_t.shape[0])
+        pose, logits = self.denoiser(x_t, levels, given, free if text is None else text)
+        if text is not None and guidance:
+            free_pose, free_logits = self.denoiser(x_t, levels, given, free)
+            pose = (1 + guidance) * pose - guidance * free_pose
+            logits = (1 + guidance) * logits.log_softmax(-1) - guidance * free_logits.log_softmax(-1)
+        if self.mixed.clip:
+            pose = pose.clamp(-self.mixed.clip, self.mixed.clip)
+        residual = None if self.residual is None else self.residual.at(t)
+        mean, std = self.process.posterior(x_t[..., :POSE], pose, t, previous, residual, eta)
+        states = x_t[..., POSE:]
+        state = state_of(states)
+        probs = self.categories.posterior(state, logits.softmax(dim=-1), t, previous)
+        slots, fixed = x_t.shape[1], len(self.scene_type.fixed)
+        random = torch.full((slots,), previous > 0, device=x_t.device)
+        random[:fixed] = False
+        known = self.known(slots)[:, :POSE]
+        zeros = torch.zeros(*mean.shape[:2], self.num_categories, device=mean.device)
+        clamped = self.clamp(torch.cat([mean, zeros], dim=-1))
+        if fixed:
+            certain = F.one_hot(self._fixed[:fixed, POSE:].argmax(dim=-1), self.num_categories + 1).to(probs)
+            probs = torch.cat([certain.expand(len(probs), -1, -1), probs[:, fixed:]], dim=1)
+        masked = (state == self.num_categories) & random if self._together else None
+        return MixedStep(clamped[..., :POSE], std * (~known).to(mean.dtype), probs, random, masked)
+
+    def regenerate(
+        self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int,
+        prompts: Sequence[str] | None = None, guidance: float = 0.0,
+    ) -> Tensor:  # fmt: skip
+        """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; the rest is seen as it is."""
+        text = None if prompts is None else self.encode_prompts(prompts)
+        given = Given(self.encode(batch), ~mask[..., 0], ~mask[..., 1])
+        noise = draw_noise(given.x, generators)
+        probs = self.categories.prior().to(noise).expand(*noise.shape[:2], -1)
+        start = self.clamp(self._with_states(noise[..., :POSE], probs, noise))
+        return self.run_chain(start, table, generators, given, text, guidance, resample)
+
+    @torch.no_grad()
+    def run_chain(
+        self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None, given: Given | None = None,
+        text: Text | None = None, guidance: float = 0.0, resample: int = 1, eta: float = 1.0,
+    ) -> Tensor:  # fmt: skip
+        """x_0 (B, N, D) from x_T, with given entries kept.
+
+        Args:
+            x: x_T (B, N, D).
+            table: the chain.
+            noises: one generator for all scenes, or one per scene; None for torch's own.
+            given: entries that carry no noise.
+            text, guidance, eta: as in :meth:`transition`.
+            resample: how often each step is taken, going back in between.
+        """
+        free = self.unconditional(len(x)) if text is None or guidance else None
+        x = x if given is None else given.write(x)
+        for step in range(len(table)):
+            level, after = int(table.timesteps[step]), int(table.previous[step])
+            for again in range(resample if after > 0 else 1):
+                if again:
+                    x = self._renoise(x, after, level, draw_noise(x, noises))
+                    x = x if given is None else given.write(x)
+                reverse = self.transition(x, step, table, given=given, text=text, guidance=guidance, free=free, eta=eta)
+                x = reverse.from_noise(draw_noise(x, noises))
+                x = x if given is None else given.write(x)
+        return x
+
+    def _renoise(self, x_s: Tensor, s: int, t: int, noise: Tensor) -> Tensor:
+        """A sample of q(x_t | x_s), s < t."""
+        pose = self.process.renoise(x_s[..., :POSE], s, t, noise[..., :POSE])
+        rows = self.categories.transition(s, t).to(x_s)[state_of(x_s[..., POSE:])]
+        return self.clamp(self._with_states(pose, rows, noise))
+
+    @torch.no_grad()
+    def _sample_chunk(
+        self,
+        count: int,
+        prompts: list[str] | None,
+        guidance: float,
+        num_steps: int,
+        slots: int | None,
+        generator: Generator,
+        eta: float,
+    ) -> Tensor:
+        text = None if prompts is None else self.encode_prompts(prompts)
+        start = self.initial(count, self.mixed.slots if slots is None else slots, generator)
+        return self.run_chain(start, self.step_table(num_steps), generator, text=text, guidance=guidance, eta=eta)

@@ -1,0 +1,139 @@
+"""Training of a mixed prior: its loss, the entries given in training, and the error that is measured afterwards."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import torch
+from torch import Generator, Tensor
+from torch.nn import functional as F
+
+from agents.diffusion import CategoricalProcess, ResidualVariance, StepTable
+from agents.diffusion.reverse_steps import state_of
+from agents.diffusion.weighting import loss_weights
+from agents.networks.mixed_denoiser import Given, MixedDenoiser
+from agents.networks.mixed_flux_config import POSE
+from agents.networks.text import Text
+from agents.priors.base import ScenePrior
+from agents.priors.config import MixedPriorConfig
+from agents.priors.text import PromptReader
+
+_EMPTY_WEIGHT = 0.1
+"""Weight of the pose of an empty slot in the loss: it means nothing, but chains should not drift on it."""
+
+_COUNT_WEIGHT = 0.5
+"""Weight of the numbers that a prompt asks for, read from the text alone, where the network subtracts from them."""
+
+_AT_ONCE = 32
+"""Scenes whose residual is measured at once: features of all pairs of slots of 512 rooms would be gigabytes."""
+
+
+class TrainableMixedPrior(PromptReader, ScenePrior):
+    """The part of :class:`~agents.priors.mixed.MixedPrior` that is needed to train it."""
+
+    mixed: MixedPriorConfig
+    denoiser: MixedDenoiser
+    categories: CategoricalProcess
+    """The process of the categories."""
+
+    @property
+    @abstractmethod
+    def num_categories(self) -> int:
+        """K = C + 1."""
+
+    @abstractmethod
+    def seen(self, x: Tensor, given: Given | None = None) -> Given | None:
+        """What the network is told to be exact in scenes ``x`` (B, N, D)."""
+
+    @abstractmethod
+    def add_noise(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
+        """A sample of q(x_t | x_0) from standard normal noise (B, N, D)."""
+
+    def pretraining_loss(
+        self, x0: Tensor, generator: Generator | None = None, reduction: str = "mean", t: Tensor | None = None,
+        text: Text | None = None,
+    ) -> Tensor:  # fmt: skip
+        """Mean square of the pose output plus ``category_weight`` times the category loss, on entries not given.
+
+        Args:
+            x0: (B, N, D) scenes as :meth:`encode` gives them.
+            generator: source of timesteps, noise and given entries (CPU).
+            reduction: ``"mean"`` over scenes, or ``"none"`` for (B,); always the mean over entries.
+            t: (B,) timesteps, drawn when None.
+            text: tokens and their mask.
+        """
+        per_scene = self._losses(x0, generator, t, text)
+        return per_scene.mean() if reduction == "mean" else per_scene
+
+    def _losses(self, x0: Tensor, generator: Generator | None, t: Tensor | None, text: Text | None) -> Tensor:
+        """(B,) losses of scenes, arguments as in :meth:`pretraining_loss`."""
+        config, device = self.mixed, x0.device
+        if t is None:
+            t = self.draw_timesteps(x0.shape[0], generator).to(device)
+        noise = torch.randn(x0.shape, generator=generator).to(device)
+        given = self.draw_given(x0, generator) if config.given_share > 0 else None
+        x_t = self.add_noise(x0, t, noise)
+        x_t = x_t if given is None else given.write(x_t)
+        text = self.unconditional(len(x0)) if text is None else text
+        output, logits = self.denoiser.output(x_t, t, given, text)
+        pose0, category0 = x0[..., :POSE], x0[..., POSE:].argmax(dim=-1)
+        moments = self.denoiser.moments(state_of(x_t[..., POSE:]), t)
+        error = output - self.process.target(pose0, x_t[..., :POSE], t, noise[..., :POSE], moments)
+        weight = self.loss_weight(x0.shape[1])[None, :, :POSE].to(device).expand(len(x0), -1, -1)
+        empty = (category0 == self.num_categories - 1)[..., None]
+        weight = torch.where(empty, _EMPTY_WEIGHT * weight, weight)
+        drawn = torch.ones(x0.shape[:2], device=device)
+        drawn[:, : len(self.scene_type.fixed)] = 0.0
+        if given is not None:
+            weight = weight * (~given.pose)[..., None]
+            drawn = drawn * (~given.category)
+        if self.denoiser.drops_empty:  # what is seen is certain
+            drawn = drawn * (state_of(x_t[..., POSE:]) == self.num_categories)
+        pose_loss = (error.square() * weight).sum(dim=(1, 2)) / weight.sum(dim=(1, 2)).clamp(min=1.0)
+        pose_loss = pose_loss * loss_weights(self.process.schedule, t, config.prediction, config.loss_weighting).to(
+            device
+        )
+        if config.category_loss == "bound":
+            states = x_t[..., POSE:]
+            losses = self.categories.loss(category0, state_of(states), t, logits, config.auxiliary)
+        else:
+            losses = F.cross_entropy(logits.flatten(0, 1), category0.flatten(), reduction="none").view_as(drawn)
+        category_loss = (losses * drawn).sum(dim=1) / drawn.sum(dim=1).clamp(min=1.0)
+        loss = pose_loss + config.category_weight * category_loss
+        conditioning = self.count_conditioning
+        if conditioning is not None and text is not None:
+            loss = loss + _COUNT_WEIGHT * conditioning.count_loss(text[0][:, : conditioning.things], category0)
+        return loss
+
+    def draw_given(self, x0: Tensor, generator: Generator | None) -> Given:
+        """Random given entries: slots (completion), all categories (rearrangement), or any attribute of any slot."""
+        batch, slots = x0.shape[:2]
+        kind, share = torch.rand(2, batch, 1, generator=generator)
+        kind = kind / max(self.mixed.given_share, 1e-9)  # above 1: nothing is given
+        picks = torch.rand(2, batch, slots, generator=generator) < share
+        whole, rearrange, free = kind < 0.5, (kind >= 0.5) & (kind < 0.75), (kind >= 0.75) & (kind < 1.0)
+        pose = (whole & picks[0]) | (rearrange & picks[0] & (share < 0.5)) | (free & picks[0])
+        category = (whole & picks[0]) | rearrange.expand(-1, slots) | (free & picks[1])
+        fixed = torch.zeros(slots, dtype=torch.bool)
+        fixed[: len(self.scene_type.fixed)] = True
+        return Given(x0, (pose | fixed).to(x0.device), (category | fixed).to(x0.device))
+
+    @torch.no_grad()
+    def fit_residual(self, x0: Tensor, levels: int = 40, seed: int = 0) -> ResidualVariance:
+        """Measure the error of the denoised pose on scenes ``x0`` (B, N, D) at ``levels`` timesteps, and keep it."""
+        generator = Generator().manual_seed(seed)
+        timesteps = StepTable.spaced(self.mixed.num_timesteps, levels).timesteps.flip(0)
+        present = (x0[..., POSE:].argmax(dim=-1) != self.num_categories - 1).float()
+        present[:, : len(self.scene_type.fixed)] = 0.0
+        rows = []
+        for t in timesteps:
+            noise = torch.randn(x0.shape, generator=generator).to(x0.device)
+            level = t.to(x0.device).expand(len(x0))
+            poses = [
+                self.denoiser(part, level[: len(part)], self.seen(part), self.unconditional(len(part)))[0]
+                for part in self.add_noise(x0, level, noise).split(_AT_ONCE)
+            ]
+            error = (torch.cat(poses) - x0[..., :POSE]).square() * present[..., None]
+            rows.append((error.sum(dim=(0, 1)) / present.sum()).cpu())
+        self.residual = ResidualVariance(timesteps, torch.stack(rows))
+        return self.residual

@@ -1,0 +1,66 @@
+"""Averages of weights over training, which are what is evaluated and saved."""
+
+from __future__ import annotations
+
+from typing import Generic, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+Module = TypeVar("Module", bound=nn.Module)
+
+
+class WeightAverage:
+    """Exponential moving average of a module's parameters, with a warm-up of the decay.
+
+    >>> layer = nn.Linear(1, 1)
+    >>> average = WeightAverage(layer, decay=0.5)
+    >>> _ = average.update(layer)
+    >>> bool((average.tensors["weight"] == layer.weight).all())
+    True
+    """
+
+    def __init__(self, module: nn.Module, decay: float) -> None:
+        self.decay = decay
+        self.updates = 0
+        self.tensors = {name: p.detach().clone() for name, p in module.named_parameters()}
+
+    @torch.no_grad()
+    def update(self, module: nn.Module) -> float:
+        """Move towards ``module``; returns the decay that was used."""
+        self.updates += 1
+        decay = min(self.decay, self.updates / (self.updates + 10.0))
+        for name, parameter in module.named_parameters():
+            self.tensors[name].lerp_(parameter, 1.0 - decay)
+        return decay
+
+    @torch.no_grad()
+    def copy_to(self, module: nn.Module) -> None:
+        """Write the averages into ``module``."""
+        for name, parameter in module.named_parameters():
+            parameter.copy_(self.tensors[name])
+
+
+class AveragedWeights(Generic[Module]):
+    """Context in which a module holds its averaged weights, and in the end its own again.
+
+    Args:
+        module: whose parameters are exchanged.
+        average: of its parameters; None leaves them as they are.
+    """
+
+    def __init__(self, module: Module, average: WeightAverage | None) -> None:
+        self.module, self.average = module, average
+        self._own: dict[str, Tensor] = {}
+
+    def __enter__(self) -> Module:
+        if self.average is not None:
+            self._own = {name: p.detach().clone() for name, p in self.module.named_parameters()}
+            self.average.copy_to(self.module)
+        return self.module
+
+    def __exit__(self, *_: object) -> None:
+        with torch.no_grad():
+            for name, parameter in self.module.named_parameters():
+                if name in self._own:
+                    parameter.copy_(self._own[name])

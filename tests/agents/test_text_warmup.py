@@ -1,0 +1,73 @@
+"""What a text encoder learns of numbers before a run."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from agents.pretraining.config import PretrainConfig
+from agents.pretraining.data import SceneTable
+from agents.pretraining.initial_prior import build_prior
+from agents.pretraining.text_warmup import warm_up_text
+from agents.priors.mixed import MixedPrior
+from scene_envs.datasets.prompts import describe_all
+from scene_envs.grammars import get_grammar
+from scene_envs.normalizer import Normalizer
+
+SCENES = get_grammar("living_room_shelf").sample(np.random.default_rng(0), 512)
+PROMPTS = describe_all(SCENES, np.random.default_rng(0))
+
+
+def fresh(**keys: object) -> tuple[MixedPrior, SceneTable]:
+    small = {"hidden": 32, "depth": 2, "heads": 2, "text_width": 48, "text_depth": 1, "text_latents": 2}
+    config = PretrainConfig(scene="living_room_shelf", text=True, **{**small, **keys})  # type: ignore[arg-type]
+    prior = build_prior(config, SCENES.tensor, Normalizer.fit(SCENES.tensor), PROMPTS)
+    assert isinstance(prior, MixedPrior)
+    return prior, SceneTable(prior.encode(SCENES), PROMPTS)
+
+
+def read_numbers(prior: MixedPrior, prompt: str) -> torch.Tensor:
+    """The likeliest number of each kind of object, and of all objects."""
+    conditioning = prior.denoiser.network.count_conditioning
+    with torch.no_grad():
+        return conditioning.count_logits(prior.encode_prompts([prompt])[0][:, : conditioning.things]).argmax(dim=-1)[0]  # type: ignore[no-any-return]
+
+
+def test_numbers_of_objects_are_read_from_prompts() -> None:
+    prior, data = fresh()
+    assert warm_up_text(prior, data, 250, 48, seed=0) is not None
+    assert [int(read_numbers(prior, f"A scene with {n} objects.")[-1]) for n in (4, 6, 8)] == [4, 6, 8]
+    kinds = list(dict.fromkeys(asset.display_name for asset in prior.scene_type.library))
+    games = [
+        int(read_numbers(prior, f"A scene with {what}.")[kinds.index("board game")])
+        for what in ("a board game", "two board games")
+    ]
+    assert games == [1, 2]
+
+
+def test_assets_of_one_name_are_one_kind_to_a_prompt() -> None:
+    prior, _ = fresh()
+    names = [asset.display_name for asset in prior.scene_type.library]
+    assert len(set(names)) < len(names)
+    assert prior.denoiser.network.count_conditioning.things == len(set(names)) + 1
+
+
+def test_the_same_seed_learns_the_same_and_nothing_else_changes() -> None:
+    priors = [fresh()[0] for _ in range(2)]
+    before = {name: value.clone() for name, value in priors[0].denoiser.state_dict().items()}
+    for prior in priors:
+        warm_up_text(prior, SceneTable(prior.encode(SCENES), PROMPTS), 3, 16, seed=5)
+    states = [prior.denoiser.state_dict() for prior in priors]
+    changed = {name for name in before if not torch.equal(states[0][name], before[name])}
+    assert all(torch.equal(states[0][name], states[1][name]) for name in before)
+    assert changed
+    assert all(name.startswith(("text_encoder.", "network.count_conditioning.counts_out.")) for name in changed)
+
+
+@pytest.mark.parametrize(
+    "keys", [{"text_count_conditioning": False}, {"network": "midiffusion", "empty_slots": "attended"}]
+)
+def test_a_network_without_count_conditioning_has_nothing_to_learn(keys: dict[str, object]) -> None:
+    prior, data = fresh(**keys)
+    assert warm_up_text(prior, data, 3, 16, seed=0) is None
