@@ -1,4 +1,4 @@
-"""The reward contract: what goes in, what comes out."""
+"""Reward contract: the types of a reward, its context and its output."""
 
 from __future__ import annotations
 

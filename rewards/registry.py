@@ -1,4 +1,4 @@
-"""Rewards by name: a decorator, installed plug-ins, and mappings as they stand in a config file."""
+"""Reward registry: names by decorator, by entry point of installed packages, and by mapping in a configuration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the environments need from rewards and priors, without importing either."""
+"""Protocols of rewards and priors for the environments, which import neither."""
 
 from __future__ import annotations
 

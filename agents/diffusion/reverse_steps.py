@@ -1,4 +1,4 @@
-"""The distribution of one reverse step: what a chain draws from, and what a policy gradient differentiates."""
+"""Distribution of one reverse step: sampling and log-probabilities."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How well a small set transformer tells real scenes from samples, by their scene vectors."""
+"""Classifier two-sample test on scene vectors with a small set transformer."""
 
 from __future__ import annotations
 

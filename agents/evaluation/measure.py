@@ -1,4 +1,4 @@
-"""One flat dict of numbers that says how good scenes are: for model cards, reports and the command line."""
+"""Evaluation of scenes as one flat dict of figures, for model cards, reports and the command line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measures by group: what one evaluation computes, each group on its own."""
+"""Groups of measures, each computed on its own."""
 
 from __future__ import annotations
 

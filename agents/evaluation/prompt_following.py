@@ -1,4 +1,4 @@
-"""Do samples hold what their prompts ask for: numbers of objects, names, relations."""
+"""Prompt-following: the share of samples that hold the numbers, names and relations of their prompts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where objects of each scene type may rest: data for the height errors."""
+"""Supports of each scene type: the heights on which objects may rest."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The protocol of classifier measures: split, train with early stopping, score on held-out scenes, repeat."""
+"""Protocol of the classifier two-sample test: split, train with early stopping, score on held-out scenes, repeat."""
 
 from __future__ import annotations
 

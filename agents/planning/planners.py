@@ -1,4 +1,4 @@
-"""Planners over the public methods of a search environment, counted in expansions."""
+"""Planners over the public methods of a search environment, with a budget in expansions."""
 
 from __future__ import annotations
 

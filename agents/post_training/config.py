@@ -1,4 +1,4 @@
-"""All knobs of one post-training run."""
+"""Configuration of a post-training run."""
 
 from __future__ import annotations
 

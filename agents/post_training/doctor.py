@@ -1,4 +1,4 @@
-"""Before a run: is there something to learn, can it be learned, and do the two gradients speak equally loud?"""
+"""Doctor: checks of a post-training run before it starts, on one batch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The two gradients of an update, accumulated into ``.grad`` and measured apart."""
+"""Policy and regularisation gradients of an update, accumulated into ``.grad`` and measured separately."""
 
 from __future__ import annotations
 

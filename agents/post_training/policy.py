@@ -1,4 +1,4 @@
-"""A prior as a torchrl policy over the denoising MDP: it draws x_{t-1} and knows its log-probability."""
+"""Prior as a torchrl policy over the denoising MDP: samples x_{t-1} and gives its log-probability."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The keys of a pretraining run; imports nothing, so that they can be listed quickly."""
+"""Configuration of a pretraining run, without heavy imports, so that its keys can be listed quickly."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where training scenes come from: datasets in memory, of one scene type or several, or a grammar without end."""
+"""Training scenes: datasets in memory, of one or several scene types, or an endless grammar stream."""
 
 from __future__ import annotations
 

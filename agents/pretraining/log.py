@@ -1,4 +1,4 @@
-"""Rows of a training run: to the log, to a CSV file, and to TensorBoard."""
+"""Log of a training run: rows for the log, a CSV file and TensorBoard."""
 
 from __future__ import annotations
 

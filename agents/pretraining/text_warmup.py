@@ -1,4 +1,4 @@
-"""What a text encoder learns before a run: how many of each kind of object its prompts ask for."""
+"""Text warm-up: training of the text encoder to predict the object numbers of its prompts, before a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pretraining a scene prior on a dataset: one loop, exact resume, logs and cards."""
+"""Pretraining loop of a scene prior: one loop, exact resume, logs and model cards."""
 
 from __future__ import annotations
 

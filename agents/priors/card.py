@@ -1,4 +1,4 @@
-"""What is told of a prior: a line in a listing, and a model card in a folder to give away."""
+"""Model cards of priors: a line in a listing, and a page in a folder to publish."""
 
 from __future__ import annotations
 

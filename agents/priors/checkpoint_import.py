@@ -1,4 +1,4 @@
-"""Checkpoints of others: the mixed Flux model of the paper's authors, as PyTorch Lightning wrote it."""
+"""Import of the mixed Flux checkpoints of the paper's authors (PyTorch Lightning)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What priors are made of: layout, network, process and loss."""
+"""Configuration of priors: layout, network, process and loss."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A continuous prior: Gaussian diffusion on whole slots, categories being numbers in [-1, 1] that end in an arg-max."""
+"""Continuous prior: Gaussian diffusion on whole slots; categories are real numbers with an arg-max at the end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PyTorch Lightning checkpoints of others, read safely.
+"""Safe reading of PyTorch Lightning checkpoints.
 
 Only tensors, numbers, strings and containers are read. Every other object in the file becomes an inert placeholder, so
 nothing in it is run.

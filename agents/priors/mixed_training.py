@@ -1,4 +1,4 @@
-"""Training of a mixed prior: its loss, the entries given in training, and the error that is measured afterwards."""
+"""Training of a mixed prior: loss, observed entries for inpainting, and the residual error of the denoiser."""
 
 from __future__ import annotations
 

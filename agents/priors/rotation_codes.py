@@ -1,4 +1,4 @@
-"""How a continuous prior writes scenes as numbers: which representation of rotations it diffuses.
+"""Rotation codes: the numbers in which a continuous prior diffuses rotations.
 
 The scene type's own layout (translation | rotation matrix | one-hot) stays what crosses module boundaries.
 """

@@ -1,4 +1,4 @@
-"""Priors written to a folder and read again: what of a prior goes into its files."""
+"""Saving and loading of priors: the contents of their folders."""
 
 from __future__ import annotations
 

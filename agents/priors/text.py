@@ -1,4 +1,4 @@
-"""Text of a prior: how prompts become tokens that its network attends to."""
+"""Text of a prior: prompts as tokens that its network attends to."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From the rows of a file to scenes of a scene type: units, categories, fixed objects first, keys."""
+"""Conversion of file rows to scenes of a scene type: units, categories, fixed objects first, keys."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far a generation is: a live bar on a terminal, a line now and then elsewhere."""
+"""Progress of a generation: a live bar on a terminal, occasional lines elsewhere."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One shard of a generated dataset: a function of its job and grammar alone."""
+"""One shard of a generated dataset, a function of its job and grammar alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of a dataset, written: parquet shards of normalised scenes and prompts, and one ``metadata.json``.
+"""Dataset file writer: parquet shards of normalised scenes and prompts, and one ``metadata.json``.
 
 The layout is that of the published datasets: column ``scenes`` holds normalised (N, D) float32 scenes,
 ``language_annotation`` one prompt each; ``metadata.json`` names the assets and holds the normalizer. The further

@@ -1,4 +1,4 @@
-"""A dataset larger than memory: endless shuffled scenes, read window by window, resumable."""
+"""Stream of a dataset larger than memory: endless shuffled scenes, read window by window, resumable."""
 
 from __future__ import annotations
 

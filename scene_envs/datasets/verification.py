@@ -1,4 +1,4 @@
-"""Which generated scenes are kept: inside the workspace, free of penetration, and at rest."""
+"""Verification of generated scenes: inside the workspace, free of penetration, and at rest."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shards made here or in spawned processes of this machine."""
+"""Generation of shards in this process or in spawned processes of this machine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rewards and priors by name: the packages that know them are asked when an environment is built."""
+"""Resolvers of reward and prior names, through entry points, when an environment is built."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Keyword arguments of the environments: their names, defaults and checks, once for all adapters."""
+"""Keyword arguments of the environments: names, defaults and checks, shared by all adapters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Spaces of the environments, and the checks on what users put into them."""
+"""Spaces of the environments, and checks of user input against them."""
 
 from __future__ import annotations
 

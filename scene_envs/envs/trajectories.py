@@ -1,4 +1,4 @@
-"""Records of the denoising MDP: what one step gave, and whole trajectories."""
+"""Records of the denoising MDP: results of one step, and whole trajectories."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The export itself: a folder of scenes and their assets."""
+"""Export of scenes and their assets into a folder."""
 
 from __future__ import annotations
 

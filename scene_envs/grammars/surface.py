@@ -1,4 +1,4 @@
-"""Supports that know their free 2-D region: where a child may still be placed without overlap."""
+"""Supports with their free 2-D region, where a child may be placed without overlap."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Drawn structures: towers, the surfaces they stand on, and what a node of a grammar is."""
+"""Drawn structures: towers, the surfaces they stand on, and the node protocol of grammars."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which objects stand where they are for a reason that needs no simulation: the statics of upright stacks.
+"""Statics of upright stacks: objects that are at rest without simulation.
 
 An upright object rests on the one object under it when its centre of mass, with everything that it carries, lies
 inside both its own foot and the flat face below. Gaps close and small overlaps open, from the lowest object up. What

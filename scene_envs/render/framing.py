@@ -1,4 +1,4 @@
-"""What a picture of a scene type must show, and from where: worked out from its workspace and fixed objects."""
+"""Framing of pictures: the view of a scene type, computed from its workspace and fixed objects."""
 
 from __future__ import annotations
 

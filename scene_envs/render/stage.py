@@ -1,4 +1,4 @@
-"""A stage: one PyBullet client that holds the bodies of a library and draws what a camera sees."""
+"""Stage: one PyBullet client that holds the bodies of a library and draws what a camera sees."""
 
 from __future__ import annotations
 

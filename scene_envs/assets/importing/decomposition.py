@@ -1,4 +1,4 @@
-"""Concave meshes as convex parts, by CoACD, kept on disk.
+"""Convex decomposition of concave meshes by CoACD, cached on disk.
 
 CoACD: Wei et al., "Approximate Convex Decomposition for 3D Meshes with Collision-Aware Concavity and Tree
 Search", SIGGRAPH 2022.

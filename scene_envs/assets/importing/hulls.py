@@ -1,4 +1,4 @@
-"""Convex hulls of measured surfaces: how far a surface is from convex, and hulls with few corners."""
+"""Convex hulls of surfaces: deviation of a surface from its hull, and hulls with few corners."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Mass, centre of mass and inertia of an imported model: kept where they can be true, computed where not."""
+"""Mass, centre of mass and inertia of an imported model: kept where plausible, computed elsewhere."""
 
 from __future__ import annotations
 

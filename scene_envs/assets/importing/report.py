@@ -1,4 +1,4 @@
-"""What an import did, one line per asset."""
+"""Import report: one line per asset."""
 
 from __future__ import annotations
 

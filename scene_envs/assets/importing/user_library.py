@@ -1,4 +1,4 @@
-"""A folder of files as an asset library."""
+"""Asset library of a folder of files."""
 
 from __future__ import annotations
 

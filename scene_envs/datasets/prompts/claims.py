@@ -1,4 +1,4 @@
-"""What a prompt claims, claim by claim, and whether a scene bears it out."""
+"""Claims of a prompt, and their check against a scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The facts of a scene that prompts can speak of, from poses and asset geometry alone."""
+"""Facts of a scene that prompts describe, from poses and asset geometry alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What holds each object of a batch: which thing it stands on or lies in, and on which tier."""
+"""Supports of the objects of a batch: the thing each stands on or lies in, and its tier."""
 
 from __future__ import annotations
 
