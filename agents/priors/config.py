@@ -70,7 +70,7 @@ class MixedPriorConfig:
         category_loss: ``"cross_entropy"`` of the clean category, or ``"bound"``, the paper's variational bound.
         category_weight: weight of the category loss beside the pose loss.
         auxiliary: weight of the cross-entropy in the bound.
-        given_share: share of training scenes in which some poses or categories are given, for inpainting.
+        given_share: share of training scenes in which some poses or categories are observed, for inpainting.
         text: kind and size of the text encoder; None for a prior that reads no prompts.
         noise_floor: lowest noise-to-signal ratio of the ``"karras"`` schedule, in normalised units.
         noise_ceiling: highest.

@@ -141,7 +141,7 @@ class MixedPrior(TrainableMixedPrior):
     def seen(self, x: Tensor, given: Given | None = None) -> Given | None:
         """What the network is told to be exact in scenes ``x`` (B, N, D): ``given``, or else the fixed objects.
 
-        A prior trained with given entries has always been told of its fixed objects; one trained without is not.
+        A prior trained with observed entries has always been told of its fixed objects; one trained without is not.
         """
         if given is not None or self.mixed.given_share <= 0:
             return given
@@ -273,7 +273,7 @@ class MixedPrior(TrainableMixedPrior):
         self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None, given: Given | None = None,
         text: Text | None = None, guidance: float = 0.0, resample: int = 1, eta: float = 1.0,
     ) -> Tensor:  # fmt: skip
-        """x_0 (B, N, D) from x_T, with given entries kept.
+        """x_0 (B, N, D) from x_T, with observed entries kept.
 
         Args:
             x: x_T (B, N, D).

@@ -57,7 +57,7 @@ class TrainableMixedPrior(PromptReader, ScenePrior):
 
         Args:
             x0: (B, N, D) scenes as :meth:`encode` gives them.
-            generator: source of timesteps, noise and given entries (CPU).
+            generator: source of timesteps, noise and observed entries (CPU).
             reduction: ``"mean"`` over scenes, or ``"none"`` for (B,); always the mean over entries.
             t: (B,) timesteps, drawn when None.
             text: tokens and their mask.
@@ -106,7 +106,7 @@ class TrainableMixedPrior(PromptReader, ScenePrior):
         return loss
 
     def draw_given(self, x0: Tensor, generator: Generator | None) -> Given:
-        """Random given entries: slots (completion), all categories (rearrangement), or any attribute of any slot."""
+        """Random observed entries: slots (completion), all categories (rearrangement), or any attribute of any slot."""
         batch, slots = x0.shape[:2]
         kind, share = torch.rand(2, batch, 1, generator=generator)
         kind = kind / max(self.mixed.given_share, 1e-9)  # above 1: nothing is given
