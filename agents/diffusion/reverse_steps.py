@@ -25,7 +25,7 @@ class ReverseStep(Protocol):
 
     @property
     def entries(self) -> int:
-        """How many random variables a scene's step has."""
+        """Number of random variables of the step of each scene."""
         ...
 
     def from_noise(self, noise: Tensor) -> Tensor:

@@ -28,7 +28,7 @@ FLOOR_PREFIX = "floor_"
 
 
 class Sampler(Protocol):
-    """What :func:`evaluate` needs of a prior; ``agents.priors.base.ScenePrior`` has it."""
+    """Protocol of the priors that :func:`evaluate` takes, such as ``agents.priors.base.ScenePrior``."""
 
     @property
     def scene_type(self) -> SceneType: ...

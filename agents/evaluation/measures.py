@@ -22,7 +22,7 @@ Figures = dict[str, float]
 
 @dataclass(frozen=True)
 class EvaluationInputs:
-    """What an evaluation works on.
+    """Inputs of an evaluation.
 
     Attributes:
         samples: raw samples of a prior.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Support:
-    """Where objects of a scene type may rest: a surface fixed in the world, or the top of another object.
+    """Support of objects of a scene type: a surface fixed in the world, or the top of another object.
 
     Attributes:
         kind: the name the height error is reported under, such as ``"table"`` or ``"stack"``.

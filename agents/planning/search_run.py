@@ -73,7 +73,7 @@ class SearchConfig:
 
 @dataclass(frozen=True)
 class SearchOutcome:
-    """What a search run found.
+    """Result of a search run.
 
     Attributes:
         search: the tree search.

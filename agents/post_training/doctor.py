@@ -48,7 +48,7 @@ class StepRow:
 
 @dataclass(frozen=True)
 class DoctorReport:
-    """What the doctor found.
+    """Findings of the doctor.
 
     Attributes:
         log_ratio: largest |log p_now - log p_sampling|; exactly 0 when sampler and loss agree.

@@ -23,7 +23,7 @@ class TrainingData(Protocol):
 
     @property
     def size(self) -> int:
-        """How many distinct scenes there are; 0 for no end."""
+        """Number of distinct scenes; 0 for an endless stream."""
         ...
 
     def draw(self, count: int, generator: Generator, *, prompts: bool) -> tuple[Tensor, list[Sequence[str]]]:

@@ -35,7 +35,7 @@ _FLOOR = "floor_"
 
 @dataclass(frozen=True)
 class PriorFacts:
-    """What the files of a prior say of it.
+    """Facts about a prior from its files.
 
     Attributes:
         name: as it was asked for.

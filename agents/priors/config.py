@@ -13,7 +13,7 @@ PROCESSES = ("continuous", "mixed")
 
 @dataclass(frozen=True)
 class PriorConfig:
-    """What a prior is made of.
+    """Configuration of a prior.
 
     Attributes:
         scene_type: name of its scene type.
@@ -54,7 +54,7 @@ class PriorConfig:
 
 @dataclass(frozen=True)
 class MixedPriorConfig:
-    """What a mixed discrete-continuous prior is made of.
+    """Configuration of a mixed discrete-continuous prior.
 
     Attributes:
         scene_type: name of its scene type.

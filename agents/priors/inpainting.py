@@ -31,7 +31,7 @@ class Inpainting:
 
     @property
     def device(self) -> torch.device:
-        """Where the prior computes."""
+        """Device of the weights."""
         raise NotImplementedError
 
     @abstractmethod

@@ -87,5 +87,5 @@ class _Inert:
 
     @classmethod
     def load(cls, file: IO[bytes], **options: Any) -> Any:
-        """What :class:`Unpickler` makes of ``file``; files older than the zip format begin with such pickles."""
+        """Object that :class:`Unpickler` reads from ``file``; files older than the zip format begin like this."""
         return cls.Unpickler(file, **options).load()

@@ -139,7 +139,7 @@ class MixedPrior(TrainableMixedPrior):
     # -- what the network is told ---------------------------------------------------------------
 
     def seen(self, x: Tensor, given: Given | None = None) -> Given | None:
-        """What the network is told to be exact in scenes ``x`` (B, N, D): ``given``, or else the fixed objects.
+        """Observed entries of scenes ``x`` (B, N, D) for the network: ``given``, or else the fixed objects.
 
         A prior trained with observed entries has always been told of its fixed objects; one trained without is not.
         """

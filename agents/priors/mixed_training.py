@@ -43,7 +43,7 @@ class TrainableMixedPrior(PromptReader, ScenePrior):
 
     @abstractmethod
     def seen(self, x: Tensor, given: Given | None = None) -> Given | None:
-        """What the network is told to be exact in scenes ``x`` (B, N, D)."""
+        """Observed entries of scenes ``x`` (B, N, D) for the network."""
 
     @abstractmethod
     def add_noise(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:

@@ -102,7 +102,7 @@ class SceneCode:
 
     @property
     def rotation_slice(self) -> slice:
-        """Where the rotation stands in a slot."""
+        """Entries of the rotation in a slot."""
         return slice(TRANSLATION.stop, self.pose_width)
 
     def encode(self, batch: SceneBatch) -> Tensor:

@@ -22,7 +22,7 @@ _LEVELS, _RESIDUAL = "residual.timesteps", "residual.variance"
 
 @dataclass(frozen=True)
 class StoredPrior:
-    """What the files of a prior hold.
+    """Contents of the files of a prior.
 
     Attributes:
         process: name of its process.

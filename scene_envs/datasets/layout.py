@@ -30,7 +30,7 @@ _KEYS_AT_ONCE = 1024
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """How the files of one dataset become scenes of a scene type.
+    """Conversion of the files of one dataset to scenes of a scene type.
 
     Attributes:
         info: of the files.

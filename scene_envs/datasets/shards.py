@@ -32,7 +32,7 @@ _UNFIT = "outside the normalizer"
 
 @dataclass(frozen=True)
 class Job:
-    """What one shard is to be.
+    """Specification of one shard.
 
     Attributes:
         index: of the shard.

@@ -131,7 +131,7 @@ def remove_partial(folder: Path) -> None:
 
 
 def storage_error(path: Path, error: OSError) -> StorageError:
-    """What to raise when ``path`` could not be written."""
+    """Error to raise when ``path`` could not be written."""
     full = error.errno in (errno.ENOSPC, errno.EDQUOT)
     reason = "the disk is full" if full else error.strerror or str(error)
     remedy = "make room" if full else "put that right"

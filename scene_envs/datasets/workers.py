@@ -32,7 +32,7 @@ _RESTARTS = 3
 
 @dataclass(frozen=True)
 class Work:
-    """What every worker needs, picklable.
+    """Inputs of every worker, picklable.
 
     Attributes:
         factory: makes the grammar.

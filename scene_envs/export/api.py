@@ -24,7 +24,7 @@ MANIFEST = "export.json"
 
 @dataclass(frozen=True)
 class ExportReport:
-    """What was written.
+    """Files that an export wrote.
 
     Attributes:
         output: the folder.

@@ -97,7 +97,7 @@ class Node(Protocol):
 
 
 class Filling(Protocol):
-    """What is inside a container, and how it starts before it comes to rest."""
+    """Contents of a container, and their poses before they come to rest."""
 
     @property
     def node(self) -> Node:

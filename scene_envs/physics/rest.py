@@ -40,7 +40,7 @@ _DEEPEST = 2e-3
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """What has a closed form.
+    """Objects whose motion has a closed form.
 
     Attributes:
         still: (n,) bool; free objects that need no simulation.
@@ -123,7 +123,7 @@ class Statics:
         self._foot_center = np.array([(0.0, 0.0) if bottom is None else bottom.center for bottom in bottoms])
 
     def at_rest(self, objects: Objects, pairs: ObjectPairs, contacts: Contacts, duration: float) -> Rest:
-        """What needs no simulation for ``duration`` seconds.
+        """Objects that need no simulation for ``duration`` seconds.
 
         Args:
             objects: the objects of one or more scenes.

@@ -8,7 +8,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class AssetReport:
-    """How one file became an asset.
+    """Import report of one file.
 
     Attributes:
         name: of the asset.
@@ -42,7 +42,7 @@ class AssetReport:
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What the import of a folder did.
+    """Import report of a folder.
 
     Attributes:
         folder: that was read.
