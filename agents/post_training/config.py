@@ -1,4 +1,4 @@
-"""Configuration of a post-training run."""
+"""All knobs of one post-training run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Configuration of a pretraining run, without heavy imports, so that its keys can be listed quickly."""
+"""The keys of a pretraining run; imports nothing, so that they can be listed quickly."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Log of a training run: rows for the log, a CSV file and TensorBoard."""
+"""Rows of a training run: to the log, to a CSV file, and to TensorBoard."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Progress of a generation: a live bar on a terminal, occasional lines elsewhere."""
+"""How far a generation is: a live bar on a terminal, a line now and then elsewhere."""
 
 from __future__ import annotations
 
