@@ -73,7 +73,9 @@ def test_weights_of_shipped_priors_reach_the_modules_under_their_present_names(n
     (file,) = Path(SHIPPED / name).glob("*.safetensors")
     stored = {key: value for key, value in load_file(file).items() if not key.startswith(("text_encoder.", "residual"))}
     assert {current_name(key) for key in stored} == set(loaded)
-    assert all(torch.equal(loaded[current_name(key)], value.to(loaded[current_name(key)])) for key, value in stored.items())
+    assert all(
+        torch.equal(loaded[current_name(key)], value.to(loaded[current_name(key)])) for key, value in stored.items()
+    )
     assert (state["prediction"], prior.denoiser.poses.prediction) == ("karras", "edm")
     again = config_from_state(json.loads(json.dumps(config_state(prior.denoiser.network.config))), "mixed")
     assert again == prior.denoiser.network.config

@@ -41,7 +41,9 @@ EQUIVARIANT = ("flux", "midiffusion")
 BASELINES = ("midiffusion", "diffuscene")
 
 
-def make(name: str, process: str, text_width: int = TEXT, zero: bool = False, attention: bool = True, **fields: Any) -> nn.Module:
+def make(
+    name: str, process: str, text_width: int = TEXT, zero: bool = False, attention: bool = True, **fields: Any
+) -> nn.Module:
     """A small network in float64; every parameter is random unless ``zero`` keeps what starts at zero."""
     text_width = 0 if (name, process) == ("flux", "continuous") else text_width
     config = network_config(
