@@ -228,8 +228,10 @@ def _network(prior: ScenePrior, facts: PriorFacts) -> str:
     sizes = [
         f"{field.name} {getattr(network.config, field.name)}"
         for field in fields(network.config)
-        if field.name in ("hidden", "depth", "double_blocks", "single_blocks", "heads", "attention")
+        if field.name in ("hidden", "depth", "double_blocks", "single_blocks", "heads")
     ]
+    modules = [module.name for module in getattr(network.config, "modules", ())]
+    sizes += [f"modules {', '.join(modules)}"] if modules else []
     return (
         f"{type(network).__name__}, {facts.parameters / 1e6:.1f} M parameters ({facts.megabytes:.1f} MB): "
         f"{', '.join(sizes)}"
