@@ -203,7 +203,7 @@ def card_page(name: str, prior: ScenePrior, facts: PriorFacts) -> str:
         "## How good it is",
         _measured(card, facts.measures),
         "## What it is not good at",
-        str(card.get("limits") or "Nothing was written down."),
+        str(card.get("limits") or "Not stated."),
         "## Use",
         f"```sh\nscene-envs sample prior={name}{_PROMPT if facts.text else ''} count=16 project=true\n```",
     ]
