@@ -5,7 +5,8 @@ from agents.networks.flux import FluxConfig, FluxDenoiser
 from agents.networks.midiffusion import MiDiffusion, MiDiffusionConfig, MixedMiDiffusion, MixedMiDiffusionConfig
 from agents.networks.mixed_flux import MixedFlux
 from agents.networks.mixed_flux_config import MixedFluxConfig
-from agents.networks.registry import NETWORKS, build_network, match_parameters, network_config, parameter_count
+from agents.networks.parameters import match_parameters, parameter_count
+from agents.networks.registry import NETWORKS, build_network, list_networks, network_config, register_network
 from agents.networks.text import TextConfig, TextEncoder
 
 __all__ = [
@@ -25,7 +26,9 @@ __all__ = [
     "TextConfig",
     "TextEncoder",
     "build_network",
+    "list_networks",
     "match_parameters",
     "network_config",
     "parameter_count",
+    "register_network",
 ]

@@ -1,26 +1,28 @@
-"""All networks by name: their sizes, how they are built, how a size is written to a file, and equal parameters."""
+"""Registry of networks: their sizes, how they are built, and how a size is written to a file."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, asdict, dataclass, fields, replace
-from functools import lru_cache
+from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
 from typing import Any
 
-import torch
 from torch import nn
 
 from agents.networks.diffuscene import DiffuScene, DiffuSceneConfig, MixedDiffuScene, MixedDiffuSceneConfig
 from agents.networks.flux import FluxConfig, FluxDenoiser
 from agents.networks.midiffusion import MiDiffusion, MiDiffusionConfig, MixedMiDiffusion, MixedMiDiffusionConfig
 from agents.networks.mixed_flux import MixedFlux
-from agents.networks.mixed_flux_config import RENAMED, MixedFluxConfig
+from agents.networks.mixed_flux_config import MixedFluxConfig, module_states
+from agents.networks.mixed_flux_files import FLAT_FIELDS, current_fields
 from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.plugins import load_plugins
 
 NETWORKS = ("flux", "midiffusion", "diffuscene")
 """Ours, and the two that it is compared with."""
 NETWORK_PROCESSES = ("continuous", "mixed")
 """What a network may denoise: scenes as numbers, or poses with discrete categories."""
+ENTRY_POINT_GROUP = "scene_envs.networks"
+"""Entry points of installed packages: modules that call :func:`register_network` when they are imported."""
 
 ContinuousNetworkConfig = FluxConfig | MiDiffusionConfig | DiffuSceneConfig
 MixedNetworkConfig = MixedFluxConfig | MixedMiDiffusionConfig | MixedDiffuSceneConfig
@@ -29,24 +31,74 @@ NetworkConfig = ContinuousNetworkConfig | MixedNetworkConfig
 
 @dataclass(frozen=True)
 class _Entry:
-    """What the registry knows of a network: its classes, and the width besides ``hidden`` that equal counts adjust."""
+    """What the registry knows of a network.
+
+    Attributes:
+        config: class of its configuration, a frozen dataclass.
+        network: from a configuration to a network with fresh weights.
+        ratio: the field besides ``hidden`` that equal counts of parameters adjust; None where there is none.
+        sizes: from the keys of :func:`network_config` to fields of the configuration.
+    """
 
     config: type[Any]
     network: Callable[[Any], nn.Module]
-    ratio: str
+    ratio: str | None
+    sizes: Callable[[Mapping[str, Any]], dict[str, Any]]
 
 
-_ENTRIES = {
-    ("flux", "continuous"): _Entry(FluxConfig, FluxDenoiser, "mlp_ratio"),
-    ("flux", "mixed"): _Entry(MixedFluxConfig, MixedFlux, "mlp_ratio"),
-    ("midiffusion", "continuous"): _Entry(MiDiffusionConfig, MiDiffusion, "mlp_ratio"),
-    ("midiffusion", "mixed"): _Entry(MixedMiDiffusionConfig, MixedMiDiffusion, "mlp_ratio"),
-    ("diffuscene", "continuous"): _Entry(DiffuSceneConfig, DiffuScene, "inner_ratio"),
-    ("diffuscene", "mixed"): _Entry(MixedDiffuSceneConfig, MixedDiffuScene, "inner_ratio"),
-}
-_NAMES = {entry.config: name for (name, _), entry in _ENTRIES.items()}
-_BUILDERS = {entry.config: entry.network for entry in _ENTRIES.values()}
-_RATIO_STEPS, _RATIO_STEP = 24, 1 / 64
+_ENTRIES: dict[tuple[str, str], _Entry] = {}
+
+
+def register_network(
+    name: str,
+    process: str,
+    config: type[Any],
+    network: Callable[[Any], nn.Module],
+    *,
+    ratio: str | None = None,
+    sizes: Callable[[Mapping[str, Any]], dict[str, Any]] | None = None,
+) -> None:
+    """Make a network known as ``network=NAME`` to training, files and comparisons.
+
+    A mixed network has the ``forward`` of :class:`~agents.networks.MixedFlux`, a continuous one that of
+    :class:`~agents.networks.FluxDenoiser`. A mixed one may say in its configuration what time it reads
+    (``time_input``, see :class:`~agents.networks.MixedFluxConfig`; timesteps where it says nothing) and whether it
+    takes ``slot_mask`` (``reads_slot_mask``). A package lists the module that calls this under the entry points
+    ``scene_envs.networks``.
+
+    Args:
+        name: of the network.
+        process: ``"continuous"`` or ``"mixed"``.
+        config: class of its configuration: a frozen dataclass of JSON values with ``categories`` (mixed) or
+            ``features`` (continuous), and ``text_width`` where it reads text.
+        network: from such a configuration to a module, which keeps it as ``config``.
+        ratio: the field besides ``hidden`` that :func:`match_parameters` adjusts.
+        sizes: from the keys of :func:`network_config` to fields of ``config``; None takes the keys that are fields.
+
+    Raises:
+        UnknownNameError: no process has that name.
+        InvalidInputError: another network has the name, or ``config`` is not a dataclass.
+    """
+    if process not in NETWORK_PROCESSES:
+        raise unknown_name("process", process, NETWORK_PROCESSES)
+    if not is_dataclass(config):
+        raise InvalidInputError(f"config={config!r} is not a dataclass; a network's configuration must be one")
+    if (name, process) in _ENTRIES and _ENTRIES[name, process].config is not config:
+        raise InvalidInputError(f"there is a {process} network {name!r} already; choose another name")
+    known = {field.name for field in fields(config)}
+    _ENTRIES[name, process] = _Entry(
+        config, network, ratio, sizes or (lambda keys: {key: value for key, value in keys.items() if key in known})
+    )
+
+
+def list_networks(process: str) -> list[str]:
+    """Names of all networks of a process, those of installed packages among them.
+
+    >>> list_networks("mixed")[:3]
+    ['flux', 'midiffusion', 'diffuscene']
+    """
+    load_plugins(ENTRY_POINT_GROUP)
+    return [name for name, kind in _ENTRIES if kind == process]
 
 
 def build_network(config: NetworkConfig) -> nn.Module:
@@ -58,10 +110,7 @@ def build_network(config: NetworkConfig) -> nn.Module:
     >>> type(build_network(MiDiffusionConfig(features=20, hidden=32, depth=1))).__name__
     'MiDiffusion'
     """
-    if type(config) not in _BUILDERS:
-        known = ", ".join(kind.__name__ for kind in _BUILDERS)
-        raise InvalidInputError(f"{type(config).__name__} is not the configuration of a network; these are: {known}")
-    return _BUILDERS[type(config)](config)
+    return _entry_of(config).network(config)
 
 
 def network_config(
@@ -90,7 +139,7 @@ def network_config(
     """The size of a network from the keys that all networks share.
 
     Args:
-        name: one of :data:`NETWORKS`.
+        name: of a network, see :func:`list_networks`.
         process: ``"continuous"`` or ``"mixed"``.
         features: D, numbers per slot; read by continuous networks.
         categories: K = C + 1; read by mixed networks.
@@ -112,25 +161,28 @@ def network_config(
     >>> network_config("midiffusion", "mixed", features=20, categories=8, hidden=64, depth=4, heads=4).hidden
     64
     """
+    keys: dict[str, Any] = {
+        "features": features,
+        "categories": categories,
+        "hidden": hidden,
+        "depth": depth,
+        "heads": heads,
+        "text_width": text_width,
+        "attention": attention,
+        "relation_blur": relation_blur,
+        "frequencies": frequencies,
+        "unit": unit,
+        "text_reach": text_reach,
+        "pooled_text": pooled_text,
+        "count_embedding": count_embedding,
+        "count_conditioning": count_conditioning,
+        "kinds": kinds,
+        "rotation_features": rotation_features,
+        "contacts": contacts,
+        "rotations": rotations,
+    }
     entry = _entry(name, process)
-    sizes: dict[str, Any] = {"hidden": hidden, "heads": heads}
-    sizes |= {"features": features} if process == "continuous" else {"categories": categories}
-    if name == "diffuscene":
-        sizes |= {"blocks": max(1, depth // 3), "text_width": text_width}
-    elif name == "midiffusion":
-        sizes |= {"depth": depth, "text_width": text_width}
-    elif process == "continuous":
-        if text_width:
-            raise InvalidInputError(f"text_width={text_width}: the continuous flux network reads no text; use 0")
-        sizes |= {"depth": depth, "frequencies": frequencies}
-    else:
-        sizes |= {"double_blocks": max(1, depth // 3), "single_blocks": depth, "embedding": hidden}
-        sizes |= {"text_width": text_width, "frequencies": frequencies, "unit": unit}
-        sizes |= {"attention": attention, "relation_blur": relation_blur}
-        sizes |= {"text_reach": text_reach, "pooled_text": pooled_text, "count_embedding": count_embedding}
-        sizes |= {"count_conditioning": count_conditioning if text_width else 0, "kinds": kinds}
-        sizes |= {"rotation_features": rotation_features, "contacts": contacts, "rotations": rotations}
-    config: NetworkConfig = entry.config(**sizes)
+    config: NetworkConfig = entry.config(**entry.sizes(keys))
     return config
 
 
@@ -140,9 +192,10 @@ def config_state(config: NetworkConfig) -> dict[str, Any]:
     >>> config_state(FluxConfig(features=20))["kind"]
     'flux'
     """
-    if type(config) not in _NAMES:
-        raise InvalidInputError(f"{type(config).__name__} is not the configuration of a network")
-    return {"kind": _NAMES[type(config)], **asdict(config)}
+    entry = _entry_of(config)
+    (name,) = [name for (name, _), known in _ENTRIES.items() if known is entry]
+    state = {"kind": name, **asdict(config)}
+    return {**state, "modules": module_states(config)} if isinstance(config, MixedFluxConfig) else state
 
 
 def config_from_state(state: Mapping[str, Any], process: str) -> NetworkConfig:
@@ -154,7 +207,9 @@ def config_from_state(state: Mapping[str, Any], process: str) -> NetworkConfig:
     """
     name = state.get("kind", "flux")
     kind = _entry(name, process).config
-    values = {RENAMED.get(key, key): value for key, value in state.items() if key != "kind"}
+    values = {key: value for key, value in state.items() if key != "kind"}
+    if kind is MixedFluxConfig:
+        values = current_fields(values)
     strange = sorted(values.keys() - {field.name for field in fields(kind)})
     missing = sorted(
         field.name
@@ -169,90 +224,63 @@ def config_from_state(state: Mapping[str, Any], process: str) -> NetworkConfig:
     return config
 
 
-@lru_cache(maxsize=1024)
-def parameter_count(config: NetworkConfig) -> int:
-    """Parameters of a network; leaves the random state alone.
-
-    >>> parameter_count(FluxConfig(features=20, hidden=96, depth=3, heads=4))
-    466916
-    """
-    with torch.random.fork_rng(devices=[]):
-        return sum(parameter.numel() for parameter in build_network(config).parameters())
-
-
-def match_parameters(name: str, process: str, target: int, **sizes: Any) -> NetworkConfig:
-    """The size at which a network has nearly ``target`` parameters, for comparisons at equal parameters.
-
-    The width ``hidden`` is chosen first. As it goes in multiples of ``heads``, the width inside the blocks (the MLPs of
-    the transformers, the residual blocks of ``diffuscene``) then makes up for the rest: the least change, of at most
-    3/8, that comes within 1 %, or else what comes nearest.
-
-    Args:
-        name: one of :data:`NETWORKS`.
-        process: ``"continuous"`` or ``"mixed"``.
-        target: parameters, as :func:`parameter_count` counts them.
-        sizes: the keys of :func:`network_config` but for ``hidden``.
-
-    Raises:
-        InvalidInputError: the narrowest such network has more parameters than ``target``.
-
-    >>> ours = network_config("flux", "mixed", features=20, categories=8, hidden=96, depth=4, heads=4)
-    >>> keys = {"features": 20, "categories": 8, "depth": 4, "heads": 4}
-    >>> theirs = match_parameters("diffuscene", "mixed", parameter_count(ours), **keys)
-    >>> abs(parameter_count(theirs) / parameter_count(ours) - 1) < 0.03
-    True
-    """
-    entry = _entry(name, process)
-
-    def at_width(units: int) -> NetworkConfig:
-        return network_config(name, process, hidden=units * sizes["heads"], **sizes)
-
-    def at_ratio(config: NetworkConfig, step: int) -> NetworkConfig:
-        ratio = getattr(config, entry.ratio) * (1 + step * _RATIO_STEP)
-        changed: NetworkConfig = replace(config, **{entry.ratio: ratio})
-        return changed
-
-    smallest = parameter_count(at_width(1))
-    if target < smallest:
-        raise InvalidInputError(
-            f"target={target}: a {process} {name} network of this depth and these heads has at least {smallest} "
-            "parameters; ask for more, or lower depth"
-        )
-    highest = 1
-    while parameter_count(at_width(highest)) < target:
-        highest *= 2
-    width = _last(1, highest, lambda units: parameter_count(at_width(units)) <= target)
-    candidates: list[tuple[NetworkConfig, int]] = []
-    for units in (width, width + 1):
-        step = _last(
-            -_RATIO_STEPS,
-            _RATIO_STEPS - 1,
-            lambda step, units=units: parameter_count(at_ratio(at_width(units), step)) <= target,  # type: ignore[misc]
-        )
-        candidates += [(at_ratio(at_width(units), near), abs(near)) for near in (step, step + 1, 0)]
-
-    def distance(candidate: tuple[NetworkConfig, int]) -> tuple[float, int]:
-        """How far the count is off, of which less than a hundredth counts less than how far the ratio is."""
-        config, departure = candidate
-        return max(abs(parameter_count(config) / target - 1.0), 0.01), departure
-
-    return min(candidates, key=distance)[0]
-
-
 def _entry(name: str, process: str) -> _Entry:
-    if name not in NETWORKS:
-        raise unknown_name("network", name, NETWORKS)
     if process not in NETWORK_PROCESSES:
         raise unknown_name("process", process, NETWORK_PROCESSES)
+    if (name, process) not in _ENTRIES:
+        load_plugins(ENTRY_POINT_GROUP)
+    if (name, process) not in _ENTRIES:
+        raise unknown_name("network", name, list_networks(process))
     return _ENTRIES[name, process]
 
 
-def _last(low: int, high: int, holds: Callable[[int], bool]) -> int:
-    """The largest number from ``low`` to ``high`` for which ``holds``, which must not hold again once it does not.
+def ratio_name(name: str, process: str) -> str | None:
+    """The field besides ``hidden`` that equal counts of parameters adjust; None where there is none."""
+    return _entry(name, process).ratio
 
-    ``low`` when it holds for none.
-    """
-    while low < high:
-        middle = (low + high + 1) // 2
-        low, high = (middle, high) if holds(middle) else (low, middle - 1)
-    return low
+
+def _entry_of(config: Any) -> _Entry:
+    found = [entry for entry in _ENTRIES.values() if entry.config is type(config)]
+    if not found:
+        known = ", ".join(entry.config.__name__ for entry in _ENTRIES.values())
+        raise InvalidInputError(f"{type(config).__name__} is not the configuration of a network; these are: {known}")
+    return found[0]
+
+
+# -- the networks of this package ---------------------------------------------------------------
+
+
+def _continuous_flux(keys: Mapping[str, Any]) -> dict[str, Any]:
+    if keys["text_width"]:
+        raise InvalidInputError(f"text_width={keys['text_width']}: the continuous flux network reads no text; use 0")
+    return {name: keys[name] for name in ("features", "hidden", "depth", "heads", "frequencies")}
+
+
+def _mixed_flux(keys: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of the Flux core, and its modules from the keys that ask for them."""
+    core = ("categories", "hidden", "heads", "text_width", "text_reach", "unit", "rotations")
+    chosen = current_fields({name: keys[name] for name in (*core, *FLAT_FIELDS) if name in keys})
+    depth = keys["depth"]
+    return {**chosen, "double_blocks": max(1, depth // 3), "single_blocks": depth, "embedding": keys["hidden"]}
+
+
+def _midiffusion(features: str) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
+    return lambda keys: {name: keys[name] for name in (features, "hidden", "depth", "heads", "text_width")}
+
+
+def _diffuscene(features: str) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
+    return lambda keys: {
+        **{name: keys[name] for name in (features, "hidden", "heads", "text_width")},
+        "blocks": max(1, keys["depth"] // 3),
+    }
+
+
+for _arguments in (
+    ("flux", "continuous", FluxConfig, FluxDenoiser, "mlp_ratio", _continuous_flux),
+    ("flux", "mixed", MixedFluxConfig, MixedFlux, "mlp_ratio", _mixed_flux),
+    ("midiffusion", "continuous", MiDiffusionConfig, MiDiffusion, "mlp_ratio", _midiffusion("features")),
+    ("midiffusion", "mixed", MixedMiDiffusionConfig, MixedMiDiffusion, "mlp_ratio", _midiffusion("categories")),
+    ("diffuscene", "continuous", DiffuSceneConfig, DiffuScene, "inner_ratio", _diffuscene("features")),
+    ("diffuscene", "mixed", MixedDiffuSceneConfig, MixedDiffuScene, "inner_ratio", _diffuscene("categories")),
+):
+    register_network(*_arguments[:4], ratio=_arguments[4], sizes=_arguments[5])

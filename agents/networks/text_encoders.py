@@ -1,4 +1,4 @@
-"""Which text encoder a mixed prior reads prompts with: by configuration, by the entry of a file, by a run's key."""
+"""Choice of the text encoder that a mixed prior reads prompts with: by configuration, by the entry of a file, by a run's key."""
 
 from __future__ import annotations
 

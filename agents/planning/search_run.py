@@ -1,4 +1,4 @@
-"""One search run: a tree of inpaintings against best-of-N at equal NFE, and its files."""
+"""Search run: a tree of inpaintings and best-of-N at equal NFE, with output files."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class SearchConfig:
 
 @dataclass(frozen=True)
 class SearchOutcome:
-    """What a search run found.
+    """Result of a search run.
 
     Attributes:
         search: the tree search.

@@ -1,4 +1,4 @@
-"""What learns: the prior as a policy, its environment, its two gradients, its optimiser."""
+"""Learner: the prior as a policy, its environment, its two gradients and its optimiser."""
 
 from __future__ import annotations
 

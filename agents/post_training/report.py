@@ -1,4 +1,4 @@
-"""A page about a run: one HTML file that needs nothing else."""
+"""Report of a run: one self-contained HTML file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The post-training loop: sample scenes, score them, follow the score function, stay a prior."""
+"""Post-training loop: sample scenes, score them, update the prior, check the guard."""
 
 from __future__ import annotations
 

@@ -45,7 +45,8 @@ class PretrainConfig:
             of the noise.
         contacts: with attention=relative: the network learns at what distance two objects touch, and is told the gap
             that is left in units of the noise.
-        prediction: what the network predicts (``karras``, ``epsilon``, ``x0``, ``v``).
+        prediction: what the network predicts (``edm``, the preconditioning of Karras et al. 2022, ``epsilon``,
+            ``x0``, ``v``).
         schedule: noise schedule (``karras``, ``linear``, ``cosine``).
         noise_floor: lowest noise-to-signal ratio of the karras schedule, in normalised units.
         noise_ceiling: highest noise-to-signal ratio of the karras schedule.
@@ -133,7 +134,7 @@ class PretrainConfig:
     frequencies: int = 8
     rotation_features: bool = True
     contacts: bool = True
-    prediction: str = "karras"
+    prediction: str = "edm"
     schedule: str = "karras"
     noise_floor: float = 0.002
     noise_ceiling: float = 20.0

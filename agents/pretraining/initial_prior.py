@@ -22,7 +22,7 @@ from agents.priors.mixed import MixedPrior
 from agents.priors.rotation_codes import SceneCode
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
-from scene_envs.scene import POSE
+from scene_envs.scene import POSE_FEATURES
 from scene_envs.scene_types import get_scene_type
 
 MOMENTS = ("category", "feature", "scene")
@@ -81,7 +81,7 @@ def _check_constants(prior: ScenePrior, free: Tensor, name: str) -> None:
     normalizer = prior.normalizer
     constant = normalizer.is_constant.cpu().clone()
     if prior.process_name == "mixed":
-        constant[POSE.stop :] = False  # categories are states there
+        constant[POSE_FEATURES:] = False  # categories are states there
     objects = free[free[..., -1] == 0]
     off = ((objects - normalizer.input_min.cpu()).abs() > 1e-4).any(dim=0) & constant
     if bool(off.any()):
@@ -208,14 +208,14 @@ def _conditions_counts(config: PretrainConfig) -> bool:
 
 def _pose_moments(kind: str, raw: Tensor, normalizer: Normalizer) -> Preconditioning:
     """Moments of the normalised poses of all objects of raw scenes (M, N, D)."""
-    poses = normalizer.normalize(raw)[..., : POSE.stop]
+    poses = normalizer.normalize(raw)[..., :POSE_FEATURES]
     moments = Preconditioning.fit(poses[raw[..., -1] == 0])
     if kind == "scene":
         return moments.pooled()
     if kind == "feature":
         return moments
-    categories = raw[..., POSE.stop :].argmax(dim=-1)
-    count = raw.shape[-1] - POSE.stop
+    categories = raw[..., POSE_FEATURES:].argmax(dim=-1)
+    count = raw.shape[-1] - POSE_FEATURES
     return replace(moments, by_category=CategoryMoments.fit(poses.flatten(0, 1), categories.flatten(), count))
 
 
@@ -228,5 +228,5 @@ def _unit(normalizer: Normalizer) -> tuple[float, float, float]:
 
 def _rotations(normalizer: Normalizer) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """What nine normalised numbers are multiplied by, and what is then added, to be a rotation matrix."""
-    low, high = normalizer.input_min[3 : POSE.stop], normalizer.input_max[3 : POSE.stop]
+    low, high = normalizer.input_min[3:POSE_FEATURES], normalizer.input_max[3:POSE_FEATURES]
     return tuple(((high - low) / 2).tolist()), tuple(((high + low) / 2).tolist())

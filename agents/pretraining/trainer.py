@@ -1,4 +1,4 @@
-"""Pretraining a scene prior on a dataset: one loop, exact resume, logs and cards."""
+"""Pretraining loop of a scene prior: one loop, exact resume, logs and model cards."""
 
 from __future__ import annotations
 
@@ -233,6 +233,8 @@ class Pretrainer:
     def _load(self) -> None:
         state = load_checkpoint(self.checkpoint_path)
         try:
+            self.network.load_state_dict({**state["network"], **state["average"]})  # gives weights their present names
+            average = WeightAverage(self.network, self.config.ema)
             self.network.load_state_dict(state["network"])
             self.optimizer.load_state_dict(state["optimizer"])
         except (RuntimeError, ValueError, KeyError) as error:
@@ -240,7 +242,7 @@ class Pretrainer:
                 f"the run in {str(self.directory)!r} cannot go on: it was started with {self._started_with(state)}; "
                 "give the same keys again, or another output"
             ) from error
-        self.average.tensors = state["average"]
+        self.average = average
         self.average.updates = state["average_updates"]
         self.step, self.seconds = state["step"], state["seconds"]
         self.evaluations = state["evaluations"]

@@ -39,7 +39,7 @@ def _categories(kernel: str, empty_slots: str, loss: str) -> dict[str, Any]:
 
 
 FACTORS: tuple[Setting, ...] = (
-    *_predictions("none", "", "karras", "epsilon", "v", "x0"),
+    *_predictions("none", "", "edm", "epsilon", "v", "x0"),
     *_predictions("min_snr", ", min-SNR", "epsilon", "v", "x0"),
     *_each("schedule", "schedule", "karras", "cosine", "linear"),
     *_each("noise floor", "noise_floor", 0.01, 0.002, 0.0005),
@@ -67,7 +67,7 @@ FACTORS: tuple[Setting, ...] = (
 _NEEDS = {
     "noise_floor": ("schedule", "karras"),
     "noise_ceiling": ("schedule", "karras"),
-    "moments": ("prediction", "karras"),
+    "moments": ("prediction", "edm"),
     "contacts": ("attention", "relative"),
     "relation_blur": ("attention", "relative"),
 }

@@ -1,4 +1,4 @@
-"""What the environments know of prompts: where they come from, and what an agent sees of them."""
+"""Prompts of the environments: their sources, and their observation."""
 
 from __future__ import annotations
 

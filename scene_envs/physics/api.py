@@ -102,7 +102,7 @@ def penetration(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> Penetr
 
 
 def equilibrium(batch: SceneBatch, *, duration: float = 0.1, pool: PhysicsPool | None = None) -> EquilibriumResult:
-    """How far every object moves under gravity in ``duration`` seconds, nothing removed.
+    """Displacement of every object under gravity in ``duration`` seconds, nothing removed.
 
     A heap of objects so deep in each other that its simulation would take long is invalid: project it first.
 

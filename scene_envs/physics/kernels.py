@@ -1,4 +1,4 @@
-"""The physics of a chunk of scenes in one process: numpy in, numpy out. Workers run these."""
+"""Physics of a chunk of scenes in one process: numpy in, numpy out. Workers run these functions."""
 
 from __future__ import annotations
 

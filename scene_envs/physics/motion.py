@@ -62,7 +62,7 @@ class Physics:
         self._world: World | None = None
 
     def rest(self, objects: Objects, pairs: ObjectPairs, duration: float) -> Rest:
-        """Which objects of some scenes need no simulation for ``duration`` seconds."""
+        """Objects of some scenes that need no simulation for ``duration`` seconds."""
         contacts = self.collider.contacts(objects, pairs, self.support.differs(objects, pairs))
         return self.statics.at_rest(objects, pairs, contacts, duration)
 
@@ -106,7 +106,7 @@ class Moved:
 
 
 def motion(physics: Physics, objects: Objects, pairs: ObjectPairs, duration: float) -> tuple[Array, Array, Index]:
-    """How far objects of several scenes move in ``duration`` seconds.
+    """Displacement of the objects of several scenes in ``duration`` seconds.
 
     Args:
         physics: of the scenes' assets.

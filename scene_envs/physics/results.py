@@ -1,4 +1,4 @@
-"""What the physics functions return."""
+"""Results of the physics functions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A page that shows scenes in any browser: one HTML file that needs nothing else."""
+"""Viewer: one self-contained HTML file that shows scenes in a browser."""
 
 from __future__ import annotations
 

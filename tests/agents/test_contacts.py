@@ -10,8 +10,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from agents.networks import MixedFluxConfig, build_network
-from agents.networks.contacts import CHANNELS, Contacts, gated_displacement
+from agents.networks.contacts import CHANNELS, Contacts, ContactsConfig, gated_displacement
+from agents.networks.relations import RelationsConfig
 
+MODULES = (RelationsConfig(), ContactsConfig())
 SIDEWAYS, HEIGHT, OWN, OTHERS = 0, 1, slice(2, 5), slice(5, 8)
 REACH, TOUCH = 4.0, 0.1
 IDENTITY = torch.eye(3, dtype=torch.float64)
@@ -20,7 +22,7 @@ IDENTITY = torch.eye(3, dtype=torch.float64)
 def linear_along(*gaps: int | slice) -> Contacts:
     """Everything touches at 0.1 m, and all that is offered is each of these gaps, linearly, along itself."""
     torch.manual_seed(0)
-    contacts = Contacts(categories=3, features=4, hidden=8).double()
+    contacts = Contacts(categories=3, features=4, hidden=8, embedding=8).double()
     for layer in (contacts.touch[-1], contacts.amplitudes):
         for parameter in layer.parameters():
             nn.init.zeros_(parameter)
@@ -103,7 +105,7 @@ def test_what_is_offered_turns_with_the_scene() -> None:
     metres = 0.1 * torch.randn(5, 3, generator=generator, dtype=torch.float64)
     rotation = torch.from_numpy(Rotation.random(5, random_state=4).as_matrix())
     torch.manual_seed(1)
-    contacts = Contacts(categories=3, features=4, hidden=8).double()
+    contacts = Contacts(categories=3, features=4, hidden=8, embedding=8).double()
     before = displacement(contacts, metres, 0.01, rotation)
     after = displacement(contacts, metres @ turn.T, 0.01, turn @ rotation)
     torch.testing.assert_close(after, before @ turn.T, atol=1e-9, rtol=1e-9)
@@ -111,7 +113,7 @@ def test_what_is_offered_turns_with_the_scene() -> None:
 
 def test_an_object_alone_and_filling_offer_nothing() -> None:
     torch.manual_seed(1)
-    contacts = Contacts(categories=3, features=4, hidden=8).double()
+    contacts = Contacts(categories=3, features=4, hidden=8, embedding=8).double()
     nn.init.normal_(contacts.out.weight)
     assert displacement(contacts, torch.zeros(1, 3, dtype=torch.float64), 0.1).tolist() == [[0.0, 0.0, 0.0]]
     level, features = torch.full((1, 2, 3), 0.1).double(), torch.zeros(1, 2, 2, 4).double()
@@ -125,7 +127,7 @@ def test_an_object_alone_and_filling_offer_nothing() -> None:
 
 def test_a_masked_slot_is_moved_but_told_nothing() -> None:
     torch.manual_seed(1)
-    contacts = Contacts(categories=3, features=4, hidden=8).double()
+    contacts = Contacts(categories=3, features=4, hidden=8, embedding=8).double()
     nn.init.normal_(contacts.out.weight)
     metres = torch.tensor([[[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]], dtype=torch.float64)
     level, features = torch.full((1, 2, 3), 0.1).double(), torch.zeros(1, 2, 2, 4).double()
@@ -147,7 +149,7 @@ def test_gates_weigh_every_displacement_by_itself() -> None:
 
 
 def test_a_network_with_contacts_starts_at_the_mean_like_any_other() -> None:
-    config = MixedFluxConfig(categories=5, hidden=16, heads=2, embedding=16, attention="relative", contacts=1)
+    config = MixedFluxConfig(categories=5, hidden=16, heads=2, embedding=16, modules=MODULES)
     network = build_network(config)
     pose = torch.randn(2, 4, 12)
     output, logits = network(
@@ -156,12 +158,12 @@ def test_a_network_with_contacts_starts_at_the_mean_like_any_other() -> None:
     assert output.abs().max() == 0
     assert logits.abs().max() == 0
     output.sum().backward()
-    assert network.contact_gates.weight.grad.abs().max() > 0
+    assert network.contacts.gates.weight.grad.abs().max() > 0
 
 
 def test_numbers_that_are_none_stay_with_their_scene() -> None:
     torch.manual_seed(1)
-    contacts = Contacts(categories=3, features=4, hidden=8).double()
+    contacts = Contacts(categories=3, features=4, hidden=8, embedding=8).double()
     metres = torch.randn(2, 3, 3, dtype=torch.float64)
     metres[1, 0, 0] = math.nan
     level, features = torch.full((2, 3, 3), 0.1).double(), torch.zeros(2, 3, 3, 4).double()
@@ -173,7 +175,7 @@ def test_numbers_that_are_none_stay_with_their_scene() -> None:
 def test_half_precision_of_the_network_leaves_contacts_exact() -> None:
     """bfloat16 knows a metre to four millimetres."""
     torch.manual_seed(0)
-    config = MixedFluxConfig(categories=5, hidden=16, heads=2, embedding=16, attention="relative", contacts=1)
+    config = MixedFluxConfig(categories=5, hidden=16, heads=2, embedding=16, modules=MODULES)
     network = build_network(config)
     told: list[Tensor] = []
     network.contacts.register_forward_hook(lambda module, given, out: told.append(out[1].detach()))
@@ -188,7 +190,7 @@ def test_half_precision_of_the_network_leaves_contacts_exact() -> None:
 def test_noise_without_end_moves_nothing_without_end() -> None:
     """Noisy matrices are no rotations: what is made of their axes would grow with the noise."""
     torch.manual_seed(0)
-    config = MixedFluxConfig(categories=5, hidden=16, heads=2, embedding=16, attention="relative", contacts=1)
+    config = MixedFluxConfig(categories=5, hidden=16, heads=2, embedding=16, modules=MODULES)
     network = build_network(config)
     for parameter in network.parameters():
         nn.init.normal_(parameter, std=0.2)

@@ -354,9 +354,9 @@ def test_min_snr_weighs_the_error_of_the_clean_scene(prediction: str) -> None:
 
 def test_weights_of_one_and_names() -> None:
     schedule, t = make_schedule("karras"), torch.tensor([1, 500, 1000])
-    assert loss_weights(schedule, t, "karras", "none").tolist() == [1.0, 1.0, 1.0]
-    with pytest.raises(InvalidInputError, match="prediction='karras'"):
-        check_weighting("min_snr", "karras")
+    assert loss_weights(schedule, t, "edm", "none").tolist() == [1.0, 1.0, 1.0]
+    with pytest.raises(InvalidInputError, match="prediction='edm'"):
+        check_weighting("min_snr", "edm")
     with pytest.raises(UnknownNameError, match="did you mean 'min_snr'"):
         loss_weights(schedule, t, "v", "min-snr")
     with pytest.raises(UnknownNameError, match="prediction"):
@@ -380,7 +380,7 @@ def test_a_prior_weighs_its_loss() -> None:
 
 @pytest.mark.parametrize(
     ("prediction", "timesteps", "uniform"),
-    [("karras", None, False), ("epsilon", None, True), ("v", "lognormal", False), ("karras", "uniform", True)],
+    [("edm", None, False), ("epsilon", None, True), ("v", "lognormal", False), ("edm", "uniform", True)],
 )
 def test_timesteps_are_drawn_as_published_or_as_asked(prediction: str, timesteps: str | None, uniform: bool) -> None:
     base = tiny_prior()

@@ -51,7 +51,7 @@ def test_add_noise_equals_diffusers(moments: Preconditioning) -> None:
 
 
 @pytest.mark.parametrize("name", ["karras", "linear", "cosine"])
-@pytest.mark.parametrize("prediction", ["karras", "epsilon", "x0", "v"])
+@pytest.mark.parametrize("prediction", ["edm", "epsilon", "x0", "v"])
 def test_the_target_decodes_to_the_clean_scene(name: str, prediction: str, moments: Preconditioning) -> None:
     """A network that outputs the regression target has denoised perfectly."""
     process = GaussianProcess(make_schedule(name), prediction, moments)
@@ -62,10 +62,10 @@ def test_the_target_decodes_to_the_clean_scene(name: str, prediction: str, momen
     torch.testing.assert_close(process.x0_from_output(x_t, t, target), x0, atol=2e-3, rtol=2e-3)
 
 
-def test_karras_input_and_target_have_unit_variance() -> None:
+def test_edm_input_and_target_have_unit_variance() -> None:
     """For data with the assumed moments the network sees and predicts unit variance at every level."""
     moments = Preconditioning(torch.full((D,), 0.3), torch.linspace(0.1, 0.9, D))
-    process = GaussianProcess(make_schedule("karras"), "karras", moments)
+    process = GaussianProcess(make_schedule("karras"), "edm", moments)
     generator = torch.Generator().manual_seed(0)
     x0 = 0.3 + moments.std * torch.randn(20_000, 1, D, generator=generator)
     noise = torch.randn(x0.shape, generator=generator)
@@ -84,7 +84,7 @@ def test_the_optimal_gaussian_chain_reproduces_the_data(num_steps: int) -> None:
     For x_0 ~ N(m, s^2) the error of the best denoiser is s^2 sigma^2 / (alpha^2 s^2 + sigma^2).
     """
     moments = Preconditioning(torch.full((D,), 0.2), torch.full((D,), 0.5))
-    process = GaussianProcess(make_schedule("karras"), "karras", moments)
+    process = GaussianProcess(make_schedule("karras"), "edm", moments)
     generator = torch.Generator().manual_seed(0)
     table = StepTable.spaced(1000, num_steps)
     x = torch.randn(4000, 1, D, generator=generator)

@@ -29,7 +29,10 @@ from agents.networks import (
 )
 from agents.networks.count_conditioning import CountConditioning, still_to_come
 from agents.networks.count_embedding import count_states
+from agents.networks.fourier_features import FourierFeaturesConfig
+from agents.networks.given_flags import GivenFlagsConfig
 from agents.networks.registry import config_from_state, config_state
+from agents.networks.relations import RelationsConfig
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 FEATURES, CATEGORIES, TEXT = 20, 8, 12
@@ -38,7 +41,9 @@ EQUIVARIANT = ("flux", "midiffusion")
 BASELINES = ("midiffusion", "diffuscene")
 
 
-def make(name: str, process: str, text_width: int = TEXT, zero: bool = False, **fields: Any) -> nn.Module:
+def make(
+    name: str, process: str, text_width: int = TEXT, zero: bool = False, attention: bool = True, **fields: Any
+) -> nn.Module:
     """A small network in float64; every parameter is random unless ``zero`` keeps what starts at zero."""
     text_width = 0 if (name, process) == ("flux", "continuous") else text_width
     config = network_config(
@@ -58,8 +63,12 @@ def make(name: str, process: str, text_width: int = TEXT, zero: bool = False, **
         count_embedding=1,
         count_conditioning=9,
     )
+    if isinstance(config, MixedFluxConfig) and not attention:
+        config = config.without("contacts", "relations")
+    if isinstance(config, MixedFluxConfig) and zero:
+        config = config.without(*(["count_conditioning"] if text_width else []))  # begins with what a prompt asks for
     torch.manual_seed(0)
-    network = build_network(type(config)(**{**vars(config), **fields})).double()
+    network = build_network(replace(config, **fields)).double()
     if not zero:
         with torch.no_grad():
             for parameter in network.parameters():
@@ -126,9 +135,8 @@ def test_transformers_do_not_care_about_the_order_of_slots(name: str, process: s
     assert order_error(name, process) < 1e-9
 
 
-@pytest.mark.parametrize("attention", ["relative"])
-def test_distances_do_not_care_about_the_order_of_slots(attention: str) -> None:
-    assert order_error("flux", "mixed", attention=attention, unit=(0.5, 0.4, 0.1)) < 1e-9
+def test_distances_do_not_care_about_the_order_of_slots() -> None:
+    assert order_error("flux", "mixed", unit=(0.5, 0.4, 0.1)) < 1e-9
 
 
 @pytest.mark.parametrize("process", PROCESSES)
@@ -149,8 +157,6 @@ def test_any_number_of_slots_goes_through(name: str, process: str, slots: int) -
 @pytest.mark.parametrize("name", NETWORKS)
 def test_outputs_start_at_zero(name: str, process: str) -> None:
     network = make(name, process, zero=True)
-    if isinstance(network, MixedFlux):
-        network.count_conditioning = None  # begins with the shares that a prompt asks for
     assert (run(network, process, inputs(process, 6)) == 0).all()
 
 
@@ -194,7 +200,7 @@ def test_a_row_of_padding_alone_is_no_text(name: str, process: str) -> None:
 def test_gradients_reach_every_parameter(name: str, process: str, text: bool) -> None:
     network = make(name, process, text_width=TEXT if text else 0)
     loss = run(network, process, inputs(process, 9, text)).square().sum()
-    if isinstance(network, MixedFlux) and network.count_conditioning is not None:
+    if isinstance(network, MixedFlux) and hasattr(network, "count_conditioning"):
         loss = (
             loss
             + network.count_conditioning.count_loss(
@@ -261,14 +267,14 @@ def test_fourier_features_are_off_as_published_and_need_positions(name: str) -> 
     arguments = {key: inputs("mixed", 6, text=False)[key].to(kind) for key, kind in _PLAIN.items()}
     assert build_network(config)(**arguments)[0].shape == (2, 6, 12)
     with pytest.raises(InvalidInputError, match="position="):
-        build_network(type(config)(**{**vars(config), "frequencies": 2}))(**arguments)
+        build_network(replace(config, frequencies=2))(**arguments)
 
 
 _PLAIN = {"pose": torch.float32, "states": torch.int64, "time": torch.float32}
 
 
-@pytest.mark.parametrize("attention", ["plain", "relative"])
-def test_text_that_ends_in_double_blocks_is_read_and_its_padding_is_not(attention: str) -> None:
+@pytest.mark.parametrize("attention", [False, True])
+def test_text_that_ends_in_double_blocks_is_read_and_its_padding_is_not(attention: bool) -> None:
     network = make("flux", "mixed", text_reach="double", attention=attention)
     arguments = inputs("mixed", 7)
     said = run(network, "mixed", arguments)
@@ -299,7 +305,7 @@ def test_files_give_the_same_network_back(name: str, process: str) -> None:
 def test_files_without_a_kind_hold_flux_networks() -> None:
     assert config_from_state({"features": 20}, "continuous") == FluxConfig(20)
     assert config_from_state({"categories": 8, "unit": [1.0, 2.0, 3.0]}, "mixed") == MixedFluxConfig(
-        8, unit=(1.0, 2.0, 3.0)
+        8, unit=(1.0, 2.0, 3.0), time_input="log_noise", modules=(GivenFlagsConfig(), FourierFeaturesConfig())
     )
 
 
@@ -321,7 +327,7 @@ def test_sizes_with_equal_parameters(name: str, process: str) -> None:
 
 def test_counts_agree_with_the_papers_size_and_with_a_sum_by_hand() -> None:
     assert parameter_count(MixedFluxConfig.paper(categories=21)) == pytest.approx(88.3e6, rel=2e-3)
-    distance = MixedFluxConfig(categories=8, hidden=16, heads=2, single_blocks=3, attention="relative")
+    distance = MixedFluxConfig(categories=8, hidden=16, heads=2, single_blocks=3, modules=(RelationsConfig(),))
     plain = MixedFluxConfig(categories=8, hidden=16, heads=2, single_blocks=3)
     assert parameter_count(distance) > parameter_count(plain)
     h, inner = 16, 24

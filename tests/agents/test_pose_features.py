@@ -12,13 +12,15 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from agents.networks import MixedFlux, MixedFluxConfig
-from agents.networks.rotation_features import nearest_rotations, rotation_features
+from agents.networks.flux_modules import ModuleConfig
+from agents.networks.fourier_features import FourierFeaturesConfig
+from agents.networks.rotation_features import RotationFeaturesConfig, nearest_rotations, rotation_features
 from scene_envs.errors import InvalidInputError
 
 
-def network(**fields: Any) -> MixedFlux:
+def network(*modules: ModuleConfig, **fields: Any) -> MixedFlux:
     torch.manual_seed(0)
-    return MixedFlux(MixedFluxConfig(categories=5, hidden=16, heads=2, **fields))
+    return MixedFlux(MixedFluxConfig(categories=5, hidden=16, heads=2, modules=modules, **fields))
 
 
 def arguments(position: Tensor, level: float = 0.0) -> dict[str, Any]:
@@ -49,7 +51,7 @@ def turns(count: int, seed: int = 0) -> Tensor:
 @pytest.mark.parametrize("level", [0.01, 0.1, 0.5])
 def test_features_of_a_position_are_the_mean_of_those_of_noisy_ones(level: float) -> None:
     """E sin(w (x + s n)) = sin(w x) exp(-w^2 s^2 / 2): a wave that noise blurs is as faint as it is unknown."""
-    made = network(frequencies=3)
+    made = network(FourierFeaturesConfig(3))
     generator = torch.Generator().manual_seed(1)
     place = torch.rand(1, 1, 3, generator=generator) * 2 - 1
     noisy = place + level * torch.randn(40_000, 1, 3, generator=generator)
@@ -96,8 +98,9 @@ def test_a_milliradian_is_seen_through_features_of_rotations_alone() -> None:
     flat = torch.cat([torch.zeros(3), torch.eye(3).flatten()]).expand(1, 2, 12).clone()
     tilted = flat.clone()
     tilted[0, 1, 8], tilted[0, 1, 10] = -1e-3, 1e-3
-    for used in (0, 1):
-        made = network(rotation_features=used)
+    waves = FourierFeaturesConfig()
+    for used, modules in enumerate([(waves,), (waves, RotationFeaturesConfig())]):
+        made = network(*modules)
         change = first_layer_input(made, tilted, 1e-3) - first_layer_input(made, flat, 1e-3)
         assert float(change.abs().max()) == pytest.approx(used, abs=0.05)
 
@@ -106,16 +109,16 @@ def test_rotations_are_read_in_normalised_units() -> None:
     """Matrices that are normalised to another range are the same matrices."""
     exact = turns(4).float().flatten(-2)
     places = torch.zeros(1, 4, 3)
-    plain = network(rotation_features=1)
-    scaled = network(rotation_features=1, rotations=((0.5,) * 9, (0.25,) * 9))
+    plain = network(RotationFeaturesConfig())
+    scaled = network(RotationFeaturesConfig(), rotations=((0.5,) * 9, (0.25,) * 9))
     same = torch.cat([places, (exact - 0.25) / 0.5], dim=-1)
     wanted = first_layer_input(plain, torch.cat([places, exact], dim=-1), 0.05)[..., -13:]
     torch.testing.assert_close(first_layer_input(scaled, same, 0.1)[..., -13:], wanted, atol=1e-4, rtol=0)
 
 
 def test_features_of_poses_need_poses() -> None:
-    made = network(frequencies=0, rotation_features=1)
-    with pytest.raises(InvalidInputError, match="position="):
+    made = network(RotationFeaturesConfig())
+    with pytest.raises(InvalidInputError, match="rotation_features needs position="):
         made(**{**arguments(torch.zeros(1, 2, 12)), "position": None})
 
 

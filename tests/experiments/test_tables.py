@@ -67,7 +67,7 @@ def test_every_factor_is_asked() -> None:
     asked = {(key, value) for row in ours for key, value in row.overrides.items()} | {
         (key, value) for key, value in STANDARD.items() if isinstance(value, str | int | float)
     }
-    assert {("prediction", name) for name in ("epsilon", "v", "x0", "karras")} <= asked
+    assert {("prediction", name) for name in ("epsilon", "v", "x0", "edm")} <= asked
     assert {("schedule", name) for name in ("linear", "cosine", "karras")} <= asked
     assert {("moments", name) for name in ("scene", "feature", "category")} <= asked
     assert {("noise_floor", value) for value in (0.01, 0.002, 0.0005)} <= asked
