@@ -153,9 +153,7 @@ def test_a_run_that_an_earlier_version_began_is_refused_in_plain_words(tmp_path:
     name = next(iter(weights))
     weights["its_old_name"] = weights.pop(name)
     torch.save(state, tmp_path / "checkpoint.pt")
-    with pytest.raises(
-        InvalidInputError, match=r"checkpoint\.pt' cannot be resumed: 2 .* earlier version .* another outp"
-    ):
+    with pytest.raises(InvalidInputError, match=r"cannot be resumed: 2 .* earlier version .* another output"):
         post_train(small_config(tmp_path), prior=tiny_prior())
 
 
