@@ -22,6 +22,7 @@ from agents.pretraining.setup import prepare
 from agents.pretraining.text_warmup import warm_up_text
 from agents.priors.base import ScenePrior
 from agents.utils.checkpoints import check_tensors, load_checkpoint, save_checkpoint
+from agents.utils.loggers import make_logger
 from agents.utils.process_group import ProcessGroup
 from agents.utils.seeds import derived_generator
 from agents.utils.weight_average import AveragedWeights, WeightAverage
@@ -91,7 +92,8 @@ class Pretrainer:
         self.schedule = self._schedule()
         self.seconds = 0.0
         self.directory = Path(config.output)
-        self.log = TrainingLog(self.directory, config.tensorboard and self.processes.is_first)
+        chosen = "tensorboard" if config.tensorboard and self.processes.is_first else "csv"
+        self.log = TrainingLog(self.directory, make_logger(chosen, self.directory))
         self.evaluations: list[dict[str, float]] = []
 
     @property
@@ -111,6 +113,7 @@ class Pretrainer:
         for row in self._steps():
             if self.processes.is_first:
                 self.log.write(row, self.config.iterations)
+        self.log.close()
         if self.processes.is_first:
             logger.info("measuring the error that is left at 40 noise levels, for the samplers")
         with self._averaged():
