@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import inspect
 import re
 import shutil
 import textwrap
@@ -12,6 +11,7 @@ from dataclasses import dataclass
 from importlib import resources
 from typing import Any, get_type_hints
 
+from agents.utils.docstrings import attribute_meanings
 from scene_envs.errors import InvalidInputError, unknown_name
 
 _FIRST = ("scene", "prior", "scenes", "data", "reward", "objective", "count", "output")
@@ -24,7 +24,6 @@ _WANTED = {
     bool: "true or false",
 }
 _OPENING = "[{('\""
-_FIELD = re.compile(r"(\w+): (.*)")
 
 
 @dataclass(frozen=True)
@@ -43,10 +42,8 @@ class KeyHelp:
 
 
 def describe_fields(config: type) -> list[KeyHelp]:
-    """The keys of a config dataclass; meanings stand under ``Attributes:`` in its docstring or a base class's."""
-    meanings: dict[str, str] = {}
-    for base in reversed(config.__mro__):
-        meanings.update(_attribute_meanings(inspect.cleandoc(base.__doc__ or "")))
+    """The keys of a config dataclass; meanings stand under ``Attributes:`` in its docstrings."""
+    meanings = attribute_meanings(config)
     keys = [
         KeyHelp(field.name, _typed(_default(field)), meanings.get(field.name, ""))
         for field in dataclasses.fields(config)
@@ -138,23 +135,6 @@ def _plain_reason(error: BaseException, words: Sequence[str], hints: dict[str, A
         return f"{key}: {reason}" if key else f"a value cannot be read: {reason}"
     wanted = _WANTED.get(hints[key])
     return f"{typed[key]} is not {wanted}" if wanted else f"{typed[key]}: {reason}"
-
-
-def _attribute_meanings(docstring: str) -> dict[str, str]:
-    """Field name to sentence from the ``Attributes:`` section of a Google-style docstring."""
-    meanings: dict[str, str] = {}
-    name = ""
-    _, _, section = docstring.partition("Attributes:\n")
-    for line in section.splitlines():
-        if line and not line.startswith(" "):
-            break
-        found = _FIELD.match(line[4:]) if line.startswith("    ") and not line.startswith("     ") else None
-        if found:
-            name, text = found.groups()
-            meanings[name] = text
-        elif name and line.strip():
-            meanings[name] += " " + line.strip()
-    return {key: text.replace("``", "") for key, text in meanings.items()}
 
 
 def _default(field: dataclasses.Field[Any]) -> Any:

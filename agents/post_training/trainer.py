@@ -13,7 +13,7 @@ from agents.post_training.config import PostTrainConfig
 from agents.post_training.curves import draw_curve
 from agents.post_training.guard import Guard, realism
 from agents.post_training.learner import Learner, NonFiniteGradient, is_finite
-from agents.post_training.progress import Progress
+from agents.post_training.progress import run_progress
 from agents.post_training.prompts import PROMPTS_NAME, PromptSets, prompts_beside, save_prompts
 from agents.post_training.rollouts import Rollout, stream_seed
 from agents.post_training.run_files import (
@@ -118,7 +118,7 @@ class PostTrainer:
             self._save_prior()  # until something better: the base
         title = f"post-train {self.prior.scene_type.name}"
         started = time.perf_counter() - self.seconds
-        with Progress(title, config.iterations, config.progress, self.iteration) as progress:
+        with run_progress(title, config.iterations, config.progress, self.iteration) as report:
             while self.iteration < config.iterations and not self._stopped:
                 rollout, row = self.step()
                 self.seconds = time.perf_counter() - started
@@ -129,7 +129,7 @@ class PostTrainer:
                 if self.iteration % config.checkpoint_every == 0 or last or self._stopped:
                     self.save()
                 write_log(self.directory, self.history)
-                progress.update(self.iteration, row["reward"], self.guard.ratio)
+                report(self.iteration, row["reward"], self.guard.ratio)
         return self._finish()
 
     def prepare(self, *, reuse_scenes: bool = False) -> None:

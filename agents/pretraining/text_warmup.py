@@ -8,6 +8,7 @@ import math
 import numpy as np
 import torch
 from torch import nn
+from torch.optim.lr_scheduler import LambdaLR
 
 from agents.pretraining.data import TrainingData
 from agents.priors.base import ScenePrior
@@ -41,6 +42,7 @@ def warm_up_text(prior: ScenePrior, data: TrainingData, steps: int, batch_size: 
         return None
     parameters = [*prior.denoiser.text_encoder.parameters(), *conditioning.counts_out.parameters()]
     optimizer = torch.optim.AdamW(parameters, lr=_RATE, weight_decay=0.01)
+    schedule = LambdaLR(optimizer, lambda step: _rate(step, steps))
     losses = []
     for step in range(steps):
         generator = derived_generator(seed, step, steps)
@@ -52,9 +54,8 @@ def warm_up_text(prior: ScenePrior, data: TrainingData, steps: int, batch_size: 
         loss = conditioning.count_loss(asked, states).mean()
         loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(parameters, 1.0)
-        for group in optimizer.param_groups:
-            group["lr"] = _RATE * _rate(step, steps)
         optimizer.step()
+        schedule.step()
         optimizer.zero_grad(set_to_none=True)
         losses.append(float(loss.detach()))
     last = losses[-max(1, steps // 10) :]

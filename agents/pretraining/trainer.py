@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from torch import Generator, Tensor, nn
+from torch.optim.lr_scheduler import LambdaLR
 
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.data import TrainingData
@@ -20,7 +21,8 @@ from agents.pretraining.optimizers import build_optimizer
 from agents.pretraining.setup import prepare
 from agents.pretraining.text_warmup import warm_up_text
 from agents.priors.base import ScenePrior
-from agents.utils.checkpoints import load_checkpoint, save_checkpoint
+from agents.utils.checkpoints import check_tensors, load_checkpoint, save_checkpoint
+from agents.utils.loggers import make_logger
 from agents.utils.process_group import ProcessGroup
 from agents.utils.seeds import derived_generator
 from agents.utils.weight_average import AveragedWeights, WeightAverage
@@ -87,9 +89,11 @@ class Pretrainer:
             raise unknown_name("matmul_precision", config.matmul_precision, _MATMUL_PRECISIONS)
         torch.set_float32_matmul_precision(config.matmul_precision)
         self.step = 0
+        self.schedule = self._schedule()
         self.seconds = 0.0
         self.directory = Path(config.output)
-        self.log = TrainingLog(self.directory, config.tensorboard and self.processes.is_first)
+        chosen = "tensorboard" if config.tensorboard and self.processes.is_first else "csv"
+        self.log = TrainingLog(self.directory, make_logger(chosen, self.directory))
         self.evaluations: list[dict[str, float]] = []
 
     @property
@@ -109,6 +113,7 @@ class Pretrainer:
         for row in self._steps():
             if self.processes.is_first:
                 self.log.write(row, self.config.iterations)
+        self.log.close()
         if self.processes.is_first:
             logger.info("measuring the error that is left at 40 noise levels, for the samplers")
         with self._averaged():
@@ -161,9 +166,8 @@ class Pretrainer:
             )
         self.processes.sum_gradients(self.network.parameters())
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), config.clip)
-        for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate_at(self.step, config) * group["rate"]
         self.optimizer.step()
+        self.schedule.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.average.update(self.network)
         return value, float(norm)
@@ -181,6 +185,12 @@ class Pretrainer:
             for group, pick, dropped in zip(prompts, *choice, strict=True)
         ]
         return self.prior.pretraining_loss(x0, generator, text=self.prior.encode_prompts(texts))
+
+    def _schedule(self) -> LambdaLR:
+        """The learning rate from the present step on; what it has been hangs on the number of the step alone."""
+        for group in self.optimizer.param_groups:
+            group["initial_lr"] = group["rate"]
+        return LambdaLR(self.optimizer, lambda step: learning_rate_at(step, self.config), last_epoch=self.step - 1)
 
     def _evaluate(self) -> float:
         with self._averaged():
@@ -232,6 +242,9 @@ class Pretrainer:
 
     def _load(self) -> None:
         state = load_checkpoint(self.checkpoint_path)
+        before = self._started_with(state)
+        if not before:
+            check_tensors(self.network, state["network"], self.checkpoint_path)
         try:
             self.network.load_state_dict({**state["network"], **state["average"]})  # gives weights their present names
             average = WeightAverage(self.network, self.config.ema)
@@ -239,21 +252,22 @@ class Pretrainer:
             self.optimizer.load_state_dict(state["optimizer"])
         except (RuntimeError, ValueError, KeyError) as error:
             raise InvalidInputError(
-                f"the run in {str(self.directory)!r} cannot go on: it was started with {self._started_with(state)}; "
-                "give the same keys again, or another output"
+                f"the run in {str(self.directory)!r} cannot go on: it was started with "
+                f"{before or 'another network or optimiser'}; give the same keys again, or another output"
             ) from error
         self.average = average
         self.average.updates = state["average_updates"]
         self.step, self.seconds = state["step"], state["seconds"]
+        self.schedule = self._schedule()
         self.evaluations = state["evaluations"]
         logger.info("resumed at step %d", self.step)
 
     def _started_with(self, state: dict[str, Any]) -> str:
-        """The keys of the run in a checkpoint that are not those of this one."""
+        """The keys of the run in a checkpoint that are not those of this one; empty when all are the same."""
         now = asdict(self.config)
         now |= {"iterations": state["config"]["iterations"], "output": state["config"]["output"]}  # may differ
-        keys = [f"{key}={value}" for key, value in state["config"].items() if value != now.get(key)]
-        return ", ".join(keys) or "another network or optimiser"
+        keys = [f"{key}={value}" for key, value in state["config"].items() if value != now.get(key, value)]
+        return ", ".join(keys)
 
     def save_prior(self) -> ScenePrior:
         """Write the averaged prior to ``output/prior`` and return the prior holding the averaged weights."""

@@ -100,6 +100,50 @@ def test_a_run_does_not_go_on_with_keys_that_do_not_fit_it(config: PretrainConfi
             make_run(replace(config, iterations=8, **other), raw).run()  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("process", ["continuous", "mixed"])
+def test_a_run_that_an_earlier_version_began_is_refused_in_plain_words(
+    config: PretrainConfig, raw: torch.Tensor, process: str
+) -> None:
+    config = replace(config, process=process)
+    run = make_run(config, raw)
+    run.run()
+    state = torch.load(run.checkpoint_path, weights_only=True)
+    name = next(iter(state["network"]))
+    state["network"]["its_old_name"] = state["network"].pop(name)
+    state["config"]["a_key_of_old"] = 3
+    torch.save(state, run.checkpoint_path)
+    with pytest.raises(InvalidInputError, match=r"cannot be resumed: 2 .* earlier version .* give another output"):
+        make_run(replace(config, iterations=8), raw).run()
+
+
+def test_a_checkpoint_that_holds_no_base_rates_resumes_bit_for_bit(
+    config: PretrainConfig, raw: torch.Tensor, tmp_path: Path
+) -> None:
+    """The learning rate hangs on the number of the step alone, whatever the optimiser's groups say."""
+    config = replace(config, decay_share=1.0)
+    whole = make_run(replace(config, output=str(tmp_path / "whole")), raw)
+    whole.run()
+    first = make_run(config, raw)
+    save = first._save
+
+    def stops_after_two_steps() -> None:
+        save()
+        raise Killed
+
+    first._save = stops_after_two_steps  # type: ignore[method-assign]
+    with pytest.raises(Killed):
+        first.run()
+    state = torch.load(first.checkpoint_path, weights_only=True)
+    for group in state["optimizer"]["param_groups"]:
+        del group["initial_lr"]
+        group["lr"] = 123.0
+    torch.save(state, first.checkpoint_path)
+    resumed = make_run(config, raw)
+    resumed.run()
+    for name, tensor in whole.network.state_dict().items():
+        assert torch.equal(tensor, resumed.network.state_dict()[name]), name
+
+
 def test_what_an_older_prior_takes_as_constant_may_not_vary_where_it_is_trained_further(
     config: PretrainConfig, raw: torch.Tensor
 ) -> None:
