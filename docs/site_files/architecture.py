@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from html import escape
+from itertools import pairwise
 from pathlib import Path
 
 FILE = Path(__file__).parents[1] / "images" / "architecture.svg"
@@ -69,7 +70,7 @@ def drawing() -> str:
             f'<text x="{x + 12}" y="38" font-size="16" font-weight="bold" fill="#3a3e46">{name}</text>',
         ]
     parts += [_asks(*pair) for pair in ASKS]
-    parts += [_way(first, second) for first, second in zip(WAY, WAY[1:], strict=False)]
+    parts += [_way(first, second) for first, second in pairwise(WAY)]
     for rooms in ROWS:
         parts += [_box(room, text) for room, (_, text) in rooms.items()]
     legend = height - 26
@@ -78,7 +79,8 @@ def drawing() -> str:
         f'<text x="74" y="{legend + 4}" font-size="13" fill="#3a3e46">one sample\'s way, downwards only</text>',
         f'<path d="M330 {legend} h40" stroke="#8a8f98" stroke-dasharray="5 4" marker-end="url(#asks)"/>',
         f'<text x="384" y="{legend + 4}" font-size="13" fill="#3a3e46">asks on the way</text>',
-        f'<text x="540" y="{legend + 4}" font-size="13" fill="#3a3e46">A room imports rooms of higher rows alone.</text>',
+        f'<text x="540" y="{legend + 4}" font-size="13" fill="#3a3e46">',
+        "A room imports rooms of higher rows alone.</text>",
         "</svg>",
     ]
     return "\n".join(parts) + "\n"

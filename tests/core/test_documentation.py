@@ -6,6 +6,7 @@ import importlib.util
 import re
 import subprocess
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 
@@ -69,7 +70,7 @@ def test_every_room_is_drawn_below_what_it_imports() -> None:
 
 
 def test_arrows_of_the_drawing_are_imports() -> None:
-    steps = [(later, earlier) for earlier, later in zip(ARCHITECTURE.WAY, ARCHITECTURE.WAY[1:], strict=False)]
+    steps = [(later, earlier) for earlier, later in pairwise(ARCHITECTURE.WAY)]
     assert {*steps, *ARCHITECTURE.ASKS} <= ROOM_IMPORTS
 
 
