@@ -78,6 +78,17 @@ def test_the_committed_drawing_is_that_of_the_script() -> None:
     assert ARCHITECTURE.FILE.read_text(encoding="utf-8") == ARCHITECTURE.drawing()
 
 
+@pytest.mark.parametrize(
+    "page", ["planners/uct", "planners/best_of", "rewards/object_count", "rewards/feasible_objects"]
+)
+def test_code_of_a_page_runs(page: str) -> None:
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8"), re.DOTALL)
+    names: dict[str, object] = {}
+    assert blocks
+    for block in blocks:
+        exec(block, names)
+
+
 def test_make_help_lists_every_target() -> None:
     listed = set(re.findall(r"^make ([\w-]+)  ", subprocess.run(
         ["make", "--no-print-directory", "help"], cwd=ROOT, capture_output=True, text=True, check=True
