@@ -13,9 +13,10 @@ from rewards import evaluate_reward, make_reward
 from scene_envs.errors import InvalidInputError
 from scene_envs.physics import equilibrium, feasibility, make_ready, penetration, project, settle
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import get_scene_type, list_scene_types
+from scene_envs.scene_types import get_scene_type
+from scene_envs.scene_types.built_in import BUILT_IN
 
-TYPES = list_scene_types()
+TYPES = [scene_type.name for scene_type in BUILT_IN]
 PHYSICS: dict[str, Callable[[SceneBatch], object]] = {
     "penetration": penetration,
     "feasibility": feasibility,
