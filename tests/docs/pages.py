@@ -21,7 +21,7 @@ SMALLER: dict[str, dict[str, str]] = {
         "iterations=40, ": "iterations=1, batch_size=2, num_steps=3, bank_size=16, guard_scenes=8, progress='none', ",
         'PostTrainConfig(output="runs/clutter")': (
             'PostTrainConfig(output="runs/compared", iterations=1, batch_size=2, num_steps=3, bank_size=16, '
-            "guard_scenes=8, progress='none'), count=4"
+            "guard_scenes=8, progress='none'), scenes=4, num_steps=3"
         ),
     },
     "docs/datasets.md": {
@@ -40,15 +40,20 @@ SMALLER: dict[str, dict[str, str]] = {
         "branching=8": "branching=2, num_steps=2",
         "range(5)": "range(1)",
     },
-    "docs/evaluation.md": {"count=20, num_steps=10": "count=4, num_steps=3", "workers=2": "workers=1"},
+    "docs/evaluation.md": {"count=20, num_steps=10": "count=4, ready=False, num_steps=10", "workers=2": "workers=1"},
     "docs/evaluation_learned.md": {"seeds=10": "seeds=1"},
+    "docs/grammars.md": {
+        'prior="runs/tea_table"': (
+            'prior=__import__("agents.priors.testing", fromlist=["tiny_prior"]).tiny_prior("tea_table")'
+        ),
+    },
     "docs/physics.md": {"workers=4": "workers=1"},
     "docs/search.md": {
-        "budget=64, branching=4": "budget=4, branching=2, num_steps=2",
+        "budget=64, branching=4": "budget=3, branching=2, num_steps=2",
         "branching=4)": "branching=2, num_steps=2)",
         "budget=32": "budget=3",
     },
-    "README.md": {"budget=32": "budget=2, num_steps=2"},
+    "README.md": {"budget=32": "budget=3, branching=2, num_steps=2"},
 }
 """Text of Python blocks, and what a test puts in its place: the same calls with smaller numbers."""
 
@@ -80,7 +85,7 @@ SMALL_KEYS: dict[str, dict[str, str]] = {
     "complete": {"num_steps": "3"},
     "rearrange": {"num_steps": "3"},
     "generate": {"count": "3", "workers": "0", "progress": "false"},
-    "search": {"budget": "2", "num_steps": "2", "branching": "2"},
+    "search": {"budget": "3", "num_steps": "2", "branching": "2"},
     "export": {"count": "2", "num_steps": "3", "workers": "0"},
     "view": {"count": "2", "num_steps": "3", "first": "0", "open": "false"},
     "priors": {},
@@ -139,13 +144,13 @@ def given(page: str) -> dict[str, Any]:
 
     if page not in GIVEN:
         return {}
-    scenes = grammar_scenes("dimsum_table", 24, seed=0)
+    scenes = grammar_scenes("dimsum_table", 60, seed=0)
     values = {
         "batch": scenes[:2],
         "names": ["one", "two"],
-        "real": scenes[:8],
-        "samples": scenes[8:16],
-        "other_real": scenes[16:],
+        "real": scenes[:20],
+        "samples": scenes[20:40],
+        "other_real": scenes[40:],
         "gym": gym,
     }
     return {name: values[name] for name in GIVEN[page]}
