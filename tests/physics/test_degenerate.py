@@ -16,6 +16,8 @@ from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type
 from scene_envs.scene_types.built_in import BUILT_IN
 
+pytestmark = pytest.mark.slow
+
 TYPES = [scene_type.name for scene_type in BUILT_IN]
 PHYSICS: dict[str, Callable[[SceneBatch], object]] = {
     "penetration": penetration,

@@ -17,6 +17,8 @@ from scene_envs.physics import PhysicsPool, feasibility, make_ready, project, se
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types.built_in import BUILT_IN
 
+pytestmark = pytest.mark.slow
+
 NOISE = (0.004, 0.015, 0.03)
 """m along every axis; one scene each."""
 
