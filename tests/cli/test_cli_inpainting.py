@@ -15,7 +15,7 @@ from agents.priors.testing import tiny_prior
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type
-from tests.agents.authors_flux import random_state, write_checkpoint
+from tests.helpers.authors_flux import random_state, write_checkpoint
 
 
 @pytest.fixture(scope="module")

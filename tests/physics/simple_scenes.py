@@ -12,16 +12,6 @@ from scene_envs.assets.shapes import box, hull_of, mass_properties, ring, solid
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import Camera, FixedObject, SceneType, register_scene_type
 
-SEVEN_TYPES = (
-    "breakfast_table_high_clutter",
-    "breakfast_table_low_clutter",
-    "dimsum_table",
-    "living_room_shelf",
-    "pantry_shelf",
-    "restaurant_high_clutter",
-    "restaurant_low_clutter",
-)
-"""Scene types of the library, without those that tests register."""
 SIDE = 0.1
 """Side of the box, m; its frame is the centre of its bottom face."""
 

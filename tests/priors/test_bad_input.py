@@ -27,7 +27,7 @@ from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.grammars import get_grammar
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch
-from tests.agents.authors_flux import random_state, write_checkpoint
+from tests.helpers.authors_flux import random_state, write_checkpoint
 
 NAN = float("nan")
 

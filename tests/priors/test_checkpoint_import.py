@@ -14,7 +14,7 @@ from agents.priors.base import ScenePrior
 from agents.priors.checkpoint_import import import_checkpoint
 from agents.priors.lightning_files import read_lightning
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, UnknownNameError
-from tests.agents.authors_flux import DIMSUM, forward, random_state, write_checkpoint
+from tests.helpers.authors_flux import DIMSUM, forward, random_state, write_checkpoint
 
 
 @pytest.mark.parametrize("text", [0, 10])

@@ -24,8 +24,8 @@ from scene_envs.datasets.prompts import describe_all
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.grammars import get_grammar
 from scene_envs.normalizer import Normalizer
-from tests.agents.authors_flux import random_state, write_checkpoint
-from tests.agents.small_bert import write_bert
+from tests.helpers.authors_flux import random_state, write_checkpoint
+from tests.helpers.small_bert import write_bert
 
 pytest.importorskip("transformers")
 

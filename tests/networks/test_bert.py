@@ -16,7 +16,7 @@ from agents.networks.bert_files import FOLDER_VARIABLE, load_bert
 from agents.networks.text import TextConfig, TextEncoder
 from agents.networks.text_encoders import text_config, text_config_from_state, text_encoder
 from scene_envs.errors import InvalidInputError, MissingDependencyError
-from tests.agents.small_bert import WORDS, write_bert
+from tests.helpers.small_bert import WORDS, write_bert
 
 transformers = pytest.importorskip("transformers")
 pytest.importorskip("tokenizers")
