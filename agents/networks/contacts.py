@@ -11,16 +11,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from agents.networks.flux_modules import FluxModule, ModuleConfig, Scene
-
-if TYPE_CHECKING:
-    from agents.networks.mixed_flux_config import MixedFluxConfig
+from agents.networks.flux_modules import FluxModule, FluxSizes, ModuleConfig, Scene
 
 CHANNELS = 4
 """Displacements that are offered for every slot."""
@@ -44,7 +40,7 @@ class ContactsConfig(ModuleConfig):
     reads_geometry = True
     reads_rotations = True
 
-    def build(self, core: MixedFluxConfig) -> Contacts:
+    def build(self, core: FluxSizes) -> Contacts:
         return Contacts(core.categories, core.pair_width, core.hidden, core.embedding)
 
 

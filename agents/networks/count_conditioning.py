@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from agents.networks.count_embedding import count_states
-from agents.networks.flux_modules import FluxModule, ModuleConfig, Scene
-
-if TYPE_CHECKING:
-    from agents.networks.mixed_flux_config import MixedFluxConfig
+from agents.networks.flux_modules import FluxModule, FluxSizes, ModuleConfig, Scene
 
 _DELTA = 0.02
 """Objects that may always still come, so that logarithms are finite."""
@@ -39,14 +35,14 @@ class CountConditioningConfig(ModuleConfig):
     def __post_init__(self) -> None:
         object.__setattr__(self, "kinds", tuple(self.kinds))  # a list, when it comes from JSON
 
-    def kinds_of(self, core: MixedFluxConfig) -> tuple[int, ...]:
+    def kinds_of(self, core: FluxSizes) -> tuple[int, ...]:
         """The kind of each category."""
         return self.kinds or tuple(range(core.categories - 1))
 
-    def text_tokens(self, core: MixedFluxConfig) -> int:
+    def text_tokens(self, core: FluxSizes) -> int:
         return max(self.kinds_of(core)) + 2
 
-    def build(self, core: MixedFluxConfig) -> CountConditioning:
+    def build(self, core: FluxSizes) -> CountConditioning:
         return CountConditioning(self.kinds_of(core), core.text_width, core.hidden, self.largest)
 
 

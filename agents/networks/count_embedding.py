@@ -6,16 +6,12 @@ Attention takes averages, and a prompt asks for numbers.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from agents.networks.flux_modules import FluxModule, ModuleConfig, Scene
-
-if TYPE_CHECKING:
-    from agents.networks.mixed_flux_config import MixedFluxConfig
+from agents.networks.flux_modules import FluxModule, FluxSizes, ModuleConfig, Scene
 
 
 @dataclass(frozen=True)
@@ -25,7 +21,7 @@ class CountEmbeddingConfig(ModuleConfig):
     name = "count_embedding"
     place = "condition"
 
-    def build(self, core: MixedFluxConfig) -> CountEmbedding:
+    def build(self, core: FluxSizes) -> CountEmbedding:
         return CountEmbedding(core.categories, core.text_width, core.hidden)
 
 

@@ -4,15 +4,56 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal, Protocol
 
 from torch import Tensor, nn
 
-if TYPE_CHECKING:
-    from agents.networks.mixed_flux_config import MixedFluxConfig
-
 Place = Literal["slots", "condition", "attention", "output"]
 """The part of the core after which the weights of a module are drawn, so that a seed keeps its meaning."""
+
+
+class FluxSizes(Protocol):
+    """The sizes of the core that modules are built for; fields of :class:`~agents.networks.MixedFluxConfig`."""
+
+    @property
+    def categories(self) -> int:
+        """Assets and *empty*."""
+        ...
+
+    @property
+    def hidden(self) -> int:
+        """Width of the token streams."""
+        ...
+
+    @property
+    def heads(self) -> int:
+        """Attention heads."""
+        ...
+
+    @property
+    def embedding(self) -> int:
+        """Width of the embedding of a slot."""
+        ...
+
+    @property
+    def text_width(self) -> int:
+        """Width of the text tokens; 0 without text."""
+        ...
+
+    @property
+    def unit(self) -> tuple[float, float, float]:
+        """Metres per normalised unit along x, y, z."""
+        ...
+
+    @property
+    def blocks(self) -> int:
+        """Number of blocks, of both kinds."""
+        ...
+
+    @property
+    def pair_width(self) -> int:
+        """Number of features of a pair of slots, of all modules that offer some."""
+        ...
 
 
 @dataclass
@@ -121,10 +162,10 @@ class ModuleConfig:
         """Features of a pair of slots that the module offers."""
         return 0
 
-    def text_tokens(self, core: MixedFluxConfig) -> int:
+    def text_tokens(self, core: FluxSizes) -> int:
         """Leading text tokens that are for this module alone."""
         return 0
 
-    def build(self, core: MixedFluxConfig) -> FluxModule:
+    def build(self, core: FluxSizes) -> FluxModule:
         """The module with fresh weights, for a network of this configuration."""
         raise NotImplementedError

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from agents.networks.flux_modules import FluxModule, ModuleConfig, Scene
-
-if TYPE_CHECKING:
-    from agents.networks.mixed_flux_config import MixedFluxConfig
+from agents.networks.flux_modules import FluxModule, FluxSizes, ModuleConfig, Scene
 
 
 @dataclass(frozen=True)
@@ -33,7 +29,7 @@ class FourierFeaturesConfig(ModuleConfig):
     def pose_width(self) -> int:
         return 6 * self.octaves
 
-    def build(self, core: MixedFluxConfig) -> FourierFeatures:
+    def build(self, core: FluxSizes) -> FourierFeatures:
         return FourierFeatures(self.octaves)
 
 

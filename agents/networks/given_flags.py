@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from torch import Tensor, nn
 
-from agents.networks.flux_modules import FluxModule, ModuleConfig, Scene
-
-if TYPE_CHECKING:
-    from agents.networks.mixed_flux_config import MixedFluxConfig
+from agents.networks.flux_modules import FluxModule, FluxSizes, ModuleConfig, Scene
 
 
 @dataclass(frozen=True)
@@ -20,7 +16,7 @@ class GivenFlagsConfig(ModuleConfig):
     name = "given_flags"
     place = "slots"
 
-    def build(self, core: MixedFluxConfig) -> GivenFlags:
+    def build(self, core: FluxSizes) -> GivenFlags:
         return GivenFlags(core.embedding)
 
 

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from torch import Tensor, nn
 
-from agents.networks.flux_modules import FluxModule, ModuleConfig, Scene
-
-if TYPE_CHECKING:
-    from agents.networks.mixed_flux_config import MixedFluxConfig
+from agents.networks.flux_modules import FluxModule, FluxSizes, ModuleConfig, Scene
 
 
 @dataclass(frozen=True)
@@ -21,7 +17,7 @@ class PooledTextConfig(ModuleConfig):
     place = "condition"
     reads_text = True
 
-    def build(self, core: MixedFluxConfig) -> PooledText:
+    def build(self, core: FluxSizes) -> PooledText:
         return PooledText(core.text_width, core.hidden)
 
 

@@ -9,17 +9,13 @@ structure module of AlphaFold, Jumper et al. 2021).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from agents.networks.flux_modules import FluxModule, ModuleConfig, Scene
+from agents.networks.flux_modules import FluxModule, FluxSizes, ModuleConfig, Scene
 from scene_envs.errors import unknown_name
-
-if TYPE_CHECKING:
-    from agents.networks.mixed_flux_config import MixedFluxConfig
 
 _SCALES, _DIRECTED = 8, 8
 FEATURES = 2 * _SCALES + 3 * _DIRECTED
@@ -50,7 +46,7 @@ class RelationsConfig(ModuleConfig):
     def pair_width(self) -> int:
         return FEATURES
 
-    def build(self, core: MixedFluxConfig) -> Relations:
+    def build(self, core: FluxSizes) -> Relations:
         return Relations(core.blocks, core.heads, core.unit, blur=self.blur)
 
 

@@ -8,17 +8,13 @@ place and leans in another then lies flat to ten degrees only.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from agents.networks.flux_modules import FluxModule, ModuleConfig, Scene
+from agents.networks.flux_modules import FluxModule, FluxSizes, ModuleConfig, Scene
 from scene_envs.rotations import project_to_so3
-
-if TYPE_CHECKING:
-    from agents.networks.mixed_flux_config import MixedFluxConfig
 
 ROTATION_FEATURES = 9 + 4
 """Numbers per rotation."""
@@ -42,7 +38,7 @@ class RotationFeaturesConfig(ModuleConfig):
     def pose_width(self) -> int:
         return ROTATION_FEATURES
 
-    def build(self, core: MixedFluxConfig) -> RotationFeatures:
+    def build(self, core: FluxSizes) -> RotationFeatures:
         return RotationFeatures(core.embedding)
 
 
