@@ -29,6 +29,8 @@ _READY_DEPTH = 1e-4
 """How deep a ready object may overlap another one (m)."""
 _READY_DURATIONS = (0.1, 0.5, 2.0, 2.0)
 """Times (s) for which it stays where it is, judged one after the other."""
+_PATIENCE = 2
+"""Rounds without more ready objects after which a scene is left as it is."""
 _UNMOVED = 1e-4
 """Motion (m) below which an object is believed not to depend on others that move."""
 _CHUNK = 8
@@ -165,9 +167,9 @@ def make_ready(
     A free object is ready when it is inside the workspace, overlaps nothing deeper than 0.1 mm, and stays within 1 mm
     and 0.01 rad of where it is for 2 s of simulation, also without the objects that are not ready. Scenes with objects
     in the workspace that are not ready go through projection and settling again, with more solver iterations, up to
-    ``rounds`` times in all, as long as that makes more of them ready. The round with most ready objects is kept, the
-    earliest of equal ones. A heap, whose objects are so deep in each other that projection has to spread them, is
-    invalid.
+    ``rounds`` times in all, until two in a row have made no more of them ready. The round with most ready objects is
+    kept, the earliest of equal ones. A heap, whose objects are so deep in each other that projection has to spread
+    them, is invalid.
 
     Args:
         batch: B scenes of N slots.
@@ -182,15 +184,16 @@ def make_ready(
     best = last = _make_ready_once(batch, duration, ITERATIONS, pool)
     tensor, ready, counts = best.batch.tensor.clone(), best.ready.clone(), best.counts.clone()
     scenes = torch.arange(len(batch))  # that went through the last round
-    gained = torch.ones(len(batch), dtype=torch.bool)
+    without_gain = torch.zeros(len(batch), dtype=torch.int64)  # rounds in a row
     for _ in range(rounds - 1):
         unready = last.batch.is_free & last.batch.in_workspace & ~last.ready
-        again = (last.valid & gained & unready.any(dim=-1)).nonzero()[:, 0]
+        again = (last.valid & (without_gain[scenes] < _PATIENCE) & unready.any(dim=-1)).nonzero()[:, 0]
         if not len(again):
             break
         scenes = scenes[again]
         last = _make_ready_once(last.batch[again], duration, CONVERGED, pool)
-        better = gained = last.counts > counts[scenes]
+        better = last.counts > counts[scenes]
+        without_gain[scenes] = (without_gain[scenes] + 1) * ~better
         improved = scenes[better]
         tensor[improved], ready[improved] = last.batch.tensor[better], last.ready[better]
         counts[improved] = last.counts[better]
