@@ -20,14 +20,16 @@ from agents.diffusion import (
     StepTable,
 )
 from agents.networks.count_conditioning import CountConditioning
+from agents.networks.mixed_denoiser import Given
 from agents.networks.text import Text
+from agents.priors.forward import DenoiserOutput, NoisedScenes
 from agents.priors.inpainting import Inpainting
 from agents.priors.prompt_validation import check_prompts, no_text
 from agents.priors.storage import StoredPrior, explained, read_stored, write_stored
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
-from scene_envs.scene import TRANSLATION, SceneBatch
+from scene_envs.scene import POSE_FEATURES, TRANSLATION, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
 _CLASSES: dict[str, type[ScenePrior]] = {}
@@ -332,6 +334,33 @@ class ScenePrior(Inpainting, nn.Module, ABC):
             t: (B,) timesteps, drawn when None.
             text: tokens (B, L, W) and their mask (B, L), as :meth:`encode_prompts` gives them; None without prompts.
         """
+
+    @abstractmethod
+    def noised(
+        self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None, observed: Given | None = None
+    ) -> NoisedScenes:
+        """A draw of the forward process for scenes ``x0`` (B, N, D), as the pretraining loss takes it.
+
+        Args:
+            x0: normalised scenes.
+            generator: source of timesteps, noise and observed entries (CPU).
+            t: (B,) timesteps, drawn when None.
+            observed: entries without noise; None draws them as in pretraining.
+        """
+
+    @abstractmethod
+    def output(self, noised: NoisedScenes, text: Text | None = None) -> DenoiserOutput:
+        """What the denoiser says of noised scenes; differentiable in its parameters.
+
+        Args:
+            noised: as :meth:`noised` gives them.
+            text: tokens (B, L, W) and their mask (B, L), as :meth:`encode_prompts` gives them; None without prompts.
+        """
+
+    @property
+    def pose_width(self) -> int:
+        """Leading features of the continuous output that are poses; the others, if any, are categories."""
+        return POSE_FEATURES
 
     @abstractmethod
     def fit_residual(self, x0: Tensor, levels: int = 40, seed: int = 0) -> ResidualVariance:

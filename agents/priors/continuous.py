@@ -14,10 +14,12 @@ from agents.diffusion.gaussian import timestep_weights
 from agents.diffusion.schedules import make_schedule
 from agents.diffusion.weighting import check_weighting, loss_weights, timestep_distribution
 from agents.networks.denoiser import Denoiser
+from agents.networks.mixed_denoiser import Given
 from agents.networks.registry import build_network, config_from_state, config_state
 from agents.networks.text import Text
 from agents.priors.base import ScenePrior
 from agents.priors.config import PriorConfig, current_names
+from agents.priors.forward import DenoiserOutput, NoisedScenes
 from agents.priors.inpainting import draw_noise
 from agents.priors.prompt_validation import no_text
 from agents.priors.rotation_codes import SceneCode
@@ -117,6 +119,11 @@ class ContinuousPrior(ScenePrior):
         return self.code.features
 
     @property
+    def pose_width(self) -> int:
+        """Leading features of the continuous output that are poses."""
+        return self.code.pose_width
+
+    @property
     def is_constant(self) -> Tensor:
         """(D,) bool: features that never vary."""
         return self.code.normalizer.is_constant
@@ -202,16 +209,35 @@ class ContinuousPrior(ScenePrior):
         """
         if text is not None:
             raise no_text(self.scene_type, "")
+        noised = self.noised(x0, generator, t)
+        error = self.output(noised).continuous - noised.target
+        weight = noised.weight[0]
+        per_scene = (error.square() * weight).sum(dim=(1, 2)) / weight.sum() * noised.scale
+        return per_scene.mean() if reduction == "mean" else per_scene
+
+    def noised(
+        self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None, observed: Given | None = None
+    ) -> NoisedScenes:
+        """Noised scenes, their targets and weights; see :meth:`ScenePrior.noised`."""
+        if observed is not None:
+            raise InvalidInputError(
+                "a continuous prior sees everything with noise; take a mixed prior, or observed=None"
+            )
         if t is None:
             t = self.draw_timesteps(x0.shape[0], generator).to(x0.device)
         noise = torch.randn(x0.shape, generator=generator).to(x0.device)
         x_t = self.clamp(self.process.add_noise(x0, t, noise))
-        error = self.denoiser.output(x_t, t) - self.process.target(x0, x_t, t, noise)
-        weight = self.loss_weight(x0.shape[1])
-        per_scene = (error.square() * weight).sum(dim=(1, 2)) / weight.sum()
-        schedule, config = self.process.schedule, self.config
-        per_scene = per_scene * loss_weights(schedule, t, config.prediction, config.loss_weighting)
-        return per_scene.mean() if reduction == "mean" else per_scene
+        target = self.process.target(x0, x_t, t, noise)
+        weight = self.loss_weight(x0.shape[1]).to(x0.device).expand(len(x0), -1, -1)
+        scale = loss_weights(self.process.schedule, t, self.config.prediction, self.config.loss_weighting)
+        category = x0[..., self.code.pose_width :].argmax(dim=-1)
+        return NoisedScenes(x_t, t, target, weight, scale.to(x0.device), category)
+
+    def output(self, noised: NoisedScenes, text: Text | None = None) -> DenoiserOutput:
+        """The output (B, N, D) of noised scenes; ``text`` must be None."""
+        if text is not None:
+            raise no_text(self.scene_type, "")
+        return DenoiserOutput(self.denoiser.output(noised.x_t, noised.t))
 
     @torch.no_grad()
     def fit_residual(self, x0: Tensor, levels: int = 40, seed: int = 0) -> ResidualVariance:

@@ -15,6 +15,7 @@ from agents.networks.mixed_denoiser import Given, MixedDenoiser
 from agents.networks.text import Text
 from agents.priors.base import ScenePrior
 from agents.priors.config import MixedPriorConfig
+from agents.priors.forward import DenoiserOutput, NoisedScenes
 from agents.priors.text import PromptReader
 from scene_envs.scene import POSE_FEATURES
 
@@ -67,43 +68,60 @@ class TrainableMixedPrior(PromptReader, ScenePrior):
 
     def _losses(self, x0: Tensor, generator: Generator | None, t: Tensor | None, text: Text | None) -> Tensor:
         """(B,) losses of scenes, arguments as in :meth:`pretraining_loss`."""
-        config, device = self.mixed, x0.device
-        if t is None:
-            t = self.draw_timesteps(x0.shape[0], generator).to(device)
-        noise = torch.randn(x0.shape, generator=generator).to(device)
-        given = self.draw_given(x0, generator) if config.given_share > 0 else None
-        x_t = self.add_noise(x0, t, noise)
-        x_t = x_t if given is None else given.write(x_t)
+        config = self.mixed
+        noised = self.noised(x0, generator, t)
         text = self.unconditional(len(x0)) if text is None else text
-        output, logits = self.denoiser.output(x_t, t, given, text)
-        pose0, category0 = x0[..., :POSE_FEATURES], x0[..., POSE_FEATURES:].argmax(dim=-1)
-        moments = self.denoiser.moments(state_of(x_t[..., POSE_FEATURES:]), t)
-        error = output - self.process.target(pose0, x_t[..., :POSE_FEATURES], t, noise[..., :POSE_FEATURES], moments)
-        weight = self.loss_weight(x0.shape[1])[None, :, :POSE_FEATURES].to(device).expand(len(x0), -1, -1)
-        empty = (category0 == self.num_categories - 1)[..., None]
-        weight = torch.where(empty, _EMPTY_WEIGHT * weight, weight)
-        drawn = torch.ones(x0.shape[:2], device=device)
-        drawn[:, : len(self.scene_type.fixed)] = 0.0
-        if given is not None:
-            weight = weight * (~given.pose)[..., None]
-            drawn = drawn * (~given.category)
-        if self.denoiser.drops_empty:  # what is seen is certain
-            drawn = drawn * (state_of(x_t[..., POSE_FEATURES:]) == self.num_categories)
+        output = self.output(noised, text)
+        logits, drawn, weight = output.logits, noised.drawn, noised.weight
+        assert logits is not None and drawn is not None
+        error = output.continuous - noised.target
         pose_loss = (error.square() * weight).sum(dim=(1, 2)) / weight.sum(dim=(1, 2)).clamp(min=1.0)
-        pose_loss = pose_loss * loss_weights(self.process.schedule, t, config.prediction, config.loss_weighting).to(
-            device
-        )
+        pose_loss = pose_loss * noised.scale
         if config.category_loss == "bound":
-            states = x_t[..., POSE_FEATURES:]
-            losses = self.categories.loss(category0, state_of(states), t, logits, config.auxiliary)
+            states = state_of(noised.x_t[..., POSE_FEATURES:])
+            losses = self.categories.loss(noised.category, states, noised.t, logits, config.auxiliary)
         else:
-            losses = F.cross_entropy(logits.flatten(0, 1), category0.flatten(), reduction="none").view_as(drawn)
+            losses = F.cross_entropy(logits.flatten(0, 1), noised.category.flatten(), reduction="none").view_as(drawn)
         category_loss = (losses * drawn).sum(dim=1) / drawn.sum(dim=1).clamp(min=1.0)
         loss = pose_loss + config.category_weight * category_loss
         conditioning = self.count_conditioning
         if conditioning is not None and text is not None:
-            loss = loss + _COUNT_WEIGHT * conditioning.count_loss(text[0][:, : conditioning.things], category0)
+            loss = loss + _COUNT_WEIGHT * conditioning.count_loss(text[0][:, : conditioning.things], noised.category)
         return loss
+
+    def noised(
+        self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None, observed: Given | None = None
+    ) -> NoisedScenes:
+        """Noised scenes, their targets and weights; see :meth:`ScenePrior.noised`."""
+        config, device = self.mixed, x0.device
+        if t is None:
+            t = self.draw_timesteps(x0.shape[0], generator).to(device)
+        noise = torch.randn(x0.shape, generator=generator).to(device)
+        if observed is None and config.given_share > 0:
+            observed = self.draw_given(x0, generator)
+        x_t = self.add_noise(x0, t, noise)
+        x_t = x_t if observed is None else observed.write(x_t)
+        pose0, category = x0[..., :POSE_FEATURES], x0[..., POSE_FEATURES:].argmax(dim=-1)
+        states = state_of(x_t[..., POSE_FEATURES:])
+        moments = self.denoiser.moments(states, t)
+        target = self.process.target(pose0, x_t[..., :POSE_FEATURES], t, noise[..., :POSE_FEATURES], moments)
+        weight = self.loss_weight(x0.shape[1])[None, :, :POSE_FEATURES].to(device).expand(len(x0), -1, -1)
+        empty = (category == self.num_categories - 1)[..., None]
+        weight = torch.where(empty, _EMPTY_WEIGHT * weight, weight)
+        drawn = torch.ones(x0.shape[:2], device=device)
+        drawn[:, : len(self.scene_type.fixed)] = 0.0
+        if observed is not None:
+            weight = weight * (~observed.pose)[..., None]
+            drawn = drawn * (~observed.category)
+        if self.denoiser.drops_empty:  # what is seen is certain
+            drawn = drawn * (states == self.num_categories)
+        scale = loss_weights(self.process.schedule, t, config.prediction, config.loss_weighting).to(device)
+        return NoisedScenes(x_t, t, target, weight, scale, category, drawn, observed)
+
+    def output(self, noised: NoisedScenes, text: Text | None = None) -> DenoiserOutput:
+        """The pose output (B, N, 12) and logits (B, N, K) of noised scenes."""
+        text = self.unconditional(len(noised.t)) if text is None else text
+        return DenoiserOutput(*self.denoiser.output(noised.x_t, noised.t, noised.observed, text))
 
     def draw_given(self, x0: Tensor, generator: Generator | None) -> Given:
         """Random observed entries: slots (completion), all categories (rearrangement), or any attribute of any slot."""

@@ -1,0 +1,316 @@
+"""Losses of forward-process reinforcement learning: NFT, AWM and reward-weighted fine-tuning, as torchrl losses.
+
+They weight the pretraining loss of finished scenes by how good the scenes were. They need no log-probabilities, no
+stored trajectories and no particular sampler.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Generator, Tensor
+from torch.nn import functional as F
+from torchrl.objectives import LossModule
+
+from agents.networks.text import Text
+from agents.priors.base import ScenePrior
+from agents.priors.forward import NoisedScenes
+from scene_envs.errors import InvalidInputError
+
+
+class ForwardProcessLoss(LossModule):
+    """A loss of finished scenes x_0 at random timesteps of the forward process.
+
+    Every scene is noised once per call. The trained denoiser says o, the sampling policy's denoiser says o_old, and a
+    subclass says what the loss of an entry is, given the advantage of its slot. Squared errors are weighted and reduced
+    as in pretraining: a mean over the entries of a scene, then over the valid scenes. Losses of categories are a mean
+    over the slots whose category is masked at that timestep, times the prior's ``category_weight``.
+
+    Poses take ``advantage``, categories ``category_advantage``; each is one number per scene or one per slot. In x_t
+    every slot sees the others, so an advantage per slot credits an object for its own pose alone.
+
+    Accepted keys (``set_keys``):
+        scene: (B, N, D) float, finished scenes x_0 as the prior encodes them. Default ``"scene"``.
+        advantage: (B,), (B, 1) or (B, N) float, for poses. Default ``"advantage"``.
+        category_advantage: the same for categories, optional; without it they have no credit. Default
+            ``"category_advantage"``.
+        timestep: (B,) or (B, 1) int64, optional; drawn as in pretraining without. Default ``"timestep"``.
+        valid: (B,) or (B, 1) bool, optional; False rows are left out of the mean. Default ``"valid"``.
+        text, text_mask: (B, L, W) tokens and (B, L) their mask, optional. Default ``"text"`` and ``"text_mask"``.
+
+    Args:
+        prior: what is trained.
+        sampler: what made the scenes, such as a slower copy of ``prior``; its weights get no gradient.
+        generator: source of timesteps, noise and observed entries (CPU); None for torch's own.
+
+    Returns (``forward``): ``loss_objective`` (), and detached ``distance`` (), the root mean square of o - o_old.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        scene: NestedKey = "scene"
+        advantage: NestedKey = "advantage"
+        category_advantage: NestedKey = "category_advantage"
+        timestep: NestedKey = "timestep"
+        valid: NestedKey = "valid"
+        text: NestedKey = "text"
+        text_mask: NestedKey = "text_mask"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_objective", "distance"]  # noqa: RUF012  (torchrl reads lists)
+    prior: ScenePrior
+    generator: Generator | None
+
+    def __init__(self, prior: ScenePrior, sampler: ScenePrior, *, generator: Generator | None = None) -> None:
+        super().__init__()
+        self.prior = prior
+        self.generator = generator
+        self._sampler = (sampler,)  # in a tuple: not a module of the loss, whose parameters are the prior's
+
+    @property
+    def sampler(self) -> ScenePrior:
+        """What made the scenes."""
+        return self._sampler[0]
+
+    @property
+    def functional(self) -> bool:
+        """False: the prior's own parameters receive the gradient."""
+        return False
+
+    @property
+    def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
+        """Keys that must be present."""
+        return [self.tensor_keys.scene, self.tensor_keys.advantage]
+
+    def _forward_value_estimator_keys(self, **kwargs: object) -> None:
+        """These losses have no value estimator."""
+
+    @abstractmethod
+    def continuous_loss(self, output: Tensor, old: Tensor, target: Tensor, advantage: Tensor) -> Tensor:
+        """Losses of continuous entries; all arguments broadcast to (B, N, F).
+
+        Args:
+            output: o of the denoiser in training.
+            old: o_old of the sampling policy, a constant.
+            target: what a denoiser should have said of this noise.
+            advantage: of each entry's slot.
+        """
+
+    @abstractmethod
+    def category_loss(self, logits: Tensor, old: Tensor, category: Tensor, advantage: Tensor) -> Tensor:
+        """(B, N) losses of categories.
+
+        Args:
+            logits: (B, N, K) of the denoiser in training.
+            old: (B, N, K) of the sampling policy, constants.
+            category: (B, N) int64, the clean categories.
+            advantage: (B, 1) or (B, N).
+        """
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """The loss of a batch of finished scenes.
+
+        Raises:
+            InvalidInputError: an advantage has neither one value per scene nor one per slot.
+        """
+        keys = self.tensor_keys
+        flat = tensordict.reshape(-1)
+        scene = flat.get(keys.scene).detach()
+        advantage = self._advantage(flat, keys.advantage, scene)
+        credit = self._advantage(flat, keys.category_advantage, scene)
+        timestep = flat.get(keys.timestep, None)
+        noised = self.prior.noised(scene, self.generator, None if timestep is None else timestep.reshape(-1))
+        tokens, mask = flat.get(keys.text, None), flat.get(keys.text_mask, None)
+        text = None if tokens is None or mask is None else (tokens.detach(), mask)
+        losses, distance = self._losses(noised, text, advantage, credit)
+        valid = flat.get(keys.valid, None)
+        kept = torch.ones_like(losses, dtype=torch.bool) if valid is None else valid.reshape(-1)
+        count = kept.sum().clamp(min=1)
+        fields = {
+            "loss_objective": torch.where(kept, losses, 0.0).sum() / count,
+            "distance": (torch.where(kept, distance, 0.0).sum() / count).sqrt(),
+        }
+        return TensorDict(fields, [])
+
+    def _losses(
+        self, noised: NoisedScenes, text: Text | None, advantage: Tensor, credit: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """(B,) losses, and (B,) mean squares of o - o_old."""
+        output = self.prior.output(noised, text)
+        with torch.no_grad():
+            old = self.sampler.output(noised, text)
+        features, poses = output.continuous.shape[-1], self.prior.pose_width
+        of_entries = advantage[..., None].expand(-1, output.continuous.shape[1], features)
+        if features > poses:  # a continuous prior: categories are entries, too
+            of_entries = torch.cat(
+                [of_entries[..., :poses], credit[..., None].expand(*of_entries.shape[:2], features - poses)], dim=-1
+            )
+        weight = noised.weight / noised.weight.sum(dim=(1, 2), keepdim=True).clamp(min=1.0)
+        entries = self.continuous_loss(output.continuous, old.continuous, noised.target, of_entries)
+        losses = (entries * weight).sum(dim=(1, 2)) * noised.scale
+        distance = ((output.continuous - old.continuous).detach().square() * weight).sum(dim=(1, 2))
+        if output.logits is not None and old.logits is not None and noised.drawn is not None:
+            slots = self.category_loss(output.logits, old.logits, noised.category, credit)
+            mean = (slots * noised.drawn).sum(dim=1) / noised.drawn.sum(dim=1).clamp(min=1.0)
+            losses = losses + self.prior.config.category_weight * mean
+        return losses, distance
+
+    def _advantage(self, flat: TensorDictBase, key: NestedKey, scene: Tensor) -> Tensor:
+        """(B, 1) or (B, N); zeros where the key is missing."""
+        found = flat.get(key, None)
+        if found is None:
+            return scene.new_zeros(len(scene), 1)
+        found = found.detach().reshape(len(scene), -1)
+        if found.shape[1] not in (1, scene.shape[1]):
+            raise InvalidInputError(
+                f"{key!r} has {found.shape[1]} values per scene; give one, or one per slot ({scene.shape[1]})"
+            )
+        return found
+
+
+class NFTLoss(ForwardProcessLoss):
+    """Negative-aware fine-tuning (Zheng et al. 2025, arXiv 2509.16117), for poses and, on logits, for categories.
+
+    With the optimality r = 1/2 + clip(A / c, -1, 1) / 2 and the implicit policies
+
+        o_plus = (1 - beta) o_old + beta o,    o_minus = (1 + beta) o_old - beta o
+
+    the loss is r |o_plus - target|^2 + (1 - r) |o_minus - target|^2. Its minimum over o at one x_t is
+    o_old + (2 E[r] - 1 + cov) / beta in the direction of the error of o_old: a step that is bounded by beta. Categories
+    have the same with cross-entropies of l_plus and l_minus, which are made of logits as o_plus and o_minus are.
+
+    Args:
+        prior, sampler, generator: as in :class:`ForwardProcessLoss`.
+        beta: strength; smaller ones step further from the sampling policy.
+        clip: c, the advantage at which a sample is fully good or bad.
+
+    >>> from agents.priors.testing import tiny_prior
+    >>> prior = tiny_prior("dimsum_table", process="mixed")
+    >>> scenes = TensorDict({"scene": prior.encode(prior.sample(2, num_steps=3)), "advantage": torch.ones(2, 34)}, [2])
+    >>> loss = NFTLoss(prior, prior)(scenes)
+    >>> sorted(loss.keys()), float(loss["distance"])
+    (['distance', 'loss_objective'], 0.0)
+    >>> loss["loss_objective"].backward()
+    """
+
+    def __init__(
+        self,
+        prior: ScenePrior,
+        sampler: ScenePrior,
+        *,
+        beta: float = 0.5,
+        clip: float = 1.0,
+        generator: Generator | None = None,
+    ) -> None:
+        super().__init__(prior, sampler, generator=generator)
+        _positive(beta=beta, clip=clip)
+        self.beta, self.clip = beta, clip
+
+    def continuous_loss(self, output: Tensor, old: Tensor, target: Tensor, advantage: Tensor) -> Tensor:
+        """See :class:`ForwardProcessLoss`."""
+        good = self.optimality(advantage)
+        change, error = self.beta * (output - old), target - old
+        return good * (change - error).square() + (1 - good) * (change + error).square()
+
+    def category_loss(self, logits: Tensor, old: Tensor, category: Tensor, advantage: Tensor) -> Tensor:
+        """See :class:`ForwardProcessLoss`."""
+        good = self.optimality(advantage)
+        change = self.beta * (logits - old)
+        return good * _cross_entropy(old + change, category) + (1 - good) * _cross_entropy(old - change, category)
+
+    def optimality(self, advantage: Tensor) -> Tensor:
+        """r in [0, 1]."""
+        return 0.5 + 0.5 * (advantage / self.clip).clamp(-1.0, 1.0)
+
+
+class AWMLoss(ForwardProcessLoss):
+    """Advantage weighted matching (Xue et al. 2025, arXiv 2509.25050) with a pull to the sampling policy.
+
+    With a = clip(A / c, -1, 1) the loss of an entry is a |o - target|^2 + beta |o - o_old|^2, and that of a category
+    a times its cross-entropy plus beta KL(p_old || p). It is bounded below for beta > 1. Its gradient at o = o_old is
+    that of :class:`NFTLoss` divided by the latter's beta.
+
+    Args:
+        prior, sampler, generator: as in :class:`ForwardProcessLoss`.
+        beta: strength of the pull, above 1.
+        clip: c, the largest advantage.
+    """
+
+    def __init__(
+        self,
+        prior: ScenePrior,
+        sampler: ScenePrior,
+        *,
+        beta: float = 2.0,
+        clip: float = 1.0,
+        generator: Generator | None = None,
+    ) -> None:
+        super().__init__(prior, sampler, generator=generator)
+        _positive(clip=clip)
+        if not beta > 1:
+            raise InvalidInputError(f"beta={beta} must be above 1: below, a bad sample pushes without bound")
+        self.beta, self.clip = beta, clip
+
+    def continuous_loss(self, output: Tensor, old: Tensor, target: Tensor, advantage: Tensor) -> Tensor:
+        """See :class:`ForwardProcessLoss`."""
+        bounded = (advantage / self.clip).clamp(-1.0, 1.0)
+        return bounded * (output - target).square() + self.beta * (output - old).square()
+
+    def category_loss(self, logits: Tensor, old: Tensor, category: Tensor, advantage: Tensor) -> Tensor:
+        """See :class:`ForwardProcessLoss`."""
+        bounded = (advantage / self.clip).clamp(-1.0, 1.0)
+        pull = F.kl_div(logits.log_softmax(-1), old.log_softmax(-1), reduction="none", log_target=True).sum(dim=-1)
+        return bounded * _cross_entropy(logits, category) + self.beta * pull
+
+
+class RewardWeightedLoss(ForwardProcessLoss):
+    """Reward-weighted fine-tuning: the pretraining loss of own samples, weighted by exp(A / temperature).
+
+    The baseline that every other method is compared with (Peters and Schaal 2007; Lee et al. 2023): good samples pull,
+    none pushes. Weights are bounded by ``largest``.
+
+    Args:
+        prior, sampler, generator: as in :class:`ForwardProcessLoss`.
+        temperature: of the weights.
+        largest: largest weight.
+    """
+
+    def __init__(
+        self,
+        prior: ScenePrior,
+        sampler: ScenePrior,
+        *,
+        temperature: float = 1.0,
+        largest: float = 10.0,
+        generator: Generator | None = None,
+    ) -> None:
+        super().__init__(prior, sampler, generator=generator)
+        _positive(temperature=temperature, largest=largest)
+        self.temperature, self.largest = temperature, largest
+
+    def continuous_loss(self, output: Tensor, old: Tensor, target: Tensor, advantage: Tensor) -> Tensor:
+        """See :class:`ForwardProcessLoss`."""
+        return self._weight(advantage) * (output - target).square()
+
+    def category_loss(self, logits: Tensor, old: Tensor, category: Tensor, advantage: Tensor) -> Tensor:
+        """See :class:`ForwardProcessLoss`."""
+        return self._weight(advantage) * _cross_entropy(logits, category)
+
+    def _weight(self, advantage: Tensor) -> Tensor:
+        return (advantage / self.temperature).exp().clamp(max=self.largest)
+
+
+def _cross_entropy(logits: Tensor, category: Tensor) -> Tensor:
+    """(B, N) cross-entropies of (B, N, K) logits."""
+    return F.cross_entropy(logits.flatten(0, 1), category.flatten(), reduction="none").view(category.shape)
+
+
+def _positive(**values: float) -> None:
+    for name, value in values.items():
+        if not value > 0:
+            raise InvalidInputError(f"{name}={value} must be positive")
