@@ -65,8 +65,12 @@ def load_resumable(directory: Path, config: PostTrainConfig) -> dict[str, Any] |
     if not path.exists():
         return None
     state = load_checkpoint(path)
-    before, now = state.get("config", {}), config.plain()
-    changed = [name for name in now if name not in RESUMABLE and before.get(name, now[name]) != now[name]]
+    before, now = _dotted(state.get("config", {})), _dotted(config.plain())
+    changed = [
+        name
+        for name in now
+        if name.partition(".")[0] not in RESUMABLE and before.get(name, now[name]) != now[name]
+    ]
     if changed:
         differences = "; ".join(f"{name} was {before[name]!r}, is {now[name]!r}" for name in changed)
         raise InvalidInputError(
@@ -74,3 +78,12 @@ def load_resumable(directory: Path, config: PostTrainConfig) -> dict[str, Any] |
             "give another output, or the same settings to resume it"
         )
     return state
+
+
+def _dotted(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The keys of a configuration, those of its groups behind a dot."""
+    flat: dict[str, Any] = {}
+    for name, value in config.items():
+        group = value if isinstance(value, Mapping) and name != "reward" else None
+        flat |= {name: value} if group is None else {f"{name}.{key}": item for key, item in group.items()}
+    return flat

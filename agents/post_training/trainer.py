@@ -65,8 +65,9 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> P
     >>> from tempfile import TemporaryDirectory
     >>> from agents.priors.testing import tiny_prior
     >>> with TemporaryDirectory() as output:
-    ...     config = PostTrainConfig(output=output, iterations=2, batch_size=4, num_steps=4, gradient_steps=2,
-    ...         bank_size=20, guard_scenes=8, regularisation_batch=4, progress="none")
+    ...     config = PostTrainConfig(output=output, iterations=2, batch_size=4, num_steps=4,
+    ...         algorithm={"gradient_steps": 2}, regularisation={"bank_size": 20, "batch_size": 4},
+    ...         guard={"scenes": 8}, logger="silent")
     ...     result = post_train(config, prior=tiny_prior())
     >>> len(result.history), result.history[0]["log_ratio"]
     (2, 0.0)
@@ -91,7 +92,7 @@ class PostTrainer:
 
     def __init__(self, config: PostTrainConfig, *, prior: ScenePrior | None = None) -> None:
         self.config = config
-        self.directory = Path(config.output)
+        self.directory = Path(config.output or "runs/post-train")
         self.learner = Learner(config, ScenePrior.load(config.prior if prior is None else prior))
         self.prior = self.learner.prior
         self.iteration = 0
@@ -118,15 +119,15 @@ class PostTrainer:
             self._save_prior()  # until something better: the base
         title = f"post-train {self.prior.scene_type.name}"
         started = time.perf_counter() - self.seconds
-        with Progress(title, config.iterations, config.progress, self.iteration) as progress:
+        with Progress(title, config.iterations, config.logger.progress, self.iteration) as progress:
             while self.iteration < config.iterations and not self._stopped:
                 rollout, row = self.step()
                 self.seconds = time.perf_counter() - started
                 self.history.append({**row, "seconds": round(self.seconds, 2)})
                 last = self.iteration == config.iterations
-                if self.iteration % config.guard_every == 0 or last:
+                if self.iteration % config.guard.every == 0 or last:
                     self._check(rollout)
-                if self.iteration % config.checkpoint_every == 0 or last or self._stopped:
+                if self.iteration % config.logger.checkpoint_every == 0 or last or self._stopped:
                     self.save()
                 write_log(self.directory, self.history)
                 progress.update(self.iteration, row["reward"], self.guard.ratio)
@@ -140,7 +141,9 @@ class PostTrainer:
             batch = SceneBatch.load(path)
         else:
             slots = self.learner.slots
-            batch, found = real_scenes(self.prior, config.real_scenes, config.bank_size, seed=seed, slots=slots)
+            batch, found = real_scenes(
+                self.prior, config.regularisation.scenes, config.regularisation.bank_size, seed=seed, slots=slots
+            )
             _writing(f"the real scenes {str(path)!r}", lambda: batch.save(path))
             texts.unlink(missing_ok=True)  # of other scenes, by a run that never reached a checkpoint
             if found is not None and self.prior.conditional:
@@ -154,9 +157,9 @@ class PostTrainer:
                     [text for i in large for text in prompts(i)], self.prior.scene_type, self.learner.slots
                 )
         x0 = self.prior.encode(batch.to(config.device))
-        self.scenes = SceneBank.split(x0, config.guard_scenes, prompts)
+        self.scenes = SceneBank.split(x0, config.guard.scenes, prompts)
         asked = self.scenes.heldout_prompts()
-        self.guard = Guard(self.scenes.heldout, config.guard_limit, stream_seed(config.seed, "guard"), asked)
+        self.guard = Guard(self.scenes.heldout, config.guard.limit, stream_seed(config.seed, "guard"), asked)
         self.learner.deal_prompts(self.scenes)
 
     def step(self) -> tuple[Rollout, dict[str, float]]:
@@ -174,8 +177,9 @@ class PostTrainer:
     def _learn(self, rollout: Rollout) -> dict[str, float]:
         row: dict[str, float] = {}
         advantage = self.learner.advantage(rollout)
-        for update in range(self.config.updates):
-            index = self.iteration * self.config.updates + update
+        updates = self.config.algorithm.optimiser_steps
+        for update in range(updates):
+            index = self.iteration * updates + update
             try:
                 row = self.learner.update(rollout, advantage, self.scenes, index)
             except NonFiniteGradient as error:
@@ -186,7 +190,7 @@ class PostTrainer:
 
     @property
     def _stopped(self) -> bool:
-        return self.config.guard_action == "stop" and self.guard.over_limit_at is not None
+        return self.config.guard.action == "stop" and self.guard.over_limit_at is not None
 
     def _check(self, rollout: Rollout) -> None:
         since = self.guard.readings[-1].iteration if self.guard.readings else 0
@@ -200,7 +204,7 @@ class PostTrainer:
 
     def _count_invalid(self) -> None:
         self.invalid_streak += 1
-        if self.invalid_streak < self.config.max_invalid:
+        if self.invalid_streak < self.config.guard.max_invalid:
             return
         raise TrainingError(
             f"the reward {self.config.plain()['reward']!r} scored no scene in {self.invalid_streak} batches in a row, "
@@ -213,8 +217,7 @@ class PostTrainer:
         return TrainingError(
             f"iteration {self.iteration + 1} gave a gradient that is not finite ({numbers}); it was not applied. "
             f"The last good checkpoint is {str(self.directory / CHECKPOINT_NAME)!r}, the best prior so far "
-            f"{str(self.directory / 'prior')!r}. Lower learning_rate (now {self.config.learning_rate:g}) or raise "
-            f"min_std (now {self.config.min_std:g})"
+            f"{str(self.directory / 'prior')!r}. Lower optimizer.lr (now {self.config.optimizer.lr:g})"
         )
 
     # -- files ----------------------------------------------------------------------------------
@@ -267,7 +270,7 @@ class PostTrainer:
         }
         write_metrics(self.directory, metrics)
         name = f"mean {reward_name(self.config.reward).replace('_', ' ')}"
-        draw_curve(self.history, self.directory / "curve.png", reward_name=name, limit=self.config.guard_limit)
+        draw_curve(self.history, self.directory / "curve.png", reward_name=name, limit=self.config.guard.limit)
         return PostTrainResult(ScenePrior.load(self.directory / "prior"), self.history, metrics, self.directory)
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from agents.configuration.fields import named
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
@@ -31,7 +33,7 @@ class ImportCheckpointConfig:
 
     checkpoint: str = ""
     metadata: str = ""
-    scene: str = ""
+    scene: Any = named("", "scene")
     aliases: dict[str, str] = field(default_factory=dict)
     text_encoder: str = ""
     count: int = 4

@@ -1,0 +1,7 @@
+"""Configuration: nested dataclasses, validated, composed by Hydra from the groups of ``configs``."""
+
+from agents.configuration.compose import compose_tree, group_options
+from agents.configuration.fields import composed, named, nested
+from agents.configuration.tree import build, changed, plain_tree
+
+__all__ = ["build", "changed", "compose_tree", "composed", "group_options", "named", "nested", "plain_tree"]
