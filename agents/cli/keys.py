@@ -103,7 +103,7 @@ def format_rows(rows: Sequence[tuple[str, str]]) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-def compose(command: str, config: type, words: Sequence[str], sources: Sources = Sources()) -> Any:  # noqa: B008
+def compose(command: str, config: type, words: Sequence[str], sources: Sources = Sources()) -> Any:
     """An instance of ``config`` from ``key=value`` words, options of groups and ``+experiment=NAME``.
 
     Values are written as in Hydra: numbers, ``true``, ``null``, ``[1, 2]``, ``{name: clip, high: 20}``; the brackets of
@@ -125,6 +125,7 @@ def compose(command: str, config: type, words: Sequence[str], sources: Sources =
             check_option("experiment", value, sources.config_dir)
             read.append(word)
             continue
+        check_not_moved(config, word, command)
         head = key.partition(".")[0]
         if head not in fields:
             check_not_moved(config, key, command)

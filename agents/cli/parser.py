@@ -112,9 +112,7 @@ def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str
     named = _named(words, getattr(module, "POSITIONAL", ()))
     if not sweep:
         return _run(command, module, compose(command, module.config(), named, sources), bool(shown))
-    runs = [
-        (compose(command, module.config(), variant, sources), label) for variant, label in expand_sweeps(named)
-    ]
+    runs = [(compose(command, module.config(), variant, sources), label) for variant, label in expand_sweeps(named)]
     return _run_all(command, module, runs, bool(shown))
 
 

@@ -2,6 +2,16 @@
 
 from agents.configuration.compose import compose_tree, group_options
 from agents.configuration.fields import composed, named, nested
-from agents.configuration.tree import build, changed, plain_tree
+from agents.configuration.tree import build, changed, dotted_values, plain_tree
 
-__all__ = ["build", "changed", "compose_tree", "composed", "group_options", "named", "nested", "plain_tree"]
+__all__ = [
+    "build",
+    "changed",
+    "compose_tree",
+    "composed",
+    "dotted_values",
+    "group_options",
+    "named",
+    "nested",
+    "plain_tree",
+]

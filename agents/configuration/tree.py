@@ -57,7 +57,8 @@ def convert(field: dataclasses.Field[Any], hint: Any, value: Any, path: str, com
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
             return value
         if not isinstance(value, Mapping):
-            raise InvalidInputError(f"{path}={_typed(value)} is not a group of keys; give {path}.KEY=VALUE")
+            keys = ", ".join(f"{path}.{inner.name}" for inner in dataclasses.fields(hint))
+            raise InvalidInputError(f"{path}={_typed(value)}: {path} is a group of keys; give one of {keys}")
         return build(kind_of(field, hint, value), value, f"{path}.", command)
     return _scalar(hint, value, path)
 
@@ -157,12 +158,14 @@ def _scalar(hint: Any, value: Any, path: str) -> Any:
                 return _scalar(option, value, path) if option is not type(None) else _refuse(option, value, path)
             except InvalidInputError as error:
                 errors.append(error)
-        wanted = " or ".join([*(_wanted(option) for option in arguments if option is not type(None))])
+        wanted = " or ".join(map(_wanted, options))
         raise InvalidInputError(f"{path}={_typed(value)} is not {wanted}{' or null' * (type(None) in arguments)}")
     if origin in (list, tuple):
         if not isinstance(value, list | tuple):
             _refuse(hint, value, path)
         return origin(_scalar(arguments[0], item, path) for item in value) if arguments else origin(value)
+    if origin is dict:
+        return _plain(value) if isinstance(value, Mapping) else _refuse(hint, value, path)
     if hint is float and isinstance(value, int | float | str) and not isinstance(value, bool):
         try:
             return float(value)  # YAML reads 1e-4 as a text
@@ -182,6 +185,8 @@ def _wanted(hint: Any) -> str:
     if get_origin(hint) in (list, tuple):
         inner = {int: "whole numbers", float: "numbers", str: "texts"}.get((*get_args(hint), Any)[0], "values")
         return f"a list of {inner}"
+    if get_origin(hint) is dict:
+        return "a mapping, as {key: value}"
     return _WANTED.get(hint, str(hint))
 
 

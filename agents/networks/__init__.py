@@ -5,7 +5,15 @@ from agents.networks.flux import FluxConfig, FluxDenoiser
 from agents.networks.midiffusion import MiDiffusion, MiDiffusionConfig, MixedMiDiffusion, MixedMiDiffusionConfig
 from agents.networks.mixed_flux import MixedFlux
 from agents.networks.mixed_flux_config import MixedFluxConfig
-from agents.networks.registry import NETWORKS, build_network, match_parameters, network_config, parameter_count
+from agents.networks.registry import (
+    NETWORKS,
+    build_network,
+    list_networks,
+    match_parameters,
+    network_config,
+    parameter_count,
+    register_network,
+)
 from agents.networks.text import TextConfig, TextEncoder
 
 __all__ = [
@@ -25,7 +33,9 @@ __all__ = [
     "TextConfig",
     "TextEncoder",
     "build_network",
+    "list_networks",
     "match_parameters",
     "network_config",
     "parameter_count",
+    "register_network",
 ]

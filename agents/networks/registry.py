@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, asdict, dataclass, fields, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import nn
@@ -16,6 +16,7 @@ from agents.networks.midiffusion import MiDiffusion, MiDiffusionConfig, MixedMiD
 from agents.networks.mixed_flux import MixedFlux
 from agents.networks.mixed_flux_config import RENAMED, MixedFluxConfig
 from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.plugins import plugin_entry_points
 
 NETWORKS = ("flux", "midiffusion", "diffuscene")
 """Ours, and the two that it is compared with."""
@@ -47,6 +48,47 @@ _ENTRIES = {
 _NAMES = {entry.config: name for (name, _), entry in _ENTRIES.items()}
 _BUILDERS = {entry.config: entry.network for entry in _ENTRIES.values()}
 _RATIO_STEPS, _RATIO_STEP = 24, 1 / 64
+
+ENTRY_POINT_GROUP = "scene_envs.networks"
+"""Packages offer networks under this group: the entry's name is the network's, its value a class or a module that
+:func:`register_network` decorates."""
+Network = TypeVar("Network", bound=type[nn.Module])
+
+
+def register_network(
+    name: str, process: str, config: type[Any], ratio: str = "mlp_ratio"
+) -> Callable[[Network], Network]:
+    """Make a network available as ``network=name``; the same name again replaces it.
+
+    The decorated class is made of a ``config``, and does what the networks here do: ``FluxDenoiser`` for scenes as
+    numbers, ``MixedFlux`` for poses with categories.
+
+    Args:
+        name: letters, digits and underscores.
+        process: ``"continuous"`` or ``"mixed"``.
+        config: the dataclass of its size; those of its fields that :func:`network_config` knows are filled in.
+        ratio: field of ``config`` that equal parameter counts adjust beside ``hidden``.
+
+    Raises:
+        InvalidInputError: the name is not one word.
+        UnknownNameError: no process has that name.
+    """
+    if not name.isidentifier():
+        raise InvalidInputError(f"network name {name!r}: use letters, digits and underscores, such as 'my_flux'")
+    if process not in NETWORK_PROCESSES:
+        raise unknown_name("process", process, NETWORK_PROCESSES)
+
+    def register(network: Network) -> Network:
+        _ENTRIES[name, process] = _Entry(config, network, ratio)
+        _NAMES[config], _BUILDERS[config] = name, network
+        return network
+
+    return register
+
+
+def list_networks() -> list[str]:
+    """Names of all networks, those of installed packages included, sorted."""
+    return sorted({name for name, _ in _ENTRIES} | set(plugin_entry_points(ENTRY_POINT_GROUP)))
 
 
 def build_network(config: NetworkConfig) -> nn.Module:
@@ -112,10 +154,13 @@ def network_config(
     >>> network_config("midiffusion", "mixed", features=20, categories=8, hidden=64, depth=4, heads=4).hidden
     64
     """
+    given = dict(locals())
     entry = _entry(name, process)
     sizes: dict[str, Any] = {"hidden": hidden, "heads": heads}
     sizes |= {"features": features} if process == "continuous" else {"categories": categories}
-    if name == "diffuscene":
+    if name not in NETWORKS:
+        sizes = {field.name: given[field.name] for field in fields(entry.config) if field.name in given}
+    elif name == "diffuscene":
         sizes |= {"blocks": max(1, depth // 3), "text_width": text_width}
     elif name == "midiffusion":
         sizes |= {"depth": depth, "text_width": text_width}
@@ -240,10 +285,15 @@ def match_parameters(name: str, process: str, target: int, **sizes: Any) -> Netw
 
 
 def _entry(name: str, process: str) -> _Entry:
-    if name not in NETWORKS:
-        raise unknown_name("network", name, NETWORKS)
     if process not in NETWORK_PROCESSES:
         raise unknown_name("process", process, NETWORK_PROCESSES)
+    points = plugin_entry_points(ENTRY_POINT_GROUP)
+    if (name, process) not in _ENTRIES and name in points:
+        points[name].load()
+    if (name, process) not in _ENTRIES:
+        if name in list_networks():
+            raise InvalidInputError(f"network {name!r} has no {process} form; choose another process")
+        raise unknown_name("network", name, list_networks())
     return _ENTRIES[name, process]
 
 

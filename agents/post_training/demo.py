@@ -10,6 +10,7 @@ from agents.post_training.comparison_run import post_train_and_compare
 from agents.post_training.config import PostTrainConfig
 from agents.priors.base import ScenePrior
 
+
 def run_demo(
     output: str | Path = "runs/demo",
     seed: int = 0,

@@ -45,7 +45,9 @@ class Learner:
             raise no_text(self.prior.scene_type, config.prompt)
         self.prior.freeze_text()
         self.slots = self.prior.config.slots if config.slots is None else config.slots
-        self.policy = DenoisingPolicy(self.prior, config.num_steps, chunk=config.optimizer.chunk, guidance=config.guidance)
+        self.policy = DenoisingPolicy(
+            self.prior, config.num_steps, chunk=config.optimizer.chunk, guidance=config.guidance
+        )
         self.stds = self.policy.stds(self.slots).cpu()
         self.algorithm = make_algorithm(config.algorithm, self.policy, self.stds)
         self.loss = self.algorithm.loss

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from torch import Generator, Tensor
 from agents.priors.base import ScenePrior
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.envs.prompts import grammar_prompts
-from scene_envs.errors import InvalidInputError
 from scene_envs.files import write_text
 from scene_envs.scene import SceneBatch
 

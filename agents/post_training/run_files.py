@@ -67,9 +67,7 @@ def load_resumable(directory: Path, config: PostTrainConfig) -> dict[str, Any] |
     state = load_checkpoint(path)
     before, now = _dotted(state.get("config", {})), _dotted(config.plain())
     changed = [
-        name
-        for name in now
-        if name.partition(".")[0] not in RESUMABLE and before.get(name, now[name]) != now[name]
+        name for name in now if name.partition(".")[0] not in RESUMABLE and before.get(name, now[name]) != now[name]
     ]
     if changed:
         differences = "; ".join(f"{name} was {before[name]!r}, is {now[name]!r}" for name in changed)

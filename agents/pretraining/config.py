@@ -238,6 +238,8 @@ class PretrainConfig:
         **_moved("network", "hidden", "depth", "heads", "attention", "relation_blur", "frequencies"),
         **_moved("network", "rotation_features", "contacts", "text_reach", "pooled_text", "count_embedding"),
         **_moved("network", tally="count_embedding"),
+        "text=true": "text=vocabulary",
+        "text=false": "text=none",
         **_moved("process", "prediction", "schedule", "noise_floor", "noise_ceiling", "moments", "rotation", "kernel"),
         **_moved("process", "empty_slots", "unmasking", "denoised_clip"),
         **_moved("loss", "noise_mean", "noise_std", "timesteps", "translation_weight", "category_weight"),

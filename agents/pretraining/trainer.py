@@ -76,7 +76,9 @@ class Pretrainer:
                 f"the {self.processes.size} process(es) times accumulate={config.optimizer.accumulate}"
             )
         if not 0.0 <= config.optimizer.decay_share <= 1.0:
-            raise InvalidInputError(f"decay_share={config.optimizer.decay_share} is outside 0..1: it is a share of the steps")
+            raise InvalidInputError(
+                f"decay_share={config.optimizer.decay_share} is outside 0..1: it is a share of the steps"
+            )
         self.prior = prior.to(config.device).train()
         self.network: nn.Module = prior.denoiser
         settings = config.optimizer

@@ -77,8 +77,18 @@ PAPER: dict[str, Any] = {
 
 NETWORKS: dict[str, dict[str, Any]] = {
     "flux": {"network.name": "flux"},
-    "midiffusion": {"network.name": "midiffusion", "network.attention": "plain", "network.frequencies": 0, "process.empty_slots": "attended"},
-    "diffuscene": {"network.name": "diffuscene", "network.attention": "plain", "network.frequencies": 0, "process.empty_slots": "attended"},
+    "midiffusion": {
+        "network.name": "midiffusion",
+        "network.attention": "plain",
+        "network.frequencies": 0,
+        "process.empty_slots": "attended",
+    },
+    "diffuscene": {
+        "network.name": "diffuscene",
+        "network.attention": "plain",
+        "network.frequencies": 0,
+        "process.empty_slots": "attended",
+    },
 }
 """Ours with its defaults; the others read poses as they are, as published."""
 NETWORK_LABELS = {"flux": "ours (flux)", "midiffusion": "MiDiffusion", "diffuscene": "DiffuScene"}

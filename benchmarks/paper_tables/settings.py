@@ -105,7 +105,9 @@ class TablesConfig:
         if not self.tables:
             raise InvalidInputError(f"tables=[] asks for nothing; name some of {', '.join(ALL_TABLES)}")
         if self.pretraining is not None and not isinstance(self.pretraining, Mapping):
-            raise InvalidInputError(f"pretraining={self.pretraining!r} is no mapping; write it like {{network: {{hidden: 64}}}}")
+            raise InvalidInputError(
+                f"pretraining={self.pretraining!r} is no mapping; write it like {{network: {{hidden: 64}}}}"
+            )
         taken = [f"{key} ({why})" for key, why in _NOT_OF_PRETRAINING.items() if key in (self.pretraining or {})]
         if taken:
             raise InvalidInputError(f"pretraining cannot set {', '.join(taken)}")

@@ -16,7 +16,15 @@ from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
 from scene_envs.files import write_json
 
 CONFIG_NAME, METRICS_NAME = "row.json", "metrics.json"
-_RUN_ONLY = ("output", "device", "logger.log_every", "logger.evaluate_every", "logger.checkpoint_every", "logger.pictures_every", "logger.tensorboard")
+_RUN_ONLY = (
+    "output",
+    "device",
+    "logger.log_every",
+    "logger.evaluate_every",
+    "logger.checkpoint_every",
+    "logger.pictures_every",
+    "logger.tensorboard",
+)
 """Keys that may change between the parts of a resumed run."""
 _SHAPING = (
     "network.name",

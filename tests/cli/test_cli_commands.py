@@ -74,7 +74,13 @@ def test_generate_pretrain_post_train_and_sample_the_result(tmp_path, capsys):
 
 
 def test_the_doctor_prints_its_screen_and_keeps_the_numbers(prior, tmp_path, capsys):
-    words = ["batch_size=2", "num_steps=3", "algorithm.gradient_steps=2", "regularisation.batch_size=2", "regularisation.bank_size=8"]
+    words = [
+        "batch_size=2",
+        "num_steps=3",
+        "algorithm.gradient_steps=2",
+        "regularisation.batch_size=2",
+        "regularisation.bank_size=8",
+    ]
     assert main(["doctor", f"prior={prior}", *words, "guard.scenes=2", "slots=20", f"output={tmp_path}"]) == 0
     assert metrics(tmp_path)["log_ratio"] == 0
     assert "log-ratio at the start" in capsys.readouterr().out

@@ -73,7 +73,13 @@ def test_search_and_post_training_take_prompts(reader: Path, tmp_path: Path) -> 
     assert 0.0 <= metrics["search"]["objective"] <= 1.0
     words = ["post-train", f"prior={reader}", "reward=prompt_match", "iterations=1", "batch_size=4", "num_steps=2"]
     words += ["regularisation.batch_size=2", "regularisation.bank_size=9", "guard.scenes=4"]
-    words += ["prompt=[A scene with two cups., A scene with 9 objects.]", "algorithm.scenes_per_prompt=2", "algorithm.min_std=0.0001", "logger=silent", "logger.report_scenes=0"]
+    words += [
+        "prompt=[A scene with two cups., A scene with 9 objects.]",
+        "algorithm.scenes_per_prompt=2",
+        "algorithm.min_std=0.0001",
+        "logger=silent",
+        "logger.report_scenes=0",
+    ]
     assert main([*words, f"output={tmp_path / 'run'}"]) == 0
     config = json.loads((tmp_path / "run" / "metrics.json").read_text())["config"]
     assert config["prompt"] == ["A scene with two cups.", "A scene with 9 objects."]

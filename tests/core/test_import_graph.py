@@ -16,6 +16,7 @@ ROOT = Path(__file__).parents[2]
 LAYERS = ("scene_envs", "rewards", "agents")
 """Each may import those before it."""
 
+
 def module_name(file: Path) -> str:
     parts = file.relative_to(ROOT).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)

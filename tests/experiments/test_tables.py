@@ -58,7 +58,10 @@ def test_every_precision_row_changes_one_thing_of_the_first_of_its_part() -> Non
         if entry.row.capacity != 1:
             assert not changed
         else:
-            together = ({"process.prediction", "loss.weighting"}, {"process.kernel", "loss.category", "process.empty_slots"})
+            together = (
+                {"process.prediction", "loss.weighting"},
+                {"process.kernel", "loss.category", "process.empty_slots"},
+            )
             assert len(changed) == 1 or any(changed <= keys for keys in together), changed
 
 
@@ -74,7 +77,12 @@ def test_every_factor_is_asked() -> None:
     assert {("loss.translation_weight", 1.0), ("loss.translation_weight", 3.0)} <= asked
     assert {("optimizer.final_lr", 1.0), ("optimizer.decay_share", 1.0)} <= asked
     assert {("network.rotation_features", True), ("network.rotation_features", False)} <= asked
-    assert {("network.attention", "plain"), ("network.attention", "relative"), ("network.frequencies", 0), ("network.frequencies", 8)} <= asked
+    assert {
+        ("network.attention", "plain"),
+        ("network.attention", "relative"),
+        ("network.frequencies", 0),
+        ("network.frequencies", 8),
+    } <= asked
     assert {row.capacity for row in ours} == {0.5, 1.0, 2.0}
     assert [entry.row.overrides for entry in make_tables(["precision"], ["paper"])[0].entries] == [PAPER]
 
@@ -88,7 +96,10 @@ def test_rows_are_chosen_by_pattern() -> None:
 
 def test_keys_of_a_row_win_over_those_of_all_rows(tmp_path: Path) -> None:
     settings = TablesConfig(
-        size="tiny", iterations=7, pretraining={"network": {"depth": 3}, "process.schedule": "cosine"}, output=str(tmp_path)
+        size="tiny",
+        iterations=7,
+        pretraining={"network": {"depth": 3}, "process.schedule": "cosine"},
+        output=str(tmp_path),
     )
     config = run_config(Row("one", {"process.schedule": "linear"}), settings)
     assert (config.process.schedule, config.network.depth, config.iterations, config.batch_size) == ("linear", 3, 7, 4)
