@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import types
 from collections.abc import Callable, Mapping
@@ -152,12 +153,10 @@ def _scalar(hint: Any, value: Any, path: str) -> Any:
     if origin in (Union, types.UnionType):
         if value is None and type(None) in arguments:
             return None
-        errors = []
-        for option in sorted(arguments, key=lambda option: option is str):  # a list of texts before a text
-            try:
-                return _scalar(option, value, path) if option is not type(None) else _refuse(option, value, path)
-            except InvalidInputError as error:
-                errors.append(error)
+        options = [option for option in arguments if option is not type(None)]
+        for option in sorted(options, key=lambda option: option is str):  # a list of texts before a text
+            with contextlib.suppress(InvalidInputError):
+                return _scalar(option, value, path)
         wanted = " or ".join(map(_wanted, options))
         raise InvalidInputError(f"{path}={_typed(value)} is not {wanted}{' or null' * (type(None) in arguments)}")
     if origin in (list, tuple):

@@ -33,7 +33,7 @@ class DDPO:
         clip = settings.clip_epsilon if isinstance(settings, DDPOISSettings) else None
         self.loss = DDPOSFLoss(
             policy, step_weights=weights, reduction=settings.log_prob_reduction, clip_epsilon=clip
-        ).to(policy.prior.device)
+        ).to(next(policy.parameters()).device)
 
     def advantage(self, rollout: Rollout) -> Tensor:
         """(B,) or (B, N), as ``credit`` says; among the scenes of the same prompt where there are prompts."""

@@ -184,7 +184,8 @@ def _advice(report: DoctorReport, config: PostTrainConfig) -> list[str]:
         if report.gradient_ratio < QUIET:
             advice.append(
                 f"Regularisation drowns the reward (ratio {report.gradient_ratio:.2g}): "
-                f"lower regularisation.weight from {config.regularisation.weight:g}, or change algorithm.log_prob_reduction."
+                f"lower regularisation.weight from {config.regularisation.weight:g}, or change "
+                "algorithm.log_prob_reduction."
             )
         if report.gradient_ratio > LOUD:
             advice.append(

@@ -42,7 +42,7 @@ class Learner:
         self.config = config
         self.prior = deepcopy(prior).to(config.device).eval()
         if config.prompt is not None and not self.prior.conditional:
-            raise no_text(self.prior.scene_type, config.prompt)
+            raise no_text(self.prior.scene_type, str(config.prompt))
         self.prior.freeze_text()
         self.slots = self.prior.config.slots if config.slots is None else config.slots
         self.policy = DenoisingPolicy(

@@ -75,6 +75,8 @@ PAPER: dict[str, Any] = {
 } | {"network.name": "flux"}
 """The paper's setting, ``configs/recipe/paper.yaml``, for a network of the tables' size and a run of their length."""
 
+_PLAIN = {"network.attention": "plain", "network.frequencies": 0, "process.empty_slots": "attended"}
+
 NETWORKS: dict[str, dict[str, Any]] = {
     "flux": {"network.name": "flux"},
     "midiffusion": {

@@ -37,7 +37,8 @@ SIZES: dict[str, Size] = {
     "small": Size(600, 64, 700_000, 256, pretraining={"network.depth": 4, "network.heads": 4, "optimizer.warmup": 50}),
     "paper": Size(
         100_000, 256, 88_300_000, 2000,
-        pretraining={"network.depth": 10, "network.heads": 16, "optimizer.warmup": 1000, "optimizer.lr": 1e-4, "optimizer.matmul_precision": "high"},
+        pretraining={"network.depth": 10, "network.heads": 16,
+            "optimizer.warmup": 1000, "optimizer.lr": 1e-4, "optimizer.matmul_precision": "high"},
     ),
 }  # fmt: skip
 """``tiny`` is for tests, ``small`` for a CPU, ``paper`` has the size of the paper's network and wants a GPU."""

@@ -99,7 +99,8 @@ def test_training_reads_prompts_and_resumes_bit_for_bit(bert: Path, tmp_path: Pa
     _data().save(tmp_path / "data")
     config = PretrainConfig(
         data=str(tmp_path / "data"), text={"encoder": str(bert)}, network={"hidden": 32, "depth": 1, "heads": 2},
-        iterations=4, batch_size=4, logger={"evaluate_every": 10, "checkpoint_every": 2}, output=str(tmp_path / "whole"),
+        iterations=4, batch_size=4, logger={"evaluate_every": 10, "checkpoint_every": 2},
+        output=str(tmp_path / "whole"),
     )  # fmt: skip
     pretrain(config)
     halves = replace(config, output=str(tmp_path / "halves"))

@@ -231,7 +231,8 @@ def test_one_prior_is_trained_on_several_scene_types(tmp_path: Path) -> None:
     for scene in ("dimsum_table", "pantry_shelf"):
         generate(scene, 12, tmp_path / scene, workers=0, verify=False, progress=False)
     config = PretrainConfig(
-        output=str(tmp_path / "run"), data=f"{tmp_path / 'dimsum_table'},{tmp_path / 'pantry_shelf'}", text="vocabulary",
+        output=str(tmp_path / "run"), data=f"{tmp_path / 'dimsum_table'},{tmp_path / 'pantry_shelf'}",
+        text="vocabulary",
         iterations=2, batch_size=8, network={"hidden": 16, "depth": 1, "heads": 2},
         logger={"log_every": 1, "evaluate_every": 2},
     )  # fmt: skip

@@ -105,7 +105,7 @@ def test_keys_of_a_row_win_over_those_of_all_rows(tmp_path: Path) -> None:
     assert (config.process.schedule, config.network.depth, config.iterations, config.batch_size) == ("linear", 3, 7, 4)
     assert config.output == str(tmp_path / "runs" / "one")
     assert target_parameters(Row("two", capacity=2.0), settings) == 120_000
-    with pytest.raises(UnknownNameError, match="did you mean 'process.schedule'"):
+    with pytest.raises(UnknownNameError, match=r"did you mean 'process\.schedule'"):
         run_config(Row("one", {"process.shedule": "linear"}), settings)
 
 
