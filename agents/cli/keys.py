@@ -10,7 +10,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_args, get_origin, get_type_hints
 
 from agents.configuration.compose import check_option, compose_tree, group_options
 from agents.configuration.tree import build, check_not_moved, default_of, dotted_keys
@@ -213,7 +213,7 @@ def _hint(config: type, key: str) -> Any:
 def _override(word: str, hint: Any) -> str:
     """The word as Hydra reads it, text quoted so that any character may stand in it."""
     key, _, value = word.partition("=")
-    options = get_args(hint) or (hint,)
+    options = (hint,) if get_origin(hint) is list else get_args(hint) or (hint,)
     is_list = any(get_args(option) for option in options) and value.startswith("[")
     if str in options and not is_list and not (type(None) in options and value == "null"):
         value = _quoted(value)
