@@ -1,5 +1,12 @@
-# make demo    steer the shipped prior and write runs/demo/report.html
-# make test    run the tests
+# make demo      steer the shipped prior and write runs/demo/report.html
+# make test      run the tests; JOBS=8 for more processes, SEED=1 for one order
+# make lint      check style, formatting and types
+# make docs      build the documentation into site/index.html
+# make check     run all of this as continuous integration does
+# make install   install SceneEnvs into .venv
+# make install-dev   install the tools for tests, checks and documentation as well
+# make clean     remove .venv and everything that was built
+# make help      list the targets
 # Each is the only command needed on a Linux machine with Python 3.11; the first one installs into .venv.
 
 JOBS ?= 2
@@ -7,7 +14,7 @@ SEED ?= $(shell date +%s)
 ENV := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 PIP := .venv/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test lint install install-dev clean help
+.PHONY: demo test lint docs check install install-dev clean help
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -22,6 +29,13 @@ lint: install-dev
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
+
+docs: install-dev
+	NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --quiet --strict
+	@echo "Wrote site/index.html."
+
+check:
+	bash .ci/run
 
 install: .venv/installed
 
@@ -41,4 +55,4 @@ install-dev: .venv/installed-dev
 	@sh .ci/make-venv "$(PYTHON)"
 
 clean:
-	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -1,4 +1,4 @@
-"""What learns and what plans: priors, post-training, planning, evaluation, the command line.
+"""Priors, post-training, planning, evaluation and the command line.
 
 The names below load their modules, and torch with them, when they are first used.
 

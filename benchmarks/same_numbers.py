@@ -40,7 +40,7 @@ from agents import (
 from agents.priors import import_checkpoint
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.scene import SceneBatch
-from tests.agents.authors_flux import random_state, write_checkpoint
+from tests.helpers.authors_flux import random_state, write_checkpoint
 
 FILE = Path(__file__).with_suffix(".json")
 Figures = dict[str, Any]

@@ -1,4 +1,4 @@
-"""What scenes are worth: rewards, their registry and their contract.
+"""Rewards: scores of scenes, their registry and their contract.
 
 A reward is any callable ``(SceneBatch, RewardContext) -> RewardOutput``. The same reward, named once, serves
 reinforcement learning, search and evaluation.

@@ -1,4 +1,4 @@
-"""The reward contract: what goes in, what comes out."""
+"""Reward contract: the types of a reward, its context and its output."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RewardContext:
-    """What a reward may use beside the scenes.
+    """Inputs of a reward besides the scenes.
 
     Attributes:
         prompts: one per scene when the prior is conditional, else None.

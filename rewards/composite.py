@@ -1,4 +1,4 @@
-"""Rewards made of rewards: weighted sum, product, gate, clip.
+"""Composite rewards: weighted sum, product, gate, clip.
 
 Every part may be a name, a mapping, a function or a reward. A scene is valid when every part could score it.
 A part's value is a term under the part's name, and its own terms follow as ``"<part>.<term>"``.

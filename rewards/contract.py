@@ -1,4 +1,4 @@
-"""A public check that a reward keeps its contract, to run in a reward author's own tests."""
+"""Public check of the reward contract, for the tests of reward authors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Calling a reward so that a bad one cannot spoil a run: every output is checked, a failure is invalid."""
+"""Evaluation of rewards: every output is checked, and a failure makes scenes invalid."""
 
 from __future__ import annotations
 

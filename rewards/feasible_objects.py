@@ -1,4 +1,4 @@
-"""How many objects of a scene obey physics as they are."""
+"""Reward: number of objects that are physically feasible as sampled."""
 
 from __future__ import annotations
 

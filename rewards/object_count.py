@@ -1,4 +1,4 @@
-"""How many objects a scene holds: the paper's own objective for clutter."""
+"""Reward: number of objects of a scene, the paper's objective for clutter."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How well a scene holds what its prompt asks for."""
+"""Reward: mean score of the claims of a prompt, from 0 to 1."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rewards by name: a decorator, installed plug-ins, and mappings as they stand in a config file."""
+"""Reward registry: names by decorator, by entry point of installed packages, and by mapping in a configuration."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def list_rewards() -> list[str]:
 
 
 def reward_info(name: str) -> RewardInfo:
-    """What ``name`` is, for listings; imports its plug-in."""
+    """Description of ``name`` for listings; imports its plug-in."""
     maker = _find(name)
     lines = (inspect.getdoc(maker) or "").split("\n\n")[0].split()
     try:

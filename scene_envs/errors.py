@@ -1,4 +1,4 @@
-"""The one exception family: every message names the value, the place and the fix."""
+"""Exception family of SceneEnvs: every message names the value, the place and the fix."""
 
 from __future__ import annotations
 

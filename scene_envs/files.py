@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, and JSON that every reader takes."""
+"""Atomic file writes, and JSON without non-finite numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Entry points: what installed packages bring to the registries of SceneEnvs."""
+"""Entry points: contents that installed packages add to the registries of SceneEnvs."""
 
 from __future__ import annotations
 

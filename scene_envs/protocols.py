@@ -1,4 +1,4 @@
-"""What the environments need from rewards and priors, without importing either."""
+"""Protocols of rewards and priors for the environments, which import neither."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scene_envs.scene_types import SceneType
 
 
 class RewardResult(Protocol):
-    """What a reward says of B scenes with N slots."""
+    """Result of a reward for B scenes with N slots."""
 
     @property
     def value(self) -> Tensor:
@@ -131,7 +131,7 @@ class PromptedPriorLike(PriorLike, Protocol):
 
     @property
     def prompt_space(self) -> tuple[int, int]:
-        """How many tokens a prompt has at most, and how many different ones there are; 0 is padding."""
+        """Largest number of tokens of a prompt, and size of the vocabulary; 0 is padding."""
         ...
 
     def read_prompts(self, prompts: Sequence[str], slots: int) -> Tensor:
@@ -139,7 +139,7 @@ class PromptedPriorLike(PriorLike, Protocol):
         ...
 
     def encode_tokens(self, indices: Tensor) -> Any:
-        """What the network attends to, from token indices (B, L)."""
+        """Text that the network attends to, from token indices (B, L)."""
         ...
 
     def transition(

@@ -1,4 +1,4 @@
-"""The one data type that crosses module boundaries: a batch of scenes."""
+"""SceneBatch: a batch of scenes, the one data type that crosses module boundaries."""
 
 from __future__ import annotations
 

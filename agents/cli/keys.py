@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-import inspect
 import re
 import shutil
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 from agents.configuration.compose import check_option, compose_tree, group_options
 from agents.configuration.tree import build, check_not_moved, default_of, dotted_keys
+from agents.utils.docstrings import attribute_meanings
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
 
 _FIRST = ("scene", "prior", "scenes", "data", "reward", "objective", "count", "output")
 """Keys that a listing starts with, in this order."""
 _OPENING = "[{('\""
-_FIELD = re.compile(r"(\w+): (.*)")
 
 
 @dataclass(frozen=True)
@@ -53,9 +52,7 @@ class Sources:
 def describe_fields(config: type | Any, prefix: str = "") -> list[KeyHelp]:
     """The keys of a config dataclass, those of groups last; meanings stand under ``Attributes:`` in its docstrings."""
     kind = config if isinstance(config, type) else type(config)
-    meanings: dict[str, str] = {}
-    for base in reversed(kind.__mro__):
-        meanings.update(_attribute_meanings(inspect.cleandoc(base.__doc__ or "")))
+    meanings = attribute_meanings(kind)
     keys, groups = [], []
     for field in dataclasses.fields(kind):
         value = default_of(field)
@@ -242,23 +239,6 @@ def _text_list(word: str, value: str) -> str:
 def _quoted(text: str) -> str:
     """``text`` in Hydra's quotes, where backslashes count only before a quote."""
     return "'" + re.sub(r"(\\*)('|$)", lambda found: 2 * found[1] + ("\\'" if found[2] else ""), text) + "'"
-
-
-def _attribute_meanings(docstring: str) -> Mapping[str, str]:
-    """Field name to sentence from the ``Attributes:`` section of a Google-style docstring."""
-    meanings: dict[str, str] = {}
-    name = ""
-    _, _, section = docstring.partition("Attributes:\n")
-    for line in section.splitlines():
-        if line and not line.startswith(" "):
-            break
-        found = _FIELD.match(line[4:]) if line.startswith("    ") and not line.startswith("     ") else None
-        if found:
-            name, text = found.groups()
-            meanings[name] = text
-        elif name and line.strip():
-            meanings[name] += " " + line.strip()
-    return {key: text.replace("``", "") for key, text in meanings.items()}
 
 
 def _typed(value: Any) -> str:

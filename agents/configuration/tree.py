@@ -133,6 +133,18 @@ def dotted_values(config: Any) -> dict[str, Any]:
     return values
 
 
+def dotted(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as one, its keys behind dots.
+
+    >>> dotted({"optimizer": {"lr": 0.1}, "seed": 0})
+    {'optimizer.lr': 0.1, 'seed': 0}
+    """
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        flat |= dotted(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {prefix + key: value}
+    return flat
+
+
 def plain_tree(config: Any) -> dict[str, Any]:
     """A config as nested mappings of numbers, strings and lists."""
     return {field.name: _plain(getattr(config, field.name)) for field in dataclasses.fields(config)}

@@ -12,8 +12,34 @@ from scene_envs.errors import InvalidInputError, unknown_name
 Moments = tuple[Tensor, Tensor]
 """Mean and standard deviation."""
 
-PREDICTIONS = ("karras", "epsilon", "x0", "v")
+PREDICTIONS = ("edm", "epsilon", "x0", "v")
 """What a network may predict; see :meth:`GaussianProcess.x0_from_output`."""
+_FORMER = {"karras": "edm"}
+"""Predictions as earlier versions called them, and their names."""
+
+
+def check_prediction(name: str) -> None:
+    """Raise when ``name`` is not a prediction.
+
+    Raises:
+        InvalidInputError: the prediction has another name now; says which.
+        UnknownNameError: there is no such prediction.
+
+    >>> check_prediction("edm")
+    """
+    if name in _FORMER:
+        raise InvalidInputError(f"prediction={name!r} has another name now: prediction={_FORMER[name]!r}")
+    if name not in PREDICTIONS:
+        raise unknown_name("prediction", name, PREDICTIONS)
+
+
+def current_prediction(name: str) -> str:
+    """The name of a prediction that a file, perhaps of an earlier version, calls ``name``.
+
+    >>> current_prediction("karras"), current_prediction("v")
+    ('edm', 'v')
+    """
+    return _FORMER.get(name, name)
 
 
 class GaussianProcess:
@@ -22,14 +48,13 @@ class GaussianProcess:
     Args:
         schedule: signal rates for t = 0..T.
         prediction: what the network's output means (one of :data:`PREDICTIONS`).
-        preconditioning: data moments, used by ``"karras"``.
+        preconditioning: data moments, used by ``"edm"``.
 
     All timesteps ``t`` are int64 tensors of shape (B,) or (); chains run in float32.
     """
 
     def __init__(self, schedule: NoiseSchedule, prediction: str, preconditioning: Preconditioning) -> None:
-        if prediction not in PREDICTIONS:
-            raise unknown_name("prediction", prediction, PREDICTIONS)
+        check_prediction(prediction)
         self.schedule = schedule
         self.prediction = prediction
         self.preconditioning = preconditioning
@@ -59,7 +84,7 @@ class GaussianProcess:
 
     def network_input(self, x_t: Tensor, t: Tensor) -> Tensor:
         """x_t scaled to unit variance per feature (Karras et al. 2022, c_in); raw for other predictions."""
-        if self.prediction != "karras":
+        if self.prediction != "edm":
             return x_t
         alpha, sigma = self.rates(t, x_t)
         mean, std = self._moments(x_t, None)
@@ -68,14 +93,14 @@ class GaussianProcess:
     def x0_from_output(self, x_t: Tensor, t: Tensor, output: Tensor, moments: Moments | None = None) -> Tensor:
         """The denoised scene x_0 that a network output stands for.
 
-        ``karras``: skip and output scaling of Karras et al. (2022), Table 1, in variance-preserving
+        ``edm``: skip and output scaling of Karras et al. (2022), Table 1, in variance-preserving
         coordinates and with per-feature moments; ``epsilon``: predicted noise; ``v``: Salimans and Ho (2022).
 
         ``moments``, here and in :meth:`target`, are mean and std that broadcast against ``x_t`` and scale the output;
         None takes those of all data, by which the input is always scaled: positions must stay comparable.
         """
         alpha, sigma = self.rates(t, x_t)
-        if self.prediction == "karras":
+        if self.prediction == "edm":
             mean, std = self._moments(x_t, moments)
             variance = alpha**2 * std**2 + sigma**2
             skip = alpha * std**2 / variance
@@ -89,7 +114,7 @@ class GaussianProcess:
     def target(self, x0: Tensor, x_t: Tensor, t: Tensor, noise: Tensor, moments: Moments | None = None) -> Tensor:
         """The regression target whose plain mean square is the training loss."""
         alpha, sigma = self.rates(t, x0)
-        if self.prediction == "karras":
+        if self.prediction == "edm":
             mean, std = self._moments(x0, moments)
             variance = alpha**2 * std**2 + sigma**2
             skip = alpha * std**2 / variance

@@ -1,4 +1,4 @@
-"""First and second moments of the data, by which network inputs and outputs are scaled (Karras et al. 2022)."""
+"""Moments of the data that scale network inputs and outputs (Karras et al. 2022)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How wrong a denoiser is at each noise level: what few-step chains must add to the posterior variance."""
+"""Residual error of a denoiser by noise level: the variance that few-step chains add (Bao et al. 2022)."""
 
 from __future__ import annotations
 

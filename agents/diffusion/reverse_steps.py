@@ -1,4 +1,4 @@
-"""The distribution of one reverse step: what a chain draws from, and what a policy gradient differentiates."""
+"""Distribution of one reverse step: sampling and log-probabilities."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class ReverseStep(Protocol):
 
     @property
     def entries(self) -> int:
-        """How many random variables a scene's step has."""
+        """Number of random variables of the step of each scene."""
         ...
 
     def from_noise(self, noise: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Noise schedules: how much signal is left at each of T timesteps."""
+"""Noise schedules: the share of signal at each of T timesteps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Explicit reverse steps: which timesteps a chain visits, and where each step lands."""
+"""Explicit reverse steps: pairs of timesteps (t, t_prev) of a chain."""
 
 from __future__ import annotations
 

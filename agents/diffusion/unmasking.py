@@ -1,4 +1,4 @@
-"""Which masked slots a step of an absorbing chain unmasks: as near to the expected number as can be.
+"""Unmasking of absorbing chains: as near to the expected number of slots per step as possible.
 
 Where every slot is unmasked by its own chance, slots that are unmasked in the same step do not know of each other's
 categories, and a scene of few steps gets one cup too many. The chance of each slot stays what the chain says it is;

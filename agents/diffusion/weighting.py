@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from agents.diffusion.gaussian import PREDICTIONS
+from agents.diffusion.gaussian import check_prediction
 from agents.diffusion.schedules import NoiseSchedule
 from scene_envs.errors import InvalidInputError, unknown_name
 
@@ -21,15 +21,14 @@ def check_weighting(kind: str, prediction: str) -> None:
 
     Raises:
         UnknownNameError: a name is not known.
-        InvalidInputError: ``"min_snr"`` with ``"karras"`` prediction, whose target already weighs the levels.
+        InvalidInputError: ``"min_snr"`` with ``"edm"`` prediction, whose target already weighs the levels.
     """
     if kind not in LOSS_WEIGHTINGS:
         raise unknown_name("loss weighting", kind, LOSS_WEIGHTINGS)
-    if prediction not in PREDICTIONS:
-        raise unknown_name("prediction", prediction, PREDICTIONS)
-    if kind == "min_snr" and prediction == "karras":
+    check_prediction(prediction)
+    if kind == "min_snr" and prediction == "edm":
         raise InvalidInputError(
-            "loss_weighting='min_snr' does not go with prediction='karras', whose target has unit variance at every "
+            "loss_weighting='min_snr' does not go with prediction='edm', whose target has unit variance at every "
             "level already; use loss_weighting='none', or prediction 'epsilon', 'v' or 'x0'"
         )
 
@@ -69,9 +68,9 @@ def loss_weights(
 def timestep_distribution(timesteps: str | None, prediction: str) -> str:
     """The distribution of training timesteps: the given one, or that which was published with ``prediction``.
 
-    >>> timestep_distribution(None, "epsilon"), timestep_distribution(None, "karras")
+    >>> timestep_distribution(None, "epsilon"), timestep_distribution(None, "edm")
     ('uniform', 'lognormal')
     >>> timestep_distribution("lognormal", "v")
     'lognormal'
     """
-    return timesteps or ("lognormal" if prediction == "karras" else "uniform")
+    return timesteps or ("lognormal" if prediction == "edm" else "uniform")

@@ -1,4 +1,4 @@
-"""How good scenes are, in numbers."""
+"""Evaluation: measures of scenes against real scenes."""
 
 from agents.evaluation.classifier import classifier_accuracy
 from agents.evaluation.frechet import frechet_scene_distance

@@ -1,4 +1,4 @@
-"""How well a small set transformer tells real scenes from samples, by their scene vectors."""
+"""Classifier two-sample test on scene vectors with a small set transformer."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def classifier_accuracy(
         fake: samples of the same scene type. Of the larger batch as many as the smaller has are drawn.
         seeds: repetitions with other splits and weights.
         seed: the first of them.
-        resolution: standard deviation of the noise (m, rad); (0, 0) judges at full precision.
+        resolution: standard deviation of the noise (m, rad); (0, 0) compares at full precision.
         config: sizes of the parts, and how the classifier is trained; it trains on at most 50,000 objects.
 
     Returns:

@@ -1,4 +1,4 @@
-"""One flat dict of numbers that says how good scenes are: for model cards, reports and the command line."""
+"""Evaluation of scenes as one flat dict of figures, for model cards, reports and the command line."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FLOOR_PREFIX = "floor_"
 
 
 class Sampler(Protocol):
-    """What :func:`evaluate` needs of a prior; ``agents.priors.base.ScenePrior`` has it."""
+    """Protocol of the priors that :func:`evaluate` takes, such as ``agents.priors.base.ScenePrior``."""
 
     @property
     def scene_type(self) -> SceneType: ...

@@ -1,4 +1,4 @@
-"""Measures by group: what one evaluation computes, each group on its own."""
+"""Groups of measures, each computed on its own."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Figures = dict[str, float]
 
 @dataclass(frozen=True)
 class EvaluationInputs:
-    """What an evaluation works on.
+    """Inputs of an evaluation.
 
     Attributes:
         samples: raw samples of a prior.

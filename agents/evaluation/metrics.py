@@ -1,4 +1,4 @@
-"""How close scenes are to a reference: counts, categories, heights, overlaps. Pure functions, no simulator."""
+"""Distances of scenes from a reference: counts, categories, heights, overlaps. Pure functions, no simulator."""
 
 from __future__ import annotations
 

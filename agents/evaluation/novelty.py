@@ -1,4 +1,4 @@
-"""Are samples copies: of each other, or of training scenes? Distances between scenes as sets of objects."""
+"""Novelty: duplicates and distances to training scenes, between scenes as sets of objects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Overlap and stability of scenes, from what the physics computed."""
+"""Overlap and stability figures of scenes, from results of the physics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Do samples hold what their prompts ask for: numbers of objects, names, relations."""
+"""Prompt-following: the share of samples that hold the numbers, names and relations of their prompts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _NAMES = {"count": "prompt_counts", "names": "prompt_names", "relations": "promp
 
 
 def prompt_following(batch: SceneBatch, prompts: Sequence[str]) -> dict[str, float]:
-    """How many scenes bear out their own prompt.
+    """Share of scenes that hold their own prompt.
 
     The paper's prompt-following accuracy: a prompt is followed when every claim in it is true of the scene; numbers
     are exact for what is named. Relations have the tolerances of the checker, see the page on prompts.
@@ -58,7 +58,7 @@ def prompt_following(batch: SceneBatch, prompts: Sequence[str]) -> dict[str, flo
 
 
 def prompt_chance(batch: SceneBatch, prompts: Sequence[str], seed: int = 0) -> dict[str, float]:
-    """What scenes score that know nothing of their prompts: each is checked against the prompt of another.
+    """Score by chance: each scene is checked against the prompt of another.
 
     Args:
         batch: B >= 2 real scenes.
@@ -99,6 +99,6 @@ def own_prompts(batch: SceneBatch, seed: int = 0) -> list[str]:
 
 
 def kind_of(prompt: PromptFacts) -> str:
-    """Which of :data:`~scene_envs.datasets.prompts.KINDS` a prompt is."""
+    """Kind of a prompt, one of :data:`~scene_envs.datasets.prompts.KINDS`."""
     first = prompt.claims[0]
     return "count" if isinstance(first, ObjectCount) else "names" if isinstance(first, NameCount) else "relations"

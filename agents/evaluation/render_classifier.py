@@ -1,4 +1,4 @@
-"""How well a small CNN tells real scenes from samples, by their semantic renders."""
+"""Classifier two-sample test on semantic renders with a small CNN."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures as a table for people: each beside its floor, with a line on how to read it."""
+"""Tables of figures with their floors and a line on how to read each."""
 
 from __future__ import annotations
 

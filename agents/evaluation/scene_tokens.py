@@ -1,4 +1,4 @@
-"""What learned measures read of a scene: one token per object, with its nearest neighbours."""
+"""Scene tokens, the input of learned measures: one token per object, with its nearest neighbours."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A frozen set encoder: scenes of any type to features for the Fréchet scene distance."""
+"""Frozen set encoder: features of scenes of any type for the Fréchet scene distance."""
 
 from __future__ import annotations
 

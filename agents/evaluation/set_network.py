@@ -85,7 +85,7 @@ class SetNetwork(nn.Module):
     """Objects of a scene to ``outputs`` numbers; permutation-invariant, and blind to padding.
 
     Set Transformer (Lee et al. 2019) with induced attention. Each token has already looked at its nearest neighbours
-    through a small MLP over pairs, which is where overlap and distance are judged. Pooled by attention, mean, maximum
+    through a small MLP over pairs, which is where overlap and distance show. Pooled by attention, mean, maximum
     and a scaled sum.
 
     >>> network = SetNetwork(SetNetworkConfig(features=5, categories=4, outputs=2)).eval()
@@ -118,7 +118,7 @@ class SetNetwork(nn.Module):
             nn.init.normal_(embedding.weight, std=0.3)
 
     def forward(self, own: Tensor, categories: Tensor, offsets: Tensor, neighbours: Tensor, present: Tensor) -> Tensor:
-        """Judge.
+        """Outputs per scene: logits, or features.
 
         Args:
             own: (B, N, F) numbers of each object.

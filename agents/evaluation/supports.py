@@ -1,4 +1,4 @@
-"""Where objects of each scene type may rest: data for the height errors."""
+"""Supports of each scene type: the heights on which objects may rest."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Support:
-    """Where objects of a scene type may rest: a surface fixed in the world, or the top of another object.
+    """Support of objects of a scene type: a surface fixed in the world, or the top of another object.
 
     Attributes:
         kind: the name the height error is reported under, such as ``"table"`` or ``"stack"``.

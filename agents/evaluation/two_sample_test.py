@@ -1,4 +1,4 @@
-"""The protocol of classifier measures: split, train with early stopping, score on held-out scenes, repeat."""
+"""Protocol of the classifier two-sample test: split, train with early stopping, score on held-out scenes, repeat."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SURE = 5e-3
 
 @dataclass(frozen=True)
 class Accuracy:
-    """How often a classifier tells real scenes from samples; 0.5 is chance, 1 is always.
+    """Accuracy of a classifier that tells real scenes from samples; 0.5 is chance, 1 is always right.
 
     Attributes:
         mean: over the seeds.
@@ -45,7 +45,7 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class ClassifierConfig:
-    """How a classifier is trained and tested.
+    """Settings of the training and test of a classifier.
 
     Attributes:
         train_fraction: share of the scenes of each class to train on.

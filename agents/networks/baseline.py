@@ -1,4 +1,4 @@
-"""What the networks that ours is compared with have in common: how slots, time and text enter, and how slots leave.
+"""The common part of the networks that ours is compared with: how slots, time and text enter, and how slots leave.
 
 Between the two stands a *trunk*, which is what tells the baselines apart: tokens (B, N, H), a time embedding (B, H) and
 text (B, L, H) with its mask (B, 1, 1, L), both None without text, to tokens (B, N, H).
@@ -14,8 +14,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from agents.networks.flux import timestep_embedding
-from agents.networks.mixed_flux_config import POSE
+from agents.networks.fourier_features import fourier_features
 from scene_envs.errors import InvalidInputError
+from scene_envs.scene import POSE_FEATURES
 
 _TIME_WIDTH = 256
 
@@ -42,6 +43,11 @@ class BaselineConfig:
                 raise InvalidInputError(f"{name}={getattr(self, name)} is not positive")
         if self.hidden % self.heads:
             raise InvalidInputError(f"hidden={self.hidden} is not a multiple of heads={self.heads}")
+
+    @property
+    def time_input(self) -> str:
+        """What is embedded as time, as of :class:`~agents.networks.MixedFluxConfig`."""
+        return "log_noise" if self.frequencies else "timestep"
 
 
 class Attention(nn.Module):
@@ -116,9 +122,7 @@ class _Baseline(nn.Module):
             return features
         if position is None or noise_level is None:
             raise InvalidInputError("a network with Fourier features needs position= and noise_level=")
-        angle = position[..., :3, None] * self.octaves  # (B, N, 3, F)
-        damping = torch.exp(-0.5 * (self.octaves * noise_level[..., None]) ** 2).unsqueeze(-2)  # (B, N, 1, F)
-        return torch.cat([features, (angle.sin() * damping).flatten(-2), (angle.cos() * damping).flatten(-2)], dim=-1)
+        return torch.cat([features, fourier_features(position, noise_level, self.octaves)], dim=-1)
 
 
 class ContinuousBaseline(_Baseline):
@@ -162,12 +166,12 @@ class MixedBaseline(_Baseline):
         super().__init__(config, trunk)
         hidden = config.hidden
         self.time_scale = time_scale
-        self.pose_in = mlp(POSE + 6 * config.frequencies, hidden, hidden)
+        self.pose_in = mlp(POSE_FEATURES + 6 * config.frequencies, hidden, hidden)
         self.category_in = nn.Embedding(categories + 1, hidden)
         self.given_in = nn.Embedding(4, hidden) if flags else None
         if self.given_in is not None:
             nn.init.zeros_(self.given_in.weight)
-        self.pose_out = head(hidden, POSE)
+        self.pose_out = head(hidden, POSE_FEATURES)
         self.logits_out = head(hidden, categories)
 
     def forward(

@@ -1,4 +1,4 @@
-"""At what distance two objects touch, and what follows for where each of them has to go.
+"""Pairwise contacts: distances at which two objects touch, and displacements along the gaps that are left.
 
 Objects exclude each other and stand on each other to within a fraction of a millimetre, and how far apart their centres
 then are is a matter of both categories and of the direction, hardly of anything else. A transformer that sees positions
@@ -10,10 +10,13 @@ move anything.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from agents.networks.flux_modules import FluxModule, FluxSizes, ModuleConfig, Scene
 
 CHANNELS = 4
 """Displacements that are offered for every slot."""
@@ -27,7 +30,21 @@ _TYPICAL = 0.1  # metres between the centres of objects that touch
 _LEAST_NOISE = 2e-4  # metres
 
 
-class Contacts(nn.Module):
+@dataclass(frozen=True)
+class ContactsConfig(ModuleConfig):
+    """Displacements along the gaps between objects; reads the features of pairs that relations offer."""
+
+    name = "contacts"
+    place = "output"
+    requires = ("relations",)
+    reads_geometry = True
+    reads_rotations = True
+
+    def build(self, core: FluxSizes) -> Contacts:
+        return Contacts(core.categories, core.pair_width, core.hidden, core.embedding)
+
+
+class Contacts(FluxModule):
     """Messages between slots about the gaps between them, and displacements along those.
 
     Permutation-equivariant. For slots i and j a network on features of the pair, the direction to each other as each
@@ -43,10 +60,11 @@ class Contacts(nn.Module):
         categories: K = C + 1; the mask token is one more.
         features: numbers per pair of slots, from :class:`~agents.networks.relations.Relations`.
         hidden: width of the messages.
+        embedding: width of what the gates of the displacements are made of.
         width: of the networks on pairs.
         kind: width of what stands for a category.
 
-    >>> contacts = Contacts(categories=3, features=40, hidden=16)
+    >>> contacts = Contacts(categories=3, features=40, hidden=16, embedding=16)
     >>> metres, rotation = torch.randn(2, 5, 3), torch.eye(3).expand(2, 5, 3, 3)
     >>> states, noise, features = torch.zeros(2, 5).long(), torch.full((2, 5, 3), 0.1), torch.zeros(2, 5, 5, 40)
     >>> messages, displacements = contacts(metres, rotation, states, noise, features)
@@ -54,7 +72,9 @@ class Contacts(nn.Module):
     (torch.Size([2, 5, 16]), torch.Size([2, 5, 4, 3]))
     """
 
-    def __init__(self, categories: int, features: int, hidden: int, width: int = 32, kind: int = 16) -> None:
+    def __init__(
+        self, categories: int, features: int, hidden: int, embedding: int, width: int = 32, kind: int = 16
+    ) -> None:
         super().__init__()
         self.kind = nn.Embedding(categories + 1, kind)
         self.seen = nn.Linear(features + 2 * _DIRECTIONS, width)
@@ -64,8 +84,24 @@ class Contacts(nn.Module):
         self.second = nn.Linear(width, width)
         self.amplitudes = nn.Linear(width, CHANNELS * 2 * _GAPS)
         self.out = nn.Linear(width, hidden)
-        nn.init.zeros_(self.out.weight)
-        nn.init.zeros_(self.out.bias)
+        self.gates = nn.Linear(embedding, 3 * CHANNELS)
+        for layer in (self.out, self.gates):
+            nn.init.zeros_(layer.weight)
+            nn.init.zeros_(layer.bias)
+
+    def messages(self, scene: Scene) -> Tensor | None:
+        if scene.metres is None or scene.metres_noise is None or scene.rotation is None or scene.pairs is None:
+            return None
+        metres, rotation = scene.metres, scene.rotation.to(scene.metres)
+        with torch.autocast(metres.device.type, enabled=False):  # half of a percent of a metre is too much
+            messages, moves = self(metres, rotation, scene.states, scene.metres_noise, scene.pairs, scene.slot_mask)
+        scene.kept[ContactsConfig.name] = moves
+        result: Tensor = messages
+        return result
+
+    def pose_output(self, scene: Scene, features: Tensor) -> Tensor | None:
+        moves = scene.kept.get(ContactsConfig.name)
+        return None if moves is None else F.pad(gated_displacement(moves, self.gates(features)), (0, 9))
 
     def forward(
         self,

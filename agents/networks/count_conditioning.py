@@ -1,20 +1,52 @@
-"""What a prompt asks of each kind of object, beside how many there are already."""
+"""Count conditioning: what a prompt still wants of each kind of object joins the logits of the categories."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from agents.networks.count_embedding import count_states
+from agents.networks.flux_modules import FluxModule, FluxSizes, ModuleConfig, Scene
 
 _DELTA = 0.02
 """Objects that may always still come, so that logarithms are finite."""
 
 
-class CountConditioning(nn.Module):
+@dataclass(frozen=True)
+class CountConditioningConfig(ModuleConfig):
+    """Numbers that a prompt asks for; the first text tokens are of the kinds of objects, and of all objects.
+
+    Attributes:
+        largest: the largest number that is told apart.
+        kinds: (K - 1,) the kind of each category, as prompts call it; empty where each is one of its own.
+    """
+
+    largest: int
+    kinds: tuple[int, ...] = ()
+
+    name = "count_conditioning"
+    place = "condition"
+    reads_text = True
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "kinds", tuple(self.kinds))  # a list, when it comes from JSON
+
+    def kinds_of(self, core: FluxSizes) -> tuple[int, ...]:
+        """The kind of each category."""
+        return self.kinds or tuple(range(core.categories - 1))
+
+    def text_tokens(self, core: FluxSizes) -> int:
+        return max(self.kinds_of(core)) + 2
+
+    def build(self, core: FluxSizes) -> CountConditioning:
+        return CountConditioning(self.kinds_of(core), core.text_width, core.hidden, self.largest)
+
+
+class CountConditioning(FluxModule):
     """Logits (B, K) that are added to those of every slot: how much of each category is still wanted.
 
     A prompt asks for numbers: of objects, of cups, of whatever is named. Attention takes averages and learns exact
@@ -63,6 +95,13 @@ class CountConditioning(nn.Module):
         """(B,) mean over kinds and objects of the cross-entropy of their numbers in scenes (B, N) of 0..K-1."""
         numbers = self._numbers(count_states(states, self.categories)).long().clamp(max=self.most)
         return F.cross_entropy(self.count_logits(asked).transpose(1, 2), numbers, reduction="none").mean(dim=1)
+
+    def logits(self, scene: Scene) -> Tensor | None:
+        asked = scene.own_text.get(CountConditioningConfig.name)
+        if asked is None:
+            return None
+        result: Tensor = self(scene.states, asked, scene.slot_mask)[:, None]
+        return result
 
     def forward(self, states: Tensor, asked: Tensor, slot_mask: Tensor | None = None) -> Tensor:
         """Logits (B, K).

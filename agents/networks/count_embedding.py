@@ -1,10 +1,28 @@
-"""What a scene holds as a whole, counted: attention takes averages, and a prompt asks for numbers."""
+"""Count embedding: slots seen of each category, and slots still masked, join the embedded time.
+
+Attention takes averages, and a prompt asks for numbers.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from agents.networks.flux_modules import FluxModule, FluxSizes, ModuleConfig, Scene
+
+
+@dataclass(frozen=True)
+class CountEmbeddingConfig(ModuleConfig):
+    """Counts of what is seen, read together with the mean text token where there is text."""
+
+    name = "count_embedding"
+    place = "condition"
+
+    def build(self, core: FluxSizes) -> CountEmbedding:
+        return CountEmbedding(core.categories, core.text_width, core.hidden)
 
 
 def count_states(states: Tensor, categories: int, slot_mask: Tensor | None = None) -> Tensor:
@@ -27,7 +45,7 @@ def count_states(states: Tensor, categories: int, slot_mask: Tensor | None = Non
     return torch.cat([counts[:, : categories - 1], counts[:, categories:]], dim=1)
 
 
-class CountEmbedding(nn.Module):
+class CountEmbedding(FluxModule):
     """Counts of what is seen, beside what the prompt says, to one vector (B, H) that joins the condition.
 
     Args:
@@ -46,6 +64,10 @@ class CountEmbedding(nn.Module):
         self.layers = nn.Sequential(
             nn.Linear(2 * categories + text_width, 2 * hidden), nn.SiLU(), nn.Linear(2 * hidden, hidden)
         )
+
+    def condition(self, scene: Scene) -> Tensor | None:
+        result: Tensor = self(scene.states, scene.summary, scene.slot_mask)
+        return result
 
     def forward(self, states: Tensor, text: Tensor | None = None, slot_mask: Tensor | None = None) -> Tensor:
         """As :func:`count_states`; ``text`` (B, W) is what the prompt says, zeros when None."""

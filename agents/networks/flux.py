@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from agents.networks.flux_blocks import SingleStreamBlock
+from agents.networks.fourier_features import fourier_features
 from scene_envs.errors import InvalidInputError
 
 
@@ -88,9 +89,7 @@ class FluxDenoiser(nn.Module):
         """
         features = x
         if self.config.frequencies:
-            angle = position[..., :3, None] * self.octaves  # (B, N, 3, F)
-            damping = torch.exp(-0.5 * (self.octaves * noise_level[:, None]) ** 2)[:, None, None]  # (B, 1, 1, F)
-            features = torch.cat([x, (angle.sin() * damping).flatten(-2), (angle.cos() * damping).flatten(-2)], dim=-1)
+            features = torch.cat([x, fourier_features(position, noise_level[:, None], self.octaves)], dim=-1)
         condition = self.time_in(timestep_embedding(250.0 * noise_level.log(), 128))
         tokens = self.scene_in(features)
         for block in self.blocks:

@@ -14,10 +14,10 @@ from agents.diffusion.gaussian import Moments
 from agents.diffusion.reverse_steps import state_of
 from agents.networks.bert import BertEncoder
 from agents.networks.denoiser import autocast
-from agents.networks.mixed_flux_config import POSE
 from agents.networks.packing import run_packed, take_slots
 from agents.networks.text import Text, TextEncoder
 from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.scene import POSE_FEATURES
 
 EMPTY_SLOTS = ("attended", "dropped")
 """What a network does with slots that are known to be empty."""
@@ -46,9 +46,10 @@ class Given:
 
     def entries(self) -> Tensor:
         """(B, N, D) bool."""
-        categories = self.x.shape[-1] - POSE
+        categories = self.x.shape[-1] - POSE_FEATURES
         return torch.cat(
-            [self.pose[..., None].expand(-1, -1, POSE), self.category[..., None].expand(-1, -1, categories)], dim=-1
+            [self.pose[..., None].expand(-1, -1, POSE_FEATURES), self.category[..., None].expand(-1, -1, categories)],
+            dim=-1,
         )
 
     def write(self, x: Tensor) -> Tensor:
@@ -87,6 +88,7 @@ class MixedDenoiser(nn.Module):
         self.register_buffer("_mean", mean, persistent=False)
         self.register_buffer("_std", std, persistent=False)
         self.network = network
+        self.reads_log_noise = getattr(network.config, "time_input", "timestep") == "log_noise"
         self.precision = torch.float32
         self.text_encoder = text_encoder
         self.poses = poses
@@ -112,7 +114,7 @@ class MixedDenoiser(nn.Module):
             given: which entries carry no noise.
             text: (B, L, W) tokens and (B, L) their mask.
         """
-        pose, states = x_t[..., :POSE], state_of(x_t[..., POSE:])
+        pose, states = x_t[..., :POSE_FEATURES], state_of(x_t[..., POSE_FEATURES:])
         alpha, _ = self.poses.rates(t, pose)
         ratio = (self.poses.sigma[t.cpu()] / self.poses.alpha[t.cpu()]).to(x_t.device)
         level = ratio[:, None].expand(pose.shape[:2])
@@ -123,8 +125,7 @@ class MixedDenoiser(nn.Module):
             scaled = torch.where(exact, self.poses.network_input(pose, torch.zeros_like(t)), scaled)
             position = torch.where(exact, pose, position)
             level = torch.where(given.pose, torch.zeros_like(level), level)
-        octaves: int = self.network.config.frequencies  # type: ignore[union-attr, assignment]
-        time = 250.0 * ratio.log() if octaves else (t - 1).to(pose.dtype)
+        time = 250.0 * ratio.log() if self.reads_log_noise else (t - 1).to(pose.dtype)
         inputs = [scaled, states, position, level, *([] if given is None else [given.flags()])]
         if self.drops_empty:
             output, logits = self._on_present(inputs, time, text)
@@ -161,7 +162,7 @@ class MixedDenoiser(nn.Module):
             attended = mask | ~mask.any(dim=1, keepdim=True)  # a scene of filling alone attends to it, for no use
             return self._run([take_slots(x, rows, index) for x in inputs], time[rows], words, attended)
 
-        return run_packed(present, run, (POSE, self.categories.categories))
+        return run_packed(present, run, (POSE_FEATURES, self.categories.categories))
 
     def _certain(self, states: Tensor) -> Tensor:
         """(B, N, K) logits of categories that are what they are seen to be."""
@@ -173,5 +174,5 @@ class MixedDenoiser(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """The clean pose (B, N, 12), normalised, and the logits of the clean category (B, N, K)."""
         output, logits = self.output(x_t, t, given, text)
-        moments = self.moments(state_of(x_t[..., POSE:]), t)
-        return self.poses.x0_from_output(x_t[..., :POSE], t, output, moments), logits
+        moments = self.moments(state_of(x_t[..., POSE_FEATURES:]), t)
+        return self.poses.x0_from_output(x_t[..., :POSE_FEATURES], t, output, moments), logits

@@ -1,4 +1,4 @@
-"""Leaving slots out of a network's batch: what is known to be empty need not be computed."""
+"""Packing of scenes: slots that are known to be empty leave the batch of a network."""
 
 from __future__ import annotations
 

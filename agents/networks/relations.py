@@ -1,4 +1,4 @@
-"""What slots see of where the others stand: biases of attention, and messages that attention gathers.
+"""Relations of pairs: biases of attention by where other slots stand, and features that attention gathers.
 
 A transformer that sees positions slot by slot has to find distances by itself. Here they are features of pairs. They
 bias the attention logits, and the attention weights that gather values gather them as well, so that a head learns at
@@ -8,10 +8,13 @@ structure module of AlphaFold, Jumper et al. 2021).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from agents.networks.flux_modules import FluxModule, FluxSizes, ModuleConfig, Scene
 from scene_envs.errors import unknown_name
 
 _SCALES, _DIRECTED = 8, 8
@@ -19,6 +22,32 @@ FEATURES = 2 * _SCALES + 3 * _DIRECTED
 """Numbers per pair of slots."""
 BLURS = ("axis", "largest")
 """Whose noise blurs the features of an axis."""
+
+
+@dataclass(frozen=True)
+class RelationsConfig(ModuleConfig):
+    """Attention between slots that sees where the others stand.
+
+    Attributes:
+        blur: the noise that blurs features of an axis, one of :data:`BLURS`; see :class:`Relations`.
+    """
+
+    blur: str = "axis"
+
+    name = "relations"
+    place = "attention"
+    reads_geometry = True
+
+    def __post_init__(self) -> None:
+        if self.blur not in BLURS:
+            raise unknown_name("blur", self.blur, BLURS)
+
+    @property
+    def pair_width(self) -> int:
+        return FEATURES
+
+    def build(self, core: FluxSizes) -> Relations:
+        return Relations(core.blocks, core.heads, core.unit, blur=self.blur)
 
 
 def pair_features(metres: Tensor, noise: Tensor, scales: Tensor) -> Tensor:
@@ -46,7 +75,7 @@ def pair_features(metres: Tensor, noise: Tensor, scales: Tensor) -> Tensor:
     return torch.cat([*gaussians, level, direction], dim=-1)
 
 
-class Relations(nn.Module):
+class Relations(FluxModule):
     """Features of pairs of slots, and the biases that every attention block makes of them.
 
     Permutation-equivariant. Positions come in normalised units; features are of metres.
@@ -81,6 +110,12 @@ class Relations(nn.Module):
         self.out = nn.Linear(width, blocks * heads)
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
+
+    def relations(self, scene: Scene) -> tuple[Tensor, Tensor] | None:
+        if scene.position is None or scene.noise_level is None:
+            return None
+        biases, features = self(scene.position[..., :3], scene.noise_level)
+        return biases, features
 
     def forward(self, position: Tensor, noise_level: Tensor) -> tuple[Tensor, Tensor]:
         """Biases (blocks, B, heads, N, N) and features (B, N, N, :data:`FEATURES`).

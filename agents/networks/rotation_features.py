@@ -1,4 +1,4 @@
-"""What noisy rotation matrices say of themselves, in units of the noise on them.
+"""Rotation features: how far noisy matrices are off SO(3), and off upright, in units of the noise on them.
 
 A denoiser of nine numbers has to find out that they are those of a rotation, and that most things stand upright. Both
 are differences as small as the noise, which a network that sees the numbers alone learns last: what lies flat in one
@@ -7,9 +7,13 @@ place and leans in another then lies flat to ten degrees only.
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+from dataclasses import dataclass
 
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from agents.networks.flux_modules import FluxModule, FluxSizes, ModuleConfig, Scene
 from scene_envs.rotations import project_to_so3
 
 ROTATION_FEATURES = 9 + 4
@@ -19,6 +23,45 @@ _TILTS = (6, 7, 2, 5)
 _LEAST_NOISE = 1e-4
 _REACH = 4.0
 """Standard deviations at which the distance from upright saturates."""
+
+
+@dataclass(frozen=True)
+class RotationFeaturesConfig(ModuleConfig):
+    """Features of rotations, read beside each pose and added, through gates, to the output of rotations."""
+
+    name = "rotation_features"
+    place = "output"
+    reads_geometry = True
+    reads_rotations = True
+
+    @property
+    def pose_width(self) -> int:
+        return ROTATION_FEATURES
+
+    def build(self, core: FluxSizes) -> RotationFeatures:
+        return RotationFeatures(core.embedding)
+
+
+class RotationFeatures(FluxModule):
+    """Features (B, N, :data:`ROTATION_FEATURES`) of rotations, and gates on them that start at zero."""
+
+    def __init__(self, embedding: int) -> None:
+        super().__init__()
+        self.gates = nn.Linear(embedding, ROTATION_FEATURES)
+        nn.init.zeros_(self.gates.weight)
+        nn.init.zeros_(self.gates.bias)
+
+    def pose_features(self, scene: Scene) -> Tensor | None:
+        if scene.noisy_rotation is None or scene.rotation is None or scene.rotation_noise is None:
+            return None
+        scene.kept[RotationFeaturesConfig.name] = rotation_features(
+            scene.noisy_rotation, scene.rotation, scene.rotation_noise
+        )
+        return scene.kept[RotationFeaturesConfig.name]
+
+    def pose_output(self, scene: Scene, features: Tensor) -> Tensor | None:
+        turns = scene.kept.get(RotationFeaturesConfig.name)
+        return None if turns is None else F.pad(gated_rotation(turns, self.gates(features)), (3, 0))
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""Which text encoder a mixed prior reads prompts with: by configuration, by the entry of a file, by a run's key."""
+"""Choice of the text encoder of a mixed prior: by configuration, by the entry of a file, by the key of a run."""
 
 from __future__ import annotations
 

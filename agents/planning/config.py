@@ -9,11 +9,10 @@ from typing import Any, ClassVar, TypeVar
 from agents.configuration.fields import composed, named, nested
 from agents.planning.planners import UCTPlanner
 from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.plugins import plugin_entry_points
+from scene_envs.plugins import load_plugins
 
 ENTRY_POINT_GROUP = "scene_envs.planners"
-"""Packages offer planners under this group: the entry's name is the planner's, its value a class or a module that
-:func:`register_planner` decorates."""
+"""Entry points of installed packages: modules that call :func:`register_planner` when they are imported."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +74,8 @@ def register_planner(name: str) -> Callable[[Settings], Settings]:
 
 def list_planners() -> list[str]:
     """Names of all planners, those of installed packages included, sorted."""
-    return sorted({*_PLANNERS, *plugin_entry_points(ENTRY_POINT_GROUP)})
+    load_plugins(ENTRY_POINT_GROUP)
+    return sorted(_PLANNERS)
 
 
 def planner_settings(name: str) -> type[PlannerSettings]:
@@ -84,11 +84,8 @@ def planner_settings(name: str) -> type[PlannerSettings]:
     Raises:
         UnknownNameError: no planner has that name; the nearest known one is offered.
     """
-    points = plugin_entry_points(ENTRY_POINT_GROUP)
-    if name not in _PLANNERS and name in points:
-        found = points[name].load()
-        if isinstance(found, type):
-            _PLANNERS.setdefault(name, found)
+    if name not in _PLANNERS:
+        load_plugins(ENTRY_POINT_GROUP)
     if name not in _PLANNERS:
         raise unknown_name("planner", str(name), list_planners())
     return _PLANNERS[name]

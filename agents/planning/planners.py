@@ -1,4 +1,4 @@
-"""Planners over the public methods of a search environment, counted in expansions."""
+"""Planners over the public methods of a search environment, with a budget in expansions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _ROOT: tuple[int, ...] = ()
 
 
 class Searchable(Protocol):
-    """What a planner needs; ``scene_envs.envs.SearchEnv`` has it, and so may any deterministic tree.
+    """Protocol of the trees that a planner searches, such as ``scene_envs.envs.SearchEnv``.
 
     States are immutable. A state with an attribute ``valid`` that is False could not be scored: it is counted and
     left out of the tree.
@@ -43,7 +43,7 @@ class Searchable(Protocol):
 
 @dataclass
 class PlanResult:
-    """What a planner found.
+    """Result of a planner.
 
     Attributes:
         best_state: the state with the highest objective.

@@ -1,4 +1,4 @@
-"""Pictures of a search: the curve against NFE, and a scene with what the next step would regenerate."""
+"""Pictures of a search: the curve against NFE, and a scene with the mask of the next step."""
 
 from __future__ import annotations
 

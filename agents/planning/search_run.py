@@ -1,4 +1,4 @@
-"""One search run: a tree of inpaintings against best-of-N at equal NFE, and its files."""
+"""Search run: a tree of inpaintings and best-of-N at equal NFE, with output files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Progress = Callable[[str, int, int, float], None]
 
 @dataclass(frozen=True)
 class SearchOutcome:
-    """What a search run found.
+    """Result of a search run.
 
     Attributes:
         search: the tree search.

@@ -1,4 +1,4 @@
-"""The search tree: UCB1 selection, virtual visits for batched expansion, closed branches. No scenes, no networks."""
+"""Search tree: UCB1 selection, virtual visits for batched expansion, closed branches."""
 
 from __future__ import annotations
 

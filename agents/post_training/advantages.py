@@ -1,4 +1,4 @@
-"""From rewards to advantages: one baseline and one scale for the whole batch, over all workers."""
+"""Advantages: rewards with one baseline and one scale for the whole batch, over all workers."""
 
 from __future__ import annotations
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, TypeVar
 
+from agents.configuration.checks import at_least, one_of, positive
 from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.plugins import plugin_entry_points
+from scene_envs.plugins import load_plugins
 
 ENTRY_POINT_GROUP = "scene_envs.algorithms"
-"""Packages offer algorithms under this group: the entry's name is the algorithm's, its value a class or a module that
-:func:`register_algorithm` decorates."""
+"""Entry points of installed packages: modules that call :func:`register_algorithm` when they are imported."""
 CREDITS = ("auto", "scene", "object")
 BASELINES = ("leave_one_out", "mean")
 
@@ -32,7 +32,7 @@ class AlgorithmSettings:
     scenes_per_prompt: int = 8
 
     def __post_init__(self) -> None:
-        at_least(self, "scenes_per_prompt", 2)
+        at_least(self, 2, "scenes_per_prompt")
 
     @property
     def optimiser_steps(self) -> int:
@@ -68,7 +68,7 @@ class DDPOSFSettings(AlgorithmSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(self, "gradient_steps", 1)
+        at_least(self, 1, "gradient_steps")
         positive(self, "advantage_clip", "min_std")
         if not 0 <= self.skip_first < 1:
             raise InvalidInputError(f"skip_first={self.skip_first} must lie in [0, 1)")
@@ -91,7 +91,7 @@ class DDPOISSettings(DDPOSFSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(self, "updates", 1)
+        at_least(self, 1, "updates")
         if not 0 < self.clip_epsilon < 1:
             raise InvalidInputError(f"clip_epsilon={self.clip_epsilon} must lie between 0 and 1")
 
@@ -141,7 +141,8 @@ def register_algorithm(
 
 def list_algorithms() -> list[str]:
     """Names of all algorithms, those of installed packages included, sorted."""
-    return sorted({*_ENTRIES, *plugin_entry_points(ENTRY_POINT_GROUP)})
+    load_plugins(ENTRY_POINT_GROUP)
+    return sorted(_ENTRIES)
 
 
 def algorithm_settings(name: str) -> type[AlgorithmSettings]:
@@ -163,30 +164,8 @@ def make_algorithm(settings: AlgorithmSettings, policy: Any, stds: Any) -> Any:
 
 
 def _entry(name: str) -> _Entry:
-    points = plugin_entry_points(ENTRY_POINT_GROUP)
-    if name not in _ENTRIES and name in points:
-        found = points[name].load()
-        if isinstance(found, type) and name not in _ENTRIES:
-            _ENTRIES[name] = _Entry(getattr(found, "Settings", DDPOSFSettings), found)
+    if name not in _ENTRIES:
+        load_plugins(ENTRY_POINT_GROUP)
     if name not in _ENTRIES:
         raise unknown_name("algorithm", str(name), list_algorithms())
     return _ENTRIES[name]
-
-
-def at_least(settings: Any, name: str, low: int) -> None:
-    """Refuse a number below ``low``."""
-    if getattr(settings, name) < low:
-        raise InvalidInputError(f"{name}={getattr(settings, name)} must be at least {low}")
-
-
-def positive(settings: Any, *names: str) -> None:
-    """Refuse numbers that are not positive."""
-    for name in names:
-        if not getattr(settings, name) > 0:
-            raise InvalidInputError(f"{name}={getattr(settings, name)} must be positive")
-
-
-def one_of(settings: Any, name: str, known: tuple[str, ...]) -> None:
-    """Refuse a word that is not known."""
-    if getattr(settings, name) not in known:
-        raise InvalidInputError(f"{name}={getattr(settings, name)!r} is not known; use one of {', '.join(known)}")

@@ -1,4 +1,4 @@
-"""Before and after: the same measures on fresh samples of two priors, their pictures, and the page about them."""
+"""Comparison of a prior before and after post-training: measures on fresh samples, pictures, report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Post-training with everything around it: the run, the same measures before and after, the report."""
+"""Post-training run with measures before and after, and a report."""
 
 from __future__ import annotations
 

@@ -7,20 +7,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
+from agents.configuration.checks import at_least, one_of, positive
 from agents.configuration.fields import composed, named, nested
+from agents.configuration.settings import LoggerSettings, OptimizerSettings
 from agents.configuration.tree import plain_tree
-from agents.post_training.algorithms import (
-    AlgorithmSettings,
-    DDPOSFSettings,
-    algorithm_settings,
-    at_least,
-    one_of,
-    positive,
-)
+from agents.post_training.algorithms import AlgorithmSettings, DDPOSFSettings, algorithm_settings
+from scene_envs.envs.settings import PROMPT_SOURCES
 from scene_envs.errors import InvalidInputError
 
-PROMPT_SOURCES = ("data", "grammar")
-"""Words that stand for prompts of real scenes and of grammar scenes."""
 RESUMABLE = ("recipe", "iterations", "output", "workers", "logger")
 """Fields that may change between a run and its continuation."""
 
@@ -32,32 +26,15 @@ _LOGGER = ("progress", "checkpoint_every", "report_scenes")
 
 
 @dataclass
-class OptimizerSettings:
-    """The optimiser of a post-training run.
+class PostTrainOptimizerSettings(OptimizerSettings):
+    """The optimiser of a post-training run; its steps are updates.
 
     Attributes:
-        name: ``adamw``.
-        lr: learning rate.
-        warmup: updates over which the learning rate rises linearly.
-        weight_decay: decoupled weight decay.
-        clip: largest norm of the summed gradient.
-        ema: decay of the weight average that is evaluated and saved; 0 takes the weights themselves.
         chunk: scenes per forward and backward pass; null takes the whole batch at once.
     """
 
-    name: str = "adamw"
     lr: float = 5e-5
-    warmup: int = 0
-    weight_decay: float = 0.0
-    clip: float = 1.0
-    ema: float = 0.0
     chunk: int | None = None
-
-    def __post_init__(self) -> None:
-        one_of(self, "name", ("adamw",))
-        positive(self, "lr", "clip")
-        if not 0 <= self.ema < 1:
-            raise InvalidInputError(f"ema={self.ema} must lie in [0, 1)")
 
 
 @dataclass
@@ -77,7 +54,7 @@ class RegularisationSettings:
     bank_size: int = 4096
 
     def __post_init__(self) -> None:
-        at_least(self, "batch_size", 1)
+        at_least(self, 1, "batch_size")
         if self.weight < 0:
             raise InvalidInputError(f"regularisation.weight={self.weight} must not be negative")
 
@@ -101,30 +78,27 @@ class GuardSettings:
     max_invalid: int = 3
 
     def __post_init__(self) -> None:
-        for name in ("every", "scenes", "max_invalid"):
-            at_least(self, name, 1)
+        at_least(self, 1, "every", "scenes", "max_invalid")
         positive(self, "limit")
         one_of(self, "action", ("report", "stop"))
 
 
 @dataclass
-class LoggerSettings:
+class PostTrainLoggerSettings(LoggerSettings):
     """What a post-training run shows and keeps.
 
     Attributes:
         progress: ``bar``, ``lines`` or ``none``.
-        checkpoint_every: iterations between resumable checkpoints.
         report_scenes: fresh samples of the prior before and after that the command measures and pictures in
             report.html; 0 for no report.
     """
 
     progress: str = "bar"
-    checkpoint_every: int = 10
     report_scenes: int = 256
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         one_of(self, "progress", ("bar", "lines", "none"))
-        at_least(self, "checkpoint_every", 1)
         if self.report_scenes < 0:
             raise InvalidInputError(f"report_scenes={self.report_scenes} must not be negative; 0 writes no report")
 
@@ -198,15 +172,14 @@ class PostTrainConfig:
     algorithm: AlgorithmSettings = nested(
         DDPOSFSettings, folder="algorithm", option="ddpo_sf", kinds=algorithm_settings
     )
-    optimizer: OptimizerSettings = nested(OptimizerSettings, folder="optimizer", option="adamw")
+    optimizer: PostTrainOptimizerSettings = nested(PostTrainOptimizerSettings, folder="optimizer", option="adamw")
     regularisation: RegularisationSettings = nested(RegularisationSettings)
     guard: GuardSettings = nested(GuardSettings)
-    logger: LoggerSettings = nested(LoggerSettings, folder="logger", option="bar")
+    logger: PostTrainLoggerSettings = nested(PostTrainLoggerSettings, folder="logger", option="csv")
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "num_steps"):
-            at_least(self, name, 1)
-        at_least(self, "batch_size", 2)
+        at_least(self, 1, "iterations", "num_steps")
+        at_least(self, 2, "batch_size")
         self.prompt = list(self.prompt) if isinstance(self.prompt, tuple) else self.prompt
         check_prompt(self.prompt, self.guidance)
         if self.regularisation.bank_size < self.guard.scenes + 1:

@@ -1,4 +1,4 @@
-"""The curve of a run as a picture."""
+"""Picture of the reward and guard curves of a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The demonstration: steer the shipped Dimsum prior toward clutter, and show what it cost and gained."""
+"""Demonstration: post-training of the shipped Dimsum prior toward clutter, with a report."""
 
 from __future__ import annotations
 

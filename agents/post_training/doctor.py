@@ -1,4 +1,4 @@
-"""Before a run: is there something to learn, can it be learned, and do the two gradients speak equally loud?"""
+"""Doctor: checks of a post-training run before it starts, on one batch."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class StepRow:
 
 @dataclass(frozen=True)
 class DoctorReport:
-    """What the doctor found.
+    """Findings of the doctor.
 
     Attributes:
         log_ratio: largest |log p_now - log p_sampling|; exactly 0 when sampler and loss agree.

@@ -1,4 +1,4 @@
-"""The two gradients of an update, accumulated into ``.grad`` and measured apart."""
+"""Policy and regularisation gradients of an update, accumulated into ``.grad`` and measured separately."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from scene_envs.errors import InvalidInputError
 
 @dataclass(frozen=True)
 class PolicyGradient:
-    """What accumulating the policy gradient found.
+    """Statistics of an accumulated policy gradient.
 
     Attributes:
         loss: value of the objective, summed over the steps taken.

@@ -1,4 +1,4 @@
-"""The guard: has post-training cost the prior what it knew of real scenes?"""
+"""Guard against over-optimisation: pretraining loss and realism on held-out real scenes."""
 
 from __future__ import annotations
 

@@ -1,9 +1,10 @@
-"""What learns: the prior as a policy, its environment, its two gradients, its optimiser."""
+"""Learner: the prior as a policy, its environment, its two gradients and its optimiser."""
 
 from __future__ import annotations
 
 import math
 from copy import deepcopy
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -15,9 +16,11 @@ from agents.post_training.gradients import add_regularisation_gradient
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.prompts import PromptDeck
 from agents.post_training.rollouts import Rollout, collect, stream_seed
+from agents.post_training.run_files import CHECKPOINT_NAME
 from agents.post_training.scene_bank import SceneBank
 from agents.priors.base import ScenePrior
 from agents.priors.prompt_validation import no_text
+from agents.utils.checkpoints import check_tensors
 from agents.utils.weight_average import AveragedWeights, WeightAverage
 from scene_envs.envs import DenoisingTorchRLEnv
 
@@ -150,7 +153,12 @@ class Learner:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Inverse of :meth:`state`."""
+        """Inverse of :meth:`state`.
+
+        Raises:
+            InvalidInputError: the weights are of another network, such as an earlier version's.
+        """
+        check_tensors(self.prior, state["prior"], Path(self.config.output) / CHECKPOINT_NAME)
         self.prior.load_state_dict(state["prior"])
         self.optimizer.load_state_dict(state["optimizer"])
         if self.average is not None:

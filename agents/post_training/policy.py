@@ -1,4 +1,4 @@
-"""A prior as a torchrl policy over the denoising MDP: it draws x_{t-1} and knows its log-probability."""
+"""Prior as a torchrl policy over the denoising MDP: samples x_{t-1} and gives its log-probability."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class DenoisingPolicy(TensorDictModuleBase):
 
     @torch.no_grad()
     def read(self, prompt: Tensor) -> Text:
-        """What the network attends to, from the token indices (B, L) that an environment shows.
+        """Text that the network attends to, from the token indices (B, L) of an observation.
 
         Without gradients: post-training leaves the text encoder as it is.
         """
@@ -106,7 +106,7 @@ class DenoisingPolicy(TensorDictModuleBase):
         return self.distribution(x_t.detach(), step, text).log_prob(action.detach())
 
     def random_entries(self, slots: int) -> int:
-        """How many random variables a step of the chain draws for a scene; the other entries are known."""
+        """Number of random variables that a step of the chain draws for a scene; the other entries are known."""
         return self._steps(slots)[0].entries
 
     def stds(self, slots: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""The prompts of a post-training run: which there are, and which scene of a batch follows which."""
+"""Prompts of a post-training run and their assignment to the scenes of a batch."""
 
 from __future__ import annotations
 

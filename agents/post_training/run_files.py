@@ -1,4 +1,4 @@
-"""What a run leaves on disk: configuration, log, metrics; each file whole or not at all."""
+"""Files of a run: configuration, log and metrics, each written atomically."""
 
 from __future__ import annotations
 

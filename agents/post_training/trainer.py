@@ -1,4 +1,4 @@
-"""The post-training loop: sample scenes, score them, follow the score function, stay a prior."""
+"""Post-training loop: sample scenes, score them, update the prior, check the guard."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from agents.post_training.config import PostTrainConfig
 from agents.post_training.curves import draw_curve
 from agents.post_training.guard import Guard, realism
 from agents.post_training.learner import Learner, NonFiniteGradient, is_finite
-from agents.post_training.progress import Progress
+from agents.post_training.progress import run_progress
 from agents.post_training.prompts import PROMPTS_NAME, PromptSets, prompts_beside, save_prompts
 from agents.post_training.rollouts import Rollout, stream_seed
 from agents.post_training.run_files import (
@@ -28,6 +28,7 @@ from agents.post_training.scene_bank import SceneBank, real_scenes
 from agents.priors.base import ScenePrior
 from agents.priors.prompt_validation import check_object_count
 from agents.utils.checkpoints import save_checkpoint
+from agents.utils.loggers import make_logger
 from rewards import reward_name
 from scene_envs.errors import TrainingError
 from scene_envs.scene import SceneBatch
@@ -67,7 +68,7 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> P
     >>> with TemporaryDirectory() as output:
     ...     config = PostTrainConfig(output=output, iterations=2, batch_size=4, num_steps=4,
     ...         algorithm={"gradient_steps": 2}, regularisation={"bank_size": 20, "batch_size": 4},
-    ...         guard={"scenes": 8}, logger="silent")
+    ...         guard={"scenes": 8}, logger={"progress": "none"})
     ...     result = post_train(config, prior=tiny_prior())
     >>> len(result.history), result.history[0]["log_ratio"]
     (2, 0.0)
@@ -99,10 +100,12 @@ class PostTrainer:
         self.invalid_streak = 0
         self.seconds = 0.0
         self.history: list[dict[str, float]] = []
+        self.logger = make_logger(config.logger.name, self.directory)
 
     def close(self) -> None:
-        """Stop physics workers, if any."""
+        """Stop physics workers, if any, and close the logger."""
         self.learner.close()
+        self.logger.close()
 
     # -- the loop -------------------------------------------------------------------------------
 
@@ -119,7 +122,7 @@ class PostTrainer:
             self._save_prior()  # until something better: the base
         title = f"post-train {self.prior.scene_type.name}"
         started = time.perf_counter() - self.seconds
-        with Progress(title, config.iterations, config.logger.progress, self.iteration) as progress:
+        with run_progress(title, config.iterations, config.logger.progress, self.iteration) as report:
             while self.iteration < config.iterations and not self._stopped:
                 rollout, row = self.step()
                 self.seconds = time.perf_counter() - started
@@ -130,7 +133,8 @@ class PostTrainer:
                 if self.iteration % config.logger.checkpoint_every == 0 or last or self._stopped:
                     self.save()
                 write_log(self.directory, self.history)
-                progress.update(self.iteration, row["reward"], self.guard.ratio)
+                self.logger.log(self.history[-1], self.iteration)
+                report(self.iteration, row["reward"], self.guard.ratio)
         return self._finish()
 
     def prepare(self, *, reuse_scenes: bool = False) -> None:

@@ -6,7 +6,36 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from agents.configuration.checks import at_least, one_of, shares
 from agents.configuration.fields import composed, named, nested
+from agents.configuration.settings import LoggerSettings, OptimizerSettings
+
+
+@dataclass
+class ModuleSettings:
+    """What is added to the core of the mixed flux network; other networks do not read it.
+
+    Attributes:
+        given_flags: the network is told which poses and categories are observed, for inpainting.
+        pooled_text: the mean of the text tokens also modulates every block.
+        count_embedding: the network is told how many slots it sees of each category, and how many are masked.
+        relations: slots see where others stand, blurred along x, y and z by the noise of the ``axis`` itself, or of the
+            one where it is ``largest``; ``none`` for plain attention.
+        rotation_features: the network is told how far each rotation is off SO(3), and off upright, in units of the
+            noise.
+        contacts: the network learns at what distance two objects touch, and is told the gap that is left in units of
+            the noise; only with relations.
+    """
+
+    given_flags: bool = True
+    pooled_text: bool = True
+    count_embedding: bool = True
+    relations: str = "axis"
+    rotation_features: bool = True
+    contacts: bool = True
+
+    def __post_init__(self) -> None:
+        one_of(self, "relations", ("axis", "largest", "none"))
 
 
 @dataclass
@@ -14,38 +43,35 @@ class NetworkSettings:
     """The network of a fresh prior.
 
     Attributes:
-        name: ``flux`` (ours), ``midiffusion``, ``diffuscene``, a registered one, or ``paper`` for the paper's flux
-            network of 88.3 M parameters, whatever hidden, depth, heads, attention and frequencies say.
+        name: ``flux`` (ours), ``midiffusion``, ``diffuscene``, or a registered one.
         hidden: width of the network.
-        depth: its blocks.
+        depth: its blocks; single-stream ones where there are both.
         heads: attention heads.
-        attention: of the mixed flux network: ``plain``, or ``relative``, which sees where other objects stand.
-        relation_blur: with attention=relative: the noise that blurs what is seen along x, y and z, of the ``axis``
-            itself, or of the one where it is ``largest``.
         frequencies: octaves of Fourier features of each translation (flux only); 0 for none.
-        rotation_features: the mixed flux network is told how far each rotation is off SO(3), and off upright, in units
-            of the noise.
-        contacts: with attention=relative: the network learns at what distance two objects touch, and is told the gap
-            that is left in units of the noise.
+        double_blocks: double-stream blocks of the mixed flux network with text; null for a third of depth.
+        embedding: width of the embedding of a slot (mixed flux only); null for hidden.
+        pose_head: hidden width of the pose output (mixed flux only).
+        time_scale: what the time is multiplied by before it is embedded (mixed flux only).
         text_reach: of the mixed flux network: text meets slots in its ``double``-stream blocks alone, which is quicker,
             or in ``all``, as in the paper's.
-        pooled_text: whether the mean of the text tokens also modulates every block of the mixed flux network.
-        count_embedding: whether the mixed flux network is told how many slots it sees of each category, and how many
-            are masked.
+        modules: what is added to the core of the mixed flux network.
     """
 
     name: str = "flux"
     hidden: int = 128
     depth: int = 6
     heads: int = 4
-    attention: str = "relative"
-    relation_blur: str = "axis"
     frequencies: int = 8
-    rotation_features: bool = True
-    contacts: bool = True
+    double_blocks: int | None = None
+    embedding: int | None = None
+    pose_head: int = 64
+    time_scale: float = 1.0
     text_reach: str = "double"
-    pooled_text: bool = True
-    count_embedding: bool = True
+    modules: ModuleSettings = nested(ModuleSettings)
+
+    def __post_init__(self) -> None:
+        at_least(self, 1, "hidden", "depth", "heads")
+        at_least(self, 0, "frequencies")
 
 
 @dataclass
@@ -54,7 +80,8 @@ class ProcessSettings:
 
     Attributes:
         name: ``mixed`` (categories as discrete states) or ``continuous`` (categories as numbers).
-        prediction: what the network predicts (``karras``, ``epsilon``, ``x0``, ``v``).
+        prediction: what the network predicts (``edm``, the preconditioning of Karras et al. 2022, ``epsilon``, ``x0``,
+            ``v``).
         schedule: noise schedule (``karras``, ``linear``, ``cosine``).
         noise_floor: lowest noise-to-signal ratio of the karras schedule, in normalised units.
         noise_ceiling: highest noise-to-signal ratio of the karras schedule.
@@ -71,7 +98,7 @@ class ProcessSettings:
     """
 
     name: str = "mixed"
-    prediction: str = "karras"
+    prediction: str = "edm"
     schedule: str = "karras"
     noise_floor: float = 0.002
     noise_ceiling: float = 20.0
@@ -151,55 +178,58 @@ class TextSettings:
 
 
 @dataclass
-class OptimizerSettings:
+class PretrainOptimizerSettings(OptimizerSettings):
     """The optimiser of a pretraining run.
 
     Attributes:
-        name: ``adamw``, or ``muon`` for Muon on the matrices inside blocks and AdamW on the rest.
-        lr: peak learning rate.
         final_lr: where the learning rate ends, as a fraction of the peak; 1 for no decay.
         decay_share: share of the steps, the last ones, over which it goes there along a cosine; 1 from the warm-up on.
-        warmup: steps of linear warm-up.
-        weight_decay: decoupled weight decay.
-        clip: largest gradient norm.
-        ema: decay of the weight average that is evaluated and saved.
         accumulate: parts in which a process takes its scenes, one after the other, to save memory.
         precision: number format of the network in training, ``float32`` or ``bfloat16`` (autocast).
         matmul_precision: of float32 products on GPUs, ``highest``, ``high`` (TF32) or ``medium``.
         compile: compile the network with ``torch.compile`` (needs a C++ compiler on CPU).
     """
 
+    KNOWN = ("adamw", "muon")
+
     name: str = "muon"
-    lr: float = 1e-3
-    final_lr: float = 0.01
-    decay_share: float = 0.3
     warmup: int = 100
     weight_decay: float = 0.01
-    clip: float = 1.0
     ema: float = 0.999
+    final_lr: float = 0.01
+    decay_share: float = 0.3
     accumulate: int = 1
     precision: str = "float32"
     matmul_precision: str = "highest"
     compile: bool = False
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        shares(self, "final_lr", "decay_share")
+        at_least(self, 1, "accumulate")
+        one_of(self, "precision", ("float32", "bfloat16"))
+        one_of(self, "matmul_precision", ("highest", "high", "medium"))
+
 
 @dataclass
-class LoggerSettings:
+class PretrainLoggerSettings(LoggerSettings):
     """What a pretraining run writes, and how often.
 
     Attributes:
         log_every: steps between log rows.
         evaluate_every: steps between held-out evaluations.
-        checkpoint_every: steps between checkpoints.
         pictures_every: steps between pictures of samples; 0 draws none.
-        tensorboard: also log for TensorBoard.
     """
 
+    checkpoint_every: int = 250
     log_every: int = 20
     evaluate_every: int = 250
-    checkpoint_every: int = 250
     pictures_every: int = 0
-    tensorboard: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, 1, "log_every", "evaluate_every")
+        at_least(self, 0, "pictures_every")
 
 
 def _moved(group: str, *keys: str, **renamed: str) -> dict[str, str]:
@@ -235,9 +265,9 @@ class PretrainConfig:
     """
 
     RENAMED: ClassVar[Mapping[str, str]] = {
-        **_moved("network", "hidden", "depth", "heads", "attention", "relation_blur", "frequencies"),
-        **_moved("network", "rotation_features", "contacts", "text_reach", "pooled_text", "count_embedding"),
-        **_moved("network", tally="count_embedding"),
+        **_moved("network", "hidden", "depth", "heads", "frequencies", "text_reach"),
+        **_moved("network.modules", "rotation_features", "contacts", "pooled_text", "count_embedding"),
+        **_moved("network.modules", tally="count_embedding", attention="relations", relation_blur="relations"),
         "text=true": "text=vocabulary",
         "text=false": "text=none",
         **_moved("process", "prediction", "schedule", "noise_floor", "noise_ceiling", "moments", "rotation", "kernel"),
@@ -250,7 +280,8 @@ class PretrainConfig:
         **_moved("text", text_count_conditioning="count_conditioning", text_requests="count_conditioning"),
         **_moved("optimizer", "decay_share", "warmup", "weight_decay", "clip", "ema", "accumulate", "precision"),
         **_moved("optimizer", "matmul_precision", "compile", learning_rate="lr", final_learning_rate="final_lr"),
-        **_moved("logger", "log_every", "evaluate_every", "checkpoint_every", "pictures_every", "tensorboard"),
+        **_moved("logger", "log_every", "evaluate_every", "checkpoint_every", "pictures_every"),
+        "tensorboard": "logger=tensorboard",
     }
     """Keys of earlier versions, and their names."""
 
@@ -268,5 +299,5 @@ class PretrainConfig:
     process: ProcessSettings = nested(ProcessSettings, folder="process", option="mixed")
     loss: LossSettings = nested(LossSettings)
     text: TextSettings = nested(TextSettings, folder="text", option="none")
-    optimizer: OptimizerSettings = nested(OptimizerSettings, folder="optimizer", option="muon")
-    logger: LoggerSettings = nested(LoggerSettings, folder="logger", option="files")
+    optimizer: PretrainOptimizerSettings = nested(PretrainOptimizerSettings, folder="optimizer", option="muon")
+    logger: PretrainLoggerSettings = nested(PretrainLoggerSettings, folder="logger", option="csv")

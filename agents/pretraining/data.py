@@ -1,4 +1,4 @@
-"""Where training scenes come from: datasets in memory, of one scene type or several, or a grammar without end."""
+"""Training scenes: datasets in memory, of one or several scene types, or an endless grammar stream."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class TrainingData(Protocol):
 
     @property
     def size(self) -> int:
-        """How many distinct scenes there are; 0 for no end."""
+        """Number of distinct scenes; 0 for an endless stream."""
         ...
 
     def draw(self, count: int, generator: Generator, *, prompts: bool) -> tuple[Tensor, list[Sequence[str]]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,8 +11,16 @@ from torch import Tensor
 
 from agents.diffusion import Preconditioning
 from agents.diffusion.moments import CategoryMoments
-from agents.networks import MixedFluxConfig, TextConfig
+from agents.networks import TextConfig
+from agents.networks.contacts import ContactsConfig
+from agents.networks.count_conditioning import CountConditioningConfig
+from agents.networks.count_embedding import CountEmbeddingConfig
+from agents.networks.flux_modules import ModuleConfig
+from agents.networks.given_flags import GivenFlagsConfig
+from agents.networks.pooled_text import PooledTextConfig
 from agents.networks.registry import NetworkConfig, network_config
+from agents.networks.relations import RelationsConfig
+from agents.networks.rotation_features import RotationFeaturesConfig
 from agents.networks.text_encoders import VOCABULARY, AnyTextConfig, text_config
 from agents.pretraining.config import PretrainConfig
 from agents.priors.base import ScenePrior
@@ -22,7 +30,7 @@ from agents.priors.mixed import MixedPrior
 from agents.priors.rotation_codes import SceneCode
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
-from scene_envs.scene import POSE
+from scene_envs.scene import POSE_FEATURES
 from scene_envs.scene_types import get_scene_type
 
 MOMENTS = ("category", "feature", "scene")
@@ -81,7 +89,7 @@ def _check_constants(prior: ScenePrior, free: Tensor, name: str) -> None:
     normalizer = prior.normalizer
     constant = normalizer.is_constant.cpu().clone()
     if prior.process_name == "mixed":
-        constant[POSE.stop :] = False  # categories are states there
+        constant[POSE_FEATURES:] = False  # categories are states there
     objects = free[free[..., -1] == 0]
     off = ((objects - normalizer.input_min.cpu()).abs() > 1e-4).any(dim=0) & constant
     if bool(off.any()):
@@ -176,34 +184,31 @@ def _text(config: PretrainConfig, prompts: Sequence[Sequence[str]]) -> AnyTextCo
 def _network(
     config: PretrainConfig, features: int, normalizer: Normalizer, slots: int, text_width: int = 0
 ) -> NetworkConfig:
-    categories = get_scene_type(config.scene).num_assets + 1
-    network = config.network
-    if network.name == "paper":
-        if config.process.name != "mixed":
-            raise InvalidInputError("network='paper' is mixed; with process=continuous take network=flux")
-        return MixedFluxConfig.paper(categories, text_width)
     return network_config(
-        network.name,
-        config.process.name,
+        process=config.process.name,
         features=features,
-        categories=categories,
-        hidden=network.hidden,
-        depth=network.depth,
-        heads=network.heads,
+        categories=get_scene_type(config.scene).num_assets + 1,
         text_width=text_width,
-        attention=network.attention,
-        relation_blur=network.relation_blur,
-        frequencies=network.frequencies,
-        rotation_features=int(network.rotation_features),
-        contacts=int(network.contacts),
+        **{**vars(config.network), "modules": _modules(config, slots, text_width)},
         unit=_unit(normalizer),
         rotations=_rotations(normalizer),
-        text_reach=network.text_reach,
-        pooled_text=int(network.pooled_text),
-        count_embedding=int(network.count_embedding),
-        count_conditioning=slots if _conditions_counts(config) else 0,
-        kinds=_kinds(config.scene) if _conditions_counts(config) else (),
     )
+
+
+def _modules(config: PretrainConfig, slots: int, text_width: int) -> list[ModuleConfig]:
+    """The modules of the mixed flux network but for its Fourier features."""
+    chosen = config.network.modules
+    relations = chosen.relations != "none"
+    offered: list[tuple[bool, Callable[[], ModuleConfig]]] = [
+        (chosen.given_flags, GivenFlagsConfig),
+        (chosen.pooled_text and text_width > 0, PooledTextConfig),
+        (chosen.count_embedding, CountEmbeddingConfig),
+        (_conditions_counts(config), lambda: CountConditioningConfig(slots, _kinds(config.scene))),
+        (relations, lambda: RelationsConfig(chosen.relations)),
+        (chosen.rotation_features, RotationFeaturesConfig),
+        (relations and chosen.contacts, ContactsConfig),
+    ]
+    return [make() for used, make in offered if used]
 
 
 def _kinds(scene: str) -> tuple[int, ...]:
@@ -225,14 +230,14 @@ def _conditions_counts(config: PretrainConfig) -> bool:
 
 def _pose_moments(kind: str, raw: Tensor, normalizer: Normalizer) -> Preconditioning:
     """Moments of the normalised poses of all objects of raw scenes (M, N, D)."""
-    poses = normalizer.normalize(raw)[..., : POSE.stop]
+    poses = normalizer.normalize(raw)[..., :POSE_FEATURES]
     moments = Preconditioning.fit(poses[raw[..., -1] == 0])
     if kind == "scene":
         return moments.pooled()
     if kind == "feature":
         return moments
-    categories = raw[..., POSE.stop :].argmax(dim=-1)
-    count = raw.shape[-1] - POSE.stop
+    categories = raw[..., POSE_FEATURES:].argmax(dim=-1)
+    count = raw.shape[-1] - POSE_FEATURES
     return replace(moments, by_category=CategoryMoments.fit(poses.flatten(0, 1), categories.flatten(), count))
 
 
@@ -245,5 +250,5 @@ def _unit(normalizer: Normalizer) -> tuple[float, float, float]:
 
 def _rotations(normalizer: Normalizer) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """What nine normalised numbers are multiplied by, and what is then added, to be a rotation matrix."""
-    low, high = normalizer.input_min[3 : POSE.stop], normalizer.input_max[3 : POSE.stop]
+    low, high = normalizer.input_min[3:POSE_FEATURES], normalizer.input_max[3:POSE_FEATURES]
     return tuple(((high - low) / 2).tolist()), tuple(((high + low) / 2).tolist())

@@ -1,13 +1,12 @@
-"""Rows of a training run: to the log, to a CSV file, and to TensorBoard."""
+"""Rows of a training run: to the log, to a CSV file, and to a logger."""
 
 from __future__ import annotations
 
 import csv
 import logging
 from pathlib import Path
-from typing import Any
 
-from scene_envs.errors import MissingDependencyError
+from agents.utils.loggers import RunLogger
 
 logger = logging.getLogger(__name__)
 
@@ -18,24 +17,17 @@ class TrainingLog:
     """Writes rows as they come.
 
     Args:
-        directory: where ``log.csv`` and ``tensorboard/`` go.
-        tensorboard: whether to write events for TensorBoard.
-
-    Raises:
-        MissingDependencyError: TensorBoard is asked for and not installed.
+        directory: where ``log.csv`` goes.
+        also: the logger that gets the same rows, as :func:`agents.utils.loggers.make_logger` makes it.
     """
 
-    def __init__(self, directory: Path, tensorboard: bool = False) -> None:
+    def __init__(self, directory: Path, also: RunLogger | None = None) -> None:
         self.directory = directory
-        self._writer: Any = None
-        if tensorboard:
-            try:
-                from torch.utils.tensorboard import SummaryWriter
-            except ImportError as error:
-                raise MissingDependencyError(
-                    "tensorboard=true needs the package tensorboard; install it with: pip install tensorboard"
-                ) from error
-            self._writer = SummaryWriter(str(directory / "tensorboard"))  # type: ignore[no-untyped-call]
+        self._also = RunLogger() if also is None else also
+
+    def close(self) -> None:
+        """Close the other logger."""
+        self._also.close()
 
     def write(self, row: dict[str, float], last_step: int) -> None:
         """One row; the time left is worked out from ``last_step``."""
@@ -49,8 +41,4 @@ class TrainingLog:
             if fresh:
                 writer.writeheader()
             writer.writerow(row)
-        if self._writer is not None:
-            for key, value in row.items():
-                if key != "step":
-                    self._writer.add_scalar(key, value, step)
-            self._writer.flush()
+        self._also.log({key: value for key, value in row.items() if key != "step"}, step)

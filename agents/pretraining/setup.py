@@ -1,4 +1,4 @@
-"""What a pretraining run starts from: a fresh prior, the scenes it learns from, and scenes held out."""
+"""Initial state of a pretraining run: a fresh prior, its training scenes and held-out scenes."""
 
 from __future__ import annotations
 

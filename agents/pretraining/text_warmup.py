@@ -1,4 +1,4 @@
-"""What a text encoder learns before a run: how many of each kind of object its prompts ask for."""
+"""Text warm-up: training of the text encoder to predict the object numbers of its prompts, before a run."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ import math
 import numpy as np
 import torch
 from torch import nn
+from torch.optim.lr_scheduler import LambdaLR
 
-from agents.networks.mixed_flux_config import POSE
 from agents.pretraining.data import TrainingData
 from agents.priors.base import ScenePrior
 from agents.utils.seeds import derived_generator
+from scene_envs.scene import POSE_FEATURES
 
 logger = logging.getLogger(__name__)
 
@@ -41,6 +42,7 @@ def warm_up_text(prior: ScenePrior, data: TrainingData, steps: int, batch_size: 
         return None
     parameters = [*prior.denoiser.text_encoder.parameters(), *conditioning.counts_out.parameters()]
     optimizer = torch.optim.AdamW(parameters, lr=_RATE, weight_decay=0.01)
+    schedule = LambdaLR(optimizer, lambda step: _rate(step, steps))
     losses = []
     for step in range(steps):
         generator = derived_generator(seed, step, steps)
@@ -48,13 +50,12 @@ def warm_up_text(prior: ScenePrior, data: TrainingData, steps: int, batch_size: 
         picks = torch.rand(len(prompts), generator=generator).tolist()
         texts = [group[int(pick * len(group))] for group, pick in zip(prompts, picks, strict=True)]
         asked = prior.encode_prompts(texts)[0][:, : conditioning.things]
-        states = scenes[..., POSE:].argmax(dim=-1).to(asked.device)
+        states = scenes[..., POSE_FEATURES:].argmax(dim=-1).to(asked.device)
         loss = conditioning.count_loss(asked, states).mean()
         loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(parameters, 1.0)
-        for group in optimizer.param_groups:
-            group["lr"] = _RATE * _rate(step, steps)
         optimizer.step()
+        schedule.step()
         optimizer.zero_grad(set_to_none=True)
         losses.append(float(loss.detach()))
     last = losses[-max(1, steps // 10) :]

@@ -1,18 +1,20 @@
-"""Pretraining a scene prior on a dataset: one loop, exact resume, logs and cards."""
+"""Pretraining loop of a scene prior: one loop, exact resume, logs and model cards."""
 
 from __future__ import annotations
 
 import logging
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Generator, Tensor, nn
+from torch.optim.lr_scheduler import LambdaLR
 
+from agents.configuration.tree import dotted
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.data import TrainingData
 from agents.pretraining.log import TrainingLog
@@ -20,17 +22,17 @@ from agents.pretraining.optimizers import build_optimizer
 from agents.pretraining.setup import prepare
 from agents.pretraining.text_warmup import warm_up_text
 from agents.priors.base import ScenePrior
-from agents.utils.checkpoints import load_checkpoint, save_checkpoint
+from agents.utils.checkpoints import check_tensors, load_checkpoint, save_checkpoint
+from agents.utils.loggers import make_logger
 from agents.utils.process_group import ProcessGroup
 from agents.utils.seeds import derived_generator
 from agents.utils.weight_average import AveragedWeights, WeightAverage
-from scene_envs.errors import InvalidInputError, MissingDependencyError, TrainingError, unknown_name
+from scene_envs.errors import InvalidInputError, MissingDependencyError, TrainingError
 from scene_envs.files import write_json
 
 logger = logging.getLogger(__name__)
 
 _PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
-_MATMUL_PRECISIONS = ("highest", "high", "medium")
 
 
 def learning_rate_at(step: int, config: PretrainConfig) -> float:
@@ -75,25 +77,19 @@ class Pretrainer:
                 f"batch_size={config.batch_size} is not a multiple of {self.parts}, "
                 f"the {self.processes.size} process(es) times accumulate={config.optimizer.accumulate}"
             )
-        if not 0.0 <= config.optimizer.decay_share <= 1.0:
-            raise InvalidInputError(
-                f"decay_share={config.optimizer.decay_share} is outside 0..1: it is a share of the steps"
-            )
         self.prior = prior.to(config.device).train()
         self.network: nn.Module = prior.denoiser
         settings = config.optimizer
-        if settings.precision not in _PRECISIONS:
-            raise unknown_name("precision", settings.precision, _PRECISIONS)
         prior.denoiser.precision = _PRECISIONS[settings.precision]
         self.average = WeightAverage(self.network, settings.ema)
         self.optimizer = build_optimizer(settings.name, self.network, settings.weight_decay, config.text.lr_share)
-        if settings.matmul_precision not in _MATMUL_PRECISIONS:
-            raise unknown_name("matmul_precision", settings.matmul_precision, _MATMUL_PRECISIONS)
         torch.set_float32_matmul_precision(settings.matmul_precision)
         self.step = 0
+        self.schedule = self._schedule()
         self.seconds = 0.0
         self.directory = Path(config.output or "runs/pretrain")
-        self.log = TrainingLog(self.directory, config.logger.tensorboard and self.processes.is_first)
+        chosen = config.logger.name if self.processes.is_first else "csv"
+        self.log = TrainingLog(self.directory, make_logger(chosen, self.directory))
         self.evaluations: list[dict[str, float]] = []
 
     @property
@@ -113,6 +109,7 @@ class Pretrainer:
         for row in self._steps():
             if self.processes.is_first:
                 self.log.write(row, self.config.iterations)
+        self.log.close()
         if self.processes.is_first:
             logger.info("measuring the error that is left at 40 noise levels, for the samplers")
         with self._averaged():
@@ -165,9 +162,8 @@ class Pretrainer:
             )
         self.processes.sum_gradients(self.network.parameters())
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), config.optimizer.clip)
-        for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate_at(self.step, config) * group["rate"]
         self.optimizer.step()
+        self.schedule.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.average.update(self.network)
         return value, float(norm)
@@ -185,6 +181,12 @@ class Pretrainer:
             for group, pick, dropped in zip(prompts, *choice, strict=True)
         ]
         return self.prior.pretraining_loss(x0, generator, text=self.prior.encode_prompts(texts))
+
+    def _schedule(self) -> LambdaLR:
+        """The learning rate from the present step on; what it has been hangs on the number of the step alone."""
+        for group in self.optimizer.param_groups:
+            group["initial_lr"] = group["rate"]
+        return LambdaLR(self.optimizer, lambda step: learning_rate_at(step, self.config), last_epoch=self.step - 1)
 
     def _evaluate(self) -> float:
         with self._averaged():
@@ -236,26 +238,32 @@ class Pretrainer:
 
     def _load(self) -> None:
         state = load_checkpoint(self.checkpoint_path)
+        before = self._started_with(state)
+        if not before:
+            check_tensors(self.network, state["network"], self.checkpoint_path)
         try:
+            self.network.load_state_dict({**state["network"], **state["average"]})  # gives weights their present names
+            average = WeightAverage(self.network, self.config.optimizer.ema)
             self.network.load_state_dict(state["network"])
             self.optimizer.load_state_dict(state["optimizer"])
         except (RuntimeError, ValueError, KeyError) as error:
             raise InvalidInputError(
-                f"the run in {str(self.directory)!r} cannot go on: it was started with {self._started_with(state)}; "
-                "give the same keys again, or another output"
+                f"the run in {str(self.directory)!r} cannot go on: it was started with "
+                f"{before or 'another network or optimiser'}; give the same keys again, or another output"
             ) from error
-        self.average.tensors = state["average"]
+        self.average = average
         self.average.updates = state["average_updates"]
         self.step, self.seconds = state["step"], state["seconds"]
+        self.schedule = self._schedule()
         self.evaluations = state["evaluations"]
         logger.info("resumed at step %d", self.step)
 
     def _started_with(self, state: dict[str, Any]) -> str:
-        """The keys of the run in a checkpoint that are not those of this one."""
-        before, now = _dotted(state["config"]), _dotted(asdict(self.config))
+        """The keys of the run in a checkpoint that are not those of this one; empty when all are the same."""
+        before, now = dotted(state["config"]), dotted(asdict(self.config))
         now |= {"iterations": before["iterations"], "output": before["output"]}  # may differ
-        keys = [f"{key}={value}" for key, value in before.items() if value != now.get(key)]
-        return ", ".join(keys) or "another network or optimiser"
+        keys = [f"{key}={value}" for key, value in before.items() if value != now.get(key, value)]
+        return ", ".join(keys)
 
     def save_prior(self) -> ScenePrior:
         """Write the averaged prior to ``output/prior`` and return the prior holding the averaged weights."""
@@ -271,15 +279,6 @@ class Pretrainer:
                 self.prior.save(self.directory / "prior")
         self.processes.wait()
         return ScenePrior.load(self.directory)
-
-
-def _dotted(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The keys of a configuration, those of its groups behind a dot."""
-    flat: dict[str, Any] = {}
-    for name, value in config.items():
-        inner = {f"{name}.{key}": item for key, item in value.items()} if isinstance(value, Mapping) else {name: value}
-        flat |= inner
-    return flat
 
 
 def part_generator(seed: int, step: int, part: int) -> Generator:

@@ -85,7 +85,7 @@ class ScenePrior(Inpainting, nn.Module, ABC):
 
     @property
     def device(self) -> torch.device:
-        """Where the prior computes."""
+        """Device of the weights."""
         return self._fixed.device
 
     # -- text -----------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""What is told of a prior: a line in a listing, and a model card in a folder to give away."""
+"""Model cards of priors: a line in a listing, and a page in a folder to publish."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _FLOOR = "floor_"
 
 @dataclass(frozen=True)
 class PriorFacts:
-    """What the files of a prior say of it.
+    """Facts about a prior from its files.
 
     Attributes:
         name: as it was asked for.
@@ -203,7 +203,7 @@ def card_page(name: str, prior: ScenePrior, facts: PriorFacts) -> str:
         "## How good it is",
         _measured(card, facts.measures),
         "## What it is not good at",
-        str(card.get("limits") or "Nothing was written down."),
+        str(card.get("limits") or "Not stated."),
         "## Use",
         f"```sh\nscene-envs sample prior={name}{_PROMPT if facts.text else ''} count=16 project=true\n```",
     ]
@@ -228,8 +228,10 @@ def _network(prior: ScenePrior, facts: PriorFacts) -> str:
     sizes = [
         f"{field.name} {getattr(network.config, field.name)}"
         for field in fields(network.config)
-        if field.name in ("hidden", "depth", "double_blocks", "single_blocks", "heads", "attention")
+        if field.name in ("hidden", "depth", "double_blocks", "single_blocks", "heads")
     ]
+    modules = [module.name for module in getattr(network.config, "modules", ())]
+    sizes += [f"modules {', '.join(modules)}"] if modules else []
     return (
         f"{type(network).__name__}, {facts.parameters / 1e6:.1f} M parameters ({facts.megabytes:.1f} MB): "
         f"{', '.join(sizes)}"

@@ -1,4 +1,4 @@
-"""Checkpoints of others: the mixed Flux model of the paper's authors, as PyTorch Lightning wrote it."""
+"""Import of the mixed Flux checkpoints of the paper's authors (PyTorch Lightning)."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ from torch import Tensor
 from agents.diffusion import Preconditioning
 from agents.networks.bert import BertTextConfig
 from agents.networks.bert_files import BASE
-from agents.networks.mixed_flux_config import POSE, MixedFluxConfig
+from agents.networks.mixed_flux_config import MixedFluxConfig
 from agents.priors.config import MixedPriorConfig
 from agents.priors.lightning_files import read_lightning
 from agents.priors.mixed import MixedPrior
 from scene_envs.datasets import DatasetInfo, read_metadata
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
 from scene_envs.normalizer import Normalizer
+from scene_envs.scene import POSE_FEATURES
 from scene_envs.scene_types import Camera, SceneType, get_scene_type, register_scene_type
 
 _LOGGER = logging.getLogger(__name__)
@@ -110,7 +111,7 @@ def import_checkpoint(
         given_share=0.0,
         clip=1.0,
     )
-    moments = Preconditioning(torch.zeros(POSE), torch.ones(POSE))
+    moments = Preconditioning(torch.zeros(POSE_FEATURES), torch.ones(POSE_FEATURES))
     card = {"imported_from": Path(file).name, "trained_steps": int(checkpoint.get("global_step", 0))}
     prior = MixedPrior(prior_config, _with_categories(normalizer, scene_type), moments, card)
     _fill(prior.denoiser.network, tensors, file)
@@ -226,9 +227,7 @@ def sizes(tensors: Mapping[str, Tensor], file: str | os.PathLike[str]) -> MixedF
             embedding=width,
             pose_head=tensors["pose_out.0.weight"].shape[0],
             text_width=tensors["text_in.weight"].shape[1] if "text_in.weight" in tensors else 0,
-            frequencies=0,
             time_scale=1000.0,
-            flags=0,
         )
     except (KeyError, ValueError, IndexError) as error:
         raise CorruptFileError(f"{str(file)!r} lacks tensors of the mixed Flux model: {error}") from error
@@ -274,8 +273,11 @@ def _list(names: list[str]) -> str:
 def _with_categories(normalizer: Normalizer, scene: SceneType) -> Normalizer:
     """The normalizer over all D features; theirs covers poses, and may cover one-hots as well."""
     low, high = (torch.zeros(scene.features), torch.ones(scene.features))
-    low[:POSE], high[:POSE] = normalizer.input_min[:POSE], normalizer.input_max[:POSE]
+    low[:POSE_FEATURES], high[:POSE_FEATURES] = (
+        normalizer.input_min[:POSE_FEATURES],
+        normalizer.input_max[:POSE_FEATURES],
+    )
     whole = Normalizer.from_range(low, high)
     scale, offset = whole.scale.clone(), whole.min.clone()
-    scale[:POSE], offset[:POSE] = normalizer.scale[:POSE], normalizer.min[:POSE]
+    scale[:POSE_FEATURES], offset[:POSE_FEATURES] = normalizer.scale[:POSE_FEATURES], normalizer.min[:POSE_FEATURES]
     return Normalizer(scale, offset, whole.input_min, whole.input_max)

@@ -1,9 +1,12 @@
-"""What priors are made of: layout, network, process and loss."""
+"""Configuration of priors: layout, network, process and loss."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
+from agents.diffusion.gaussian import current_prediction
 from agents.networks.registry import ContinuousNetworkConfig, MixedNetworkConfig
 from agents.networks.text_encoders import AnyTextConfig
 
@@ -13,21 +16,21 @@ PROCESSES = ("continuous", "mixed")
 
 @dataclass(frozen=True)
 class PriorConfig:
-    """What a prior is made of.
+    """Configuration of a prior.
 
     Attributes:
         scene_type: name of its scene type.
         slots: slots per scene that it was trained on.
         network: kind and size of its denoiser, any configuration of a continuous network.
         schedule: noise schedule, ``"karras"``, ``"linear"`` or ``"cosine"``.
-        prediction: ``"karras"``, ``"epsilon"``, ``"x0"`` or ``"v"``.
+        prediction: ``"edm"`` (preconditioning of Karras et al. 2022), ``"epsilon"``, ``"x0"`` or ``"v"``.
         num_timesteps: T of the schedule.
         noise_mean: mean of ln(noise-to-signal) over training timesteps.
         noise_std: its standard deviation.
         translation_weight: weight of x, y, z in the pretraining loss, other features having 1.
         rotation: what is diffused as rotation, ``"matrix"``, ``"quaternion"`` or ``"axis_angle"``.
         timesteps: distribution of training timesteps, ``"lognormal"`` (of the noise-to-signal ratio), ``"uniform"`` or
-            ``"both"`` in equal parts; None is what was published with the prediction, lognormal for ``"karras"`` and
+            ``"both"`` in equal parts; None is what was published with the prediction, lognormal for ``"edm"`` and
             uniform for the others.
         loss_weighting: of the loss by timestep, ``"none"`` or ``"min_snr"``.
         noise_floor: lowest noise-to-signal ratio of the ``"karras"`` schedule, in normalised units.
@@ -39,7 +42,7 @@ class PriorConfig:
     slots: int
     network: ContinuousNetworkConfig
     schedule: str = "karras"
-    prediction: str = "karras"
+    prediction: str = "edm"
     num_timesteps: int = 1000
     noise_mean: float = -1.8
     noise_std: float = 2.1
@@ -54,14 +57,14 @@ class PriorConfig:
 
 @dataclass(frozen=True)
 class MixedPriorConfig:
-    """What a mixed discrete-continuous prior is made of.
+    """Configuration of a mixed discrete-continuous prior.
 
     Attributes:
         scene_type: name of its scene type.
         slots: slots per scene that it was trained on.
         network: kind and size of its denoiser.
         schedule: noise schedule of the poses, ``"karras"``, ``"linear"`` or ``"cosine"``.
-        prediction: ``"karras"``, ``"epsilon"``, ``"x0"`` or ``"v"``, of the poses.
+        prediction: ``"edm"`` (preconditioning of Karras et al. 2022), ``"epsilon"``, ``"x0"`` or ``"v"``, of the poses.
         kernel: of the categories, one of :data:`~agents.diffusion.CATEGORICAL_KERNELS`.
         num_timesteps: T of both.
         noise_mean: mean of ln(noise-to-signal) over training timesteps.
@@ -70,7 +73,7 @@ class MixedPriorConfig:
         category_loss: ``"cross_entropy"`` of the clean category, or ``"bound"``, the paper's variational bound.
         category_weight: weight of the category loss beside the pose loss.
         auxiliary: weight of the cross-entropy in the bound.
-        given_share: share of training scenes in which some poses or categories are given, for inpainting.
+        given_share: share of training scenes in which some poses or categories are observed, for inpainting.
         text: kind and size of the text encoder; None for a prior that reads no prompts.
         noise_floor: lowest noise-to-signal ratio of the ``"karras"`` schedule, in normalised units.
         noise_ceiling: highest.
@@ -88,7 +91,7 @@ class MixedPriorConfig:
     slots: int
     network: MixedNetworkConfig
     schedule: str = "karras"
-    prediction: str = "karras"
+    prediction: str = "edm"
     kernel: str = "mask_and_replace"
     num_timesteps: int = 1000
     noise_mean: float = -1.8
@@ -106,3 +109,8 @@ class MixedPriorConfig:
     empty_slots: str = "attended"
     clip: float = 0.0
     unmasking: str = "even"
+
+
+def current_names(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of a prior's configuration with the names of today, from those of a file of an earlier version."""
+    return {key: current_prediction(value) if key == "prediction" else value for key, value in fields.items()}

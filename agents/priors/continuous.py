@@ -1,4 +1,4 @@
-"""A continuous prior: Gaussian diffusion on whole slots, categories being numbers in [-1, 1] that end in an arg-max."""
+"""Continuous prior: Gaussian diffusion on whole slots; categories are real numbers with an arg-max at the end."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from agents.networks.denoiser import Denoiser
 from agents.networks.registry import build_network, config_from_state, config_state
 from agents.networks.text import Text
 from agents.priors.base import ScenePrior
-from agents.priors.config import PriorConfig
+from agents.priors.config import PriorConfig, current_names
 from agents.priors.inpainting import draw_noise
 from agents.priors.prompt_validation import no_text
 from agents.priors.rotation_codes import SceneCode
@@ -102,7 +102,7 @@ class ContinuousPrior(ScenePrior):
         residual: ResidualVariance | None,
     ) -> ContinuousPrior:
         """From the ``prior`` entry of a configuration file."""
-        fields = {**fields, "network": config_from_state(fields["network"], "continuous")}
+        fields = {**current_names(fields), "network": config_from_state(fields["network"], "continuous")}
         return cls(PriorConfig(**fields), normalizer, preconditioning, card, residual)
 
     def config_state(self) -> dict[str, Any]:

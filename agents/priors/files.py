@@ -1,4 +1,4 @@
-"""Where priors live on disk: names, directories, safetensors and their configuration."""
+"""Locations of priors on disk: names, directories, safetensors and their configuration."""
 
 from __future__ import annotations
 

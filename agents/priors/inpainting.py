@@ -1,4 +1,4 @@
-"""Inpainting: some slots, poses or categories are regenerated, the others guide them."""
+"""Inpainting: regeneration of slots, poses or categories given the observed entries."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Inpainting:
 
     @property
     def device(self) -> torch.device:
-        """Where the prior computes."""
+        """Device of the weights."""
         raise NotImplementedError
 
     @abstractmethod

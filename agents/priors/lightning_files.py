@@ -1,4 +1,4 @@
-"""PyTorch Lightning checkpoints of others, read safely.
+"""Safe reading of PyTorch Lightning checkpoints.
 
 Only tensors, numbers, strings and containers are read. Every other object in the file becomes an inert placeholder, so
 nothing in it is run.
@@ -87,5 +87,5 @@ class _Inert:
 
     @classmethod
     def load(cls, file: IO[bytes], **options: Any) -> Any:
-        """What :class:`Unpickler` makes of ``file``; files older than the zip format begin with such pickles."""
+        """Object that :class:`Unpickler` reads from ``file``; files older than the zip format begin like this."""
         return cls.Unpickler(file, **options).load()

@@ -29,17 +29,16 @@ from agents.diffusion.schedules import make_schedule
 from agents.diffusion.unmasking import UNMASKINGS
 from agents.diffusion.weighting import check_weighting
 from agents.networks.mixed_denoiser import Given, MixedDenoiser
-from agents.networks.mixed_flux_config import POSE, MixedFluxConfig, current_name
 from agents.networks.registry import build_network, config_from_state, config_state
 from agents.networks.text import Text
 from agents.networks.text_encoders import text_config_from_state, text_encoder
-from agents.priors.config import MixedPriorConfig
+from agents.priors.config import MixedPriorConfig, current_names
 from agents.priors.inpainting import draw_noise
 from agents.priors.mixed_training import TrainableMixedPrior
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
-from scene_envs.scene import SceneBatch
+from scene_envs.scene import POSE_FEATURES, SceneBatch
 from scene_envs.scene_types import get_scene_type
 
 CATEGORY_LOSSES = ("cross_entropy", "bound")
@@ -86,7 +85,7 @@ class MixedPrior(TrainableMixedPrior):
         if config.unmasking not in UNMASKINGS:
             raise unknown_name("unmasking", config.unmasking, UNMASKINGS)
         check_weighting(config.loss_weighting, config.prediction)
-        if config.empty_slots == "dropped" and not isinstance(config.network, MixedFluxConfig):
+        if config.empty_slots == "dropped" and not getattr(config.network, "reads_slot_mask", False):
             raise InvalidInputError("empty_slots='dropped' needs network='flux'; others take empty_slots='attended'")
         self.mixed = config
         self._keep(config, normalizer, preconditioning, card, residual)
@@ -113,7 +112,7 @@ class MixedPrior(TrainableMixedPrior):
     ) -> MixedPrior:
         """From the ``prior`` entry of a configuration file."""
         text = text_config_from_state(fields.get("text"))
-        fields = {**fields, "network": config_from_state(fields["network"], "mixed"), "text": text}
+        fields = {**current_names(fields), "network": config_from_state(fields["network"], "mixed"), "text": text}
         return cls(MixedPriorConfig(**fields), normalizer, preconditioning, card, residual)
 
     def config_state(self) -> dict[str, Any]:
@@ -131,7 +130,7 @@ class MixedPrior(TrainableMixedPrior):
         """Inverse of :meth:`weights`; raises RuntimeError when names or shapes differ."""
         text = {name.removeprefix(_TEXT): value for name, value in tensors.items() if name.startswith(_TEXT)}
         self.denoiser.network.load_state_dict(
-            {current_name(name): value for name, value in tensors.items() if not name.startswith(_TEXT)}
+            {name: value for name, value in tensors.items() if not name.startswith(_TEXT)}
         )
         if self.denoiser.text_encoder is not None:
             self.denoiser.text_encoder.load_state_dict(text)
@@ -139,9 +138,9 @@ class MixedPrior(TrainableMixedPrior):
     # -- what the network is told ---------------------------------------------------------------
 
     def seen(self, x: Tensor, given: Given | None = None) -> Given | None:
-        """What the network is told to be exact in scenes ``x`` (B, N, D): ``given``, or else the fixed objects.
+        """Observed entries of scenes ``x`` (B, N, D) for the network: ``given``, or else the fixed objects.
 
-        A prior trained with given entries has always been told of its fixed objects; one trained without is not.
+        A prior trained with observed entries has always been told of its fixed objects; one trained without is not.
         """
         if given is not None or self.mixed.given_share <= 0:
             return given
@@ -159,7 +158,7 @@ class MixedPrior(TrainableMixedPrior):
     def known(self, slots: int) -> Tensor:
         """(slots, D) bool: entries that are clamped (fixed welded slots, constant pose features)."""
         constant = self.normalizer.is_constant.to(self._fixed.device).clone()
-        constant[POSE:] = False
+        constant[POSE_FEATURES:] = False
         known = constant.expand(slots, -1).clone()
         known[: len(self.scene_type.fixed)] = True
         return known
@@ -167,8 +166,14 @@ class MixedPrior(TrainableMixedPrior):
     def clamp(self, x: Tensor) -> Tensor:
         """``x`` (B, N, D) with its known entries set to their values."""
         count = len(self.scene_type.fixed)
-        constant = self.normalizer.is_constant[:POSE].to(x.device)
-        x = torch.cat([torch.where(constant, torch.zeros_like(x[..., :POSE]), x[..., :POSE]), x[..., POSE:]], dim=-1)
+        constant = self.normalizer.is_constant[:POSE_FEATURES].to(x.device)
+        x = torch.cat(
+            [
+                torch.where(constant, torch.zeros_like(x[..., :POSE_FEATURES]), x[..., :POSE_FEATURES]),
+                x[..., POSE_FEATURES:],
+            ],
+            dim=-1,
+        )
         if count:
             x = torch.cat([self._fixed[:count].to(x).expand(x.shape[0], -1, -1), x[:, count:]], dim=1)
         return x
@@ -178,20 +183,20 @@ class MixedPrior(TrainableMixedPrior):
 
         The pose of an empty slot means nothing; it takes the mean of poses, where it asks nothing of the network.
         """
-        pose = batch.to_tensor(normalised=self.normalizer)[..., :POSE]
+        pose = batch.to_tensor(normalised=self.normalizer)[..., :POSE_FEATURES]
         pose = torch.where(batch.is_empty[..., None], self.preconditioning.mean.to(pose), pose)
-        return torch.cat([pose, batch.tensor[..., POSE:]], dim=-1)
+        return torch.cat([pose, batch.tensor[..., POSE_FEATURES:]], dim=-1)
 
     def initial(self, count: int, slots: int, generator: Generator | None = None) -> Tensor:
         """x_T (count, slots, D): normal poses, categories from the end of their chain, known entries clamped."""
         noise = torch.randn(count, slots, self.scene_type.features, generator=generator, device=self._fixed.device)
         probs = self.categories.prior().to(noise).expand(count, slots, -1)
-        return self.clamp(self._with_states(noise[..., :POSE], probs, noise))
+        return self.clamp(self._with_states(noise[..., :POSE_FEATURES], probs, noise))
 
     def add_noise(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
         """A sample of q(x_t | x_0) from standard normal noise (B, N, D)."""
-        pose = self.process.add_noise(x0[..., :POSE], t, noise[..., :POSE])
-        category = x0[..., POSE:].argmax(dim=-1)
+        pose = self.process.add_noise(x0[..., :POSE_FEATURES], t, noise[..., :POSE_FEATURES])
+        category = x0[..., POSE_FEATURES:].argmax(dim=-1)
         return self.clamp(self._with_states(pose, self.categories.marginal(category, t.expand(len(x0))), noise))
 
     @staticmethod
@@ -240,21 +245,21 @@ class MixedPrior(TrainableMixedPrior):
         if self.mixed.clip:
             pose = pose.clamp(-self.mixed.clip, self.mixed.clip)
         residual = None if self.residual is None else self.residual.at(t)
-        mean, std = self.process.posterior(x_t[..., :POSE], pose, t, previous, residual, eta)
-        states = x_t[..., POSE:]
+        mean, std = self.process.posterior(x_t[..., :POSE_FEATURES], pose, t, previous, residual, eta)
+        states = x_t[..., POSE_FEATURES:]
         state = state_of(states)
         probs = self.categories.posterior(state, logits.softmax(dim=-1), t, previous)
         slots, fixed = x_t.shape[1], len(self.scene_type.fixed)
         random = torch.full((slots,), previous > 0, device=x_t.device)
         random[:fixed] = False
-        known = self.known(slots)[:, :POSE]
+        known = self.known(slots)[:, :POSE_FEATURES]
         zeros = torch.zeros(*mean.shape[:2], self.num_categories, device=mean.device)
         clamped = self.clamp(torch.cat([mean, zeros], dim=-1))
         if fixed:
-            certain = F.one_hot(self._fixed[:fixed, POSE:].argmax(dim=-1), self.num_categories + 1).to(probs)
+            certain = F.one_hot(self._fixed[:fixed, POSE_FEATURES:].argmax(dim=-1), self.num_categories + 1).to(probs)
             probs = torch.cat([certain.expand(len(probs), -1, -1), probs[:, fixed:]], dim=1)
         masked = (state == self.num_categories) & random if self._together else None
-        return MixedStep(clamped[..., :POSE], std * (~known).to(mean.dtype), probs, random, masked)
+        return MixedStep(clamped[..., :POSE_FEATURES], std * (~known).to(mean.dtype), probs, random, masked)
 
     def regenerate(
         self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int,
@@ -265,7 +270,7 @@ class MixedPrior(TrainableMixedPrior):
         given = Given(self.encode(batch), ~mask[..., 0], ~mask[..., 1])
         noise = draw_noise(given.x, generators)
         probs = self.categories.prior().to(noise).expand(*noise.shape[:2], -1)
-        start = self.clamp(self._with_states(noise[..., :POSE], probs, noise))
+        start = self.clamp(self._with_states(noise[..., :POSE_FEATURES], probs, noise))
         return self.run_chain(start, table, generators, given, text, guidance, resample)
 
     @torch.no_grad()
@@ -273,7 +278,7 @@ class MixedPrior(TrainableMixedPrior):
         self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None, given: Given | None = None,
         text: Text | None = None, guidance: float = 0.0, resample: int = 1, eta: float = 1.0,
     ) -> Tensor:  # fmt: skip
-        """x_0 (B, N, D) from x_T, with given entries kept.
+        """x_0 (B, N, D) from x_T, with observed entries kept.
 
         Args:
             x: x_T (B, N, D).
@@ -298,8 +303,8 @@ class MixedPrior(TrainableMixedPrior):
 
     def _renoise(self, x_s: Tensor, s: int, t: int, noise: Tensor) -> Tensor:
         """A sample of q(x_t | x_s), s < t."""
-        pose = self.process.renoise(x_s[..., :POSE], s, t, noise[..., :POSE])
-        rows = self.categories.transition(s, t).to(x_s)[state_of(x_s[..., POSE:])]
+        pose = self.process.renoise(x_s[..., :POSE_FEATURES], s, t, noise[..., :POSE_FEATURES])
+        rows = self.categories.transition(s, t).to(x_s)[state_of(x_s[..., POSE_FEATURES:])]
         return self.clamp(self._with_states(pose, rows, noise))
 
     @torch.no_grad()

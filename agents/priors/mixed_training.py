@@ -1,4 +1,4 @@
-"""Training of a mixed prior: its loss, the entries given in training, and the error that is measured afterwards."""
+"""Training of a mixed prior: loss, observed entries for inpainting, and the residual error of the denoiser."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from agents.diffusion import CategoricalProcess, ResidualVariance, StepTable
 from agents.diffusion.reverse_steps import state_of
 from agents.diffusion.weighting import loss_weights
 from agents.networks.mixed_denoiser import Given, MixedDenoiser
-from agents.networks.mixed_flux_config import POSE
 from agents.networks.text import Text
 from agents.priors.base import ScenePrior
 from agents.priors.config import MixedPriorConfig
 from agents.priors.text import PromptReader
+from scene_envs.scene import POSE_FEATURES
 
 _EMPTY_WEIGHT = 0.1
 """Weight of the pose of an empty slot in the loss: it means nothing, but chains should not drift on it."""
@@ -43,7 +43,7 @@ class TrainableMixedPrior(PromptReader, ScenePrior):
 
     @abstractmethod
     def seen(self, x: Tensor, given: Given | None = None) -> Given | None:
-        """What the network is told to be exact in scenes ``x`` (B, N, D)."""
+        """Observed entries of scenes ``x`` (B, N, D) for the network."""
 
     @abstractmethod
     def add_noise(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
@@ -57,7 +57,7 @@ class TrainableMixedPrior(PromptReader, ScenePrior):
 
         Args:
             x0: (B, N, D) scenes as :meth:`encode` gives them.
-            generator: source of timesteps, noise and given entries (CPU).
+            generator: source of timesteps, noise and observed entries (CPU).
             reduction: ``"mean"`` over scenes, or ``"none"`` for (B,); always the mean over entries.
             t: (B,) timesteps, drawn when None.
             text: tokens and their mask.
@@ -76,10 +76,10 @@ class TrainableMixedPrior(PromptReader, ScenePrior):
         x_t = x_t if given is None else given.write(x_t)
         text = self.unconditional(len(x0)) if text is None else text
         output, logits = self.denoiser.output(x_t, t, given, text)
-        pose0, category0 = x0[..., :POSE], x0[..., POSE:].argmax(dim=-1)
-        moments = self.denoiser.moments(state_of(x_t[..., POSE:]), t)
-        error = output - self.process.target(pose0, x_t[..., :POSE], t, noise[..., :POSE], moments)
-        weight = self.loss_weight(x0.shape[1])[None, :, :POSE].to(device).expand(len(x0), -1, -1)
+        pose0, category0 = x0[..., :POSE_FEATURES], x0[..., POSE_FEATURES:].argmax(dim=-1)
+        moments = self.denoiser.moments(state_of(x_t[..., POSE_FEATURES:]), t)
+        error = output - self.process.target(pose0, x_t[..., :POSE_FEATURES], t, noise[..., :POSE_FEATURES], moments)
+        weight = self.loss_weight(x0.shape[1])[None, :, :POSE_FEATURES].to(device).expand(len(x0), -1, -1)
         empty = (category0 == self.num_categories - 1)[..., None]
         weight = torch.where(empty, _EMPTY_WEIGHT * weight, weight)
         drawn = torch.ones(x0.shape[:2], device=device)
@@ -88,13 +88,13 @@ class TrainableMixedPrior(PromptReader, ScenePrior):
             weight = weight * (~given.pose)[..., None]
             drawn = drawn * (~given.category)
         if self.denoiser.drops_empty:  # what is seen is certain
-            drawn = drawn * (state_of(x_t[..., POSE:]) == self.num_categories)
+            drawn = drawn * (state_of(x_t[..., POSE_FEATURES:]) == self.num_categories)
         pose_loss = (error.square() * weight).sum(dim=(1, 2)) / weight.sum(dim=(1, 2)).clamp(min=1.0)
         pose_loss = pose_loss * loss_weights(self.process.schedule, t, config.prediction, config.loss_weighting).to(
             device
         )
         if config.category_loss == "bound":
-            states = x_t[..., POSE:]
+            states = x_t[..., POSE_FEATURES:]
             losses = self.categories.loss(category0, state_of(states), t, logits, config.auxiliary)
         else:
             losses = F.cross_entropy(logits.flatten(0, 1), category0.flatten(), reduction="none").view_as(drawn)
@@ -106,7 +106,7 @@ class TrainableMixedPrior(PromptReader, ScenePrior):
         return loss
 
     def draw_given(self, x0: Tensor, generator: Generator | None) -> Given:
-        """Random given entries: slots (completion), all categories (rearrangement), or any attribute of any slot."""
+        """Random observed entries: slots (completion), all categories (rearrangement), or any attribute of any slot."""
         batch, slots = x0.shape[:2]
         kind, share = torch.rand(2, batch, 1, generator=generator)
         kind = kind / max(self.mixed.given_share, 1e-9)  # above 1: nothing is given
@@ -123,7 +123,7 @@ class TrainableMixedPrior(PromptReader, ScenePrior):
         """Measure the error of the denoised pose on scenes ``x0`` (B, N, D) at ``levels`` timesteps, and keep it."""
         generator = Generator().manual_seed(seed)
         timesteps = StepTable.spaced(self.mixed.num_timesteps, levels).timesteps.flip(0)
-        present = (x0[..., POSE:].argmax(dim=-1) != self.num_categories - 1).float()
+        present = (x0[..., POSE_FEATURES:].argmax(dim=-1) != self.num_categories - 1).float()
         present[:, : len(self.scene_type.fixed)] = 0.0
         rows = []
         for t in timesteps:
@@ -133,7 +133,7 @@ class TrainableMixedPrior(PromptReader, ScenePrior):
                 self.denoiser(part, level[: len(part)], self.seen(part), self.unconditional(len(part)))[0]
                 for part in self.add_noise(x0, level, noise).split(_AT_ONCE)
             ]
-            error = (torch.cat(poses) - x0[..., :POSE]).square() * present[..., None]
+            error = (torch.cat(poses) - x0[..., :POSE_FEATURES]).square() * present[..., None]
             rows.append((error.sum(dim=(0, 1)) / present.sum()).cpu())
         self.residual = ResidualVariance(timesteps, torch.stack(rows))
         return self.residual

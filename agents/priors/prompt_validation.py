@@ -1,4 +1,4 @@
-"""Validation of prompts: whether a prior, with some guidance, can follow them in scenes of some size."""
+"""Validation of prompts and guidance for a prior and a number of slots."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a continuous prior writes scenes as numbers: which representation of rotations it diffuses.
+"""Rotation codes: the numbers in which a continuous prior diffuses rotations.
 
 The scene type's own layout (translation | rotation matrix | one-hot) stays what crosses module boundaries.
 """
@@ -102,7 +102,7 @@ class SceneCode:
 
     @property
     def rotation_slice(self) -> slice:
-        """Where the rotation stands in a slot."""
+        """Entries of the rotation in a slot."""
         return slice(TRANSLATION.stop, self.pose_width)
 
     def encode(self, batch: SceneBatch) -> Tensor:

@@ -1,4 +1,4 @@
-"""Priors written to a folder and read again: what of a prior goes into its files."""
+"""Saving and loading of priors: the contents of their folders."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LEVELS, _RESIDUAL = "residual.timesteps", "residual.variance"
 
 @dataclass(frozen=True)
 class StoredPrior:
-    """What the files of a prior hold.
+    """Contents of the files of a prior.
 
     Attributes:
         process: name of its process.

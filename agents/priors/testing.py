@@ -7,7 +7,8 @@ from torch import nn
 
 from agents.diffusion import Preconditioning
 from agents.networks import FluxConfig, MixedFluxConfig, TextConfig
-from agents.networks.mixed_flux_config import POSE
+from agents.networks.fourier_features import FourierFeaturesConfig
+from agents.networks.given_flags import GivenFlagsConfig
 from agents.priors.base import ScenePrior
 from agents.priors.config import PROCESSES, MixedPriorConfig, PriorConfig
 from agents.priors.continuous import ContinuousPrior
@@ -15,6 +16,7 @@ from agents.priors.mixed import MixedPrior
 from agents.priors.text import prompt_words
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
+from scene_envs.scene import POSE_FEATURES
 from scene_envs.scene_types import SceneType, get_scene_type
 
 
@@ -67,9 +69,11 @@ def _mixed(scene_type: SceneType, slots: int, text: bool) -> ScenePrior:
         embedding=32,
         pose_head=16,
         text_width=0 if reader is None else reader.width,
+        time_input="log_noise",
+        modules=(GivenFlagsConfig(), FourierFeaturesConfig()),
     )
     config = MixedPriorConfig(scene_type.name, slots, network, text=reader)
-    moments = Preconditioning(torch.zeros(POSE), torch.full((POSE,), 0.5))
+    moments = Preconditioning(torch.zeros(POSE_FEATURES), torch.full((POSE_FEATURES,), 0.5))
     return MixedPrior(config, _workspace_normalizer(scene_type), moments)
 
 

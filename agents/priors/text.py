@@ -1,4 +1,4 @@
-"""Text of a prior: how prompts become tokens that its network attends to."""
+"""Text of a prior: prompts as tokens that its network attends to."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class PromptReader:
 
     @property
     def prompt_space(self) -> tuple[int, int]:
-        """How many tokens a prompt has at most, and how many different ones there are; 0 is padding."""
+        """Largest number of tokens of a prompt, and size of the vocabulary; 0 is padding."""
         space: tuple[int, int] = self._encoder("").token_space
         return space
 
@@ -82,7 +82,7 @@ class PromptReader:
         return tokens[place], mask[place]
 
     def unconditional(self, count: int) -> Text | None:
-        """What stands for no prompt; None when the prior reads none."""
+        """Text of the empty prompt; None for a prior without text."""
         if not self.conditional:
             return None
         tokens, mask = self.encode_prompts([""])

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import pickle
+from collections.abc import Mapping
 from typing import Any
 
 import torch
+from torch import Tensor, nn
 
 from scene_envs.errors import CorruptFileError, InvalidInputError, TrainingError
 from scene_envs.files import replacing
@@ -48,3 +50,24 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
     if not isinstance(state, dict):
         raise CorruptFileError(f"{str(path)!r} holds a {type(state).__name__}, not a checkpoint")
     return state
+
+
+def check_tensors(module: nn.Module, tensors: Mapping[str, Tensor], path: str | os.PathLike[str]) -> None:
+    """Refuse weights of a checkpoint whose names and shapes are not those of ``module``.
+
+    Args:
+        module: what is to be restored.
+        tensors: its state dict in the checkpoint.
+        path: the checkpoint, for the message.
+
+    Raises:
+        InvalidInputError: a tensor is missing, unknown or of another shape, as in runs that an earlier version began.
+    """
+    wanted, found = ({name: x.shape for name, x in each.items()} for each in (module.state_dict(), tensors))
+    differing = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
+    if differing:
+        raise InvalidInputError(
+            f"{str(path)!r} cannot be resumed: {len(differing)} of its tensors are not those of the network here, the "
+            f"first {differing[0]!r}; an earlier version of SceneEnvs or another prior began the run: go on with that "
+            "one, or give another output to start anew"
+        )

@@ -6,6 +6,7 @@ from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 Module = TypeVar("Module", bound=nn.Module)
 
@@ -30,8 +31,8 @@ class WeightAverage:
         """Move towards ``module``; returns the decay that was used."""
         self.updates += 1
         decay = min(self.decay, self.updates / (self.updates + 10.0))
-        for name, parameter in module.named_parameters():
-            self.tensors[name].lerp_(parameter, 1.0 - decay)
+        named = dict(module.named_parameters())
+        get_ema_multi_avg_fn(decay)([self.tensors[name] for name in named], list(named.values()), self.updates)
         return decay
 
     @torch.no_grad()

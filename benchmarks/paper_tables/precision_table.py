@@ -39,7 +39,7 @@ def _categories(kernel: str, empty_slots: str, loss: str) -> dict[str, Any]:
 
 
 FACTORS: tuple[Setting, ...] = (
-    *_predictions("none", "", "karras", "epsilon", "v", "x0"),
+    *_predictions("none", "", "edm", "epsilon", "v", "x0"),
     *_predictions("min_snr", ", min-SNR", "epsilon", "v", "x0"),
     *_each("schedule", "process.schedule", "karras", "cosine", "linear"),
     *_each("noise floor", "process.noise_floor", 0.01, 0.002, 0.0005),
@@ -47,11 +47,10 @@ FACTORS: tuple[Setting, ...] = (
     *_each("timesteps", "loss.timesteps", "lognormal", "uniform", "both"),
     *_each("moments per", "process.moments", "scene", "feature", "category"),
     *_each("translation weight", "loss.translation_weight", 1.0, 3.0),
-    *_each("attention", "network.attention", "plain", "relative"),
+    *_each("relations of slots, blurred by the noise of the", "network.modules.relations", "none", "largest", "axis"),
     *_each("Fourier octaves", "network.frequencies", 0, 8),
-    *_each("features of rotations", "network.rotation_features", False, True),
-    *_each("contacts", "network.contacts", False, True),
-    *_each("relations blurred by the noise of the", "network.relation_blur", "largest", "axis"),
+    *_each("features of rotations", "network.modules.rotation_features", False, True),
+    *_each("contacts", "network.modules.contacts", False, True),
     ("no learning-rate decay", {"optimizer.final_lr": 1.0}),
     ("learning rate decays from the warm-up on", {"optimizer.decay_share": 1.0}),
     *_each("optimizer", "optimizer.name", "muon", "adamw"),
@@ -67,9 +66,8 @@ FACTORS: tuple[Setting, ...] = (
 _NEEDS = {
     "process.noise_floor": ("process.schedule", "karras"),
     "process.noise_ceiling": ("process.schedule", "karras"),
-    "process.moments": ("process.prediction", "karras"),
-    "network.contacts": ("network.attention", "relative"),
-    "network.relation_blur": ("network.attention", "relative"),
+    "process.moments": ("process.prediction", "edm"),
+    "network.modules.contacts": ("network.modules.relations", "axis"),
 }
 """Keys that are read only where another key has a value."""
 

@@ -65,32 +65,25 @@ class Table:
 
 _TEXT: dict[str, Any] = {"process.name": "mixed", "text.encoder": "vocabulary", "text.dropout": 0.1}
 
-_OF_LENGTH = ("recipe", "network.name", "optimizer.lr", "optimizer.warmup", "optimizer.decay_share")
+_OF_SIZE = (
+    *("recipe", "network.hidden", "network.depth", "network.heads", "network.double_blocks", "network.embedding"),
+    *("network.pose_head", "optimizer.lr", "optimizer.warmup", "optimizer.decay_share"),
+)
 """Keys of a recipe that belong to a network and a run of another size."""
 
 PAPER: dict[str, Any] = {
     key: value
     for key, value in dotted_values(PretrainConfig(recipe="paper")).items()
-    if value != dotted_values(PretrainConfig())[key] and key not in _OF_LENGTH
-} | {"network.name": "flux"}
+    if value != dotted_values(PretrainConfig())[key] and key not in _OF_SIZE
+}
 """The paper's setting, ``configs/recipe/paper.yaml``, for a network of the tables' size and a run of their length."""
 
-_PLAIN = {"network.attention": "plain", "network.frequencies": 0, "process.empty_slots": "attended"}
+_AS_PUBLISHED = {"network.modules.relations": "none", "network.frequencies": 0, "process.empty_slots": "attended"}
 
 NETWORKS: dict[str, dict[str, Any]] = {
     "flux": {"network.name": "flux"},
-    "midiffusion": {
-        "network.name": "midiffusion",
-        "network.attention": "plain",
-        "network.frequencies": 0,
-        "process.empty_slots": "attended",
-    },
-    "diffuscene": {
-        "network.name": "diffuscene",
-        "network.attention": "plain",
-        "network.frequencies": 0,
-        "process.empty_slots": "attended",
-    },
+    "midiffusion": {"network.name": "midiffusion", **_AS_PUBLISHED},
+    "diffuscene": {"network.name": "diffuscene", **_AS_PUBLISHED},
 }
 """Ours with its defaults; the others read poses as they are, as published."""
 NETWORK_LABELS = {"flux": "ours (flux)", "midiffusion": "MiDiffusion", "diffuscene": "DiffuScene"}

@@ -1,4 +1,4 @@
-"""The keys of the program that makes tables, and the sizes it knows; imports nothing heavy."""
+"""The keys of the program that makes tables, and the sizes it knows; imports no torch."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from agents.configuration.tree import dotted, dotted_values
+from agents.pretraining.config import PretrainConfig
 from scene_envs.errors import InvalidInputError, unknown_name
 
 
@@ -32,13 +34,15 @@ class Size:
     pretraining: Mapping[str, Any] = field(default_factory=dict)
 
 
+_PAPER = dotted_values(PretrainConfig(recipe="paper"))
+_OF_SIZE = ("network.depth", "network.heads", "optimizer.warmup", "optimizer.lr")
+
 SIZES: dict[str, Size] = {
     "tiny": Size(3, 4, 60_000, 6, 2, 1, {"network.depth": 1, "network.heads": 2, "optimizer.warmup": 1}),
     "small": Size(600, 64, 700_000, 256, pretraining={"network.depth": 4, "network.heads": 4, "optimizer.warmup": 50}),
     "paper": Size(
         100_000, 256, 88_300_000, 2000,
-        pretraining={"network.depth": 10, "network.heads": 16,
-            "optimizer.warmup": 1000, "optimizer.lr": 1e-4, "optimizer.matmul_precision": "high"},
+        pretraining={**{key: _PAPER[key] for key in _OF_SIZE}, "optimizer.matmul_precision": "high"},
     ),
 }  # fmt: skip
 """``tiny`` is for tests, ``small`` for a CPU, ``paper`` has the size of the paper's network and wants a GPU."""
@@ -155,13 +159,5 @@ class TablesConfig:
             "logger.evaluate_every": max(1, iterations // 2),
             "logger.checkpoint_every": max(1, min(250, iterations // 5)),
             **preset.pretraining,
-            **_dotted(self.pretraining or {}),
+            **dotted(self.pretraining or {}),
         }
-
-
-def _dotted(keys: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Keys of groups behind a dot."""
-    flat: dict[str, Any] = {}
-    for key, value in keys.items():
-        flat |= _dotted(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {prefix + key: value}
-    return flat

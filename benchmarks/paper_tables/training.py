@@ -23,7 +23,7 @@ _RUN_ONLY = (
     "logger.evaluate_every",
     "logger.checkpoint_every",
     "logger.pictures_every",
-    "logger.tensorboard",
+    "logger.name",
 )
 """Keys that may change between the parts of a resumed run."""
 _SHAPING = (
@@ -31,10 +31,10 @@ _SHAPING = (
     "process.name",
     "text.encoder",
     "process.rotation",
-    "network.attention",
     "network.frequencies",
-    "network.rotation_features",
-    "network.contacts",
+    "network.modules.relations",
+    "network.modules.rotation_features",
+    "network.modules.contacts",
     "network.hidden",
     "network.depth",
     "network.heads",

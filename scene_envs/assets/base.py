@@ -1,4 +1,4 @@
-"""What an asset is: meshes, convex parts, mass properties."""
+"""Asset: meshes, convex parts, mass properties."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The built-in assets: those that have a recipe."""
+"""Built-in assets, each made by a recipe."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The library of assets: users' own from their folders, and the built-in ones."""
+"""Asset library: users' assets from their folders, and the built-in ones."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Model:
-    """What a recipe returns: geometry in the asset frame, m.
+    """Result of a recipe: geometry in the asset frame, m.
 
     Attributes:
         visual: coloured mesh.

@@ -229,7 +229,7 @@ def make_layout(
     fixed_tolerance: float,
     slots: int | None,
 ) -> Layout:
-    """How files with this ``metadata.json`` become scenes; arguments and errors as for :meth:`SceneDataset.load`."""
+    """Layout of files with this ``metadata.json``; arguments and errors as for :meth:`SceneDataset.load`."""
     info: DatasetInfo = read_metadata(metadata)
     name = scene_type if scene_type is not None else info.scene_type
     if name is None:

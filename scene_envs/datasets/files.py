@@ -1,4 +1,4 @@
-"""Files of a dataset, read: parquet and arrow, whole or block by block, in whatever list layout they come."""
+"""Dataset file reader: parquet and arrow, whole or block by block, in any list layout."""
 
 from __future__ import annotations
 

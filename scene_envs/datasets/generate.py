@@ -29,7 +29,7 @@ _SETTINGS = ("grammar", "seed", "count", "shard_size", "verified")
 
 @dataclass(frozen=True)
 class GenerationReport:
-    """What a generation made.
+    """Result of a generation.
 
     Attributes:
         output: the dataset folder.

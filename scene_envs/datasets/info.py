@@ -1,4 +1,4 @@
-"""What ``metadata.json`` says about a dataset, readable without the dataset."""
+"""Contents of ``metadata.json``, readable without the dataset."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Verdicts on the candidates of a shard under way, so that an interrupted shard is not judged again."""
+"""Journal of verdicts on the candidates of an unfinished shard, for resuming it."""
 
 from __future__ import annotations
 

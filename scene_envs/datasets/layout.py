@@ -1,4 +1,4 @@
-"""From the rows of a file to scenes of a scene type: units, categories, fixed objects first, keys."""
+"""Conversion of file rows to scenes of a scene type: units, categories, fixed objects first, keys."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _KEYS_AT_ONCE = 1024
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """How the files of one dataset become scenes of a scene type.
+    """Conversion of the files of one dataset to scenes of a scene type.
 
     Attributes:
         info: of the files.

@@ -107,7 +107,7 @@ class MixedDataset:
         return SceneDataset.from_sets(tensor, [sets[i] for i in place], self.normalizer, union)
 
     def state_dict(self) -> dict[str, Any]:
-        """Where the mixture is; JSON-able."""
+        """Position of the mixture; JSON-able."""
         return {"step": self._step, "streams": [stream.state_dict() for stream in self._streams]}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:

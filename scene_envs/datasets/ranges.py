@@ -1,4 +1,4 @@
-"""The fixed normalizer of a generated dataset: known before the first scene, so all shards share it."""
+"""Fixed normalizer of a generated dataset, known before the first scene, so that all shards share it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shards made by a Ray cluster: on this machine, or on many."""
+"""Generation of shards on a Ray cluster, on this machine or on many."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One shard of a generated dataset: a function of its job and grammar alone."""
+"""One shard of a generated dataset, a function of its job and grammar alone."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _UNFIT = "outside the normalizer"
 
 @dataclass(frozen=True)
 class Job:
-    """What one shard is to be.
+    """Specification of one shard.
 
     Attributes:
         index: of the shard.

@@ -1,4 +1,4 @@
-"""Files of a dataset, written: parquet shards of normalised scenes and prompts, and one ``metadata.json``.
+"""Dataset file writer: parquet shards of normalised scenes and prompts, and one ``metadata.json``.
 
 The layout is that of the published datasets: column ``scenes`` holds normalised (N, D) float32 scenes,
 ``language_annotation`` one prompt each; ``metadata.json`` names the assets and holds the normalizer. The further
@@ -131,7 +131,7 @@ def remove_partial(folder: Path) -> None:
 
 
 def storage_error(path: Path, error: OSError) -> StorageError:
-    """What to raise when ``path`` could not be written."""
+    """Error to raise when ``path`` could not be written."""
     full = error.errno in (errno.ENOSPC, errno.EDQUOT)
     reason = "the disk is full" if full else error.strerror or str(error)
     remedy = "make room" if full else "put that right"

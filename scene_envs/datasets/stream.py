@@ -1,4 +1,4 @@
-"""A dataset larger than memory: endless shuffled scenes, read window by window, resumable."""
+"""Stream of a dataset larger than memory: endless shuffled scenes, read window by window, resumable."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class SceneStream:
         return _joined(pieces)
 
     def state_dict(self) -> dict[str, int]:
-        """Where the stream is; JSON-able."""
+        """Position of the stream; JSON-able."""
         return {"epoch": self._epoch, "window": self._window, "offset": self._offset}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Scenes of several scene types in one category space: what a prior trained on all of them needs."""
+"""Scenes of several scene types in one category space, for priors trained on all of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which generated scenes are kept: inside the workspace, free of penetration, and at rest."""
+"""Verification of generated scenes: inside the workspace, free of penetration, and at rest."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ KEPT = ""
 
 
 def judge_scenes(batch: SceneBatch) -> list[str]:
-    """Why each scene is thrown away: ``"outside workspace"``, ``"penetration"``, … or :data:`KEPT`.
+    """Reason why each scene is rejected: ``"outside workspace"``, ``"penetration"``, … or :data:`KEPT`.
 
     Runs in the calling process. Scenes are judged in the constructed poses; settling only tests them. The verdict on
     a scene does not depend on the others of the batch.

@@ -1,4 +1,4 @@
-"""Shards made here or in spawned processes of this machine."""
+"""Generation of shards in this process or in spawned processes of this machine."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _RESTARTS = 3
 
 @dataclass(frozen=True)
 class Work:
-    """What every worker needs, picklable.
+    """Inputs of every worker, picklable.
 
     Attributes:
         factory: makes the grammar.

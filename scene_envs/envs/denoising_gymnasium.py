@@ -17,7 +17,7 @@ Observation = dict[str, np.ndarray]
 
 
 def denoising_observation_space(core: DenoisingCore) -> spaces.Dict:
-    """What one environment shows: ``scene``, ``timestep``, ``object_mask``, and ``prompt`` if there can be one."""
+    """Observation space of one environment: ``scene``, ``timestep``, ``object_mask``, and ``prompt`` if it has any."""
     observed: dict[str, spaces.Space[Any]] = {
         "scene": scene_box(STATE_BOUND, core.slots, core.features),
         "timestep": spaces.Box(0, core.first_timestep, (1,), np.int64),

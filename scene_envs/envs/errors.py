@@ -1,4 +1,4 @@
-"""Errors of the environments that Gymnasium has a name for too."""
+"""Errors of the environments that are also Gymnasium errors."""
 
 from __future__ import annotations
 

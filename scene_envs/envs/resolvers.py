@@ -1,4 +1,4 @@
-"""Rewards and priors by name: the packages that know them are asked when an environment is built."""
+"""Resolvers of reward and prior names, through entry points, when an environment is built."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ENTRY_POINT_GROUP = "scene_envs.resolvers"
 
 
 def resolve_reward(reward: Any) -> SceneScorer:
-    """What scores scenes by ``reward``: a registered name, a mapping with settings, a function or a reward object.
+    """Scorer of ``reward``: a registered name, a mapping with settings, a function or a reward object.
 
     Raises:
         UnknownNameError: no reward has that name; the nearest known one is offered.

@@ -1,4 +1,4 @@
-"""The search MDP: its states, and their roots, children and values as pure functions. No episode, no Gymnasium."""
+"""Search MDP: states, and roots, children and values as pure functions. No episode, no Gymnasium."""
 
 from __future__ import annotations
 

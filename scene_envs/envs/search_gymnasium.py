@@ -1,4 +1,4 @@
-"""The Gymnasium adapter of the search MDP: choose among inpaintings of a scene until it is good."""
+"""Gymnasium adapter of the search MDP: a choice among inpaintings of a scene per step."""
 
 from __future__ import annotations
 

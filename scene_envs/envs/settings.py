@@ -1,4 +1,4 @@
-"""Keyword arguments of the environments: their names, defaults and checks, once for all adapters."""
+"""Keyword arguments of the environments: names, defaults and checks, shared by all adapters."""
 
 from __future__ import annotations
 
@@ -13,13 +13,15 @@ from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.scene_types import SceneType
 
 ACTION_MODES = ("next_sample", "noise")
+PROMPT_SOURCES = ("data", "grammar")
+"""Values of ``prompt`` that stand for prompts of scenes; all others are prompts themselves."""
 
 Init = TypeVar("Init", bound=Callable[..., None])
 
 
 @dataclass(frozen=True, kw_only=True)
 class EnvSettings:
-    """What every environment takes.
+    """Settings of every environment.
 
     Attributes:
         scene: scene type or its name.
@@ -53,7 +55,7 @@ class EnvSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class DenoisingSettings(EnvSettings):
-    """What the denoising environments take.
+    """Settings of the denoising environments.
 
     Attributes:
         reward: name, mapping, function or reward object.
@@ -83,7 +85,7 @@ class DenoisingSettings(EnvSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class SearchSettings(EnvSettings):
-    """What the search environment takes.
+    """Settings of the search environment.
 
     Attributes:
         objective: any reward: name, mapping, function or reward object.

@@ -1,4 +1,4 @@
-"""Spaces of the environments, and the checks on what users put into them."""
+"""Spaces of the environments, and checks of user input against them."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def check_slots(scene_type: SceneType, slots: int | None) -> int:
 
 
 def prior_device(prior: PriorLike) -> torch.device:
-    """Where the prior's weights are; CPU for a prior that has none."""
+    """Device of the prior's weights; CPU for a prior without weights."""
     parameters: Iterable[Tensor] = prior.parameters() if hasattr(prior, "parameters") else ()
     return next((p.device for p in parameters), torch.device("cpu"))
 

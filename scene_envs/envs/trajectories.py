@@ -1,4 +1,4 @@
-"""Records of the denoising MDP: what one step gave, and whole trajectories."""
+"""Records of the denoising MDP: results of one step, and whole trajectories."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
 @dataclass(frozen=True)
 class StepResult:
-    """What one step gave the B episodes of a core.
+    """Result of one step of the B episodes of a core.
 
     Attributes:
         reward: (B,) float32; 0 before the last step and where ``valid`` is False.

@@ -1,4 +1,4 @@
-"""The export itself: a folder of scenes and their assets."""
+"""Export of scenes and their assets into a folder."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MANIFEST = "export.json"
 
 @dataclass(frozen=True)
 class ExportReport:
-    """What was written.
+    """Files that an export wrote.
 
     Attributes:
         output: the folder.

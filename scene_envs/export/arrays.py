@@ -13,7 +13,7 @@ from scene_envs.export.placed import PlacedScene
 
 
 def scene_arrays(scene: PlacedScene) -> dict[str, Any]:
-    """What both files hold, for the n objects of a scene in slot order.
+    """Arrays of both files, for the n objects of a scene in slot order.
 
     Returns:
         ``translations`` (n, 3) float64 m, ``rotations`` (n, 3, 3) float64, ``categories`` (n,) int64, ``slots`` (n,)

@@ -48,7 +48,7 @@ class AssetFiles:
         return self._names[asset.name]
 
     def folder(self, asset: Asset) -> Path:
-        """Where the asset's files lie."""
+        """Folder of the asset's files."""
         folder = self.root / self.name(asset)
         folder.mkdir(parents=True, exist_ok=True)
         return folder

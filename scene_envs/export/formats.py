@@ -1,4 +1,4 @@
-"""Formats by name: the built-in ones, those of installed packages, and yours."""
+"""Registry of export formats: built-in ones, those of installed packages, and yours."""
 
 from __future__ import annotations
 

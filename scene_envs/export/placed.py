@@ -1,4 +1,4 @@
-"""Scenes as a file format wants them: named objects with exact poses in double precision."""
+"""Scenes for file formats: named objects with exact poses in double precision."""
 
 from __future__ import annotations
 

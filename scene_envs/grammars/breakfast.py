@@ -1,4 +1,4 @@
-"""What a breakfast table is laid with: place settings, shared food, a crock of cutlery.
+"""Parts of breakfast tables: place settings, shared food, a crock of cutlery.
 
 Probabilities follow the scene grammar of the paper's dataset (Pfaff et al., CoRL 2025).
 """

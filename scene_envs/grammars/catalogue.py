@@ -1,4 +1,4 @@
-"""Grammars by name: the built-in ones, those of installed packages, and yours."""
+"""Registry of grammars: built-in ones, those of installed packages, and yours."""
 
 from __future__ import annotations
 

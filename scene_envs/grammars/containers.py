@@ -1,4 +1,4 @@
-"""Things in hollow things: poses that come from letting them come to rest, in the container's own frame."""
+"""Contents of hollow objects: poses at rest in the frame of the container, from simulation."""
 
 from __future__ import annotations
 

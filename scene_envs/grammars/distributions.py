@@ -129,7 +129,7 @@ class Moved:
 
 @dataclass(frozen=True)
 class Yaw:
-    """How a child is turned about the vertical: one of ``choices`` plus a normal deviate.
+    """Turn of a child about the vertical: one of ``choices`` plus a normal deviate.
 
     Attributes:
         std: standard deviation, rad; infinite for any angle.

@@ -1,4 +1,4 @@
-"""The words of a grammar: objects, stacks, choices and repetitions, each of which draws towers.
+"""Words of a grammar: objects, stacks, choices and repetitions, each of which draws towers.
 
 A *tower* is what stands on a support: one object, or a stack of objects on the same vertical axis, with what
 stands on it and what is in it. Nodes say what is there (the structure); a distribution such as

@@ -1,4 +1,4 @@
-"""From a structure to exact poses: towers placed on surfaces, surfaces carried by objects, contents at rest."""
+"""Layout of a structure: exact poses of towers on surfaces, surfaces on objects, contents at rest."""
 
 from __future__ import annotations
 

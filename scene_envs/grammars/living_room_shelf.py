@@ -65,7 +65,7 @@ def drinks(asset: str, p: float) -> Node:
 
 
 def things(toy: float, game: float, p: float) -> Node:
-    """What stands on one tier.
+    """Objects of one tier.
 
     Args:
         toy: chance of the book and of each toy.

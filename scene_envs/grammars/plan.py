@@ -1,4 +1,4 @@
-"""Plans of objects: discs and rectangles in the plane of a support, and whether two of them meet."""
+"""Plans of objects: discs and rectangles in the plane of a support, and their intersection test."""
 
 from __future__ import annotations
 

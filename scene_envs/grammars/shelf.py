@@ -1,4 +1,4 @@
-"""The shelf: where its four tiers are, and what keeps clear of its boards."""
+"""Shelf: positions of its four tiers, and clearance from its boards."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Supports that know their free 2-D region: where a child may still be placed without overlap."""
+"""Supports with their free 2-D region, where a child may be placed without overlap."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _MOST_CELLS = 100
 
 @dataclass(frozen=True)
 class Region:
-    """Where children may stand: a rectangle cut by an optional disc, in the support's frame.
+    """Region of the frames of children: a rectangle cut by an optional disc, in the support's frame.
 
     Attributes:
         half_x, half_y: half sides of the rectangle (m) in which object frames stay.
@@ -89,7 +89,7 @@ class Region:
 
 @dataclass(frozen=True)
 class Outline:
-    """What a child needs of its support.
+    """Area that a child needs on its support.
 
     Attributes:
         keep_out: what no other child's keep-out may meet; one plan per level of a stack.
@@ -128,7 +128,7 @@ class FreeSurface:
     _cores: list[tuple[float, float, float]] = field(default_factory=list)
 
     def mark(self) -> int:
-        """How many plans stand here, for :meth:`reset`."""
+        """Number of plans on the surface, for :meth:`reset`."""
         return len(self._placed)
 
     def reset(self, mark: int) -> None:

@@ -1,4 +1,4 @@
-"""Drawn structures: towers, the surfaces they stand on, and what a node of a grammar is."""
+"""Drawn structures: towers, the surfaces they stand on, and the node protocol of grammars."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class Node(Protocol):
 
 
 class Filling(Protocol):
-    """What is inside a container, and how it starts before it comes to rest."""
+    """Contents of a container, and their poses before they come to rest."""
 
     @property
     def node(self) -> Node:

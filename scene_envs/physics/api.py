@@ -25,8 +25,14 @@ from scene_envs.physics.results import (
 from scene_envs.rotations import geodesic_angle, project_to_so3
 from scene_envs.scene import SceneBatch
 
-_READY_DEPTH, _READY_DURATION = 1e-4, 2.0
-"""What a ready object may overlap (m), and how long it stays where it is (s)."""
+_READY_DEPTH = 1e-4
+"""How deep a ready object may overlap another one (m)."""
+_READY_DURATIONS = (0.1, 0.5, 2.0, 2.0)
+"""Times (s) for which it stays where it is, judged one after the other."""
+_PATIENCE = 2
+"""Rounds without more ready objects after which a scene is left as it is."""
+_UNMOVED = 1e-4
+"""Motion (m) below which an object is believed not to depend on others that move."""
 _CHUNK = 8
 """Scenes per message to a worker."""
 _ORTHOGONAL = 1e-3
@@ -98,7 +104,9 @@ def penetration(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> Penetr
 
 
 def equilibrium(batch: SceneBatch, *, duration: float = 0.1, pool: PhysicsPool | None = None) -> EquilibriumResult:
-    """How far every object moves under gravity in ``duration`` seconds, nothing removed.
+    """Displacement of every object under gravity in ``duration`` seconds, nothing removed.
+
+    A heap of objects so deep in each other that its simulation would take long is invalid: project it first.
 
     Raises InvalidInputError and MissingDependencyError as :func:`feasibility` does.
     """
@@ -112,7 +120,8 @@ def settle(
     """Let every scene come to rest under gravity, with slight damping.
 
     Simulates up to ``duration`` seconds, and stops earlier when nothing moves any more. Objects that fall off
-    their support are where they fell to; they are outside the workspace.
+    their support are where they fell to, outside the workspace; those more than a metre below it stay there. A heap
+    of objects so deep in each other that its simulation would take long is invalid: project it first.
 
     Args:
         batch: B scenes of N slots.
@@ -145,6 +154,7 @@ def project(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> Projection
         converged=_stack(rows, batch, "converged", torch.bool, shape=()),
         residual_depth=_stack(rows, batch, "residual_depth", shape=()),
         moved=moved,
+        heap=_stack(rows, batch, "heap", torch.bool, shape=()),
         valid=_valid(rows),
     )
 
@@ -156,8 +166,10 @@ def make_ready(
 
     A free object is ready when it is inside the workspace, overlaps nothing deeper than 0.1 mm, and stays within 1 mm
     and 0.01 rad of where it is for 2 s of simulation, also without the objects that are not ready. Scenes with objects
-    that are not ready go through projection and settling again, with more solver iterations, up to ``rounds`` times
-    in all. The round with most ready objects is kept, the earliest of equal ones.
+    in the workspace that are not ready go through projection and settling again, with more solver iterations, up to
+    ``rounds`` times in all, until two in a row have made no more of them ready. The round with most ready objects is
+    kept, the earliest of equal ones. A heap, whose objects are so deep in each other that projection has to spread
+    them, is invalid.
 
     Args:
         batch: B scenes of N slots.
@@ -171,31 +183,21 @@ def make_ready(
         raise InvalidInputError(f"rounds={rounds} must be at least 1: each projects and settles once")
     best = last = _make_ready_once(batch, duration, ITERATIONS, pool)
     tensor, ready, counts = best.batch.tensor.clone(), best.ready.clone(), best.counts.clone()
-    free = best.batch.is_free.sum(dim=-1)
     scenes = torch.arange(len(batch))  # that went through the last round
+    without_gain = torch.zeros(len(batch), dtype=torch.int64)  # rounds in a row
     for _ in range(rounds - 1):
-        again = (last.valid & (counts < free)[scenes]).nonzero()[:, 0]
+        unready = last.batch.is_free & last.batch.in_workspace & ~last.ready
+        again = (last.valid & (without_gain[scenes] < _PATIENCE) & unready.any(dim=-1)).nonzero()[:, 0]
         if not len(again):
             break
         scenes = scenes[again]
         last = _make_ready_once(last.batch[again], duration, CONVERGED, pool)
         better = last.counts > counts[scenes]
+        without_gain[scenes] = (without_gain[scenes] + 1) * ~better
         improved = scenes[better]
         tensor[improved], ready[improved] = last.batch.tensor[better], last.ready[better]
         counts[improved] = last.counts[better]
     return ReadyResult(SceneBatch(tensor, best.batch.scene_type), ready, counts, best.valid)
-
-
-def _ready_alone(batch: SceneBatch, ready: Tensor, pool: PhysicsPool | None) -> Tensor:
-    """Which of the ``ready`` objects (B, N) are ready without the others: those that lean on what is not are struck."""
-    ready = ready.clone()
-    scenes = (ready.any(dim=-1) & (batch.is_free & ~ready).any(dim=-1)).nonzero()[:, 0]
-    while len(scenes):
-        judged = _judge_ready(_keep(batch[scenes], ready[scenes]), pool)
-        struck = (ready[scenes] & ~judged).any(dim=-1)
-        ready[scenes] &= judged
-        scenes = scenes[struck]
-    return ready
 
 
 def _keep(batch: SceneBatch, kept: Tensor) -> SceneBatch:
@@ -207,16 +209,37 @@ def _keep(batch: SceneBatch, kept: Tensor) -> SceneBatch:
 def _make_ready_once(batch: SceneBatch, duration: float, iterations: int, pool: PhysicsPool | None) -> ReadyResult:
     """One round of :func:`make_ready`."""
     projected = project(batch, pool=pool)
-    settled = settle(projected.batch, duration=duration, iterations=iterations, pool=pool)
-    valid = projected.valid & settled.valid
-    ready = _ready_alone(settled.batch, _judge_ready(settled.batch, pool) & valid[:, None], pool)
-    return ReadyResult(settled.batch, ready, ready.sum(dim=-1), valid)
+    rows = (projected.valid & ~projected.heap).nonzero()[:, 0]
+    settled = settle(projected.batch[rows], duration=duration, iterations=iterations, pool=pool)
+    tensor, ready = projected.batch.tensor.clone(), torch.zeros_like(projected.batch.is_empty)
+    tensor[rows], ready[rows] = settled.batch.tensor, _judge_ready(settled.batch, pool) & settled.valid[:, None]
+    valid = torch.zeros(len(batch), dtype=torch.bool)
+    valid[rows] = settled.valid
+    return ReadyResult(SceneBatch(tensor, batch.scene_type), ready, ready.sum(dim=-1), valid)
 
 
 def _judge_ready(batch: SceneBatch, pool: PhysicsPool | None) -> Tensor:
-    """(B, N) free objects inside the workspace that hardly overlap and stay where they are."""
-    judged = feasibility(batch, max_penetration=_READY_DEPTH, duration=_READY_DURATION, pool=pool)
-    return judged.feasible & batch.in_workspace & judged.valid[:, None]
+    """(B, N) free objects that are simulation-ready; see :func:`make_ready`.
+
+    What moves at once is struck first, then what moves later or without what was struck. Where the last judgement
+    still strikes something, everything that moved is struck with it.
+    """
+    ready = batch.is_free & batch.in_workspace
+    scenes = ready.any(dim=-1).nonzero()[:, 0]
+    for duration in _READY_DURATIONS:
+        if not len(scenes):
+            break
+        kept = _keep(batch[scenes], ready[scenes])
+        judged = feasibility(kept, max_penetration=_READY_DEPTH, duration=duration, pool=pool)
+        feasible = judged.feasible & judged.valid[:, None]
+        struck = (ready[scenes] & ~feasible).any(dim=-1)
+        ready[scenes] &= feasible
+        still = judged.displacement < _UNMOVED
+        if duration == _READY_DURATIONS[-1]:
+            scenes, still = scenes[struck], still[struck]
+    if len(scenes):
+        ready[scenes] &= still
+    return ready
 
 
 # -- from and to tensors ------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Which objects of a scene overlap, and how deep: boxes, then face planes, then exact depths of parts."""
+"""Collision of objects: overlapping pairs of a scene and their depths, by boxes, face planes and exact depths."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The flat faces that objects stand on and carry others with."""
+"""Contact faces: the flat faces of assets that carry objects or rest on others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Collision geometry of an asset library, built once per process: what never changes from scene to scene."""
+"""Collision geometry of an asset library, built once per process."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""The physics of a chunk of scenes in one process: numpy in, numpy out. Workers run these."""
+"""Physics of a chunk of scenes in one process: numpy in, numpy out. Workers run these functions."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -12,10 +13,15 @@ from numpy.typing import NDArray
 from scene_envs.physics.motion import Physics, motion, physics_of, settle_scene
 from scene_envs.physics.placement import Objects, flatten
 from scene_envs.physics.projection import TOLERANCE, project_objects
+from scene_envs.physics.spreading import heaps
 from scene_envs.scene_types import SceneType
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+_LOGGER = logging.getLogger(__name__)
+_FALLEN = 1.0
+"""Objects further than this (m) below the workspace have fallen off, and are simulated no further."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +50,16 @@ class Chunk:
 
 
 Kernel = Callable[..., dict[str, Any]]
+
+
+def _is_heap(physics: Physics, objects: Objects) -> bool:
+    """Whether objects of one scene overlap too much to be simulated in bounded time."""
+    if not heaps(physics.collider, objects).any():
+        return False
+    _LOGGER.warning(
+        "objects of a scene are too deep in each other to be simulated; project it first; its row is invalid"
+    )
+    return True
 
 
 def _objects(physics: Physics, chunk: Chunk) -> Objects:
@@ -79,8 +95,14 @@ def equilibrium_kernel(chunk: Chunk, *, duration: float) -> dict[str, Any]:
     """See :func:`scene_envs.physics.equilibrium`."""
     physics = physics_of(chunk.scene_type)
     objects = _objects(physics, chunk)
-    displacement, rotation, lost = motion(physics, objects, physics.collider.pairs(objects), duration)
+    invalid = [index for index in range(len(chunk)) if _is_heap(physics, objects[objects.scene == index])]
+    kept = np.flatnonzero(~np.isin(objects.scene, invalid))
+    displacement, rotation = np.zeros(len(objects)), np.zeros(len(objects))
+    displacement[kept], rotation[kept], lost = motion(
+        physics, objects[kept], physics.collider.pairs(objects[kept]), duration
+    )
     valid = np.ones(len(chunk), dtype=bool)
+    valid[invalid] = False
     valid[lost] = False
     return {
         "displacement": _scatter(chunk, objects, displacement),
@@ -114,9 +136,13 @@ def settle_kernel(chunk: Chunk, *, duration: float, iterations: int) -> dict[str
     physics = physics_of(chunk.scene_type)
     translations, rotations = chunk.translations.copy(), chunk.rotations.copy()
     valid = np.ones(len(chunk), dtype=bool)
+    bottom = chunk.scene_type.workspace[0][2] - _FALLEN
     for index in range(len(chunk)):
         objects = _objects(physics, chunk.row(index))
-        new_rotation, new_translation, valid[index] = settle_scene(physics, objects, duration, iterations)
+        valid[index] = not _is_heap(physics, objects)
+        if not valid[index]:
+            continue
+        new_rotation, new_translation, valid[index] = settle_scene(physics, objects, duration, iterations, bottom)
         if valid[index]:
             translations[index, objects.slot] = new_translation
             rotations[index, objects.slot] = new_rotation
@@ -127,16 +153,17 @@ def projection_kernel(chunk: Chunk) -> dict[str, Any]:
     """See :func:`scene_envs.physics.project`."""
     physics = physics_of(chunk.scene_type)
     translations = chunk.translations.copy()
-    residual = np.zeros(len(chunk))
+    residual, heap = np.zeros(len(chunk)), np.zeros(len(chunk), dtype=bool)
     for index in range(len(chunk)):
         objects = _objects(physics, chunk.row(index))
         result = project_objects(physics.collider, objects, chunk.scene_type.workspace)
         translations[index, objects.slot] = result.translation
-        residual[index] = result.residual_depth
+        residual[index], heap[index] = result.residual_depth, result.heap
     return {
         "translations": translations,
         "residual_depth": residual,
         "converged": residual <= TOLERANCE,
+        "heap": heap,
         "valid": np.ones(len(chunk), dtype=bool),
     }
 

@@ -62,7 +62,7 @@ class Physics:
         self._world: World | None = None
 
     def rest(self, objects: Objects, pairs: ObjectPairs, duration: float) -> Rest:
-        """Which objects of some scenes need no simulation for ``duration`` seconds."""
+        """Objects of some scenes that need no simulation for ``duration`` seconds."""
         contacts = self.collider.contacts(objects, pairs, self.support.differs(objects, pairs))
         return self.statics.at_rest(objects, pairs, contacts, duration)
 
@@ -106,7 +106,7 @@ class Moved:
 
 
 def motion(physics: Physics, objects: Objects, pairs: ObjectPairs, duration: float) -> tuple[Array, Array, Index]:
-    """How far objects of several scenes move in ``duration`` seconds.
+    """Displacement of the objects of several scenes in ``duration`` seconds.
 
     Args:
         physics: of the scenes' assets.
@@ -219,7 +219,7 @@ def _simulate(
         displacement = np.linalg.norm(moved.translation - objects.translation, axis=1)
         creeping = due & (displacement > _DOUBT[0]) & (displacement < _CREEP)
         if creeping.any():
-            run(due & np.isin(group, group[creeping]), replace(FINEST, iterations=CONVERGED))
+            run(due & np.isin(group, group[creeping]), replace(settings_for(0), iterations=CONVERGED))
     return left
 
 
@@ -259,7 +259,9 @@ def _merge(objects: Objects, pairs: ObjectPairs, group: Index, first: Index, sec
     return due
 
 
-def settle_scene(physics: Physics, objects: Objects, duration: float, iterations: int) -> tuple[Array, Array, bool]:
+def settle_scene(
+    physics: Physics, objects: Objects, duration: float, iterations: int, bottom: float
+) -> tuple[Array, Array, bool]:
     """Let one scene come to rest: rotation (n, 3, 3), translation (n, 3) m, and whether it stayed finite.
 
     Args:
@@ -267,6 +269,7 @@ def settle_scene(physics: Physics, objects: Objects, duration: float, iterations
         objects: of one scene.
         duration: s, the longest time to simulate.
         iterations: of the solver per step.
+        bottom: height (m) below which objects are left where they are.
     """
     current = objects
     calm = np.zeros(len(objects), dtype=bool)  # was simulated, and did not move
@@ -277,7 +280,8 @@ def settle_scene(physics: Physics, objects: Objects, duration: float, iterations
         pairs = physics.collider.pairs(current)
         rest = physics.rest(current, pairs, span)
         active = ~(rest.still | current.fixed)
-        done = active & ~company(current, pairs, active & ~calm)
+        fallen = active & (current.translation[:, 2] < bottom)
+        done = fallen | active & ~company(current, pairs, active & ~calm & ~fallen)
         rest = Rest(rest.still | done, rest.rise, rest.tilt)
         if not (active & ~done).any() and (np.abs(rest.rise) < _STILL).all():
             break

@@ -1,4 +1,4 @@
-"""Separating planes between the objects of one scene, and the nearest translations on the right side of all of them."""
+"""Separating planes between the objects of one scene, and the nearest translations that satisfy all of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Worker processes for physics: order-preserving, and no scene is lost with the worker that had it."""
+"""Worker processes for physics: order-preserving, with a retry when a worker dies."""
 
 from __future__ import annotations
 

@@ -63,12 +63,14 @@ class Projection:
         residual_depth: deepest overlap that is left, m.
         total_depth: sum over object pairs of the overlap that is left, m.
         overlapping: (n,) bool, objects that still overlap another one.
+        heap: whether objects were so deep in each other that they were spread first.
     """
 
     translation: Array
     residual_depth: float
     total_depth: float
     overlapping: Mask
+    heap: bool = False
 
 
 def project_objects(collider: Collider, objects: Objects, workspace: Corners) -> Projection:
@@ -82,11 +84,11 @@ def project_objects(collider: Collider, objects: Objects, workspace: Corners) ->
     home = objects.translation
     bounds = _bounds(home, objects, workspace)
     chosen, start, best = heaps(collider, objects), objects, None
-    wanted = home
+    wanted, heap = home, bool(chosen.any())
     for _ in range(SEARCHES):
         if chosen.any():
             wanted = np.where(chosen[:, None], spread(collider.library, start, chosen, home, bounds), wanted)
-        found = _search(collider, replace(objects, translation=wanted), bounds)
+        found = replace(_search(collider, replace(objects, translation=wanted), bounds), heap=heap)
         if best is None or found.total_depth < best.total_depth:
             best = found
         if found.residual_depth <= TOLERANCE:

@@ -1,4 +1,4 @@
-"""Which objects stand where they are for a reason that needs no simulation: the statics of upright stacks.
+"""Statics of upright stacks: objects that are at rest without simulation.
 
 An upright object rests on the one object under it when its centre of mass, with everything that it carries, lies
 inside both its own foot and the flat face below. Gaps close and small overlaps open, from the lowest object up. What
@@ -40,7 +40,7 @@ _DEEPEST = 2e-3
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """What has a closed form.
+    """Objects whose motion has a closed form.
 
     Attributes:
         still: (n,) bool; free objects that need no simulation.
@@ -123,7 +123,7 @@ class Statics:
         self._foot_center = np.array([(0.0, 0.0) if bottom is None else bottom.center for bottom in bottoms])
 
     def at_rest(self, objects: Objects, pairs: ObjectPairs, contacts: Contacts, duration: float) -> Rest:
-        """What needs no simulation for ``duration`` seconds.
+        """Objects that need no simulation for ``duration`` seconds.
 
         Args:
             objects: the objects of one or more scenes.

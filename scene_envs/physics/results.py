@@ -1,4 +1,4 @@
-"""What the physics functions return."""
+"""Results of the physics functions."""
 
 from __future__ import annotations
 
@@ -107,6 +107,7 @@ class ProjectionResult:
         converged: (B,) bool; no overlap deeper than the tolerance is left.
         residual_depth: (B,) m, deepest overlap left.
         moved: (B, N) m, how far each object was moved.
+        heap: (B,) bool; objects were so deep in each other that they were spread to free places.
         valid: (B,) bool.
     """
 
@@ -114,6 +115,7 @@ class ProjectionResult:
     converged: Tensor
     residual_depth: Tensor
     moved: Tensor
+    heap: Tensor
     valid: Tensor
 
 

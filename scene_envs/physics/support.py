@@ -1,4 +1,4 @@
-"""Who touches whom: when coarse shapes give the same verdict, how high stacks are, what is simulated together."""
+"""Contact graph of a scene: level of detail of each object, height of stacks, clusters to simulate together."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ _STILL_WAY, _STILL_ANGLE = 1e-4, 1e-3
 
 @dataclass(frozen=True)
 class SolverSettings:
-    """How the motion is integrated.
+    """Settings of the integration of motion.
 
     Attributes:
         time_step: s.

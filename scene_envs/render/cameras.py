@@ -1,4 +1,4 @@
-"""Cameras for pictures, and the lamp that goes with them."""
+"""Cameras and lamps for pictures."""
 
 from __future__ import annotations
 

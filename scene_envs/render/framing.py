@@ -1,4 +1,4 @@
-"""What a picture of a scene type must show, and from where: worked out from its workspace and fixed objects."""
+"""Framing of pictures: the view of a scene type, computed from its workspace and fixed objects."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _RAYS = 24
 
 @dataclass(frozen=True, eq=False)
 class Framing:
-    """What is to be seen, and the directions to look and to light it from.
+    """Points to show, with the directions of camera and lamp.
 
     Attributes:
         points: (P, 3) m, world frame; all of them belong in the picture.
@@ -46,7 +46,7 @@ class Framing:
 
 @lru_cache(maxsize=64)
 def frame_scene_type(scene_type: SceneType) -> Framing:
-    """How to look at scenes of this type.
+    """Framing of scenes of this type.
 
     A support that rises through the workspace (a shelf) is seen whole, from its open side and slightly above; one that
     is open to the sky (a bin) steeply from above. Where objects stand on a support (a table, a floor) or on nothing,

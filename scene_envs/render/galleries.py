@@ -1,4 +1,4 @@
-"""Many images on one page."""
+"""Galleries: many images on one page."""
 
 from __future__ import annotations
 

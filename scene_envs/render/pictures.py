@@ -1,4 +1,4 @@
-"""Scenes to images."""
+"""Images of scenes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A stage: one PyBullet client that holds the bodies of a library and draws what a camera sees."""
+"""Stage: one PyBullet client that holds the bodies of a library and draws what a camera sees."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _CELL, _CELLS = 8, 32
 
 @dataclass(frozen=True)
 class Frame:
-    """What a camera saw.
+    """Images of one camera.
 
     Attributes:
         color: (H, W, 3) float32 in 0..255, lit but without shadows.

@@ -1,12 +1,9 @@
-"""A page that shows scenes in any browser: one HTML file that needs nothing else."""
+"""Viewer: one self-contained HTML file that shows scenes in a browser."""
 
 from __future__ import annotations
 
 import base64
-import html
-import json
 import os
-import re
 from collections.abc import Sequence
 from functools import cache
 from importlib import resources
@@ -73,13 +70,18 @@ def write_viewer(
 
 def _page(title: str, data: dict[str, Any]) -> str:
     """The template with everything filled in; nothing in the data can end the element that holds it."""
-    parts = {
-        "TITLE": html.escape(title),
-        "STYLE": _web("viewer.css"),
-        "SCRIPTS": "\n".join(_web(name) for name in _SCRIPTS),
-        "DATA": json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
-    }
-    return re.sub(r"@@([A-Z]+)@@", lambda found: parts[found[1]], _web("viewer.html"))
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from jinja2.utils import htmlsafe_json_dumps
+    from markupsafe import Markup
+
+    loader = PackageLoader("scene_envs.render", "web")
+    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, keep_trailing_newline=True)
+    return environment.get_template("viewer.html").render(
+        title=title,
+        style=Markup(_web("viewer.css")),
+        scripts=Markup("\n".join(_web(name) for name in _SCRIPTS)),
+        data=htmlsafe_json_dumps(data, separators=(",", ":"), allow_nan=False),
+    )
 
 
 @cache

@@ -1,4 +1,4 @@
-"""Scene types: which assets, where, seen from where; by name."""
+"""Scene types: assets, workspace, fixed objects and camera, by name."""
 
 from scene_envs.scene_types.base import Camera, FixedObject, SceneType
 from scene_envs.scene_types.registry import (

@@ -1,4 +1,4 @@
-"""A scene type: which assets, where, seen from where. Pure data, no torch."""
+"""Scene type: assets, workspace, fixed objects and camera. Pure data, no torch."""
 
 from __future__ import annotations
 

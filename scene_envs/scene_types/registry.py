@@ -1,4 +1,4 @@
-"""Scene types by name: the built-in ones, those of installed packages, yours, and unions of them."""
+"""Registry of scene types: built-in ones, those of installed packages, yours, and unions of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One scene type for the scenes of several."""
+"""Union of several scene types as one scene type."""
 
 from __future__ import annotations
 

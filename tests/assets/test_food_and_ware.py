@@ -16,7 +16,8 @@ from scene_envs.assets import get_library, list_assets
 from scene_envs.physics import equilibrium, feasibility, penetration, project, settle
 from scene_envs.physics.parts import PartGeometry
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import Camera, FixedObject, SceneType, get_scene_type, list_scene_types
+from scene_envs.scene_types import Camera, FixedObject, SceneType
+from scene_envs.scene_types.built_in import BUILT_IN
 
 SIZES = {  # (x, y, z) m, handles aside
     "cereal_box": (0.19, 0.06, 0.28),
@@ -224,7 +225,7 @@ def test_visual_mesh_shows_what_collides(library, name):
 
 
 def test_class_colors_of_all_scene_types_differ():
-    wanted = {name for scene_type in list_scene_types() for name in get_scene_type(scene_type).assets}
+    wanted = {name for scene_type in BUILT_IN for name in scene_type.assets}
     library = get_library(sorted(wanted & set(list_assets())))
     colors = np.array([asset.color for asset in library], dtype=float)
     gaps = np.linalg.norm(colors[:, None] - colors[None], axis=-1) + 1e3 * np.eye(len(colors))

@@ -15,7 +15,7 @@ from agents.priors.testing import tiny_prior
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type
-from tests.agents.authors_flux import random_state, write_checkpoint
+from tests.helpers.authors_flux import random_state, write_checkpoint
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_search_and_post_training_take_prompts(reader: Path, tmp_path: Path) -> 
         "prompt=[A scene with two cups., A scene with 9 objects.]",
         "algorithm.scenes_per_prompt=2",
         "algorithm.min_std=0.0001",
-        "logger=silent",
+        "logger.progress=none",
         "logger.report_scenes=0",
     ]
     assert main([*words, f"output={tmp_path / 'run'}"]) == 0

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from agents.cli.keys import compose
-from agents.networks.registry import parameter_count
+from agents.networks import parameter_count
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.initial_prior import build_prior
 from agents.priors.mixed import MixedPrior

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from importlib.metadata import EntryPoint
 from typing import Any
-from unittest.mock import patch
 
 import gymnasium as gym
 import numpy as np
@@ -110,14 +109,12 @@ def test_names_are_resolved_and_unknown_ones_get_an_offer() -> None:
 
 
 def test_a_registered_mask_works_by_name_in_the_environment(prior: ToyPrior, free_objects: Any) -> None:
-    with patch.dict(masks._MASKS):
+    @register_mask("odd_slots")
+    def odd_slots(scene: SceneBatch, score: Score, rng: np.random.Generator) -> torch.Tensor:
+        return torch.arange(scene.tensor.shape[1]) % 2 == 1
 
-        @register_mask("odd_slots")
-        def odd_slots(scene: SceneBatch, score: Score, rng: np.random.Generator) -> torch.Tensor:
-            return torch.arange(scene.tensor.shape[1]) % 2 == 1
-
-        env = gym.make(ID, prior=prior, objective=free_objects, num_steps=1, mask="odd_slots").unwrapped
-        observation, _ = env.reset(seed=0)
+    env = gym.make(ID, prior=prior, objective=free_objects, num_steps=1, mask="odd_slots").unwrapped
+    observation, _ = env.reset(seed=0)
     welded = env.scene().is_welded[0].numpy()
     assert observation["regenerate"].tolist() == ((np.arange(34) % 2 == 1) & ~welded).tolist()
     with pytest.raises(InvalidInputError, match="mask name"):
@@ -127,9 +124,8 @@ def test_a_registered_mask_works_by_name_in_the_environment(prior: ToyPrior, fre
 def test_a_mask_of_an_installed_package_works_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     point = EntryPoint("everything", "torch:ones_like", "scene_envs.masks")
     monkeypatch.setattr(masks, "plugin_entry_points", lambda group: {"everything": point})
-    with patch.dict(masks._MASKS):
-        assert "everything" in list_masks()
-        assert resolve_mask("everything") is torch.ones_like
+    assert "everything" in list_masks()
+    assert resolve_mask("everything") is torch.ones_like
 
 
 def test_the_environment_and_the_search_run_have_one_default(prior: ToyPrior, free_objects: Any) -> None:

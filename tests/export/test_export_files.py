@@ -218,9 +218,7 @@ def test_no_scenes_and_empty_scenes_are_fine(tmp_path):
 # -- a format of one's own ---------------------------------------------------------------------------
 
 
-def test_a_format_of_ones_own_gets_poses_and_meshes(tmp_path, monkeypatch):
-    monkeypatch.setattr(formats, "_FORMATS", dict(formats._FORMATS))
-
+def test_a_format_of_ones_own_gets_poses_and_meshes(tmp_path):
     @register_format("height_list", summary="heights")
     def heights(scene, files: AssetFiles, folder):
         path = folder / "heights.txt"

@@ -8,7 +8,6 @@ import sys
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
-from unittest.mock import patch
 
 import gymnasium as gym
 import numpy as np
@@ -26,10 +25,8 @@ from scene_envs.datasets import SceneDataset, generate, judge_scenes, parse_prom
 from scene_envs.errors import UnknownNameError
 from scene_envs.export import export
 from scene_envs.grammars import get_grammar, list_grammars
-from scene_envs.grammars.grammar import GRAMMARS
 from scene_envs.physics import PhysicsPool, feasibility, make_ready
 from scene_envs.render import render, write_viewer
-from scene_envs.scene_types import registry
 
 PACKAGE = Path(__file__).parents[1] / "scene_type_package"
 DOCS = Path(__file__).parents[2] / "docs" / "grammars.md"
@@ -44,10 +41,10 @@ def tea_house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     options = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--disable-pip-version-check"]
     command = [sys.executable, "-m", "pip", "install", *options, "--target", str(site), str(copy)]
     subprocess.run(command, check=True, capture_output=True, text=True)
-    list_grammars()  # the built-in ones are registered for good, before the registry is swapped
-    with pytest.MonkeyPatch.context() as monkeypatch, patch.dict(registry._REGISTRY), patch.dict(GRAMMARS):
+    with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.syspath_prepend(str(site))
         plugins.load_plugins.cache_clear()
+        list_scene_types()  # imports what is installed, once per process
         yield site
     plugins.load_plugins.cache_clear()
     for name in [name for name in sys.modules if name.startswith("tea_house")]:

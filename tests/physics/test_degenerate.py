@@ -13,9 +13,11 @@ from rewards import evaluate_reward, make_reward
 from scene_envs.errors import InvalidInputError
 from scene_envs.physics import equilibrium, feasibility, make_ready, penetration, project, settle
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import get_scene_type, list_scene_types
+from scene_envs.scene_types import get_scene_type
+from scene_envs.scene_types.built_in import BUILT_IN
 
-TYPES = list_scene_types()
+pytestmark = pytest.mark.slow
+
 PHYSICS: dict[str, Callable[[SceneBatch], object]] = {
     "penetration": penetration,
     "feasibility": feasibility,
@@ -87,7 +89,7 @@ SCENES = {f.__name__: f for f in (at_one_point, in_pairs, nested, far_outside, t
 
 
 @pytest.mark.parametrize("kind", SCENES)
-@pytest.mark.parametrize("name", TYPES)
+@pytest.mark.parametrize("name", [scene_type.name for scene_type in BUILT_IN])
 def test_every_function_answers(name: str, kind: str) -> None:
     batch = SCENES[kind](name)
     for function in PHYSICS.values():

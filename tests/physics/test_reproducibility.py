@@ -15,7 +15,9 @@ from torch import Tensor
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import PhysicsPool, feasibility, make_ready, project, settle
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import list_scene_types
+from scene_envs.scene_types.built_in import BUILT_IN
+
+pytestmark = pytest.mark.slow
 
 NOISE = (0.004, 0.015, 0.03)
 """m along every axis; one scene each."""
@@ -64,7 +66,7 @@ def pool() -> Iterator[PhysicsPool]:
         yield pool
 
 
-@pytest.mark.parametrize("name", list_scene_types())
+@pytest.mark.parametrize("name", [scene_type.name for scene_type in BUILT_IN])
 def test_no_history_changes_a_result(name: str, pool: PhysicsPool) -> None:
     """Each function of each scene alone, after others in a random order, and in workers with histories of their own."""
     batch = crowded(name)

@@ -19,6 +19,8 @@ from scene_envs.rotations import matrix_to_quaternion, yaw_matrix
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import Camera, get_scene_type
 
+pytestmark = pytest.mark.slow
+
 DIMSUM = get_scene_type("dimsum_table")
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from rewards import registry
 from scene_envs import SceneBatch
 
 PLUGIN = Path(__file__).parents[1] / "plugin_package"
@@ -29,16 +28,9 @@ def plugin_site(tmp_path_factory) -> Path:
 def plugin(plugin_site, monkeypatch):
     """The plug-in package on the path of this process, for one test."""
     monkeypatch.syspath_prepend(str(plugin_site))
-    monkeypatch.setattr(registry, "_registry", dict(registry._registry))
     yield
     for name in [name for name in sys.modules if name.startswith("open_space_rewards")]:
         del sys.modules[name]
-
-
-@pytest.fixture
-def own_registry(monkeypatch):
-    """Registrations of one test vanish with it."""
-    monkeypatch.setattr(registry, "_registry", dict(registry._registry))
 
 
 @pytest.fixture

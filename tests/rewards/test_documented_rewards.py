@@ -9,8 +9,6 @@ from rewards import check_reward, make_reward, resolve_reward
 
 ROOT = Path(__file__).parents[2]
 
-pytestmark = pytest.mark.usefixtures("own_registry")
-
 
 def python_blocks(path: str) -> list[str]:
     return re.findall(r"```python\n(.*?)```", (ROOT / path).read_text(), re.DOTALL)

@@ -19,8 +19,6 @@ from rewards import (
 )
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
-pytestmark = pytest.mark.usefixtures("own_registry")
-
 
 def low(batch, context, *, factor=1.0):
     """Lowness."""

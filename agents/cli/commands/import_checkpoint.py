@@ -22,7 +22,7 @@ class ImportCheckpointConfig:
         checkpoint: the Lightning .ckpt of a mixed Flux model; the first word without =.
         metadata: the metadata.json of the data it was trained on; the second word without =.
         scene: scene type whose assets its model paths name; empty makes one from the metadata.
-        aliases: model path or its stem to asset name, as in {their_cup: teacup}.
+        aliases: model path or its stem to asset name, as in {their_cup: teacup}; null for none.
         text_encoder: folder or hub name of the BERT that the checkpoint reads prompts with; empty takes BERT-base where
             it is at hand, and else makes a prior without prompts.
         count: scenes to sample as a trial; 0 for none.
@@ -58,7 +58,7 @@ def run(settings: ImportCheckpointConfig, run: Run) -> None:
         settings.checkpoint,
         settings.metadata,
         scene=settings.scene or None,
-        aliases=settings.aliases,
+        aliases=settings.aliases or {},
         text_encoder=settings.text_encoder,
     )
     prior.save(run.directory / "prior")

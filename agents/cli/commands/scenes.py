@@ -1,4 +1,4 @@
-"""What several commands do with scenes: score them, make them ready, draw them."""
+"""Functions on scenes that several commands share: scoring, making ready, drawing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One file as an asset: read, scaled, decomposed, weighed and put on its base."""
+"""Import of one file as an asset: reading, scaling, decomposition, mass, base."""
 
 from __future__ import annotations
 

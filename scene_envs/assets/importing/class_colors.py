@@ -1,4 +1,4 @@
-"""Class colours for assets that bring none: far from each other and from those that are taken."""
+"""Class colours for assets without one, distinct from each other and from colours in use."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Concave meshes as convex parts, by CoACD, kept on disk.
+"""Convex decomposition of concave meshes by CoACD, cached on disk.
 
 CoACD: Wei et al., "Approximate Convex Decomposition for 3D Meshes with Collision-Aware Concavity and Tree
 Search", SIGGRAPH 2022.
@@ -39,7 +39,7 @@ _MOST_BODIES = 128
 
 
 def cache_folder() -> Path:
-    """Where decompositions are kept: ``$SCENE_ENVS_CACHE``, else ``scene_envs`` in the user's cache folder."""
+    """Folder of cached decompositions: ``$SCENE_ENVS_CACHE``, else ``scene_envs`` in the user's cache folder."""
     if chosen := os.environ.get("SCENE_ENVS_CACHE"):
         return Path(chosen).expanduser()
     if os.name == "nt" and (local := os.environ.get("LOCALAPPDATA")):

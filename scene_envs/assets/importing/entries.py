@@ -1,4 +1,4 @@
-"""``library.yaml``: what a user says about the files of a folder."""
+"""``library.yaml``: a user's settings for the files of a folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Convex hulls of measured surfaces: how far a surface is from convex, and hulls with few corners."""
+"""Convex hulls of surfaces: deviation of a surface from its hull, and hulls with few corners."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def few_cornered_hull(points: Array, tolerance: float, corners: int = MOST_CORNE
 
 
 def concavity(points: Array, hull: ConvexPart) -> float:
-    """How deep (m) the deepest of the points (P, 3) lies below the surface of ``hull``."""
+    """Largest depth (m) of the points (P, 3) below the surface of ``hull``."""
     planes = ConvexHull(hull.vertices).equations
     deepest = 0.0
     for start in range(0, len(points), 4096):

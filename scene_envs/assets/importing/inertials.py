@@ -1,4 +1,4 @@
-"""Mass, centre of mass and inertia of an imported model: kept where they can be true, computed where not."""
+"""Mass, centre of mass and inertia of an imported model: kept where plausible, computed elsewhere."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _FACTOR = 10.0
 
 
 class Weight(NamedTuple):
-    """What an asset weighs, and what is to be said about it."""
+    """Mass properties of an asset, with remarks for the report."""
 
     properties: MassProperties
     notes: tuple[str, ...]
@@ -76,7 +76,7 @@ def weigh(
 
 
 def why_impossible(inertia: Array, center: Array, parts: Sequence[ConvexPart], computed: MassProperties) -> str:
-    """Why a body of this shape cannot have this inertia (3, 3) and centre of mass (3,); empty when it can.
+    """Reason why a body of this shape cannot have this inertia (3, 3) and centre of mass (3,); empty if it can.
 
     >>> from scene_envs.assets.shapes import box
     >>> cube = [box((0.1, 0.1, 0.1))]

@@ -1,4 +1,4 @@
-"""Reading mesh files: triangles with a colour per corner, checked."""
+"""Mesh files: triangles with a colour per corner, checked."""
 
 from __future__ import annotations
 

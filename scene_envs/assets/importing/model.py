@@ -1,4 +1,4 @@
-"""What a model file says, whatever its format: shapes, inertials, and whether it is fixed to the world."""
+"""Contents of a model file in any format: shapes, inertials, and whether it is fixed to the world."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an import did, one line per asset."""
+"""Import report: one line per asset."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class AssetReport:
-    """How one file became an asset.
+    """Import report of one file.
 
     Attributes:
         name: of the asset.
@@ -42,7 +42,7 @@ class AssetReport:
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What the import of a folder did.
+    """Import report of a folder.
 
     Attributes:
         folder: that was read.

@@ -1,4 +1,4 @@
-"""Reading SDF: the links of one model merged at zero joint positions."""
+"""SDF reader: the links of one model merged at zero joint positions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reading URDF: links merged at zero joint positions into one rigid model."""
+"""URDF reader: links merged at zero joint positions into one rigid model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A folder of files as an asset library."""
+"""Asset library of a folder of files."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def load_library(folder: str | os.PathLike[str]) -> AssetLibrary:
 
 
 def import_report(folder: str | os.PathLike[str]) -> ImportReport:
-    """What the import of a folder chose, put right, or could not read; ``str`` gives a line per asset.
+    """Report on the import of a folder: choices, corrections, unreadable files; ``str`` gives a line per asset.
 
     Raises as :func:`load_library` does for the folder and its YAML; files that cannot be read are in the report.
     """
@@ -102,7 +102,7 @@ class FolderIndex:
         return self._built(name)[0]
 
     def report(self, name: str) -> AssetReport:
-        """How the asset called ``name`` came to be."""
+        """Import report of the asset ``name``."""
         return self._built(name)[1]
 
     def _built(self, name: str) -> tuple[Asset, AssetReport]:
@@ -113,7 +113,7 @@ class FolderIndex:
 
 
 def folder_index(folder: str | os.PathLike[str]) -> FolderIndex:
-    """What a folder offers, without reading its models.
+    """Index of a folder, without reading its models.
 
     Raises:
         InvalidInputError: no such folder, no assets in it, or a wrong entry.

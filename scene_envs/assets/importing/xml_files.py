@@ -1,4 +1,4 @@
-"""Reading XML models: numbers, colours and the files they refer to, with errors that say where."""
+"""XML reader for models: numbers, colours and referenced files, with errors that name the place."""
 
 from __future__ import annotations
 

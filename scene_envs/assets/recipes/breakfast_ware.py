@@ -1,4 +1,4 @@
-"""What a breakfast table is laid with: plates, mugs, jugs and a crock for cutlery."""
+"""Breakfast ware: plates, mugs, jugs and a crock for cutlery."""
 
 from __future__ import annotations
 

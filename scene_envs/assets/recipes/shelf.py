@@ -1,4 +1,4 @@
-"""A shelf with four tiers, and what stands on it: book, lamp, speaker."""
+"""Shelf with four tiers, and book, lamp and speaker."""
 
 from __future__ import annotations
 

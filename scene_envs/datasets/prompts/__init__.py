@@ -1,4 +1,4 @@
-"""Prompts that are true of a scene, and a parser and a checker that read them back."""
+"""Prompts that are true of a scene, with a parser and a checker."""
 
 from scene_envs.datasets.prompts.claims import (
     Claim,

@@ -1,4 +1,4 @@
-"""What a prompt claims, claim by claim, and whether a scene bears it out."""
+"""Claims of a prompt, and their check against a scene."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Place:
 
 @dataclass(frozen=True)
 class ClaimCheck:
-    """How one claim fares in one scene.
+    """Check of one claim in one scene.
 
     Attributes:
         claim: what was claimed.
@@ -195,7 +195,7 @@ Claim = ObjectCount | NameCount | PlaceCount | SupportCount | PairCount | SideCl
 
 @dataclass(frozen=True)
 class PromptFacts:
-    """What one prompt claims.
+    """Claims of one prompt.
 
     Attributes:
         claims: the claims, in the order of the text.

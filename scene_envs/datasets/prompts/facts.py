@@ -1,4 +1,4 @@
-"""The facts of a scene that prompts can speak of, from poses and asset geometry alone."""
+"""Facts of a scene that prompts describe, from poses and asset geometry alone."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ LOOSE = Tolerances(contact=0.015, beside=0.06, beside_furniture=0.6)
 
 @dataclass(frozen=True, eq=False)
 class SceneFacts:
-    """What prompts can say about one scene of n objects. Indices are into these n objects.
+    """Facts that prompts can state about one scene of n objects. Indices are into these n objects.
 
     Attributes:
         names: (n,) display names.
@@ -174,7 +174,7 @@ def viewer_axes(scene_type: str | SceneType) -> Array:
 
 
 def scene_facts(batch: SceneBatch, tolerances: Tolerances = NOMINAL) -> list[SceneFacts]:
-    """What can be said about each scene of ``batch``."""
+    """Facts about each scene of ``batch``."""
     return facts_under(batch, [tolerances])[0]
 
 

@@ -92,7 +92,7 @@ def say_reference(reference: Reference, *, near: Place | None = None) -> str:
 
 
 def place_word(place: Place) -> str:
-    """What kind of place it is; tiers are called shelves where they belong to the one thing called a shelf."""
+    """Noun of a place; tiers are called shelves where they belong to the one thing called a shelf."""
     if place.tier is None:
         return place.unit.name
     return "shelf" if place.unit == Reference("shelf") else "tier"

@@ -1,4 +1,4 @@
-"""Reads prompts back into their claims."""
+"""Parser of prompts into claims."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the facts need to know of each asset: extreme points, the height of its upper side, hollows and tiers."""
+"""Asset shapes for facts: extreme points, height of the upper side, hollows and tiers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What holds each object of a batch: which thing it stands on or lies in, and on which tier."""
+"""Supports of the objects of a batch: the thing each stands on or lies in, and its tier."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class Holding:
-    """What holds each of n objects; indices are into the same n.
+    """Supports of n objects; indices are into the same n.
 
     Attributes:
         support: (n,) the thing it stands on or lies in; -1 for none.
@@ -89,7 +89,7 @@ class Holding:
     tier: Index
 
     def part(self, rows: slice) -> Holding:
-        """What holds the objects of ``rows``, which are whole scenes; indices count from their first object."""
+        """Supports of the objects of ``rows``, which are whole scenes; indices count from their first object."""
         pointers = (np.maximum(column[rows] - rows.start, -1) for column in (self.support, self.inside, self.place))
         support, inside, place = pointers
         return Holding(support, self.contained[rows], inside, place, self.tier[rows])
@@ -144,7 +144,7 @@ class Contacts:
         )
 
     def holding(self, tolerance: float) -> Holding:
-        """What holds each object when surfaces up to ``tolerance`` (m) apart, or into each other, touch.
+        """Supports of objects, where surfaces up to ``tolerance`` (m) apart, or into each other, touch.
 
         For what touches nothing, three times the tolerance decides on the place and tier alone.
         """

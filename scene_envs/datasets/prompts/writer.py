@@ -1,4 +1,4 @@
-"""Chooses what to say of a scene, and says it."""
+"""Writer of prompts: chooses facts of a scene and phrases them."""
 
 from __future__ import annotations
 

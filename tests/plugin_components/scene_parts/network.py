@@ -10,8 +10,11 @@ class ThinConfig(MixedMiDiffusionConfig):
     """Feed-forward layers as wide as the tokens."""
 
     mlp_ratio: float = 1.0
+    frequencies: int = 0
 
 
-@register_network("thin", "mixed", ThinConfig)
 class Thin(MixedMiDiffusion):
     """MiDiffusion with narrow feed-forward layers."""
+
+
+register_network("thin", "mixed", ThinConfig, Thin)

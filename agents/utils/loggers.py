@@ -1,0 +1,109 @@
+"""Loggers of a run's figures: a CSV file alone, TensorBoard, or Weights & Biases offline."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from scene_envs.errors import MissingDependencyError, unknown_name
+
+LOGGERS = ("csv", "tensorboard", "wandb")
+"""Names that :func:`make_logger` takes."""
+
+
+class RunLogger:
+    """Takes the rows of a run; this one adds nothing to ``log.csv``, which every run writes itself.
+
+    >>> logger = RunLogger()
+    >>> logger.log({"reward": 1.0}, step=1)
+    >>> logger.close()
+    """
+
+    def log(self, row: Mapping[str, float], step: int) -> None:
+        """One row of figures after ``step`` steps or iterations."""
+
+    def close(self) -> None:
+        """Write what is left; nothing is logged after it."""
+
+
+class TensorBoardRunLogger(RunLogger):
+    """Events for TensorBoard.
+
+    Args:
+        folder: of the run; events go into ``tensorboard/`` in it.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        _require("tensorboard")
+        from torchrl.record.loggers import TensorboardLogger
+
+        self._logger: Any = TensorboardLogger(exp_name="tensorboard", log_dir=str(folder))
+
+    def log(self, row: Mapping[str, float], step: int) -> None:
+        """One row; events are on disk when it returns."""
+        self._logger.log_metrics(dict(row), step=step)
+        self._logger.experiment.flush()
+
+    def close(self) -> None:
+        """Close the file of events."""
+        self._logger.experiment.close()
+
+
+class WandbRunLogger(RunLogger):
+    """A run of Weights & Biases that stays on disk; ``wandb sync`` sends it.
+
+    Args:
+        folder: of the run; its name is the name of the run, and files go into ``wandb/`` in it.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        _require("wandb")
+        from torchrl.record.loggers import WandbLogger
+
+        self._logger: Any = WandbLogger(
+            exp_name=Path(folder).resolve().name,
+            offline=True,
+            save_dir=str(folder),
+            project="scene-envs",
+            log_env_packages=False,
+            mode="offline",
+        )
+
+    def log(self, row: Mapping[str, float], step: int) -> None:
+        """One row."""
+        self._logger.log_metrics(dict(row), step=step)
+
+    def close(self) -> None:
+        """Finish the run of Weights & Biases."""
+        self._logger.experiment.finish()
+
+
+def make_logger(name: str, folder: str | os.PathLike[str]) -> RunLogger:
+    """The logger ``name`` of the run in ``folder``.
+
+    Args:
+        name: ``"csv"``, ``"tensorboard"`` or ``"wandb"``.
+        folder: of the run.
+
+    Raises:
+        UnknownNameError: no such logger.
+        MissingDependencyError: its package is not installed.
+    """
+    if name == "csv":
+        return RunLogger()
+    if name == "tensorboard":
+        return TensorBoardRunLogger(folder)
+    if name == "wandb":
+        return WandbRunLogger(folder)
+    raise unknown_name("logger", name, LOGGERS)
+
+
+def _require(package: str) -> None:
+    if importlib.util.find_spec(package) is None:
+        raise MissingDependencyError(
+            f"logger={package} needs the package {package}, which is not installed: pip install "
+            f"'scene-envs[{package}]', or take logger=csv"
+        )

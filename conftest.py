@@ -1,0 +1,72 @@
+"""Isolation of tests: what one test or doctest registers, draws or warns of is unknown to the next."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")  # parallel tests do not fight for cores
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+
+def _registries() -> list[dict[str, Any]]:
+    """Every registry that users add to by name, the built-in entries in place."""
+    from rewards.registry import _registry as rewards
+    from scene_envs.envs.masks import _MASKS
+    from scene_envs.export.formats import _FORMATS
+    from scene_envs.grammars import list_grammars
+    from scene_envs.grammars.grammar import GRAMMARS
+    from scene_envs.scene_types.registry import _REGISTRY
+
+    list_grammars()  # registers the built-in ones, which happens once per process
+    return [_REGISTRY, GRAMMARS, _MASKS, _FORMATS, rewards]
+
+
+@contextmanager
+def _restored() -> Iterator[None]:
+    from rewards.registry import _allowed_targets
+
+    registries, targets = _registries(), list(_allowed_targets)
+    before = [dict(registry) for registry in registries]
+    yield
+    _allowed_targets[:] = targets
+    for registry, entries in zip(registries, before, strict=True):
+        registry.clear()
+        registry.update(entries)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _registries_of_module() -> Iterator[None]:
+    """What the fixtures of a module register is forgotten with the module."""
+    with _restored():
+        yield
+
+
+@pytest.fixture(autouse=True)
+def _registries_of_test(_registries_of_module: None) -> Iterator[None]:
+    """What a test registers is forgotten with the test; warnings that come once come once per test."""
+    from rewards import evaluation
+
+    evaluation._warned.clear()
+    with _restored():
+        yield
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_fixture_setup() -> None:
+    _seed_torch()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_call() -> None:
+    _seed_torch()
+
+
+def _seed_torch() -> None:
+    """Seed torch's default generator as pytest-randomly seeds those of ``random`` and numpy."""
+    import torch
+
+    torch.manual_seed(0)

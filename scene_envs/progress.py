@@ -1,0 +1,94 @@
+"""Progress of long work: a live bar on a terminal, lines elsewhere, both on stderr."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from time import perf_counter
+from types import TracebackType
+
+from scene_envs.errors import unknown_name
+
+STYLES = ("bar", "lines", "none")
+"""How progress is shown; where there is no terminal, a bar becomes lines."""
+
+
+class Progress:
+    """Context manager that shows how far some work is.
+
+    Args:
+        title: what is done.
+        total: how many there are to do.
+        done: how many were done before.
+        style: ``"bar"`` (lines where stderr is no terminal), ``"lines"`` or ``"none"``.
+        every: seconds between lines.
+        always: numbers done at which a line is printed however little time has passed.
+
+    Attributes:
+        seconds: since it was made.
+
+    >>> with Progress("Counting", 3, style="none") as progress:
+    ...     progress.update(3, "all of them")
+    """
+
+    def __init__(
+        self,
+        title: str,
+        total: int,
+        *,
+        done: int = 0,
+        style: str = "bar",
+        every: float = 5.0,
+        always: Collection[int] = (),
+    ) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+        from rich.progress import Progress as Bar
+
+        if style not in STYLES:
+            raise unknown_name("progress", style, STYLES)
+        self.total, self.every, self.always = total, every, always
+        self._console = Console(stderr=True)
+        live = style == "bar" and self._console.is_terminal
+        self._prints = style != "none" and not live
+        self._bar = Bar(
+            TextColumn("[bold]{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[text]}"),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            console=self._console,
+            disable=not live,
+            speed_estimate_period=120,
+        )
+        self._task = self._bar.add_task(title, total=total, completed=done, text="")
+        self._started = self._printed = perf_counter()
+
+    def __enter__(self) -> Progress:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since it was made."""
+        return perf_counter() - self._started
+
+    def update(self, done: int, text: str, line: str = "") -> None:
+        """So many are done.
+
+        Args:
+            done: how many of the total.
+            text: what stands beside the bar, in the markup of rich.
+            line: what is printed where there is no bar.
+        """
+        self._bar.update(self._task, completed=done, text=text)
+        now = perf_counter()
+        if self._prints and line and (now - self._printed >= self.every or done in self.always):
+            self._printed = now
+            self._console.print(line, highlight=False, markup=False, soft_wrap=True)

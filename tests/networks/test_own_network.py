@@ -1,0 +1,79 @@
+"""A network of a package outside the repository: found by its entry point, trained, saved, loaded and sampled."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from unittest.mock import patch
+
+import pytest
+import torch
+
+from agents import PretrainConfig, ScenePrior, pretrain
+from agents.networks import MixedFluxConfig, list_networks, match_parameters, parameter_count, registry
+from agents.networks.registry import register_network
+from scene_envs import plugins
+from scene_envs.errors import InvalidInputError, UnknownNameError
+
+PACKAGE = Path(__file__).parents[1] / "network_package"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """The package installed by pip, without network, on the path of this process; forgotten afterwards."""
+    copy, site = tmp_path_factory.mktemp("source") / "package", tmp_path_factory.mktemp("site")
+    shutil.copytree(PACKAGE, copy)  # pip leaves build products beside the source
+    options = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--disable-pip-version-check"]
+    command = [sys.executable, "-m", "pip", "install", *options, "--target", str(site), str(copy)]
+    subprocess.run(command, check=True, capture_output=True, text=True)
+    with pytest.MonkeyPatch.context() as monkeypatch, patch.dict(registry._ENTRIES):
+        monkeypatch.syspath_prepend(str(site))
+        plugins.load_plugins.cache_clear()
+        yield
+    plugins.load_plugins.cache_clear()
+    sys.modules.pop("deep_sets", None)
+
+
+def test_it_is_listed_without_an_import_of_its_package() -> None:
+    assert list_networks("mixed") == ["flux", "midiffusion", "diffuscene", "deep_sets"]
+    assert "deep_sets" not in list_networks("continuous")
+    with pytest.raises(UnknownNameError, match="did you mean 'deep_sets'"):
+        match_parameters("deep_set", "mixed", 1000)
+
+
+def test_two_steps_train_it_and_its_files_give_it_back(tmp_path: Path) -> None:
+    config = PretrainConfig(
+        data="grammar", output=str(tmp_path / "run"), iterations=2, batch_size=4, hidden=16, depth=3, warmup=1,
+        log_every=1, evaluate_every=2, checkpoint_every=2, process="mixed", network="deep_sets",
+        empty_slots="attended",
+    )  # fmt: skip
+    pretrain(config)
+    prior = ScenePrior.load(tmp_path / "run")
+    network = prior.denoiser.network
+    assert type(network).__name__ == "DeepSets"
+    assert (network.config.hidden, network.config.depth) == (16, 3)
+    assert bool(torch.isfinite(prior.sample(2, num_steps=3, seed=0).tensor).all())
+    assert float(network.out.weight.detach().abs().sum()) > 0
+
+
+def test_its_size_is_matched_like_any_other() -> None:
+    keys = {"features": 20, "categories": 8, "depth": 2, "heads": 4}
+    found = match_parameters("deep_sets", "mixed", 30_000, **keys)
+    assert abs(parameter_count(found) / 30_000 - 1) < 0.1
+
+
+def test_slots_that_it_cannot_ignore_are_refused(tmp_path: Path) -> None:
+    config = PretrainConfig(
+        data="grammar", output=str(tmp_path), iterations=1, process="mixed", network="deep_sets", empty_slots="dropped"
+    )
+    with pytest.raises(InvalidInputError, match="empty_slots='attended'"):
+        pretrain(config)
+
+
+def test_a_name_that_is_taken_is_refused() -> None:
+    with pytest.raises(InvalidInputError, match="there is a mixed network 'flux' already"):
+        register_network("flux", "mixed", registry.MixedMiDiffusionConfig, lambda config: None)  # type: ignore[arg-type, return-value]
+    register_network("flux", "mixed", MixedFluxConfig, registry.MixedFlux)  # once more, as a module imported twice

@@ -1,0 +1,290 @@
+"""Pretraining: exact resume, learning-rate curve, and what happens when things go wrong."""
+
+from __future__ import annotations
+
+import csv
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from agents.configuration.tree import changed
+from agents.pretraining.config import PretrainConfig
+from agents.pretraining.data import SceneTable
+from agents.pretraining.initial_prior import build_prior
+from agents.pretraining.setup import prepare
+from agents.pretraining.trainer import Pretrainer, learning_rate_at, part_generator
+from agents.utils.weight_average import WeightAverage
+from scene_envs.datasets import generate
+from scene_envs.errors import CorruptFileError, InvalidInputError, TrainingError, UnknownNameError
+from scene_envs.normalizer import Normalizer
+from scene_envs.scene import SceneBatch
+
+
+@pytest.fixture(scope="module")
+def raw() -> torch.Tensor:
+    """Tables with teapots somewhere: enough to train on."""
+    generator = torch.Generator().manual_seed(0)
+    scenes = SceneBatch.empty("dimsum_table", 64)
+    categories = torch.where(torch.rand(64, 34, generator=generator) < 0.5, 6, 7)
+    categories[:, 0] = 0
+    translations = torch.rand(64, 34, 3, generator=generator) - 0.5
+    translations[:, 0] = 0
+    rotations = torch.eye(3).expand(64, 34, 3, 3)
+    return SceneBatch.from_parts(translations, rotations, categories, scenes.scene_type).tensor
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> PretrainConfig:
+    return PretrainConfig(
+        output=str(tmp_path), iterations=6, batch_size=8, network={"hidden": 16, "depth": 1, "heads": 2},
+        optimizer={"warmup": 2}, logger={"log_every": 1, "evaluate_every": 3, "checkpoint_every": 2},
+    )  # fmt: skip
+
+
+def make_run(config: PretrainConfig, raw: torch.Tensor) -> Pretrainer:
+    prior = build_prior(config, raw, Normalizer.fit(raw))
+    scenes = prior.encode(SceneBatch(raw, prior.scene_type))
+    return Pretrainer(config, SceneTable(scenes[:56]), scenes[56:], prior)
+
+
+class Killed(Exception):
+    """Stands for a killed process."""
+
+
+def test_a_killed_run_resumes_bit_for_bit(config: PretrainConfig, raw: torch.Tensor, tmp_path: Path) -> None:
+    whole = make_run(replace(config, output=str(tmp_path / "whole")), raw)
+    whole.run()
+    broken = make_run(config, raw)
+    update = broken._update
+
+    def dies_at_step_five() -> tuple[float, float]:
+        if broken.step == 5:
+            raise Killed
+        return update()
+
+    broken._update = dies_at_step_five  # type: ignore[method-assign]
+    with pytest.raises(Killed):
+        broken.run()
+    resumed = make_run(config, raw)
+    resumed.run()
+    assert resumed.step == 6
+    for name, tensor in whole.network.state_dict().items():
+        assert torch.equal(tensor, resumed.network.state_dict()[name]), name
+    for name, tensor in whole.average.tensors.items():
+        assert torch.equal(tensor, resumed.average.tensors[name]), name
+
+
+def test_nan_stops_the_run_and_keeps_the_last_checkpoint(config: PretrainConfig, raw: torch.Tensor) -> None:
+    run = make_run(config, raw)
+    update = run._update
+
+    def poisoned() -> tuple[float, float]:
+        if run.step == 4:
+            run.data = SceneTable(torch.full((8, 34, 20), float("nan")))
+        return update()
+
+    run._update = poisoned  # type: ignore[method-assign]
+    with pytest.raises(TrainingError, match="nan at step 4"):
+        run.run()
+    assert make_run(config, raw).run().card["trained_steps"] == 6
+
+
+def test_a_run_does_not_go_on_with_keys_that_do_not_fit_it(config: PretrainConfig, raw: torch.Tensor) -> None:
+    make_run(config, raw).run()
+    for other, was in (
+        ({"optimizer.name": "adamw"}, "optimizer.name=muon"),
+        ({"network.hidden": 32}, "network.hidden=16"),
+    ):
+        with pytest.raises(InvalidInputError, match=f"started with {was}"):
+            make_run(changed(config, {"iterations": 8, **other}), raw).run()
+
+
+@pytest.mark.parametrize("process", ["continuous", "mixed"])
+def test_a_run_that_an_earlier_version_began_is_refused_in_plain_words(
+    config: PretrainConfig, raw: torch.Tensor, process: str
+) -> None:
+    config = replace(config, process=process)
+    run = make_run(config, raw)
+    run.run()
+    state = torch.load(run.checkpoint_path, weights_only=True)
+    name = next(iter(state["network"]))
+    state["network"]["its_old_name"] = state["network"].pop(name)
+    state["config"]["a_key_of_old"] = 3
+    torch.save(state, run.checkpoint_path)
+    with pytest.raises(InvalidInputError, match=r"cannot be resumed: 2 .* earlier version .* give another output"):
+        make_run(replace(config, iterations=8), raw).run()
+
+
+def test_a_checkpoint_that_holds_no_base_rates_resumes_bit_for_bit(
+    config: PretrainConfig, raw: torch.Tensor, tmp_path: Path
+) -> None:
+    """The learning rate hangs on the number of the step alone, whatever the optimiser's groups say."""
+    config = replace(config, decay_share=1.0)
+    whole = make_run(replace(config, output=str(tmp_path / "whole")), raw)
+    whole.run()
+    first = make_run(config, raw)
+    save = first._save
+
+    def stops_after_two_steps() -> None:
+        save()
+        raise Killed
+
+    first._save = stops_after_two_steps  # type: ignore[method-assign]
+    with pytest.raises(Killed):
+        first.run()
+    state = torch.load(first.checkpoint_path, weights_only=True)
+    for group in state["optimizer"]["param_groups"]:
+        del group["initial_lr"]
+        group["lr"] = 123.0
+    torch.save(state, first.checkpoint_path)
+    resumed = make_run(config, raw)
+    resumed.run()
+    for name, tensor in whole.network.state_dict().items():
+        assert torch.equal(tensor, resumed.network.state_dict()[name]), name
+
+
+def test_what_an_older_prior_takes_as_constant_may_not_vary_where_it_is_trained_further(
+    config: PretrainConfig, raw: torch.Tensor
+) -> None:
+    make_run(config, raw).run()
+    further = replace(config, prior=config.output)
+    assert build_prior(further, raw, Normalizer.fit(raw)).config.slots == raw.shape[1]
+    turned = raw.clone()
+    turned[:, 1:, 3:12] = torch.tensor([0.0, -1, 0, 1, 0, 0, 0, 0, 1]) * (turned[:, 1:, -1:] == 0)
+    with pytest.raises(InvalidInputError, match=r"never varied"):
+        build_prior(further, turned, Normalizer.fit(turned))
+
+
+def test_a_truncated_checkpoint_is_named(config: PretrainConfig, raw: torch.Tensor) -> None:
+    run = make_run(config, raw)
+    run.run()
+    run.checkpoint_path.write_bytes(run.checkpoint_path.read_bytes()[:500])
+    with pytest.raises(CorruptFileError, match=r"checkpoint\.pt"):
+        make_run(replace(config, iterations=8), raw).run()
+
+
+def test_learning_rate_warms_up_and_ends_at_its_floor() -> None:
+    config = PretrainConfig(iterations=1000, optimizer={"warmup": 10, "lr": 1.0, "final_lr": 0.1, "decay_share": 1.0})
+    assert learning_rate_at(0, config) == pytest.approx(0.1)
+    assert learning_rate_at(9, config) == pytest.approx(1.0)
+    assert learning_rate_at(505, config) == pytest.approx(0.55)
+    assert learning_rate_at(1000, config) == pytest.approx(0.1)
+
+
+def test_learning_rate_stays_at_its_peak_until_the_decay_begins() -> None:
+    config = PretrainConfig(iterations=1000, optimizer={"warmup": 10, "lr": 1.0, "final_lr": 0.1, "decay_share": 0.2})
+    assert {learning_rate_at(step, config) for step in range(9, 801)} == {1.0}
+    assert learning_rate_at(900, config) == pytest.approx(0.55)  # half way along the cosine
+    assert learning_rate_at(1000, config) == pytest.approx(0.1)
+    assert learning_rate_at(900, changed(config, {"optimizer.final_lr": 1.0})) == 1.0
+    late = changed(config, {"optimizer.warmup": 900})  # a decay never begins in the warm-up
+    assert learning_rate_at(899, late) == 1.0
+    assert learning_rate_at(950, late) == pytest.approx(0.55)
+
+
+def test_a_decay_share_that_is_none_is_refused(config: PretrainConfig, raw: torch.Tensor) -> None:
+    with pytest.raises(InvalidInputError, match=r"decay_share=1\.5 is outside 0\.\.1"):
+        make_run(changed(config, {"optimizer.decay_share": 1.5}), raw)
+
+
+def test_the_weight_average_follows_its_closed_form() -> None:
+    layer = torch.nn.Linear(1, 1, bias=False)
+    average = WeightAverage(layer, decay=0.5)
+    start = average.tensors["weight"].clone()
+    with torch.no_grad():
+        layer.weight.add_(1.0)
+    used = [average.update(layer) for _ in range(3)]
+    kept = torch.tensor(used).prod()
+    torch.testing.assert_close(average.tensors["weight"], kept * start + (1 - kept) * layer.weight.detach())
+
+
+@pytest.mark.parametrize("process", ["continuous", "mixed"])
+def test_parts_one_after_the_other_add_up_to_their_batch(
+    config: PretrainConfig, raw: torch.Tensor, process: str
+) -> None:
+    """The gradient of a step is the mean over its parts, each with noise of its own."""
+    run = make_run(changed(config, {"process.name": process, "optimizer.accumulate": 2, "optimizer.clip": 1e9}), raw)
+    losses = [run._part_loss(4, part_generator(0, 0, part)) for part in range(2)]
+    expected = torch.autograd.grad(sum(losses) / 2, list(run.network.parameters()), allow_unused=True)  # type: ignore[arg-type]
+    norm = torch.stack([g.norm() for g in expected if g is not None]).norm()
+    value, found = run._update()
+    assert value == pytest.approx(sum(float(loss.detach()) for loss in losses) / 2, rel=1e-5)
+    assert found == pytest.approx(float(norm), rel=1e-4)
+
+
+def test_a_batch_that_cannot_be_parted_is_refused(config: PretrainConfig, raw: torch.Tensor) -> None:
+    with pytest.raises(InvalidInputError, match="not a multiple of 3"):
+        make_run(changed(config, {"optimizer.accumulate": 3}), raw)
+    with pytest.raises(UnknownNameError, match="did you mean 'bfloat16'"):
+        make_run(changed(config, {"optimizer.precision": "bfloat"}), raw)
+
+
+def test_autocast_is_of_the_network_only(config: PretrainConfig, raw: torch.Tensor) -> None:
+    run = make_run(changed(config, {"optimizer.precision": "bfloat16"}), raw)
+    x = run.prior.initial(2, 34)
+    pose, logits = run.prior.denoiser(x, torch.tensor([5, 900]))
+    assert (pose.dtype, logits.dtype) == (torch.float32, torch.float32)
+    assert run.run().denoiser.precision == torch.float32
+
+
+def test_a_grammar_without_end_trains_a_prior_that_reads_prompts(tmp_path: Path) -> None:
+    config = PretrainConfig(
+        output=str(tmp_path), data="grammar", text="vocabulary", iterations=2, batch_size=4,
+        network={"hidden": 16, "depth": 1, "heads": 2},
+        logger={"log_every": 1, "evaluate_every": 2, "checkpoint_every": 2, "pictures_every": 2},
+    )  # fmt: skip
+    prior, data, heldout = prepare(config)
+    assert data.size == 0
+    first, again = (data.draw(3, torch.Generator().manual_seed(1), prompts=True) for _ in range(2))
+    assert torch.equal(first[0], again[0])
+    assert first[1] == again[1]
+    assert all(len(group) == 3 for group in first[1])
+    trained = Pretrainer(config, data, heldout[:64], prior).run()
+    assert trained.conditional
+    assert trained.card["training_scenes"] == 8
+    assert (tmp_path / "samples-0000002.png").stat().st_size > 1000
+
+
+def test_two_processes_take_the_steps_of_one_with_twice_the_parts(tmp_path: Path) -> None:
+    generate("dimsum_table", 64, tmp_path / "data", workers=0, verify=False, progress=False)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
+    keys = ["iterations=4", "batch_size=8", "network.hidden=16", "network.depth=1", "network.heads=2", "seed=3"]
+    keys += ["optimizer.warmup=2", "logger.log_every=1"]
+    for start, name, accumulate in ((launcher, "two", "1"), ([sys.executable], "one", "2")):
+        folders = [f"data={tmp_path / 'data'}", f"heldout={tmp_path / 'data'}", f"output={tmp_path / name}"]
+        command = [*start, "-m", "agents.cli", "pretrain", *folders, *keys, f"optimizer.accumulate={accumulate}"]
+        done = subprocess.run(command, env=environment, capture_output=True, timeout=240, text=True)
+        assert done.returncode == 0, done.stderr[-3000:]
+        assert done.stdout.count("held-out loss") == 1  # the first process alone speaks
+        assert {"config.yaml", "metrics.json", "prior"} <= {path.name for path in (tmp_path / name).iterdir()}
+    two, one = (list(csv.DictReader((tmp_path / name / "log.csv").open())) for name in ("two", "one"))
+    assert len(two) == len(one) == 4
+    for first, second in zip(two, one, strict=True):
+        assert float(first["loss"]) == pytest.approx(float(second["loss"]), rel=1e-4)
+        assert float(first["gradient_norm"]) == pytest.approx(float(second["gradient_norm"]), rel=1e-3)
+    assert float(two[-1]["heldout"]) == pytest.approx(float(one[-1]["heldout"]), rel=1e-4)
+
+
+def test_one_prior_is_trained_on_several_scene_types(tmp_path: Path) -> None:
+    for scene in ("dimsum_table", "pantry_shelf"):
+        generate(scene, 12, tmp_path / scene, workers=0, verify=False, progress=False)
+    config = PretrainConfig(
+        output=str(tmp_path / "run"), data=f"{tmp_path / 'dimsum_table'},{tmp_path / 'pantry_shelf'}",
+        text="vocabulary",
+        iterations=2, batch_size=8, network={"hidden": 16, "depth": 1, "heads": 2},
+        logger={"log_every": 1, "evaluate_every": 2},
+    )  # fmt: skip
+    prior, data, heldout = prepare(config)
+    assert prior.scene_type.name == "dimsum_table+pantry_shelf"
+    scenes, prompts = data.draw(400, torch.Generator().manual_seed(0), prompts=True)
+    tables = prior.decode(scenes).categories == prior.scene_type.assets.index("cafe_table")
+    assert float(tables.any(dim=1).float().mean()) == pytest.approx(0.5, abs=0.08)
+    assert len(prompts) == 400
+    trained = Pretrainer(config, data, heldout if len(heldout) else scenes[:4], prior).run()
+    assert trained.sample(2, prompt="A scene with 9 objects.", num_steps=2).tensor.shape[1] == 61
