@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 from agents.configuration.compose import check_option, compose_tree, group_options
-from agents.configuration.tree import build, check_not_moved, default_of, dotted_keys
+from agents.configuration.tree import build, check_not_moved, dotted_keys
 from agents.utils.docstrings import attribute_meanings
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
 
@@ -50,12 +50,15 @@ class Sources:
 
 
 def describe_fields(config: type | Any, prefix: str = "") -> list[KeyHelp]:
-    """The keys of a config dataclass, those of groups last; meanings stand under ``Attributes:`` in its docstrings."""
-    kind = config if isinstance(config, type) else type(config)
-    meanings = attribute_meanings(kind)
+    """The keys of a config, or of the default one of its class, those of groups last.
+
+    Meanings stand under ``Attributes:`` in the docstrings.
+    """
+    made = config() if isinstance(config, type) else config
+    meanings = attribute_meanings(type(made))
     keys, groups = [], []
-    for field in dataclasses.fields(kind):
-        value = default_of(field)
+    for field in dataclasses.fields(made):
+        value = getattr(made, field.name)
         if dataclasses.is_dataclass(value):
             groups += describe_fields(value, f"{prefix}{field.name}.")
         else:
@@ -64,24 +67,32 @@ def describe_fields(config: type | Any, prefix: str = "") -> list[KeyHelp]:
     return keys + groups
 
 
-def help_text(config: type, config_dir: str = "") -> str:
-    """All keys with their defaults and meanings, a paragraph for each group with its options."""
+def help_text(config: type | Any, words: Sequence[str] = (), config_dir: str = "") -> str:
+    """All keys with their values and meanings, a paragraph for each group with its options.
+
+    Args:
+        config: the config that ``words`` make, or its class.
+        words: options of groups among them stand in the headings.
+        config_dir: a folder with further options.
+    """
+    chosen = dict(word.partition("=")[::2] for word in words)
     keys = describe_fields(config)
     plain = [key for key in keys if "." not in key.name]
     parts = [format_rows([(f"{key.name}={key.default}", key.meaning) for key in plain])] if plain else []
     for field in dataclasses.fields(config):
         rows = [(f"{k.name}={k.default}", k.meaning) for k in keys if k.name.startswith(f"{field.name}.")]
         if rows:
-            parts.append(f"{_heading(field, config_dir)}\n{format_rows(rows)}")
+            parts.append(f"{_heading(field, chosen.get(field.name, ''), config_dir)}\n{format_rows(rows)}")
     return "\n\n".join(parts) or "  no keys"
 
 
-def _heading(field: dataclasses.Field[Any], config_dir: str) -> str:
+def _heading(field: dataclasses.Field[Any], chosen: str, config_dir: str) -> str:
     folder = field.metadata.get("folder")
     if not folder:
         return f"{field.name}:"
-    others = [option for option in group_options(folder, config_dir) if option != field.metadata["option"]]
-    return f"{field.name}={field.metadata['option']}" + (f" (or {', '.join(others)}):" if others else ":")
+    option = chosen or field.metadata["option"]
+    others = [other for other in group_options(folder, config_dir) if other != option]
+    return f"{field.name}={option}" + (f" (or {', '.join(others)}):" if others else ":")
 
 
 def format_rows(rows: Sequence[tuple[str, str]]) -> str:
@@ -111,7 +122,7 @@ def compose(command: str, config: type, words: Sequence[str], sources: Sources =
         InvalidInputError: a word is not ``key=value``, or the value is not of the key's type.
     """
     fields = {field.name: field for field in dataclasses.fields(config)}
-    base = read_config(sources.config) if sources.config else None
+    base = _without_output(read_config(sources.config)) if sources.config else None
     late: dict[str, Any] = {}
     read = []
     for word in words:
@@ -158,6 +169,11 @@ def read_config(path: str) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise CorruptFileError(f"--config {path} holds no keys")
     return found
+
+
+def _without_output(values: dict[str, Any]) -> dict[str, Any]:
+    """A run that is started again has a folder of its own."""
+    return {key: value for key, value in values.items() if key != "output"}
 
 
 def _component(

@@ -19,6 +19,7 @@ from typing import Any
 from agents.cli.commands import COMMANDS, RENAMED
 from agents.cli.keys import Sources, compose, format_rows, help_text
 from agents.cli.sweep import expand_sweeps
+from agents.configuration.tree import config_text
 from scene_envs import __version__
 from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError, UnknownNameError, unknown_name
 
@@ -102,14 +103,15 @@ def _dispatch(words: list[str]) -> int:
 def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str]) -> int:
     words = list(words)
     config_dir, file = _option(words, "--config-dir"), _option(words, "--config")
-    if any(word in ("-h", "--help") for word in words):
-        print(f"{program}: {meaning}.\n\n{help_text(module.config(), config_dir)}")
-        return DONE
-    shown, sweep = _option(words, "--cfg", "-c"), _flag(words, "--multirun", "-m")
+    shown, sweep, asked = _option(words, "--cfg", "-c"), _flag(words, "--multirun", "-m"), _flag(words, "-h", "--help")
     if shown not in ("", "job"):
         raise InvalidInputError(f"--cfg {shown}: only --cfg job is known, which prints the keys and runs nothing")
     command, sources = program.removeprefix("scene-envs "), Sources(config_dir, file)
     named = _named(words, getattr(module, "POSITIONAL", ()))
+    if asked:
+        config = module.config() if sweep or not named else compose(command, module.config(), named, sources)
+        print(f"{program}: {meaning}.\n\n{help_text(config, named, config_dir)}")
+        return DONE
     if not sweep:
         return _run(command, module, compose(command, module.config(), named, sources), bool(shown))
     runs = [(compose(command, module.config(), variant, sources), label) for variant, label in expand_sweeps(named)]
@@ -117,10 +119,10 @@ def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str
 
 
 def _run(command: str, module: ModuleType, settings: Any, only_show: bool) -> int:
-    from agents.cli.run_folder import Run, fresh_directory, settings_text
+    from agents.cli.run_folder import Run, fresh_directory
 
     if only_show:
-        print(settings_text(settings), end="")
+        print(config_text(settings), end="")
         return DONE
     if not getattr(module, "WRITES", True):
         module.run(settings)

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from agents.configuration.tree import plain_tree
+from agents.configuration.tree import config_text
 from agents.utils.process_group import is_first_process
 from scene_envs.errors import InvalidInputError
 from scene_envs.files import write_json, write_text
@@ -86,7 +86,7 @@ class Run:
 
     def _write_config(self) -> None:
         if self._is_first:
-            write_text(self.directory / "config.yaml", settings_text(self.settings))
+            write_text(self.directory / "config.yaml", config_text(self.settings))
 
     def _start_logging(self) -> None:
         screen = logging.StreamHandler(sys.stderr)
@@ -99,13 +99,6 @@ class Run:
             logger.setLevel(logging.INFO)
             for handler in self._handlers:
                 logger.addHandler(handler)
-
-
-def settings_text(settings: Any) -> str:
-    """All keys of a command as YAML, which ``--config`` reads."""
-    import yaml
-
-    return yaml.safe_dump(plain_tree(settings), sort_keys=False)
 
 
 def fresh_directory(command: str) -> str:

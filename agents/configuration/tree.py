@@ -150,6 +150,13 @@ def plain_tree(config: Any) -> dict[str, Any]:
     return {field.name: _plain(getattr(config, field.name)) for field in dataclasses.fields(config)}
 
 
+def config_text(values: Any) -> str:
+    """All keys as the ``config.yaml`` that ``--config`` reads; of a config, or of a nested mapping."""
+    import yaml
+
+    return yaml.safe_dump(_plain(values), sort_keys=False)
+
+
 def _plain(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return plain_tree(value)

@@ -9,15 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from agents.configuration.tree import plain_tree
+from agents.configuration.tree import config_text, plain_tree
 from agents.planning.config import SearchConfig
 from agents.planning.planners import BestOfPlanner, PlanResult
 from agents.planning.search_report import draw_curve, draw_scene
 from scene_envs.envs import SearchEnv
 from scene_envs.envs.resolvers import resolve_prior
 from scene_envs.errors import InvalidInputError, SceneEnvsError
-from scene_envs.files import finite, write_json
+from scene_envs.files import finite, write_json, write_text
 from scene_envs.scene import SceneBatch
+
+_PLAIN = (bool, int, float, str, list, dict, type(None))
+"""What YAML takes."""
 
 Progress = Callable[[str, int, int, float], None]
 """Called after every round with the planner's name, the expansions so far, the budget and the best Φ so far."""
@@ -61,8 +64,8 @@ def run_search(
         prior: a prior, or the name or path of one.
         objective: any reward: name, mapping, function or object.
         config: the settings; or give its fields as keywords.
-        output: folder for ``curve.png``, ``before.png``, ``after.png``, ``best.safetensors`` and ``metrics.json``;
-            None writes nothing.
+        output: folder for ``curve.png``, ``before.png``, ``after.png``, ``best.safetensors``, ``metrics.json`` and
+            ``config.yaml``, in which functions and objects are left out; None writes nothing.
         progress: told of every round.
         **settings: fields of :class:`SearchConfig`.
 
@@ -99,6 +102,9 @@ def run_search(
     )
     if output is not None:
         _write(outcome, config, first, search.best_state, Path(output))
+        named = {"prior": prior, "objective": objective, **plain_tree(config)}
+        plain = {key: value for key, value in named.items() if isinstance(value, _PLAIN)}
+        write_text(Path(output) / "config.yaml", config_text(plain))
     return outcome
 
 
@@ -150,12 +156,8 @@ def _metrics(
     first: Any,
     seconds: dict[str, float],
 ) -> dict[str, Any]:
-    settings = {
-        key: value if isinstance(value, int | float | str | dict) else None for key, value in plain_tree(config).items()
-    }
     return {
         "objective": objective if isinstance(objective, str) else getattr(objective, "__name__", repr(objective)),
-        "config": {**settings, "mask": config.mask if isinstance(config.mask, str) else "custom"},
         "objective_scale": scale,
         "nfe": len(search.values) * config.nfe_per_scene,
         "first_samples": {"value": first.value, "objective": first.objective},

@@ -43,12 +43,14 @@ class PostTrainResult:
         history: one row per iteration.
         metrics: what ``metrics.json`` holds.
         directory: the run directory.
+        config: what was run; on disk in ``config.yaml``.
     """
 
     prior: ScenePrior
     history: list[dict[str, float]]
     metrics: dict[str, Any]
     directory: Path
+    config: PostTrainConfig
 
 
 def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> PostTrainResult:
@@ -270,12 +272,13 @@ class PostTrainer:
                 "best": self.guard.best_reward,
             },
             "guard": self.guard.summary(),
-            "config": self.config.plain(),
         }
         write_metrics(self.directory, metrics)
         name = f"mean {reward_name(self.config.reward).replace('_', ' ')}"
         draw_curve(self.history, self.directory / "curve.png", reward_name=name, limit=self.config.guard.limit)
-        return PostTrainResult(ScenePrior.load(self.directory / "prior"), self.history, metrics, self.directory)
+        return PostTrainResult(
+            ScenePrior.load(self.directory / "prior"), self.history, metrics, self.directory, self.config
+        )
 
 
 def _writing(what: str, write: Any) -> None:

@@ -14,7 +14,7 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
-from agents.configuration.tree import dotted
+from agents.configuration.tree import config_text, dotted
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.data import TrainingData
 from agents.pretraining.log import TrainingLog
@@ -28,7 +28,7 @@ from agents.utils.process_group import ProcessGroup
 from agents.utils.seeds import derived_generator
 from agents.utils.weight_average import AveragedWeights, WeightAverage
 from scene_envs.errors import InvalidInputError, MissingDependencyError, TrainingError
-from scene_envs.files import write_json
+from scene_envs.files import write_json, write_text
 
 logger = logging.getLogger(__name__)
 
@@ -290,13 +290,14 @@ def pretrain(config: PretrainConfig) -> dict[str, Any]:
     """Train a prior as ``config`` says; resumes a run found in ``config.output``.
 
     Returns:
-        The numbers of ``metrics.json``, which is written beside the prior.
+        The numbers of ``metrics.json``, which is written beside the prior and ``config.yaml``.
     """
     prior, data, heldout = prepare(config)
     trainer = Pretrainer(config, data, heldout, prior)
     trained = trainer.run()
-    metrics = {**trained.card, "evaluations": trainer.evaluations, "config": asdict(config)}
+    metrics = {**trained.card, "evaluations": trainer.evaluations}
     if not trainer.processes.is_first:
         return metrics
+    write_text(trainer.directory / "config.yaml", config_text(config))
     write_json(trainer.directory / "metrics.json", metrics)
     return metrics

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from agents.configuration.tree import changed, dotted_keys, dotted_values, plain_tree
+from agents.configuration.tree import changed, dotted_keys, dotted_values
 from agents.pretraining.config import PretrainConfig
 from benchmarks.paper_tables.data import RowData, trained_numbers
 from benchmarks.paper_tables.rows import Row
@@ -153,7 +153,6 @@ def train(config: PretrainConfig, target: int, data: RowData) -> dict[str, Any]:
         "seconds": trainer.seconds,
         "parameters": trained_numbers(trained),
         "evaluations": trainer.evaluations,
-        "config": plain_tree(config),
     }
     write_json(directory / METRICS_NAME, metrics)
     trainer.checkpoint_path.unlink(missing_ok=True)

@@ -11,11 +11,20 @@ import pytest
 import yaml
 
 from agents.cli import main
+from agents.networks import registry as networks
+from agents.planning import config as planners
+from agents.post_training import algorithms
 from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
-from rewards import registry
+from rewards import registry as rewards
+from scene_envs.envs import masks
+from scene_envs.plugins import load_plugins
 
 PACKAGE = Path(__file__).parents[1] / "plugin_components"
+_REGISTRIES = (
+    *((rewards, "_registry"), (networks, "_ENTRIES"), (algorithms, "_ENTRIES")),
+    *((planners, "_PLANNERS"), (masks, "_MASKS")),
+)
 DIRECTORY = ["--config-dir", str(PACKAGE / "configs")]
 
 
@@ -29,8 +38,11 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> object:
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: scene-parts\nVersion: 1.0\n")
     shutil.copy(PACKAGE / "entry_points.txt", about)
     monkeypatch.syspath_prepend(str(site))
-    monkeypatch.setattr(registry, "_registry", dict(registry._registry))
+    for module, name in _REGISTRIES:
+        monkeypatch.setattr(module, name, dict(getattr(module, name)))
+    load_plugins.cache_clear()
     yield
+    load_plugins.cache_clear()
     for name in [name for name in sys.modules if name.startswith("scene_parts")]:
         del sys.modules[name]
 
@@ -69,12 +81,17 @@ def test_a_mask_and_a_planner(prior: str, tmp_path: Path) -> None:
     words = ["search", f"prior={prior}", "objective=object_count", "planner=wide", "mask=everything", "slots=6"]
     small = ["budget=3", "branching=3", "num_steps=1", f"output={tmp_path / 'run'}"]
     assert main([*words, *small, *DIRECTORY]) == 0
-    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert metrics["config"]["planner"] == {"name": "wide", "batch": 3}
-    assert metrics["config"]["mask"] == "everything"
+    config = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
+    assert config["planner"] == {"name": "wide", "batch": 3}
+    assert config["mask"] == "everything"
 
 
 @pytest.mark.usefixtures("package")
 def test_help_lists_options_of_the_folder(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["post-train", "--help", *DIRECTORY]) == 0
     assert "algorithm=ddpo_sf (or ddpo_is, signs):" in capsys.readouterr().out
+    assert main(["post-train", "algorithm=signs", "--help", *DIRECTORY]) == 0
+    shown = capsys.readouterr().out
+    assert "algorithm=signs (or ddpo_is, ddpo_sf):" in shown
+    assert "algorithm.size=0.5" in shown
+    assert "of every advantage." in shown

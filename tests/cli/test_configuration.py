@@ -14,9 +14,8 @@ from agents import PostTrainConfig, PretrainConfig, SearchConfig
 from agents.cli import main
 from agents.cli.commands import COMMANDS
 from agents.cli.keys import compose
-from agents.cli.run_folder import settings_text
 from agents.cli.sweep import expand_sweeps
-from agents.configuration import changed, dotted_values, group_options
+from agents.configuration import changed, config_text, dotted_values, group_options
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 CONFIGS = {name: import_module(f"agents.cli.commands.{name.replace('-', '_')}").config() for name in COMMANDS}
@@ -87,7 +86,7 @@ def test_old_keys_name_the_new_ones(command: str) -> None:
         word = old if "=" in old else f"{old}=1"
         with pytest.raises(InvalidInputError, match="has another name now: " + new.split(",")[0]):
             compose(command, kind, [word])
-        assert new.split(",")[0].split("=")[0] in known | {"text"}
+        assert new.split(",")[0].split("=")[0] in known | {"text", "logger"}
 
 
 @pytest.mark.parametrize(
@@ -99,7 +98,7 @@ def test_old_keys_name_the_new_ones(command: str) -> None:
         (lambda: PretrainConfig(optimizer="sgd"), "sgd"),
         (lambda: PretrainConfig(text=True), "text is a group of keys; give one of text.encoder"),
         (lambda: PostTrainConfig(rewrad="x"), "did you mean 'reward'"),
-        (lambda: PostTrainConfig(guard={"action": "halt"}), "use one of report, stop"),
+        (lambda: PostTrainConfig(guard={"action": "halt"}), "unknown action 'halt'. Known: report, stop"),
         (lambda: SearchConfig(planner={"name": "uctt"}), "did you mean 'uct'"),
     ],
 )
@@ -113,7 +112,7 @@ def test_a_written_config_gives_the_same_settings(command: str, tmp_path: Path) 
     from agents.cli.keys import Sources
 
     kind = CONFIGS[command]
-    (tmp_path / "config.yaml").write_text(settings_text(kind()))
+    (tmp_path / "config.yaml").write_text(config_text(kind()))
     assert compose(command, kind, [], Sources(config=str(tmp_path / "config.yaml"))) == kind()
 
 
@@ -121,7 +120,7 @@ def test_words_win_over_a_file(tmp_path: Path) -> None:
     from agents.cli.keys import Sources
 
     settings = PostTrainConfig(recipe="demo", algorithm="ddpo_is", reward={"name": "clip", "high": 3})
-    (tmp_path / "config.yaml").write_text(settings_text(settings))
+    (tmp_path / "config.yaml").write_text(config_text(settings))
     source = Sources(config=str(tmp_path / "config.yaml"))
     assert compose("post-train", PostTrainConfig, [], source) == settings
     words = ["algorithm=ddpo_sf", "seed=3", "reward=object_count", "optimizer.lr=0.5"]
