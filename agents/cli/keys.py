@@ -82,16 +82,19 @@ def help_text(config: type | Any, words: Sequence[str] = (), config_dir: str = "
     for field in dataclasses.fields(config):
         rows = [(f"{k.name}={k.default}", k.meaning) for k in keys if k.name.startswith(f"{field.name}.")]
         if rows:
-            parts.append(f"{_heading(field, chosen.get(field.name, ''), config_dir)}\n{format_rows(rows)}")
+            known = getattr(field.default_factory, "KNOWN", ())
+            heading = _heading(field, chosen.get(field.name, ""), known, config_dir)
+            parts.append(f"{heading}\n{format_rows(rows)}")
     return "\n\n".join(parts) or "  no keys"
 
 
-def _heading(field: dataclasses.Field[Any], chosen: str, config_dir: str) -> str:
+def _heading(field: dataclasses.Field[Any], chosen: str, known: Sequence[str], config_dir: str) -> str:
     folder = field.metadata.get("folder")
     if not folder:
         return f"{field.name}:"
     option = chosen or field.metadata["option"]
-    others = [other for other in group_options(folder, config_dir) if other != option]
+    offered = [other for other in group_options(folder, config_dir) if not known or other in known]
+    others = [other for other in offered if other != option]
     return f"{field.name}={option}" + (f" (or {', '.join(others)}):" if others else ":")
 
 

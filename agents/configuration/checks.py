@@ -29,7 +29,7 @@ def shares(settings: Any, *names: str) -> None:
             raise InvalidInputError(f"{name}={getattr(settings, name)} is outside 0..1: it is a share")
 
 
-def one_of(settings: Any, name: str, known: Sequence[str]) -> None:
-    """Refuse a word that is not known; the nearest known one is offered."""
+def one_of(settings: Any, name: str, known: Sequence[str], what: str = "") -> None:
+    """Refuse a word that is not known, as ``what``; the nearest known one is offered."""
     if getattr(settings, name) not in known:
-        raise unknown_name(name, str(getattr(settings, name)), known)
+        raise unknown_name(what or name, str(getattr(settings, name)), known)

@@ -85,6 +85,10 @@ def compose_tree(
             composed = compose(name, overrides=[*overrides, *values])
         result = OmegaConf.to_container(composed, resolve=True)
     except (HydraException, OmegaConfBaseException) as error:
+        if f"In 'recipe/{chosen.get('recipe')}'" in str(error):
+            raise InvalidInputError(
+                f"recipe={chosen['recipe']} is not for {command}: it chooses from groups that {command} does not have"
+            ) from error
         raise InvalidInputError(f"{command}: {_reason(error)}") from error
     assert isinstance(result, dict)
     return {str(key): value for key, value in result.items()}

@@ -40,6 +40,15 @@ def named(default: Any, folder: str) -> Any:
     return dataclasses.field(default=default, metadata={"folder": folder, "option": default or "", "named": True})
 
 
+def moved(group: str, *keys: str, **renamed: str) -> dict[str, str]:
+    """Keys of an earlier version and their names now, in a group.
+
+    >>> moved("optimizer", "clip", learning_rate="lr")
+    {'clip': 'optimizer.clip', 'learning_rate': 'optimizer.lr'}
+    """
+    return {**{key: f"{group}.{key}" for key in keys}, **{old: f"{group}.{new}" for old, new in renamed.items()}}
+
+
 def composed(kind: Kind) -> Kind:
     """A config dataclass that is made in Python as on the command line.
 

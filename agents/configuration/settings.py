@@ -16,8 +16,7 @@ class OptimizerSettings:
     """An optimiser of weights.
 
     Attributes:
-        name: ``adamw``, or in pretraining ``muon`` for Muon on the matrices inside blocks and AdamW on
-            the rest.
+        name: ``adamw``.
         lr: peak learning rate.
         warmup: steps over which the learning rate rises linearly.
         weight_decay: decoupled weight decay.
@@ -36,7 +35,7 @@ class OptimizerSettings:
     ema: float = 0.0
 
     def __post_init__(self) -> None:
-        one_of(self, "name", self.KNOWN)
+        one_of(self, "name", self.KNOWN, "optimizer")
         positive(self, "lr", "clip")
         at_least(self, 0, "warmup", "weight_decay")
         if not 0 <= self.ema < 1:
@@ -56,5 +55,5 @@ class LoggerSettings:
     checkpoint_every: int = 10
 
     def __post_init__(self) -> None:
-        one_of(self, "name", LOGGERS)
+        one_of(self, "name", LOGGERS, "logger")
         at_least(self, 1, "checkpoint_every")

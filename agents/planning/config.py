@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
-from agents.configuration.fields import composed, named, nested
+from agents.configuration.fields import composed, moved, named, nested
 from agents.planning.planners import UCTPlanner
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.plugins import load_plugins
@@ -102,8 +102,8 @@ class SearchConfig:
         branching: inpaintings per state; the first ``branching`` scenes are fresh samples of the prior.
         max_depth: inpaintings in a row, the fresh sample included.
         num_steps: denoiser evaluations per scene.
-        mask: which objects to regenerate: ``culprits``, ``infeasible``, ``random``, or a function; see
-            :mod:`scene_envs.envs.masks`.
+        mask: which objects to regenerate: ``culprits``, ``infeasible``, ``random``, another
+            registered one, or in Python a function.
         slots: slots per scene; null takes the scene type's.
         objective_scale: objective at which Φ is 1; null takes the environment's.
         seed: of the tree; the baseline's first scenes are those of the tree.
@@ -113,7 +113,7 @@ class SearchConfig:
         planner: what chooses the next scenes.
     """
 
-    RENAMED: ClassVar[Mapping[str, str]] = {"exploration": "planner.exploration", "parallel": "planner.parallel"}
+    RENAMED: ClassVar[Mapping[str, str]] = moved("planner", "exploration", "parallel")
     """Keys of earlier versions, and their names."""
 
     budget: int = 64

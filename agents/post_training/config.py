@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 from agents.configuration.checks import at_least, one_of, positive
-from agents.configuration.fields import composed, named, nested
+from agents.configuration.fields import composed, moved, named, nested
 from agents.configuration.settings import LoggerSettings, OptimizerSettings
 from agents.configuration.tree import plain_tree
 from agents.post_training.algorithms import AlgorithmSettings, DDPOSFSettings, algorithm_settings
@@ -17,12 +17,6 @@ from scene_envs.errors import InvalidInputError
 
 RESUMABLE = ("recipe", "iterations", "output", "workers", "logger")
 """Fields that may change between a run and its continuation."""
-
-_OPTIMIZER = {"learning_rate": "lr", "warmup": "warmup", "weight_decay": "weight_decay", "clip": "clip", "ema": "ema",
-              "chunk": "chunk"}  # fmt: skip
-_ALGORITHM = ("gradient_steps", "min_std", "skip_first", "step_weighting", "log_prob_reduction", "credit", "baseline",
-              "advantage_clip", "scenes_per_prompt")  # fmt: skip
-_LOGGER = ("progress", "checkpoint_every", "report_scenes")
 
 
 @dataclass
@@ -143,16 +137,15 @@ class PostTrainConfig:
     """
 
     RENAMED: ClassVar[Mapping[str, str]] = {
-        **{old: f"optimizer.{new}" for old, new in _OPTIMIZER.items()},
-        **{key: f"algorithm.{key}" for key in _ALGORITHM},
-        **{key: f"logger.{key}" for key in _LOGGER},
-        **{f"guard_{key}": f"guard.{key}" for key in ("every", "scenes", "limit", "action")},
-        "max_invalid": "guard.max_invalid",
+        **moved("optimizer", "warmup", "weight_decay", "clip", "ema", "chunk", learning_rate="lr"),
+        **moved("algorithm", "gradient_steps", "min_std", "skip_first", "step_weighting", "log_prob_reduction"),
+        **moved("algorithm", "credit", "baseline", "advantage_clip", "scenes_per_prompt"),
+        **moved("guard", "max_invalid", guard_every="every", guard_scenes="scenes", guard_limit="limit"),
+        **moved("guard", guard_action="action"),
+        **moved("regularisation", "bank_size", regularisation_batch="batch_size", real_scenes="scenes"),
+        **moved("logger", "progress", "checkpoint_every", "report_scenes"),
         "clip_epsilon": "algorithm.clip_epsilon, of algorithm=ddpo_is",
         "updates": "algorithm.updates, of algorithm=ddpo_is",
-        "regularisation_batch": "regularisation.batch_size",
-        "real_scenes": "regularisation.scenes",
-        "bank_size": "regularisation.bank_size",
     }
     """Keys of earlier versions, and their names."""
 

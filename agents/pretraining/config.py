@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from agents.configuration.checks import at_least, one_of, shares
-from agents.configuration.fields import composed, named, nested
+from agents.configuration.fields import composed, moved, named, nested
 from agents.configuration.settings import LoggerSettings, OptimizerSettings
 
 
@@ -182,6 +182,7 @@ class PretrainOptimizerSettings(OptimizerSettings):
     """The optimiser of a pretraining run.
 
     Attributes:
+        name: ``adamw``, or ``muon`` for Muon on the matrices inside blocks and AdamW on the rest.
         final_lr: where the learning rate ends, as a fraction of the peak; 1 for no decay.
         decay_share: share of the steps, the last ones, over which it goes there along a cosine; 1 from the warm-up on.
         accumulate: parts in which a process takes its scenes, one after the other, to save memory.
@@ -232,10 +233,6 @@ class PretrainLoggerSettings(LoggerSettings):
         at_least(self, 0, "pictures_every")
 
 
-def _moved(group: str, *keys: str, **renamed: str) -> dict[str, str]:
-    return {**{key: f"{group}.{key}" for key in keys}, **{old: f"{group}.{new}" for old, new in renamed.items()}}
-
-
 @composed
 @dataclass
 class PretrainConfig:
@@ -265,22 +262,23 @@ class PretrainConfig:
     """
 
     RENAMED: ClassVar[Mapping[str, str]] = {
-        **_moved("network", "hidden", "depth", "heads", "frequencies", "text_reach"),
-        **_moved("network.modules", "rotation_features", "contacts", "pooled_text", "count_embedding"),
-        **_moved("network.modules", tally="count_embedding", attention="relations", relation_blur="relations"),
+        **moved("network", "hidden", "depth", "heads", "frequencies", "text_reach"),
+        **moved("network.modules", "rotation_features", "contacts", "pooled_text", "count_embedding"),
+        **moved("network.modules", tally="count_embedding", relation_blur="relations"),
+        "attention": "network.modules.relations, none for plain attention",
         "text=true": "text=vocabulary",
         "text=false": "text=none",
-        **_moved("process", "prediction", "schedule", "noise_floor", "noise_ceiling", "moments", "rotation", "kernel"),
-        **_moved("process", "empty_slots", "unmasking", "denoised_clip"),
-        **_moved("loss", "noise_mean", "noise_std", "timesteps", "translation_weight", "category_weight"),
-        **_moved("loss", "given_share", loss_weighting="weighting", category_loss="category"),
-        **_moved("text", text_encoder="encoder", text_width="width", text_depth="depth", text_latents="latents"),
-        **_moved("text", text_window="window", text_learning_rate="lr_share", text_warmup="warmup"),
-        **_moved("text", text_numbers="numbers", prompt_dropout="dropout"),
-        **_moved("text", text_count_conditioning="count_conditioning", text_requests="count_conditioning"),
-        **_moved("optimizer", "decay_share", "warmup", "weight_decay", "clip", "ema", "accumulate", "precision"),
-        **_moved("optimizer", "matmul_precision", "compile", learning_rate="lr", final_learning_rate="final_lr"),
-        **_moved("logger", "log_every", "evaluate_every", "checkpoint_every", "pictures_every"),
+        **moved("process", "prediction", "schedule", "noise_floor", "noise_ceiling", "moments", "rotation", "kernel"),
+        **moved("process", "empty_slots", "unmasking", "denoised_clip"),
+        **moved("loss", "noise_mean", "noise_std", "timesteps", "translation_weight", "category_weight"),
+        **moved("loss", "given_share", loss_weighting="weighting", category_loss="category"),
+        **moved("text", text_encoder="encoder", text_width="width", text_depth="depth", text_latents="latents"),
+        **moved("text", text_window="window", text_learning_rate="lr_share", text_warmup="warmup"),
+        **moved("text", text_numbers="numbers", prompt_dropout="dropout"),
+        **moved("text", text_count_conditioning="count_conditioning", text_requests="count_conditioning"),
+        **moved("optimizer", "decay_share", "warmup", "weight_decay", "clip", "ema", "accumulate", "precision"),
+        **moved("optimizer", "matmul_precision", "compile", learning_rate="lr", final_learning_rate="final_lr"),
+        **moved("logger", "log_every", "evaluate_every", "checkpoint_every", "pictures_every"),
         "tensorboard": "logger=tensorboard",
     }
     """Keys of earlier versions, and their names."""

@@ -163,6 +163,8 @@ def test_sweeps_are_every_combination() -> None:
         (["--config"], "needs a value behind it"),
         (["+experiment=none"], "unknown experiment 'none'"),
         (["algorithm=ppo"], "unknown algorithm 'ppo'"),
+        (["recipe=paper"], "recipe=paper is not for post-train"),
+        (["optimizer=muon"], "unknown optimizer 'muon'. Known: adamw."),
         (["regularisation=0.5"], "give one of regularisation.weight"),
     ],
 )
