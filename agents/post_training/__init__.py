@@ -1,4 +1,4 @@
-"""Post-training of a prior by reinforcement learning: DDPO-SF with regularisation on real scenes."""
+"""Post-training of a prior by reinforcement learning, with regularisation on real scenes."""
 
 from typing import TYPE_CHECKING
 
@@ -7,9 +7,12 @@ from scene_envs.lazy import lazy_names
 if TYPE_CHECKING:
     from agents.post_training.advantages import compute_advantages
     from agents.post_training.algorithms import AlgorithmSettings, list_algorithms, register_algorithm
+    from agents.post_training.base import Algorithm
     from agents.post_training.comparison_run import post_train_and_compare
     from agents.post_training.config import PostTrainConfig
     from agents.post_training.ddpo import DDPO
+    from agents.post_training.forward_losses import AWMLoss, ForwardProcessLoss, NFTLoss, RewardWeightedLoss
+    from agents.post_training.forward_process import ForwardProcess
     from agents.post_training.guard import Guard
     from agents.post_training.losses import DDPOSFLoss
     from agents.post_training.policy import DenoisingPolicy
@@ -17,13 +20,19 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DDPO",
+    "AWMLoss",
+    "Algorithm",
     "AlgorithmSettings",
     "DDPOSFLoss",
     "DenoisingPolicy",
+    "ForwardProcess",
+    "ForwardProcessLoss",
     "Guard",
+    "NFTLoss",
     "PostTrainConfig",
     "PostTrainResult",
     "PostTrainer",
+    "RewardWeightedLoss",
     "compute_advantages",
     "list_algorithms",
     "post_train",
@@ -36,9 +45,17 @@ __getattr__ = lazy_names(
     {
         "agents.post_training.advantages": ("compute_advantages",),
         "agents.post_training.algorithms": ("AlgorithmSettings", "list_algorithms", "register_algorithm"),
+        "agents.post_training.base": ("Algorithm",),
         "agents.post_training.comparison_run": ("post_train_and_compare",),
         "agents.post_training.config": ("PostTrainConfig",),
         "agents.post_training.ddpo": ("DDPO",),
+        "agents.post_training.forward_losses": (
+            "AWMLoss",
+            "ForwardProcessLoss",
+            "NFTLoss",
+            "RewardWeightedLoss",
+        ),
+        "agents.post_training.forward_process": ("ForwardProcess",),
         "agents.post_training.guard": ("Guard",),
         "agents.post_training.losses": ("DDPOSFLoss",),
         "agents.post_training.policy": ("DenoisingPolicy",),

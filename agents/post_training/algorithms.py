@@ -1,11 +1,11 @@
-"""Policy-gradient algorithms by name: their settings, and where their code is; imports no torch."""
+"""Post-training algorithms by name: their settings, and where their code is; imports no torch."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from agents.configuration.checks import at_least, one_of, positive
 from scene_envs.errors import InvalidInputError, unknown_name
@@ -14,6 +14,7 @@ from scene_envs.plugins import load_plugins
 ENTRY_POINT_GROUP = "scene_envs.algorithms"
 """Entry points of installed packages: modules that call :func:`register_algorithm` when they are imported."""
 CREDITS = ("auto", "scene", "object")
+CATEGORY_CREDITS = ("auto", "scene", "none")
 BASELINES = ("leave_one_out", "mean")
 
 Algorithm = TypeVar("Algorithm", bound=type)
@@ -27,6 +28,9 @@ class AlgorithmSettings:
         name: the algorithm, a registered name.
         scenes_per_prompt: scenes of a batch that share a prompt; advantages are taken among them.
     """
+
+    learning_rate: ClassVar[float] = 5e-5
+    """Learning rate unless ``optimizer.lr`` names another."""
 
     name: str = ""
     scenes_per_prompt: int = 8
@@ -101,6 +105,96 @@ class DDPOISSettings(DDPOSFSettings):
         return self.updates
 
 
+@dataclass
+class ForwardProcessSettings(AlgorithmSettings):
+    """What the algorithms that noise finished scenes again have in common.
+
+    Attributes:
+        updates: optimiser steps per batch.
+        draws: timesteps and noises of every scene per optimiser step.
+        credit: of poses: ``scene`` gives every slot the scene's advantage, ``object`` its own (rewards with
+            ``per_object``), ``auto`` takes ``object`` where the reward allows it.
+        category_credit: of categories: ``scene`` for the scene's advantage, ``none`` to keep what is there, ``auto``
+            for ``none`` where poses have credit per object.
+        sampler_decay: of the weight average that samples, per iteration; rises from 0 to this.
+    """
+
+    learning_rate: ClassVar[float] = 2e-4
+
+    updates: int = 2
+    draws: int = 2
+    credit: str = "auto"
+    category_credit: str = "auto"
+    sampler_decay: float = 0.9
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, 1, "updates", "draws")
+        one_of(self, "credit", CREDITS)
+        one_of(self, "category_credit", CATEGORY_CREDITS)
+        if not 0 <= self.sampler_decay < 1:
+            raise InvalidInputError(f"sampler_decay={self.sampler_decay} must lie in [0, 1)")
+
+    @property
+    def optimiser_steps(self) -> int:
+        """Optimiser steps per batch."""
+        return self.updates
+
+
+@dataclass
+class NFTSettings(ForwardProcessSettings):
+    """NFT: good samples pull, bad samples push, both within bounds (Zheng et al. 2025).
+
+    Attributes:
+        beta: strength; smaller ones step further from the sampling policy.
+        advantage_clip: advantage, in standard deviations, at which a sample is fully good or bad.
+    """
+
+    name: str = "nft"
+    beta: float = 0.5
+    advantage_clip: float = 2.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        positive(self, "beta", "advantage_clip")
+
+
+@dataclass
+class AWMSettings(ForwardProcessSettings):
+    """AWM: the pretraining loss of own samples times their advantage (Xue et al. 2025).
+
+    Attributes:
+        beta: strength of the pull to the sampling policy, above 1.
+        advantage_clip: largest advantage, in standard deviations.
+    """
+
+    name: str = "awm"
+    beta: float = 2.0
+    advantage_clip: float = 2.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        positive(self, "advantage_clip")
+        if not self.beta > 1:
+            raise InvalidInputError(f"beta={self.beta} must be above 1: below, a bad sample pushes without bound")
+
+
+@dataclass
+class RewardWeightedSettings(ForwardProcessSettings):
+    """Reward-weighted fine-tuning: good samples pull, none pushes; the baseline of the other algorithms.
+
+    Attributes:
+        temperature: of the weights exp(A / temperature), A in standard deviations.
+    """
+
+    name: str = "reward_weighted"
+    temperature: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        positive(self, "temperature")
+
+
 @dataclass(frozen=True)
 class _Entry:
     settings: type[AlgorithmSettings]
@@ -108,9 +202,13 @@ class _Entry:
     """The class, or ``module:class`` until it is needed."""
 
 
+_FORWARD = "agents.post_training.forward_process:ForwardProcess"
 _ENTRIES = {
     "ddpo_sf": _Entry(DDPOSFSettings, "agents.post_training.ddpo:DDPO"),
     "ddpo_is": _Entry(DDPOISSettings, "agents.post_training.ddpo:DDPO"),
+    "nft": _Entry(NFTSettings, _FORWARD),
+    "awm": _Entry(AWMSettings, _FORWARD),
+    "reward_weighted": _Entry(RewardWeightedSettings, _FORWARD),
 }
 
 
@@ -119,8 +217,8 @@ def register_algorithm(
 ) -> Callable[[Algorithm], Algorithm]:
     """Make an algorithm available as ``algorithm=name``; the same name again replaces it.
 
-    The decorated class is made as ``(settings, policy, stds)`` and has ``loss``, ``advantage(rollout)`` and
-    ``accumulate(rollout, advantage, generator)`` as :class:`agents.post_training.ddpo.DDPO`, which it may extend.
+    The decorated class is made as ``(settings, policy, stds)`` and extends :class:`agents.post_training.base.Algorithm`
+    or one of its subclasses, such as :class:`agents.post_training.DDPO`.
 
     Args:
         name: letters, digits and underscores.

@@ -24,11 +24,16 @@ class PostTrainOptimizerSettings(OptimizerSettings):
     """The optimiser of a post-training run; its steps are updates.
 
     Attributes:
+        lr: peak learning rate; null takes the algorithm's own.
         chunk: scenes per forward and backward pass; null takes the whole batch at once.
     """
 
-    lr: float = 5e-5
+    lr: float | None = None  # type: ignore[assignment]
     chunk: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.lr is not None:
+            super().__post_init__()
 
 
 @dataclass
@@ -129,7 +134,7 @@ class PostTrainConfig:
         batch_size: scenes sampled per iteration.
         iterations: policy updates, that is batches of fresh scenes.
         recipe: a named set of the other keys: ``ours``, or ``demo`` for the demonstration; keys given beside it win.
-        algorithm: of the policy gradient.
+        algorithm: how rewards become a gradient.
         optimizer: of the weights.
         regularisation: on real scenes.
         guard: held-out real scenes.
@@ -175,6 +180,8 @@ class PostTrainConfig:
         at_least(self, 2, "batch_size")
         self.prompt = list(self.prompt) if isinstance(self.prompt, tuple) else self.prompt
         check_prompt(self.prompt, self.guidance)
+        if self.optimizer.lr is None:
+            self.optimizer = replace(self.optimizer, lr=self.algorithm.learning_rate)
         if self.regularisation.bank_size < self.guard.scenes + 1:
             raise InvalidInputError(
                 f"regularisation.bank_size={self.regularisation.bank_size} must exceed guard.scenes="

@@ -6,6 +6,7 @@ from torch import Generator, Tensor
 
 from agents.post_training.advantages import compute_advantages
 from agents.post_training.algorithms import DDPOISSettings, DDPOSFSettings
+from agents.post_training.base import Algorithm
 from agents.post_training.gradients import PolicyGradient, accumulate_policy_gradient, credited_reward, draw_steps
 from agents.post_training.losses import DDPOSFLoss
 from agents.post_training.policy import DenoisingPolicy, gradient_weights
@@ -13,7 +14,7 @@ from agents.post_training.prompts import prompt_groups
 from agents.post_training.rollouts import Rollout
 
 
-class DDPO:
+class DDPO(Algorithm[Tensor]):
     """DDPO-SF, or DDPO-IS with the settings of that (Black et al. 2024).
 
     Args:
@@ -25,8 +26,10 @@ class DDPO:
         loss: of a batch of transitions; its ``step_weights`` (S,) say which steps have part in the gradient.
     """
 
+    loss: DDPOSFLoss
+
     def __init__(self, settings: DDPOSFSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
-        self.settings = settings
+        self.settings, self.policy = settings, policy
         weights = gradient_weights(
             stds, min_std=settings.min_std, skip_first=settings.skip_first, weighting=settings.step_weighting
         )

@@ -8,12 +8,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-import torch
-
 from agents.configuration.tree import changed
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.gradients import accumulate_policy_gradient
 from agents.post_training.learner import Learner
+from agents.post_training.losses import DDPOSFLoss
 from agents.post_training.trainer import PostTrainer
 from agents.priors.base import ScenePrior
 
@@ -126,14 +125,14 @@ def _examine(trainer: PostTrainer) -> DoctorReport:
     started = time.perf_counter()
     rollout = learner.rollout(iteration=0)
     sampled = time.perf_counter()
-    advantage = learner.advantage(rollout)
+    advantage = learner.algorithm.advantage(rollout)
     row = learner.accumulate(rollout, advantage, trainer.scenes, index=0)
     updated = time.perf_counter()
     steps, largest = _step_rows(learner, rollout, advantage)
     valid = rollout.reward[rollout.valid].double()
     some = len(valid) > 0
     report = DoctorReport(
-        log_ratio=max(largest, row["log_ratio"]),
+        log_ratio=max(largest, row.get("log_ratio", 0.0)),
         steps=steps,
         reward_mean=float(valid.mean()) if some else float("nan"),
         reward_std=float(valid.std(unbiased=False)) if some else float("nan"),
@@ -149,15 +148,19 @@ def _examine(trainer: PostTrainer) -> DoctorReport:
     return replace(report, advice=_advice(report, trainer.config))
 
 
-def _step_rows(learner: Learner, rollout: Rollout, advantage: torch.Tensor) -> tuple[list[StepRow], float]:
-    """The sigma table, and the largest log-ratio over the steps in the gradient."""
-    rows, largest = [], 0.0
+def _step_rows(learner: Learner, rollout: Rollout, advantage: Any) -> tuple[list[StepRow], float]:
+    """The sigma table, and the largest log-ratio over the steps in the gradient; nothing without such steps."""
+    loss = learner.algorithm.loss
+    rows: list[StepRow] = []
+    largest = 0.0
+    if not isinstance(loss, DDPOSFLoss):
+        return rows, largest
     timesteps = learner.policy.table.timesteps.tolist()
-    for step, weight in enumerate(learner.loss.step_weights.tolist()):
+    for step, weight in enumerate(loss.step_weights.tolist()):
         norm = 0.0
         if weight > 0:
             learner.optimizer.zero_grad(set_to_none=True)
-            found = accumulate_policy_gradient(learner.loss, rollout, advantage, [step])
+            found = accumulate_policy_gradient(loss, rollout, advantage, [step])
             norm, largest = found.norm, max(largest, found.log_ratio)
         rows.append(StepRow(step, timesteps[step], float(learner.stds[step]), weight, norm))
     learner.optimizer.zero_grad(set_to_none=True)
@@ -192,6 +195,8 @@ def _advice(report: DoctorReport, config: PostTrainConfig) -> list[str]:
                 f"The reward drowns the regularisation (ratio {report.gradient_ratio:.2g}): "
                 f"raise regularisation.weight from {config.regularisation.weight:g}, or expect the guard to stop you."
             )
+    if not report.steps:
+        return advice
     worst = max(report.steps, key=lambda row: row.gradient_norm)
     total = sum(row.gradient_norm**2 for row in report.steps)
     if total > 0 and worst.gradient_norm**2 > DOMINANT * total and sum(row.weight > 0 for row in report.steps) > 2:
@@ -216,7 +221,7 @@ def _screen(report: DoctorReport) -> RenderableType:
     facts = Table(box=None, show_header=False, pad_edge=False)
     length = report.iterations * (report.sampling_seconds + report.update_seconds) / 60
     for name, value in (
-        ("log-ratio at the start", f"{report.log_ratio:.3g}"),
+        *([("log-ratio at the start", f"{report.log_ratio:.3g}")] if report.steps else []),
         ("reward", f"{report.reward_mean:.3g} ± {report.reward_std:.3g}"),
         ("reward range", f"{report.reward_min:.3g} … {report.reward_max:.3g}"),
         ("valid scenes", f"{report.valid_fraction:.0%}"),
@@ -228,4 +233,8 @@ def _screen(report: DoctorReport) -> RenderableType:
     ):
         facts.add_row(name, f"[bold]{value}")
     advice = "\n".join(f"[yellow]• {line}" for line in report.advice) or "[green]Nothing to change."
-    return Panel(Group(Columns([table, facts], padding=(0, 6)), "", advice), title="post-training doctor", expand=False)
+    return Panel(
+        Group(Columns([table, facts] if report.steps else [facts], padding=(0, 6)), "", advice),
+        title="post-training doctor",
+        expand=False,
+    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -29,6 +29,10 @@ class PolicyGradient:
     norm: float
     log_ratio: float
     clip_fraction: float
+
+    def figures(self) -> Mapping[str, float]:
+        """Further columns of the log."""
+        return {"log_ratio": self.log_ratio, "clip_fraction": self.clip_fraction}
 
 
 def draw_steps(weights: Tensor, count: int, generator: Generator) -> tuple[list[int], float]:

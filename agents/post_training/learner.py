@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Generator, Tensor, nn
+from torch import Generator, nn
 
 from agents.post_training.algorithms import make_algorithm
+from agents.post_training.base import Algorithm
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.gradients import add_regularisation_gradient
 from agents.post_training.policy import DenoisingPolicy
@@ -23,6 +24,7 @@ from agents.priors.prompt_validation import no_text
 from agents.utils.checkpoints import check_tensors
 from agents.utils.weight_average import AveragedWeights, WeightAverage
 from scene_envs.envs import DenoisingTorchRLEnv
+from scene_envs.errors import InvalidInputError
 
 
 class NonFiniteGradient(Exception):
@@ -52,8 +54,7 @@ class Learner:
             self.prior, config.num_steps, chunk=config.optimizer.chunk, guidance=config.guidance
         )
         self.stds = self.policy.stds(self.slots).cpu()
-        self.algorithm = make_algorithm(config.algorithm, self.policy, self.stds)
-        self.loss = self.algorithm.loss
+        self.algorithm: Algorithm[Any] = make_algorithm(config.algorithm, self.policy, self.stds)
         self.env = DenoisingTorchRLEnv(
             config.batch_size,
             scene=self.prior.scene_type,
@@ -66,10 +67,16 @@ class Learner:
         )
         self.deck: PromptDeck | None = None
         self.parameters = [p for p in self.prior.parameters() if p.requires_grad]
+        self.lr = config.optimizer.lr or config.algorithm.learning_rate
         self.optimizer = torch.optim.AdamW(
-            self.parameters, lr=config.optimizer.lr, weight_decay=config.optimizer.weight_decay, betas=(0.9, 0.999)
+            self.parameters, lr=self.lr, weight_decay=config.optimizer.weight_decay, betas=(0.9, 0.999)
         )
         self.average = WeightAverage(self.prior, config.optimizer.ema) if config.optimizer.ema else None
+        if self.average is not None and self.algorithm.average is not None:
+            raise InvalidInputError(
+                f"optimizer.ema={config.optimizer.ema}: algorithm={config.algorithm.name} evaluates and saves its "
+                "sampling policy, which is an average already; leave optimizer.ema=0"
+            )
 
     def close(self) -> None:
         """Stop physics workers, if any."""
@@ -89,19 +96,16 @@ class Learner:
         prompts = None
         if self.deck is not None:
             prompts = self.deck.deal(self.config.batch_size, self._generator("prompts", iteration))
-        return collect(self.env, self.policy, seed=self.config.seed, iteration=iteration, prompts=prompts)
+        return collect(
+            self.env, self.algorithm.sampling_policy, seed=self.config.seed, iteration=iteration, prompts=prompts
+        )
 
-    def advantage(self, rollout: Rollout) -> Tensor:
-        """(B,) or (B, N), as the algorithm says."""
-        advantage: Tensor = self.algorithm.advantage(rollout)
-        return advantage
-
-    def accumulate(self, rollout: Rollout, advantage: Tensor, scenes: SceneBank, index: int) -> dict[str, float]:
+    def accumulate(self, rollout: Rollout, advantage: Any, scenes: SceneBank, index: int) -> dict[str, float]:
         """Put both gradients into ``.grad`` and measure them apart.
 
         Args:
             rollout: the batch.
-            advantage: its advantages.
+            advantage: its advantages, as the algorithm makes them.
             scenes: real scenes for the regularisation.
             index: number of the update in the run; steps and real scenes are drawn by it.
         """
@@ -118,11 +122,10 @@ class Learner:
             "policy_gradient_norm": policy.norm,
             "pretraining_loss": real_loss,
             "pretraining_gradient_norm": real_norm,
-            "log_ratio": policy.log_ratio,
-            "clip_fraction": policy.clip_fraction,
+            **policy.figures(),
         }
 
-    def update(self, rollout: Rollout, advantage: Tensor, scenes: SceneBank, index: int) -> dict[str, float]:
+    def update(self, rollout: Rollout, advantage: Any, scenes: SceneBank, index: int) -> dict[str, float]:
         """One optimiser step.
 
         Raises:
@@ -134,7 +137,7 @@ class Learner:
         if not all(is_finite(row[name]) for name in ("gradient_norm", "policy_loss", "pretraining_loss")):
             self.optimizer.zero_grad(set_to_none=True)
             raise NonFiniteGradient(row)
-        row["learning_rate"] = config.lr * min(1.0, (index + 1) / max(1, config.warmup))
+        row["learning_rate"] = self.lr * min(1.0, (index + 1) / max(1, config.warmup))
         for group in self.optimizer.param_groups:
             group["lr"] = row["learning_rate"]
         self.optimizer.step()
@@ -149,6 +152,7 @@ class Learner:
             "optimizer": self.optimizer.state_dict(),
             "average": None if self.average is None else self.average.tensors,
             "average_updates": 0 if self.average is None else self.average.updates,
+            "algorithm": self.algorithm.state(),
             "random": torch.get_rng_state(),
         }
 
@@ -163,11 +167,12 @@ class Learner:
         self.optimizer.load_state_dict(state["optimizer"])
         if self.average is not None:
             self.average.tensors, self.average.updates = state["average"], state["average_updates"]
+        self.algorithm.restore(state["algorithm"])
         torch.set_rng_state(state["random"])
 
     def averaged(self) -> AveragedWeights[ScenePrior]:
         """Context in which the prior holds the weights that are evaluated and saved: the average, when there is one."""
-        return AveragedWeights(self.prior, self.average)
+        return AveragedWeights(self.prior, self.algorithm.average or self.average)
 
     def _generator(self, stream: str, index: int) -> Generator:
         return Generator().manual_seed(stream_seed(self.config.seed, stream, index))

@@ -182,7 +182,7 @@ class PostTrainer:
 
     def _learn(self, rollout: Rollout) -> dict[str, float]:
         row: dict[str, float] = {}
-        advantage = self.learner.advantage(rollout)
+        advantage = self.learner.algorithm.advantage(rollout)
         updates = self.config.algorithm.optimiser_steps
         for update in range(updates):
             index = self.iteration * updates + update
@@ -190,6 +190,7 @@ class PostTrainer:
                 row = self.learner.update(rollout, advantage, self.scenes, index)
             except NonFiniteGradient as error:
                 raise self._not_finite(error.figures) from None
+        self.learner.algorithm.end_iteration()
         return row
 
     # -- guard ----------------------------------------------------------------------------------

@@ -73,7 +73,8 @@ class TrainableMixedPrior(PromptReader, ScenePrior):
         text = self.unconditional(len(x0)) if text is None else text
         output = self.output(noised, text)
         logits, drawn, weight = output.logits, noised.drawn, noised.weight
-        assert logits is not None and drawn is not None
+        assert logits is not None
+        assert drawn is not None
         error = output.continuous - noised.target
         pose_loss = (error.square() * weight).sum(dim=(1, 2)) / weight.sum(dim=(1, 2)).clamp(min=1.0)
         pose_loss = pose_loss * noised.scale

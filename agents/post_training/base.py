@@ -1,0 +1,77 @@
+"""Base class of post-training algorithms: what the loop asks of one."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, Generic, Protocol, TypeVar
+
+from torch import Generator
+from torchrl.objectives import LossModule
+
+from agents.post_training.policy import DenoisingPolicy
+from agents.post_training.rollouts import Rollout
+from agents.utils.weight_average import WeightAverage
+
+Credit = TypeVar("Credit")
+"""What an algorithm makes of the rewards of a batch: advantages, in the form that its loss reads."""
+
+
+class BatchGradient(Protocol):
+    """Statistics of the gradient that a batch added to ``.grad``."""
+
+    @property
+    def loss(self) -> float:
+        """Value of the objective."""
+        ...
+
+    @property
+    def norm(self) -> float:
+        """Norm of its gradient."""
+        ...
+
+    def figures(self) -> Mapping[str, float]:
+        """Further columns of the log."""
+        ...
+
+
+class Algorithm(ABC, Generic[Credit]):
+    """How a batch of scenes becomes a gradient.
+
+    Attributes:
+        policy: the reverse chain of the prior in training.
+        loss: what is minimised.
+    """
+
+    policy: DenoisingPolicy
+    loss: LossModule
+
+    @property
+    def sampling_policy(self) -> DenoisingPolicy:
+        """What samples the scenes; the policy in training unless an algorithm keeps another."""
+        return self.policy
+
+    @property
+    def average(self) -> WeightAverage | None:
+        """The weights that are evaluated and saved in place of those in training; None for the latter."""
+        return None
+
+    @abstractmethod
+    def advantage(self, rollout: Rollout) -> Credit:
+        """Advantages of the scenes of a batch, or of their objects."""
+
+    @abstractmethod
+    def accumulate(self, rollout: Rollout, advantage: Credit, generator: Generator) -> BatchGradient:
+        """Add the gradient of a batch to ``.grad``; everything random is drawn from ``generator`` (CPU)."""
+
+    def end_iteration(self) -> None:
+        """Called after the last update of every batch."""
+        return
+
+    def state(self) -> dict[str, Any]:
+        """What a resumed run needs beside the weights in training."""
+        return {}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Inverse of :meth:`state`."""
+        return

@@ -1,0 +1,138 @@
+"""Forward-process algorithms: their sampling policy, their advantages, and their gradient of a batch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Generator, Tensor
+
+from agents.post_training.advantages import compute_advantages
+from agents.post_training.algorithms import AWMSettings, ForwardProcessSettings, NFTSettings, RewardWeightedSettings
+from agents.post_training.base import Algorithm
+from agents.post_training.forward_losses import AWMLoss, ForwardProcessLoss, NFTLoss, RewardWeightedLoss
+from agents.post_training.gradients import credited_reward, gradient_norm
+from agents.post_training.policy import DenoisingPolicy
+from agents.post_training.prompts import prompt_groups
+from agents.post_training.rollouts import Rollout
+from agents.priors.base import ScenePrior
+from agents.utils.weight_average import WeightAverage
+
+
+@dataclass(frozen=True)
+class ForwardGradient:
+    """Statistics of an accumulated forward-process gradient.
+
+    Attributes:
+        loss: value of the objective.
+        norm: its gradient's norm.
+        distance: root mean square of the trained denoiser's output minus that of the sampling policy's.
+    """
+
+    loss: float
+    norm: float
+    distance: float
+
+    def figures(self) -> Mapping[str, float]:
+        """Further columns of the log."""
+        return {"distance": self.distance}
+
+
+class ForwardProcess(Algorithm[TensorDict]):
+    """What NFT, AWM and reward weighting have in common; see :class:`ForwardProcessLoss`.
+
+    Scenes are sampled by a slower copy of the prior in training, an average of its weights, which is also what is
+    evaluated and saved.
+
+    Args:
+        settings: its keys.
+        policy: what is optimised.
+        stds: of the reverse steps; not used.
+    """
+
+    loss: ForwardProcessLoss
+
+    def __init__(self, settings: ForwardProcessSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
+        self.settings = settings
+        self.policy = policy
+        self.prior: ScenePrior = policy.prior  # type: ignore[assignment]
+        self.sampler = deepcopy(self.prior).eval().requires_grad_(False)
+        self._sampling_policy = DenoisingPolicy(self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance)
+        self._average = WeightAverage(self.prior, settings.sampler_decay)
+        self.loss = self.make_loss()
+
+    def make_loss(self) -> ForwardProcessLoss:
+        """The loss that the settings name."""
+        settings, pair = self.settings, (self.prior, self.sampler)
+        if isinstance(settings, NFTSettings):
+            return NFTLoss(*pair, beta=settings.beta, clip=settings.advantage_clip)
+        if isinstance(settings, AWMSettings):
+            return AWMLoss(*pair, beta=settings.beta, clip=settings.advantage_clip)
+        assert isinstance(settings, RewardWeightedSettings)
+        return RewardWeightedLoss(*pair, temperature=settings.temperature)
+
+    @property
+    def sampling_policy(self) -> DenoisingPolicy:
+        """The reverse chain of the slower copy."""
+        return self._sampling_policy
+
+    @property
+    def average(self) -> WeightAverage:
+        """The weights of the slower copy."""
+        return self._average
+
+    def advantage(self, rollout: Rollout) -> TensorDict:
+        """``advantage`` (B, 1) or (B, N) for poses and ``category_advantage`` (B, 1); both as ``credit`` says."""
+        settings = self.settings
+        reward, valid = credited_reward(rollout, settings.credit)
+        groups = None if rollout.prompts is None else prompt_groups(rollout.prompts).to(reward.device)
+        per_object = reward.ndim == 2
+        if per_object:  # empty slots have no part in the statistics: their credit is no verdict
+            valid = valid & ~rollout.batch.is_empty.to(valid.device)
+        poses = compute_advantages(reward, valid, clip=float("inf"), groups=groups).view(len(reward), -1)
+        if settings.category_credit == "none" or (settings.category_credit == "auto" and per_object):
+            categories = torch.zeros_like(poses[:, :1])
+        else:
+            scenes = compute_advantages(rollout.reward, rollout.valid, clip=float("inf"), groups=groups)
+            categories = scenes.view(-1, 1)
+        return TensorDict({"advantage": poses, "category_advantage": categories}, [len(reward)])
+
+    def accumulate(self, rollout: Rollout, advantage: TensorDict, generator: Generator) -> ForwardGradient:
+        """Add the gradient of a batch to ``.grad``: ``draws`` timesteps and noises of every scene."""
+        x0 = self.prior.encode(rollout.batch.to(self.prior.device))
+        fields: dict[str, Any] = {"scene": x0, "valid": rollout.valid, **advantage}
+        if rollout.text is not None:
+            fields |= {"text": rollout.text[0], "text_mask": rollout.text[1]}
+        scenes = TensorDict(fields, [len(x0)])
+        size = self.policy.chunk or len(x0)
+        valid = max(1, int(rollout.valid.sum()))
+        total, distance = 0.0, 0.0
+        self.loss.generator = generator
+        for _ in range(self.settings.draws):
+            for start in range(0, len(x0), size):
+                part = scenes[start : start + size]
+                share = int(part["valid"].sum()) / valid / self.settings.draws
+                result = self.loss(part)
+                objective = result["loss_objective"] * share
+                objective.backward()
+                total += float(objective.detach())
+                distance += share * float(result["distance"]) ** 2
+        return ForwardGradient(total, gradient_norm(self.prior.parameters()), distance**0.5)
+
+    def end_iteration(self) -> None:
+        """Move the sampling policy towards the prior in training."""
+        self._average.update(self.prior)
+        self._average.copy_to(self.sampler)
+
+    def state(self) -> dict[str, Any]:
+        """The sampling policy's weights."""
+        return {"sampler": self._average.tensors, "updates": self._average.updates}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Inverse of :meth:`state`."""
+        self._average.tensors, self._average.updates = state["sampler"], state["updates"]
+        self._average.copy_to(self.sampler)
