@@ -164,7 +164,9 @@ def test_credit_of_an_object_reaches_its_own_pose_alone() -> None:
     output = torch.zeros_like(noised.target, requires_grad=True)
     loss.continuous_loss(output, output.detach(), noised.target, advantage[..., None]).sum().backward()
     moved = output.grad.abs().sum(dim=-1) > 0
-    assert moved[:, 5].all() and not moved[:, :5].any() and not moved[:, 6:].any()
+    assert moved[:, 5].all()
+    assert not moved[:, :5].any()
+    assert not moved[:, 6:].any()
 
 
 def test_wrong_settings_and_shapes_are_named(prior: ScenePrior) -> None:
