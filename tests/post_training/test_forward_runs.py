@@ -119,5 +119,5 @@ def test_wrong_settings_are_named(tmp_path: Path) -> None:
         forward_config(tmp_path, "awm", algorithm_settings={"beta": 0.5})
     with pytest.raises(UnknownNameError, match="category_credit"):
         forward_config(tmp_path, "nft", algorithm_settings={"category_credit": "slot"})
-    with pytest.raises(InvalidInputError, match="optimizer.ema"):
+    with pytest.raises(InvalidInputError, match=r"optimizer\.ema"):
         post_train(forward_config(tmp_path, "nft", optimizer={"ema": 0.9}), prior=tiny_prior())
