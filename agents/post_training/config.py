@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 from agents.configuration.checks import at_least, one_of, positive
 from agents.configuration.fields import composed, moved, named, nested
 from agents.configuration.settings import LoggerSettings, OptimizerSettings
 from agents.configuration.tree import plain_tree
-from agents.post_training.algorithms import AlgorithmSettings, DDPOSFSettings, algorithm_settings
+from agents.post_training.algorithms import AlgorithmSettings, DDPOSFSettings, algorithm_settings, list_algorithms
 from scene_envs.envs.settings import PROMPT_SOURCES
 from scene_envs.errors import InvalidInputError
 
@@ -168,7 +169,7 @@ class PostTrainConfig:
     iterations: int = 60
     recipe: str = "ours"
     algorithm: AlgorithmSettings = nested(
-        DDPOSFSettings, folder="algorithm", option="ddpo_sf", kinds=algorithm_settings
+        DDPOSFSettings, folder="algorithm", option="ddpo_sf", kinds=algorithm_settings, registered=list_algorithms
     )
     optimizer: PostTrainOptimizerSettings = nested(PostTrainOptimizerSettings, folder="optimizer", option="adamw")
     regularisation: RegularisationSettings = nested(RegularisationSettings)
@@ -187,6 +188,11 @@ class PostTrainConfig:
                 f"regularisation.bank_size={self.regularisation.bank_size} must exceed guard.scenes="
                 f"{self.guard.scenes}, which are held out of it"
             )
+
+    @property
+    def directory(self) -> Path:
+        """The run directory."""
+        return Path(self.output or "runs/post-train")
 
     def plain(self) -> dict[str, Any]:
         """As numbers, strings and lists; a reward given as an object becomes its name."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 from agents.configuration.checks import at_least, one_of, shares
@@ -36,6 +37,12 @@ class ModuleSettings:
 
     def __post_init__(self) -> None:
         one_of(self, "relations", ("axis", "largest", "none"))
+
+
+def _networks() -> list[str]:
+    from agents.networks.registry import NETWORK_PROCESSES, list_networks
+
+    return [name for process in NETWORK_PROCESSES for name in list_networks(process)]
 
 
 @dataclass
@@ -293,9 +300,17 @@ class PretrainConfig:
     seed: int = 0
     device: str = "cpu"
     recipe: str = "ours"
-    network: NetworkSettings = nested(NetworkSettings, folder="network", option="flux")
+    network: NetworkSettings = nested(NetworkSettings, folder="network", option="flux", registered=_networks)
     process: ProcessSettings = nested(ProcessSettings, folder="process", option="mixed")
     loss: LossSettings = nested(LossSettings)
     text: TextSettings = nested(TextSettings, folder="text", option="none")
     optimizer: PretrainOptimizerSettings = nested(PretrainOptimizerSettings, folder="optimizer", option="muon")
     logger: PretrainLoggerSettings = nested(PretrainLoggerSettings, folder="logger", option="csv")
+
+    def __post_init__(self) -> None:
+        at_least(self, 1, "batch_size")
+
+    @property
+    def directory(self) -> Path:
+        """The run directory."""
+        return Path(self.output or "runs/pretrain")
