@@ -117,6 +117,9 @@ class ForwardProcessSettings(AlgorithmSettings):
         category_credit: of categories: ``scene`` for the scene's advantage, ``none`` to keep what is there, ``auto``
             for ``none`` where poses have credit per object.
         sampler_decay: of the weight average that samples, per iteration; rises from 0 to this.
+        siblings: neighbouring scenes that share the first steps of their chain and are compared with each other; 1 for
+            scenes that share nothing and are compared with the whole batch.
+        shared_steps: share of the chain that siblings have in common; when it ends all categories should be drawn.
     """
 
     learning_rate: ClassVar[float] = 2e-4
@@ -126,10 +129,14 @@ class ForwardProcessSettings(AlgorithmSettings):
     credit: str = "auto"
     category_credit: str = "auto"
     sampler_decay: float = 0.9
+    siblings: int = 1
+    shared_steps: float = 0.5
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(self, 1, "updates", "draws")
+        at_least(self, 1, "updates", "draws", "siblings")
+        if not 0 <= self.shared_steps < 1:
+            raise InvalidInputError(f"shared_steps={self.shared_steps} must lie in [0, 1)")
         one_of(self, "credit", CREDITS)
         one_of(self, "category_credit", CATEGORY_CREDITS)
         if not 0 <= self.sampler_decay < 1:

@@ -10,7 +10,7 @@ from torch import Generator
 from torchrl.objectives import LossModule
 
 from agents.post_training.policy import DenoisingPolicy
-from agents.post_training.rollouts import Rollout
+from agents.post_training.rollouts import Branching, Rollout
 from agents.utils.weight_average import WeightAverage
 
 Credit = TypeVar("Credit")
@@ -50,6 +50,11 @@ class Algorithm(ABC, Generic[Credit]):
     def sampling_policy(self) -> DenoisingPolicy:
         """What samples the scenes; the policy in training unless an algorithm keeps another."""
         return self.policy
+
+    @property
+    def branching(self) -> Branching:
+        """Which scenes of a batch share the first steps of their chain; none unless an algorithm says so."""
+        return Branching()
 
     @property
     def average(self) -> WeightAverage | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
@@ -11,14 +12,14 @@ import torch
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
-from agents.post_training.advantages import compute_advantages
+from agents.post_training.advantages import compute_advantages, sibling_advantages
 from agents.post_training.algorithms import AWMSettings, ForwardProcessSettings, NFTSettings, RewardWeightedSettings
 from agents.post_training.base import Algorithm
 from agents.post_training.forward_losses import AWMLoss, ForwardProcessLoss, NFTLoss, RewardWeightedLoss
 from agents.post_training.gradients import credited_reward, gradient_norm
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.prompts import prompt_groups
-from agents.post_training.rollouts import Rollout
+from agents.post_training.rollouts import Branching, Rollout
 from agents.priors.base import ScenePrior
 from agents.utils.weight_average import WeightAverage
 
@@ -85,21 +86,43 @@ class ForwardProcess(Algorithm[TensorDict]):
         """The weights of the slower copy."""
         return self._average
 
+    @property
+    def branching(self) -> Branching:
+        """Siblings share ``shared_steps`` of the chain."""
+        settings = self.settings
+        return Branching(settings.siblings, round(settings.shared_steps * len(self.policy)))
+
     def advantage(self, rollout: Rollout) -> TensorDict:
         """``advantage`` (B, 1) or (B, N) for poses and ``category_advantage`` (B, 1); both as ``credit`` says."""
         settings = self.settings
         reward, valid = credited_reward(rollout, settings.credit)
-        groups = None if rollout.prompts is None else prompt_groups(rollout.prompts).to(reward.device)
         per_object = reward.ndim == 2
-        if per_object:  # empty slots have no part in the statistics: their credit is no verdict
-            valid = valid & ~rollout.batch.is_empty.to(valid.device)
-        poses = compute_advantages(reward, valid, clip=float("inf"), groups=groups).view(len(reward), -1)
+        if per_object:
+            poses = self._object_advantages(rollout, reward, valid)
+        else:
+            poses = self._scene_advantages(rollout)
         if settings.category_credit == "none" or (settings.category_credit == "auto" and per_object):
             categories = torch.zeros_like(poses[:, :1])
         else:
-            scenes = compute_advantages(rollout.reward, rollout.valid, clip=float("inf"), groups=groups)
-            categories = scenes.view(-1, 1)
+            categories = self._scene_advantages(rollout)
         return TensorDict({"advantage": poses, "category_advantage": categories}, [len(reward)])
+
+    def _object_advantages(self, rollout: Rollout, reward: Tensor, valid: Tensor) -> Tensor:
+        """(B, N); slots that are empty have no advantage, nor have those whose siblings hold something else."""
+        valid = valid & ~rollout.batch.is_empty.to(valid.device)
+        siblings = self.settings.siblings
+        if siblings == 1:
+            return compute_advantages(reward, valid, clip=math.inf, groups=_groups(rollout))
+        categories = rollout.batch.categories.to(valid.device).unflatten(0, (-1, siblings))
+        same = (categories == categories[:, :1]).all(dim=1)
+        return sibling_advantages(reward, valid & same.repeat_interleave(siblings, dim=0), siblings)
+
+    def _scene_advantages(self, rollout: Rollout) -> Tensor:
+        """(B, 1), among siblings where there are any."""
+        groups = _groups(rollout)
+        if self.settings.siblings > 1:
+            groups = torch.arange(len(rollout.reward), device=rollout.reward.device) // self.settings.siblings
+        return compute_advantages(rollout.reward, rollout.valid, clip=math.inf, groups=groups)[:, None]
 
     def accumulate(self, rollout: Rollout, advantage: TensorDict, generator: Generator) -> ForwardGradient:
         """Add the gradient of a batch to ``.grad``: ``draws`` timesteps and noises of every scene."""
@@ -136,3 +159,8 @@ class ForwardProcess(Algorithm[TensorDict]):
         """Inverse of :meth:`state`."""
         self._average.tensors, self._average.updates = state["sampler"], state["updates"]
         self._average.copy_to(self.sampler)
+
+
+def _groups(rollout: Rollout) -> Tensor | None:
+    """(B,) int64 that tell prompts apart; None without prompts."""
+    return None if rollout.prompts is None else prompt_groups(rollout.prompts).to(rollout.reward.device)

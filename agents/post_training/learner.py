@@ -92,11 +92,19 @@ class Learner:
 
     def rollout(self, iteration: int) -> Rollout:
         """A batch of fresh scenes."""
+        algorithm, batch = self.algorithm, self.config.batch_size
+        branching = algorithm.branching
         prompts = None
         if self.deck is not None:
-            prompts = self.deck.deal(self.config.batch_size, self._generator("prompts", iteration))
+            dealt = self.deck.deal(branching.groups(batch), self._generator("prompts", iteration))
+            prompts = [text for text in dealt for _ in range(branching.siblings)]
         return collect(
-            self.env, self.algorithm.sampling_policy, seed=self.config.seed, iteration=iteration, prompts=prompts
+            self.env,
+            algorithm.sampling_policy,
+            seed=self.config.seed,
+            iteration=iteration,
+            prompts=prompts,
+            branching=branching,
         )
 
     def accumulate(self, rollout: Rollout, advantage: Any, scenes: SceneBank, index: int) -> dict[str, float]:

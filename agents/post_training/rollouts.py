@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
+from gymnasium.utils import seeding
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
@@ -13,7 +14,7 @@ from agents.networks.text import Text
 from agents.post_training.policy import DenoisingPolicy
 from agents.utils.seeds import derived_seed
 from scene_envs.envs import DenoisingTorchRLEnv
-from scene_envs.errors import TrainingError
+from scene_envs.errors import InvalidInputError, TrainingError
 from scene_envs.scene import SceneBatch
 
 STREAMS = ("start", "noise", "steps", "real", "bank", "guard", "prompts")
@@ -70,6 +71,32 @@ def stream_seed(seed: int, stream: str, iteration: int = 0) -> int:
     return derived_seed(seed, STREAMS.index(stream), iteration)
 
 
+@dataclass(frozen=True)
+class Branching:
+    """Groups of episodes that share the first steps of their chain.
+
+    Attributes:
+        siblings: neighbouring episodes per group; 1 for episodes that share nothing.
+        steps: how many steps a group shares; they are denoised once per group.
+    """
+
+    siblings: int = 1
+    steps: int = 0
+
+    def groups(self, batch: int) -> int:
+        """Number of groups of ``batch`` episodes.
+
+        Raises:
+            InvalidInputError: the siblings do not divide the batch.
+        """
+        if batch % self.siblings:
+            raise InvalidInputError(
+                f"batch_size={batch} cannot be split into groups of algorithm.siblings={self.siblings}; "
+                f"take a multiple, such as {max(1, batch // self.siblings) * self.siblings}"
+            )
+        return batch // self.siblings
+
+
 def collect(
     env: DenoisingTorchRLEnv,
     policy: DenoisingPolicy,
@@ -77,6 +104,7 @@ def collect(
     seed: int,
     iteration: int = 0,
     prompts: Sequence[str] | None = None,
+    branching: Branching = Branching(),
 ) -> Rollout:
     """Run ``policy`` to the end of one episode in each of the environment's rows.
 
@@ -85,10 +113,14 @@ def collect(
         policy: draws x_{t-1}; must have the environment's number of steps.
         seed: of the run; x_T and the chain's noise hang on it and on ``iteration`` alone.
         iteration: which batch of the run this is.
-        prompts: one per row; None draws them as the environment was told. Text is encoded once, at the start.
+        prompts: one per row, equal among siblings; None draws them as the environment was told. Text is encoded once,
+            at the start.
+        branching: which episodes share their first steps.
     """
-    with torch.random.fork_rng(devices=[]):  # set_seed touches the global generator
-        env.set_seed(stream_seed(seed, "start", iteration))
+    branching.groups(env.core.num_envs)
+    together = branching.siblings
+    start = stream_seed(seed, "start", iteration)
+    rngs = [seeding.np_random(start + row // together)[0] for row in range(env.core.num_envs)]
     device = env.core.device
     generator = Generator(device).manual_seed(stream_seed(seed, "noise", iteration))
     log_probs: list[Tensor] = []
@@ -97,7 +129,13 @@ def collect(
     def act(x_t: Tensor, step: int) -> Tensor:
         if step == 0 and env.core.prompting.reader is not None:
             texts.append(policy.read(env.core.observation()["prompt"]))
-        action, log_prob = policy.draw(x_t, step, generator, texts[0] if texts else None)
+        text = texts[0] if texts else None
+        if together > 1 and step < branching.steps:
+            first = None if text is None else (text[0][::together], text[1][::together])
+            drawn = policy.draw(x_t[::together], step, generator, first)
+            action, log_prob = (part.repeat_interleave(together, dim=0) for part in drawn)
+        else:
+            action, log_prob = policy.draw(x_t, step, generator, text)
         if not bool(torch.isfinite(log_prob).all()):
             raise TrainingError(
                 f"the prior gave values that are not finite at step {step} of iteration {iteration + 1}; "
@@ -106,7 +144,7 @@ def collect(
         log_probs.append(log_prob)
         return action
 
-    result = env.collect(act, prompts)
+    result = env.core.collect(act, rngs, prompts)
     return Rollout(
         scenes=result.scenes,
         actions=result.actions,

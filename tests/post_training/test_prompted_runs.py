@@ -72,7 +72,7 @@ def test_scenes_are_compared_with_those_of_the_same_prompt(tmp_path: Path) -> No
     rollout = trainer.learner.rollout(0)
     assert sorted(set(rollout.prompts or ())) == sorted(TWO)
     assert len(set(rollout.reward.tolist())) == 2
-    assert (trainer.learner.advantage(rollout) == 0).all()
+    assert (trainer.learner.algorithm.advantage(rollout) == 0).all()
     assert (compute_advantages(rollout.reward, rollout.valid) != 0).all()
     trainer.close()
 
