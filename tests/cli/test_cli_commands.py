@@ -61,6 +61,7 @@ def test_generate_pretrain_post_train_and_sample_the_result(tmp_path, capsys):
     words += [
         "regularisation.bank_size=8",
         "guard.scenes=2",
+        "slots=6",
         "logger.report_scenes=1",
         "logger.progress=none",
         "reward={name: clip, reward: object_count, high: 30}",

@@ -40,8 +40,8 @@ def check_words(words: list[str]) -> None:
         assert main is not None, words
         if main is cli:
             assert name in {*COMMANDS, "COMMAND"}, name
-        keys = () if name == "COMMAND" else _keys(name)
-        assert [key for word in rest if (key := word.partition("=")[0]) not in keys and "=" in word] == []
+        given = {word.partition("=")[0] for word in rest if "=" in word}
+        assert name == "COMMAND" or given <= _keys(name), words
 
 
 def _program(words: list[str]) -> tuple[str, ModuleType | None, list[str]]:
@@ -57,12 +57,13 @@ def _program(words: list[str]) -> tuple[str, ModuleType | None, list[str]]:
 
 
 def _keys(name: str) -> set[str]:
-    """The keys of a command or of a program."""
+    """The keys of a command or of a program, and the names of its groups."""
     if "." in name:
         module = import_module(f"{name}.__main__")
     else:
         module = import_module(f"agents.cli.commands.{name.replace('-', '_')}")
-    return {key.name for key in describe_fields(module.config())}
+    keys = {key.name for key in describe_fields(module.config())}
+    return keys | {key.rpartition(".")[0] for key in keys}
 
 
 def _small(name: str, words: list[str]) -> list[str]:
@@ -79,4 +80,5 @@ def _small(name: str, words: list[str]) -> list[str]:
     for word in kept:
         if word.endswith("=models/bert-base"):
             prepare("models/bert-base")
-    return [*kept, *(f"{key}={value}" for key, value in sizes.items())]
+    data = next((word.partition("=")[2] for word in words if word.startswith("data=")), "")
+    return [*kept, *(f"{key}={value.format(data=data)}" for key, value in sizes.items())]

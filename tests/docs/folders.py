@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 
 import trimesh
 
+from agents import cli
 from agents.priors.testing import tiny_prior
 from scene_envs.datasets import generate
 from tests.helpers.authors_flux import random_state, write_checkpoint
@@ -58,7 +61,13 @@ def _models(folder: Path) -> None:
 
 
 def _bert(folder: Path) -> None:
-    write_bert(folder)
+    write_bert(folder, longest=128)
+
+
+def _config(file: Path) -> None:
+    with redirect_stdout(StringIO()) as printed:
+        assert cli.main(["post-train", "reward=object_count", "--cfg", "job"]) == 0
+    file.write_text(printed.getvalue())
 
 
 def _checkpoint(file: Path) -> None:
@@ -72,6 +81,7 @@ _RECIPES: dict[str, Callable[[Path], None]] = {
     "data/living_room_shelf": _dataset("living_room_shelf"),
     "data/pantry_shelf": _dataset("pantry_shelf"),
     "runs/mixed": _prior(text=True),
+    "runs/clutter/config.yaml": _config,
     "runs/mine": _scenes,
     "runs/tea_table": _prior("tea_table"),
     "models/bert-base": _bert,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from tests.docs.pages import (
     PAGES,
     PREPARED,
     ROOT,
+    SMALL,
     SMALLER,
     Block,
     blocks_of,
@@ -26,6 +28,7 @@ from tests.docs.pages import (
     not_run,
     smaller,
 )
+from tests.helpers.outside_package import EXAMPLE, installed
 
 RUN = ("python", "sh")
 READ = ("toml", "yaml", "text")
@@ -40,8 +43,14 @@ PAGES_WITH_COMMANDS = [page for page in PAGES if page not in HISTORY and inline_
 def test_a_page_runs_from_top_to_bottom(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SCENE_ENVS_CACHE", str(tmp_path / "cache"))
+    with ExitStack() as until_the_end:
+        run_blocks(page, until_the_end)
+
+
+def run_blocks(page: str, until_the_end: ExitStack) -> None:
+    """Run the blocks of ``page`` below the working directory; what they install stays ``until_the_end``."""
     prepared = PREPARED.get(page, ())
-    names: dict[str, Any] = {"__name__": "__main__"}
+    names: dict[str, Any] = {"__name__": "__main__", "SMALL": SMALL}
     for block in blocks_of(page):
         for name in prepared:
             if name in block.code:
@@ -50,12 +59,17 @@ def test_a_page_runs_from_top_to_bottom(page: str, tmp_path: Path, monkeypatch: 
             run_python(block, names)
         elif block.language == "sh":
             for words in commands_of(block):
-                run_command(words, prepared)
+                if words[:2] == ["pip", "install"]:
+                    assert (ROOT / words[2]).resolve() == EXAMPLE
+                    Path("site").mkdir()
+                    until_the_end.enter_context(installed(Path("site").resolve()))
+                else:
+                    run_command(words, prepared)
         elif block.language == "toml":
             assert "entry-points" in tomllib.loads(block.code)["project"]
         elif block.language == "yaml":
             assert [entry["file"] for entry in yaml.safe_load(block.code)]
-            (tmp_path / "my_assets" / "library.yaml").write_text(block.code)
+            Path("my_assets", "library.yaml").write_text(block.code)
 
 
 def run_python(block: Block, names: dict[str, Any]) -> None:

@@ -199,9 +199,9 @@ def test_the_doctor_examines_a_prompted_run(tmp_path: Path) -> None:
 
 def test_the_report_compares_samples_with_their_prompts(tmp_path: Path) -> None:
     pytest.importorskip("pybullet")
-    prior = tiny_prior(process="mixed", text=True, slots=SLOTS)
+    prior = tiny_prior(process="mixed", text=True, slots=4)
     metrics = post_train_and_compare(
-        small_config(tmp_path, iterations=1, prompt="A scene with 14 objects.", slots=SLOTS + 2),
+        small_config(tmp_path, iterations=1, prompt="A scene with 5 objects.", slots=5),
         scenes=2,
         num_steps=2,
         prior=prior,

@@ -4,7 +4,7 @@ from rewards import register_reward
 
 
 @register_reward("tower")
-def tower(batch, scale: float = 1.0):
+def tower(batch, *, scale: float = 1.0):
     """Height of the highest free object's origin above the lowest one's, times ``scale``, m."""
     heights = batch.translations[..., 2]
     highest = heights.masked_fill(~batch.is_free, -1e3).amax(dim=-1)
