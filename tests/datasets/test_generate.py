@@ -97,6 +97,7 @@ generate("toy_cups", {COUNT}, sys.argv[1], seed=3, shard_size={SHARD}, workers=0
 """
 
 
+@pytest.mark.slow
 def test_killed_at_any_point_and_started_again_the_files_are_the_same(reference: Path, tmp_path: Path) -> None:
     """Killed in the middle of the first shard, and the next run in the middle of the second."""
     for shard in (0, 1):
@@ -165,6 +166,7 @@ def test_the_result_does_not_depend_on_the_size_of_chunks(
     assert _hashes(tmp_path) == _hashes(reference)
 
 
+@pytest.mark.slow
 def test_two_workers_write_the_same_files_and_a_dying_one_is_replaced(
     reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -230,6 +232,7 @@ def test_a_broken_shard_is_named_before_work_starts(reference: Path, tmp_path: P
 # -- Ray --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_ray_writes_the_same_files(reference: Path, tmp_path: Path) -> None:
     ray = pytest.importorskip("ray")
     assert not ray.is_initialized()

@@ -46,6 +46,7 @@ def many(name: str) -> SceneBatch:
     return SceneBatch.concatenate(result)
 
 
+@pytest.mark.slow
 @types
 def test_all_prompts_parse_back_and_hold(name: str) -> None:
     batch = many(name)

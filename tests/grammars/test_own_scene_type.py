@@ -27,6 +27,7 @@ from scene_envs.render import render, write_viewer
 from tests.helpers.outside_package import installed
 
 DOCS = Path(__file__).parents[2] / "docs" / "grammars.md"
+pytestmark = pytest.mark.slow
 NAME = "tea_table"
 
 

@@ -51,6 +51,7 @@ def simulations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return counts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TYPES)
 def test_generated_scenes_stand_as_simulation_says(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """As generated and with 2 mm of noise: at most one verdict in a hundred differs from simulating everything."""

@@ -69,6 +69,7 @@ def test_page_needs_nothing_but_itself_and_escapes_text(tmp_path: Path) -> None:
     assert all(escaped in text for escaped in ("&lt;t&gt;", "&lt;b&gt;", "a &amp; b", "&lt;2&gt;", "&lt;v&gt;"))
 
 
+@pytest.mark.slow
 def test_demonstration_end_to_end(tmp_path: Path) -> None:
     pytest.importorskip("scene_envs.physics")
     recipe = small_config(tmp_path, iterations=2)

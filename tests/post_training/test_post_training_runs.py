@@ -51,6 +51,7 @@ def test_chunks_do_not_change_the_gradient(tmp_path: Path) -> None:
     assert rows[0]["policy_gradient_norm"] == pytest.approx(rows[1]["policy_gradient_norm"], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_more_objects_after_training_on_their_number(tmp_path: Path) -> None:
     config = small_config(
         tmp_path,
@@ -81,6 +82,7 @@ def test_run_leaves_a_prior_a_log_and_metrics(tmp_path: Path) -> None:
     assert "reward: " in (tmp_path / "config.yaml").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changes", [{}, {"ema": 0.5, "credit": "scene"}, {"algorithm": "ddpo_is"}])
 def test_stopped_and_resumed_run_equals_the_uninterrupted_one(tmp_path: Path, changes: dict) -> None:
     whole = post_train(small_config(tmp_path / "whole", iterations=4, **changes), prior=tiny_prior())
@@ -114,6 +116,7 @@ post_train(small_config({output!r}, reward=deadly), prior=tiny_prior())
 """
 
 
+@pytest.mark.slow
 def test_killed_run_resumes_bit_for_bit(tmp_path: Path) -> None:
     here = Path(__file__).parent
     script = KILLED.format(root=str(here.parents[1]), here=str(here), output=str(tmp_path / "killed"))

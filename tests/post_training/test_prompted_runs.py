@@ -197,6 +197,7 @@ def test_the_doctor_examines_a_prompted_run(tmp_path: Path) -> None:
     assert any("not within any" in line for line in diagnose(alike, prior=reader()).advice)
 
 
+@pytest.mark.slow
 def test_the_report_compares_samples_with_their_prompts(tmp_path: Path) -> None:
     pytest.importorskip("pybullet")
     prior = tiny_prior(process="mixed", text=True, slots=4)
