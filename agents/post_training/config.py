@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 from agents.configuration.checks import at_least, one_of, positive
@@ -180,6 +181,11 @@ class PostTrainConfig:
                 f"regularisation.bank_size={self.regularisation.bank_size} must exceed guard.scenes="
                 f"{self.guard.scenes}, which are held out of it"
             )
+
+    @property
+    def directory(self) -> Path:
+        """The run directory."""
+        return Path(self.output or "runs/post-train")
 
     def plain(self) -> dict[str, Any]:
         """As numbers, strings and lists; a reward given as an object becomes its name."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from copy import deepcopy
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -158,7 +157,7 @@ class Learner:
         Raises:
             InvalidInputError: the weights are of another network, such as an earlier version's.
         """
-        check_tensors(self.prior, state["prior"], Path(self.config.output) / CHECKPOINT_NAME)
+        check_tensors(self.prior, state["prior"], self.config.directory / CHECKPOINT_NAME)
         self.prior.load_state_dict(state["prior"])
         self.optimizer.load_state_dict(state["optimizer"])
         if self.average is not None:

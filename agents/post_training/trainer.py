@@ -95,7 +95,7 @@ class PostTrainer:
 
     def __init__(self, config: PostTrainConfig, *, prior: ScenePrior | None = None) -> None:
         self.config = config
-        self.directory = Path(config.output or "runs/post-train")
+        self.directory = config.directory
         self.learner = Learner(config, ScenePrior.load(config.prior if prior is None else prior))
         self.prior = self.learner.prior
         self.iteration = 0

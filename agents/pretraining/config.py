@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 from agents.configuration.checks import at_least, one_of, shares
@@ -299,3 +300,11 @@ class PretrainConfig:
     text: TextSettings = nested(TextSettings, folder="text", option="none")
     optimizer: PretrainOptimizerSettings = nested(PretrainOptimizerSettings, folder="optimizer", option="muon")
     logger: PretrainLoggerSettings = nested(PretrainLoggerSettings, folder="logger", option="csv")
+
+    def __post_init__(self) -> None:
+        at_least(self, 1, "batch_size")
+
+    @property
+    def directory(self) -> Path:
+        """The run directory."""
+        return Path(self.output or "runs/pretrain")

@@ -87,7 +87,7 @@ class Pretrainer:
         self.step = 0
         self.schedule = self._schedule()
         self.seconds = 0.0
-        self.directory = Path(config.output or "runs/pretrain")
+        self.directory = config.directory
         chosen = config.logger.name if self.processes.is_first else "csv"
         self.log = TrainingLog(self.directory, make_logger(chosen, self.directory))
         self.evaluations: list[dict[str, float]] = []

@@ -47,7 +47,7 @@ def test_help_loads_nothing_heavy():
         (["sample", "cuont=3"], "unknown sample key 'cuont'; did you mean 'count'?"),
         (["ship", "prior=x"], "the command 'ship' has another name now: scene-envs package-prior"),
         (["tables"], "the command 'tables' has another name now: python -m benchmarks.paper_tables"),
-        (["pretrain", "tally=true"], "the pretrain key 'tally' has another name now: network.count_embedding"),
+        (["pretrain", "tally=true"], "the pretrain key 'tally' has another name now: network.modules.count_embedding"),
         (["pretrain", "text_requests=true"], "'text_requests' has another name now: text.count_conditioning"),
         (["sample", "count"], "expected key=value, got 'count'"),
         (["sample", "count=three"], "count=three is not a whole number"),

@@ -17,7 +17,7 @@ _FENCE = re.compile(r"^ *```(\w+)[^\n]*\n(.*?)^ *```", re.DOTALL | re.MULTILINE)
 _INLINE = re.compile(r"`((?:scene-envs|python|make|bash) [^`]+)`")
 
 SMALLER: dict[str, dict[str, str]] = {
-    "README.md": {"budget=32": "budget=2, branching=2, num_steps=10"},
+    "README.md": {"budget=32": "budget=2, branching=2, num_steps=20, slots=13"},
     "docs/algorithms/ddpo_sf.md": {
         "iterations=40, ": "iterations=1, batch_size=2, num_steps=3, **SMALL, ",
         'PostTrainConfig(output="runs/clutter")': (
@@ -40,7 +40,7 @@ SMALLER: dict[str, dict[str, str]] = {
         'PPO("MultiInputPolicy", env).learn(1000)': (
             'PPO("MultiInputPolicy", env, n_steps=20, batch_size=10).learn(20)'
         ),
-        "branching=8": "branching=2, num_steps=10",
+        "branching=8": "branching=2, num_steps=20, slots=13",
         "range(5)": "range(1)",
     },
     "docs/evaluation.md": {"count=20, num_steps=10": "count=2, num_steps=10", "workers=2": "workers=0"},
@@ -49,8 +49,8 @@ SMALLER: dict[str, dict[str, str]] = {
     "docs/planners/best_of.md": {"branching=8": "branching=2", "budget=8": "budget=2"},
     "docs/planners/uct.md": {"branching=3": "branching=2", "budget=9": "budget=3"},
     "docs/search.md": {
-        "budget=64, branching=4": "budget=2, branching=2, num_steps=10",
-        "branching=4)": "branching=2, num_steps=10)",
+        "budget=64, branching=4": "budget=2, branching=2, num_steps=20, slots=13",
+        "branching=4)": "branching=2, num_steps=20, slots=13)",
         "budget=32": "budget=2",
     },
 }
@@ -64,7 +64,7 @@ SMALL: dict[str, dict[str, object]] = {
 """Groups of a small post-training run, known to the Python blocks by this name."""
 
 SMALL_KEYS: dict[str, dict[str, str]] = {
-    "sample": {"count": "1", "num_steps": "20", "workers": "0"},
+    "sample": {"count": "1", "num_steps": "20", "slots": "13", "workers": "0", "pictures": "1"},
     "complete": {"num_steps": "5"},
     "rearrange": {"num_steps": "5"},
     "generate": {"count": "12", "workers": "0", "progress": "false", "verify": "false"},
@@ -81,6 +81,7 @@ SMALL_KEYS: dict[str, dict[str, str]] = {
         "iterations": "1",
         "batch_size": "2",
         "num_steps": "10",
+        "slots": "20",
         "algorithm.gradient_steps": "2",
         "algorithm.scenes_per_prompt": "2",
         "regularisation.batch_size": "2",
@@ -89,8 +90,14 @@ SMALL_KEYS: dict[str, dict[str, str]] = {
         "logger.report_scenes": "1",
         "workers": "0",
     },
-    "doctor": {"batch_size": "2", "num_steps": "5", "regularisation.bank_size": "16", "guard.scenes": "4"},
-    "search": {"budget": "2", "num_steps": "10", "branching": "2"},
+    "doctor": {
+        "batch_size": "2",
+        "num_steps": "5",
+        "slots": "13",
+        "regularisation.bank_size": "16",
+        "guard.scenes": "4",
+    },
+    "search": {"budget": "2", "num_steps": "20", "slots": "13", "branching": "2"},
     "evaluate": {"count": "2", "num_steps": "20", "training_scenes": "8", "prompt_count": "2", "workers": "0"},
     "export": {"count": "1", "num_steps": "20", "workers": "0"},
     "view": {"count": "2", "num_steps": "3", "first": "0", "open": "false"},

@@ -18,7 +18,7 @@ from agents.post_training import learner as learner_module
 from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards.base import RewardContext, RewardOutput
-from scene_envs.errors import CorruptFileError, InvalidInputError, TrainingError
+from scene_envs.errors import CorruptFileError, InvalidInputError, TrainingError, UnknownNameError
 from scene_envs.scene import SceneBatch
 
 
@@ -80,6 +80,16 @@ def test_run_leaves_a_prior_a_log_and_metrics(tmp_path: Path) -> None:
     assert metrics["guard"]["limit"] == 1.5
     assert len(metrics["guard"]["checks"]) == 2
     assert "reward: " in (tmp_path / "config.yaml").read_text()
+
+
+def test_rows_go_to_the_logger_that_is_named(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    config = small_config(tmp_path, iterations=2, **{"logger.name": "tensorboard"})
+    rewards = [row["reward"] for row in post_train(config, prior=tiny_prior()).history]
+    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert [event.value for event in events.Scalars("reward")] == pytest.approx(rewards)
 
 
 @pytest.mark.slow
@@ -274,5 +284,5 @@ def test_credit_per_object_needs_such_a_reward(tmp_path: Path) -> None:
     ],
 )
 def test_wrong_settings_are_named(tmp_path: Path, changes: dict) -> None:
-    with pytest.raises(InvalidInputError, match=next(iter(changes))):
+    with pytest.raises((InvalidInputError, UnknownNameError), match=next(iter(changes))):
         small_config(tmp_path, **changes)

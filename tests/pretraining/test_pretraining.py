@@ -125,7 +125,7 @@ def test_a_checkpoint_that_holds_no_base_rates_resumes_bit_for_bit(
     config: PretrainConfig, raw: torch.Tensor, tmp_path: Path
 ) -> None:
     """The learning rate hangs on the number of the step alone, whatever the optimiser's groups say."""
-    config = replace(config, decay_share=1.0)
+    config = changed(config, {"optimizer.decay_share": 1.0})
     whole = make_run(replace(config, output=str(tmp_path / "whole")), raw)
     whole.run()
     first = make_run(config, raw)

@@ -41,6 +41,7 @@ def run_folder(tmp_path: Path) -> Path:
     prior.card = {"trained_steps": 1200, "batch_size": 96, "seconds": 600, "training_scenes": 131000}
     prior.save(folder / "prior")
     (folder / "config.yaml").write_text(config_text(CONFIG))
+    (folder / "metrics.json").write_text(json.dumps(prior.card))
     (folder / "evaluation").mkdir()
     (folder / "evaluation" / "metrics.json").write_text(json.dumps(FIGURES))
     return folder
