@@ -19,7 +19,9 @@ _INLINE = re.compile(r"`((?:scene-envs|python|make|bash) [^`]+)`")
 SMALLER: dict[str, dict[str, str]] = {
     "README.md": {"budget=32": "budget=2, branching=2, num_steps=20, slots=13"},
     "docs/algorithms/ddpo_sf.md": {
-        "iterations=40, ": "iterations=1, batch_size=2, num_steps=3, **SMALL, ",
+        'iterations=40, output="runs/clutter"': (
+            'iterations=1, batch_size=2, num_steps=3, **SMALL, output="runs/short"'
+        ),
         'PostTrainConfig(output="runs/clutter")': (
             'PostTrainConfig(output="runs/compared", iterations=1, batch_size=2, num_steps=3, **SMALL), '
             "scenes=1, num_steps=20"

@@ -35,7 +35,6 @@ NAME = "tea_table"
 def tea_house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The package of examples/extending on the path of this process; forgotten afterwards."""
     with installed(tmp_path_factory.mktemp("site"), missing="tea_house.not_there") as site:
-        list_scene_types()  # imports what is installed, once per process
         yield site
 
 

@@ -6,12 +6,16 @@ import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
 import tomllib
 
-from scene_envs import plugins
+from agents.networks import list_networks
+from agents.planning import list_planners
+from agents.post_training import list_algorithms
+from scene_envs import list_scene_types, plugins
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "extending"
 
@@ -44,6 +48,8 @@ def installed(site: Path, *, missing: str = "") -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.syspath_prepend(str(site))
         plugins.load_plugins.cache_clear()
+        for listed in (list_algorithms, list_planners, list_scene_types, partial(list_networks, "mixed")):
+            listed()  # registers what is installed, once, before the state that every test goes back to
         yield site
     plugins.load_plugins.cache_clear()
     for name in [name for name in sys.modules if name.partition(".")[0] == "tea_house"]:

@@ -246,7 +246,7 @@ def test_a_grammar_without_end_trains_a_prior_that_reads_prompts(tmp_path: Path)
     assert torch.equal(first[0], again[0])
     assert first[1] == again[1]
     assert all(len(group) == 3 for group in first[1])
-    trained = Pretrainer(config, data, heldout[:64], prior).run()
+    trained = Pretrainer(config, data, heldout[:8], prior).run()
     assert trained.conditional
     assert trained.card["training_scenes"] == 8
     assert (tmp_path / "samples-0000002.png").stat().st_size > 1000
@@ -254,7 +254,7 @@ def test_a_grammar_without_end_trains_a_prior_that_reads_prompts(tmp_path: Path)
 
 @pytest.mark.slow
 def test_two_processes_take_the_steps_of_one_with_twice_the_parts(tmp_path: Path) -> None:
-    generate("dimsum_table", 64, tmp_path / "data", workers=0, verify=False, progress=False)
+    generate("dimsum_table", 16, tmp_path / "data", workers=0, verify=False, progress=False)
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
     keys = ["iterations=4", "batch_size=8", "network.hidden=16", "network.depth=1", "network.heads=2", "seed=3"]
