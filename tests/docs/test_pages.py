@@ -12,9 +12,9 @@ import tomllib
 import yaml
 
 from rewards import resolve_reward
-from tests.docs.commands import check_words, run_command
-from tests.docs.folders import prepare
-from tests.docs.pages import (
+from tests.helpers.doc_commands import check_words, run_command
+from tests.helpers.doc_folders import prepare
+from tests.helpers.doc_pages import (
     NOT_RUN_PYTHON,
     PAGES,
     PREPARED,

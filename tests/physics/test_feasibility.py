@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from simple_scenes import SIDE, TYPE, scene, turned
 
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.grammars import get_grammar
@@ -19,6 +18,7 @@ from scene_envs.physics.placement import Objects
 from scene_envs.physics.rest import Rest
 from scene_envs.physics.world import World
 from scene_envs.scene import SceneBatch
+from tests.helpers.simple_scenes import SIDE, TYPE, scene, turned
 
 
 def tower(height: int, x: float = 0.0) -> list[tuple[str, float, float, float]]:

@@ -11,12 +11,12 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import torch
-from simple_scenes import scene
 
 from scene_envs.errors import InvalidInputError, PhysicsError
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import FeasibilityResult, PhysicsPool, feasibility, penetration, project, settle
 from scene_envs.scene import SceneBatch
+from tests.helpers.simple_scenes import scene
 
 FIELDS = ("feasible", "depth", "displacement", "rotation", "valid", "counts")
 

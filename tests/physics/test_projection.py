@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial import ConvexHull
-from simple_scenes import SIDE
-from simple_scenes import scene as boxes
 
 from scene_envs.assets import get_library
 from scene_envs.grammars import get_grammar
@@ -15,6 +13,8 @@ from scene_envs.physics import penetration, planes, project, projection
 from scene_envs.physics.budget import Budget
 from scene_envs.rotations import yaw_matrix
 from scene_envs.scene import SceneBatch
+from tests.helpers.simple_scenes import SIDE
+from tests.helpers.simple_scenes import scene as boxes
 
 TYPE = "dimsum_table"
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from PIL import Image
 from rich.console import Console
-from small_runs import count_objects, small_config
 
 from agents.post_training.demo import run_demo
 from agents.post_training.doctor import diagnose
@@ -19,6 +18,7 @@ from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.scene import SceneBatch
+from tests.helpers.small_runs import count_objects, small_config
 
 
 def test_doctor_finds_nothing_wrong_with_log_ratio_and_writes_nothing(tmp_path: Path) -> None:

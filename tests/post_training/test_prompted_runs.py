@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from small_runs import count_objects, small_config
 from torch import Generator
 
 from agents.post_training import (
@@ -29,6 +28,7 @@ from scene_envs.datasets.prompts import parse_prompt, scene_facts
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
+from tests.helpers.small_runs import count_objects, small_config
 
 TWO = ["A scene with two cups.", "A scene with 20 objects."]
 SLOTS = 12

@@ -9,8 +9,8 @@ from types import ModuleType
 from agents import cli
 from agents.cli.commands import COMMANDS
 from agents.cli.keys import describe_fields
-from tests.docs.folders import prepare
-from tests.docs.pages import INSTEAD, NOT_RUN, ROOT, SMALL_KEYS
+from tests.helpers.doc_folders import prepare
+from tests.helpers.doc_pages import INSTEAD, NOT_RUN, ROOT, SMALL_KEYS
 
 
 def run_command(words: list[str], prepared: tuple[str, ...]) -> None:
