@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from agents.cli import main
 from agents.planning.config import planner_settings
@@ -141,7 +141,7 @@ def test_names_work_together_on_the_command_line(prior: str, tmp_path: Path) -> 
     search = ["objective=tower", "objective_scale=0.5", "mask=outer", "planner=beam", "planner.width=1", "slots=6"]
     small = ["budget=3", "branching=2", "num_steps=1", f"output={tmp_path / 'search'}"]
     assert main(["search", f"prior={prior}", *search, *small]) == 0
-    settings = json.loads((tmp_path / "search" / "metrics.json").read_text())["config"]
+    settings = yaml.safe_load((tmp_path / "search" / "config.yaml").read_text())
     assert settings["planner"] == {"name": "beam", "width": 1}
     run = ["algorithm=proximal", "algorithm.penalty=0.5", "algorithm.gradient_steps=2", "reward=tower", "slots=6"]
     sizes = ["iterations=2", "batch_size=3", "num_steps=3", "regularisation.bank_size=8", "guard.scenes=2"]

@@ -10,7 +10,7 @@ from agents import cli
 from agents.cli.commands import COMMANDS
 from agents.cli.keys import describe_fields
 from tests.helpers.doc_folders import prepare
-from tests.helpers.doc_pages import INSTEAD, NOT_RUN, ROOT, SMALL_KEYS
+from tests.helpers.doc_pages import INSTEAD, NOT_RUN, ROOT, ROWS, SMALL_KEYS
 
 
 def run_command(words: list[str], prepared: tuple[str, ...]) -> None:
@@ -80,5 +80,6 @@ def _small(name: str, words: list[str]) -> list[str]:
     for word in kept:
         if word.endswith("=models/bert-base"):
             prepare("models/bert-base")
-    data = next((word.partition("=")[2] for word in words if word.startswith("data=")), "")
-    return [*kept, *(f"{key}={value.format(data=data)}" for key, value in sizes.items())]
+    typed = dict(word.split("=", 1) for word in words if "=" in word)
+    given = {"data": typed.get("data", ""), "rows": typed.get("rows", ROWS).replace("*", "")}
+    return [*kept, *(f"{key}={value.format(**given)}" for key, value in sizes.items())]

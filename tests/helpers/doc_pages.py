@@ -65,6 +65,9 @@ SMALL: dict[str, dict[str, object]] = {
 }
 """Groups of a small post-training run, known to the Python blocks by this name."""
 
+ROWS = "[flux_mixed,flux_mixed_text,flux_continuous]"
+"""Rows of tables that are trained where a command asks for all."""
+
 SMALL_KEYS: dict[str, dict[str, str]] = {
     "sample": {"count": "1", "num_steps": "20", "slots": "13", "workers": "0", "pictures": "1"},
     "complete": {"num_steps": "5"},
@@ -104,11 +107,19 @@ SMALL_KEYS: dict[str, dict[str, str]] = {
     "export": {"count": "1", "num_steps": "20", "workers": "0"},
     "view": {"count": "2", "num_steps": "3", "first": "0", "open": "false"},
     "import-checkpoint": {"count": "1", "num_steps": "2"},
-    "benchmarks.paper_tables": {"size": "tiny", "iterations": "2", "count": "4", "workers": "0", "heldout": "{data}"},
+    "benchmarks.paper_tables": {
+        "size": "tiny",
+        "iterations": "2",
+        "count": "4",
+        "workers": "0",
+        "heldout": "{data}",
+        "rows": "{rows}",
+    },
 }
 """Keys that make a command small, those that it has, whatever it was given: sizes, and what needs a screen.
 
-``{data}`` is the value of that key. Samples of very few steps are tangled, which makes physics slow.
+``{data}`` is the value of that key, ``{rows}`` the first row of the pattern that was given, or ``ROWS``. Samples of very
+few steps are tangled, which makes physics slow.
 """
 
 INSTEAD: dict[str, str] = {
