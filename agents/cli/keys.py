@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
-from agents.configuration.compose import check_option, compose_tree, group_options
+from agents.configuration.compose import check_option, choice_word, compose_tree, group_options
 from agents.configuration.tree import build, check_not_moved, dotted_keys
 from agents.utils.docstrings import attribute_meanings
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
@@ -183,9 +183,8 @@ def _component(
     command: str, field: dataclasses.Field[Any], value: str, config_dir: str, late: dict[str, Any]
 ) -> list[str]:
     """The word that chooses a component; what is no name goes into ``late``."""
-    name, folder = field.name, field.metadata["folder"]
-    options = group_options(folder, config_dir)
-    if value in options:
+    name = field.name
+    if value in group_options(field.metadata["folder"], config_dir):
         return [f"{name}={value}"]
     if field.metadata.get("named"):
         if value.isidentifier() and value not in ("null", "true", "false"):
@@ -195,10 +194,7 @@ def _component(
             return []
         _parsed(command, name, value)
     elif not value.startswith("{"):
-        if field.metadata.get("kinds") is None:
-            check_option(folder, value, config_dir)
-        field.metadata["kinds"](value)  # a name that is registered and has no file
-        return [f"{name}.name={value}"]
+        return [choice_word(field, value, config_dir)]
     return [f"{name}={value}"]
 
 

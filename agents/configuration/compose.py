@@ -105,6 +105,19 @@ def check_option(folder: str, option: str, config_dir: str = "", others: Sequenc
         raise unknown_name(folder, option, known)
 
 
+def choice_word(field: dataclasses.Field[Any], value: str, config_dir: str = "") -> str:
+    """The word that chooses the component ``value`` of a group: by its file, or by its name where it has none.
+
+    Raises:
+        UnknownNameError: no file and no registered component has that name.
+    """
+    folder = field.metadata["folder"]
+    if value in group_options(folder, config_dir):
+        return f"{field.name}={value}"
+    check_option(folder, value, config_dir, field.metadata["registered"]())
+    return f"{field.name}.name={value}"
+
+
 def _folder(field: dataclasses.Field[Any]) -> bool:
     return bool(field.metadata.get("folder"))
 

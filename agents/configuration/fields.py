@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
-from agents.configuration.compose import compose_tree
+from agents.configuration.compose import choice_word, compose_tree
 from agents.configuration.tree import check_not_moved, convert, default_of, field_values, plain_tree
 from scene_envs.errors import unknown_name
 
@@ -16,7 +16,12 @@ Kind = TypeVar("Kind", bound=type)
 
 
 def nested(
-    make: Callable[[], Any], *, folder: str = "", option: str = "", kinds: Callable[[str], type] | None = None
+    make: Callable[[], Any],
+    *,
+    folder: str = "",
+    option: str = "",
+    kinds: Callable[[str], type] | None = None,
+    registered: Callable[[], Sequence[str]] = tuple,
 ) -> Any:
     """A field that is a group of keys, a dataclass.
 
@@ -25,8 +30,9 @@ def nested(
         folder: of ``configs`` with its options; none where there is nothing to choose.
         option: the option that is the default.
         kinds: the dataclass of the settings of a registered component, by name; None where all have the same keys.
+        registered: names of components, which may be chosen without a file.
     """
-    metadata = {"folder": folder, "option": option, "kinds": kinds}
+    metadata = {"folder": folder, "option": option, "kinds": kinds, "registered": registered}
     return dataclasses.field(default_factory=make, metadata=metadata)
 
 
@@ -83,7 +89,7 @@ def _complete(
         for name, value in given.items()
         if isinstance(value, str) and fields[name].metadata.get("folder") and not fields[name].metadata.get("named")
     }
-    words = [f"{name}={value}" for name, value in options.items()]
+    words = [choice_word(fields[name], value) for name, value in options.items()]
     if given.get("recipe", recipe) != recipe and len(given) < len(fields):
         words.append(f"recipe={given['recipe']}")
     tree = compose_tree(kind.__name__, kind, words) if words else {}

@@ -127,7 +127,9 @@ class SearchConfig:
     workers: int = 0
     prompt: str | None = None
     guidance: float = 0.0
-    planner: PlannerSettings = nested(UCTSettings, folder="planner", option="uct", kinds=planner_settings)
+    planner: PlannerSettings = nested(
+        UCTSettings, folder="planner", option="uct", kinds=planner_settings, registered=list_planners
+    )
 
     @property
     def nfe_per_scene(self) -> int:

@@ -12,7 +12,7 @@ from agents.configuration.checks import at_least, one_of, positive
 from agents.configuration.fields import composed, moved, named, nested
 from agents.configuration.settings import LoggerSettings, OptimizerSettings
 from agents.configuration.tree import plain_tree
-from agents.post_training.algorithms import AlgorithmSettings, DDPOSFSettings, algorithm_settings
+from agents.post_training.algorithms import AlgorithmSettings, DDPOSFSettings, algorithm_settings, list_algorithms
 from scene_envs.envs.settings import PROMPT_SOURCES
 from scene_envs.errors import InvalidInputError
 
@@ -164,7 +164,7 @@ class PostTrainConfig:
     iterations: int = 60
     recipe: str = "ours"
     algorithm: AlgorithmSettings = nested(
-        DDPOSFSettings, folder="algorithm", option="ddpo_sf", kinds=algorithm_settings
+        DDPOSFSettings, folder="algorithm", option="ddpo_sf", kinds=algorithm_settings, registered=list_algorithms
     )
     optimizer: PostTrainOptimizerSettings = nested(PostTrainOptimizerSettings, folder="optimizer", option="adamw")
     regularisation: RegularisationSettings = nested(RegularisationSettings)

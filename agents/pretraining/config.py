@@ -39,6 +39,12 @@ class ModuleSettings:
         one_of(self, "relations", ("axis", "largest", "none"))
 
 
+def _networks() -> list[str]:
+    from agents.networks.registry import NETWORK_PROCESSES, list_networks
+
+    return [name for process in NETWORK_PROCESSES for name in list_networks(process)]
+
+
 @dataclass
 class NetworkSettings:
     """The network of a fresh prior.
@@ -294,7 +300,7 @@ class PretrainConfig:
     seed: int = 0
     device: str = "cpu"
     recipe: str = "ours"
-    network: NetworkSettings = nested(NetworkSettings, folder="network", option="flux")
+    network: NetworkSettings = nested(NetworkSettings, folder="network", option="flux", registered=_networks)
     process: ProcessSettings = nested(ProcessSettings, folder="process", option="mixed")
     loss: LossSettings = nested(LossSettings)
     text: TextSettings = nested(TextSettings, folder="text", option="none")

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from agents import PostTrainConfig, PretrainConfig
 from agents.cli import main
 from agents.networks import registry as networks
 from agents.planning import config as planners
@@ -74,6 +75,8 @@ def test_a_network(tmp_path: Path) -> None:
     network = ScenePrior.load(tmp_path / "run").denoiser.network
     assert type(network).__name__ == "Thin"
     assert main([*words, "process=continuous", f"output={tmp_path / 'other'}"]) == 2
+    assert PretrainConfig(network="thin").network.name == "thin"  # without its YAML, with the keys of the default
+    assert PostTrainConfig(algorithm="signs").algorithm.size == 1.0  # type: ignore[attr-defined]
 
 
 @pytest.mark.usefixtures("package")

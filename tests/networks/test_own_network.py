@@ -54,9 +54,7 @@ def test_its_size_is_matched_like_any_other() -> None:
 
 @pytest.mark.usefixtures("few_grammar_scenes")
 def test_slots_that_it_cannot_ignore_are_refused(tmp_path: Path) -> None:
-    config = PretrainConfig(
-        data="grammar", output=str(tmp_path), iterations=1, network={"name": "deep_sets"}, process="mixed"
-    )
+    config = PretrainConfig(data="grammar", output=str(tmp_path), iterations=1, network="deep_sets", process="mixed")
     with pytest.raises(InvalidInputError, match="empty_slots='attended'"):
         pretrain(config)
 
