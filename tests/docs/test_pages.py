@@ -21,6 +21,7 @@ from tests.helpers.doc_pages import (
     ROOT,
     SMALL,
     SMALLER,
+    YAML_FILES,
     Block,
     blocks_of,
     commands_of,
@@ -68,8 +69,10 @@ def run_blocks(page: str, until_the_end: ExitStack) -> None:
         elif block.language == "toml":
             assert "entry-points" in tomllib.loads(block.code)["project"]
         elif block.language == "yaml":
-            assert [entry["file"] for entry in yaml.safe_load(block.code)]
-            Path("my_assets", "library.yaml").write_text(block.code)
+            assert yaml.safe_load(block.code)
+            file = Path(YAML_FILES[page])
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(block.code)
 
 
 def run_python(block: Block, names: dict[str, Any]) -> None:

@@ -118,8 +118,8 @@ SMALL_KEYS: dict[str, dict[str, str]] = {
 }
 """Keys that make a command small, those that it has, whatever it was given: sizes, and what needs a screen.
 
-``{data}`` is the value of that key, ``{rows}`` the first row of the pattern that was given, or ``ROWS``. Samples of very
-few steps are tangled, which makes physics slow.
+``{data}`` is the value of that key, ``{rows}`` the first row of the pattern that was given, or ``ROWS``. Samples of
+very few steps are tangled, which makes physics slow.
 """
 
 INSTEAD: dict[str, str] = {
@@ -162,6 +162,12 @@ PREPARED: dict[str, tuple[str, ...]] = {
     "docs/user_assets.md": ("my_assets",),
 }
 """Folders and files that a page speaks of without making them; each is made just before the block that names it."""
+
+YAML_FILES = {
+    "docs/extending.md": "my_configs/algorithm/proximal.yaml",
+    "docs/user_assets.md": "my_assets/library.yaml",
+}
+"""Where the YAML block of a page stands, as its text says."""
 
 
 @dataclass(frozen=True)
