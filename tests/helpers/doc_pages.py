@@ -141,6 +141,7 @@ NOT_RUN_PYTHON: dict[tuple[str, str], str] = {
     ("docs/datasets.md", 'backend="ray", address="auto"'): "needs a Ray cluster that runs already",
     ("docs/extending.md", '"""A'): "is a module of the package that the page installs; test_extending compares them",
     ("docs/extending.md", '"""Tea'): "likewise",
+    ("docs/extending.md", '"""Deep'): "likewise",
 }
 """Python blocks that no test runs, by page and a text in them, and why."""
 
