@@ -72,13 +72,15 @@ def _small(name: str, words: list[str]) -> list[str]:
     sizes = {key: value for key, value in SMALL_KEYS.get(name, {}).items() if key in keys}
     if "scenes" in {word.partition("=")[0] for word in words} and name != "view":
         sizes.pop("count", None)
+    if name == "post-train" and any(word.startswith("prompt=") for word in words):
+        sizes.pop("slots", None)  # prompts of real scenes ask for as many objects as those have
     kept = [word for word in words if word.partition("=")[0] not in sizes]
     for old, new in INSTEAD.items():
         for position, word in enumerate(kept):
             if word.endswith(f"={old}"):
                 kept[position] = word.removesuffix(old) + new
     for word in kept:
-        if word.endswith("=models/bert-base"):
+        if word == "text=bert":  # SCENE_ENVS_BERT names the folder
             prepare("models/bert-base")
     typed = dict(word.split("=", 1) for word in words if "=" in word)
     given = {"data": typed.get("data", ""), "rows": typed.get("rows", ROWS).replace("*", "")}

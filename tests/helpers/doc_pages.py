@@ -123,7 +123,6 @@ very few steps are tangled, which makes physics slow.
 """
 
 INSTEAD: dict[str, str] = {
-    "google-bert/bert-base-uncased": "models/bert-base",
     "/models/bert-base": "models/bert-base",
     "cuda": "cpu",
 }
