@@ -44,7 +44,6 @@ PAGES_WITH_COMMANDS = [page for page in PAGES if page not in HISTORY and inline_
 def test_a_page_runs_from_top_to_bottom(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SCENE_ENVS_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setenv("SCENE_ENVS_BERT", str(tmp_path / "models" / "bert-base"))
     with ExitStack() as until_the_end:
         run_blocks(page, until_the_end)
 
