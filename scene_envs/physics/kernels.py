@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scene_envs.physics.budget import Budget, simulation_units
 from scene_envs.physics.motion import Physics, motion, physics_of, settle_scene
 from scene_envs.physics.placement import Objects, flatten
 from scene_envs.physics.projection import TOLERANCE, project_objects
@@ -33,12 +34,14 @@ class Chunk:
         translations: (b, N, 3) float64 m.
         rotations: (b, N, 3, 3) float64.
         categories: (b, N) int64.
+        units: (b,) of simulation that each scene may spend; None leaves that to its objects.
     """
 
     scene_type: SceneType
     translations: Array
     rotations: Array
     categories: Index
+    units: Array | None = None
 
     def __len__(self) -> int:
         return len(self.categories)
@@ -46,7 +49,8 @@ class Chunk:
     def row(self, index: int) -> Chunk:
         """One scene as a chunk."""
         rows = slice(index, index + 1)
-        return Chunk(self.scene_type, self.translations[rows], self.rotations[rows], self.categories[rows])
+        units = None if self.units is None else self.units[rows]
+        return Chunk(self.scene_type, self.translations[rows], self.rotations[rows], self.categories[rows], units)
 
 
 Kernel = Callable[..., dict[str, Any]]
@@ -67,10 +71,29 @@ def _objects(physics: Physics, chunk: Chunk) -> Objects:
     return flatten(physics.library, chunk.translations, chunk.rotations, chunk.categories, welded)
 
 
+def _budgets(physics: Physics, chunk: Chunk, objects: Objects) -> list[Budget]:
+    """What the simulation of each scene may spend."""
+    if chunk.units is not None:
+        return [Budget(units) for units in chunk.units.tolist()]
+    return [
+        Budget(simulation_units(physics.library, objects[objects.scene == index])) for index in range(len(chunk))
+    ]
+
+
+def _spent(budgets: list[Budget]) -> Array:
+    return np.array([budget.spent for budget in budgets])
+
+
 def feasibility_kernel(
-    chunk: Chunk, *, max_penetration: float, max_displacement: float, max_rotation: float, duration: float
+    chunk: Chunk,
+    *,
+    max_penetration: float,
+    max_displacement: float,
+    max_rotation: float,
+    duration: float,
+    tilt: tuple[float, float] = (0.0, 0.0),
 ) -> dict[str, Any]:
-    """See :func:`scene_envs.physics.feasibility`."""
+    """See :func:`scene_envs.physics.feasibility`; gravity leans by ``tilt`` (rad) toward the x and the y axis."""
     physics = physics_of(chunk.scene_type)
     objects = _objects(physics, chunk)
     pairs = physics.collider.pairs(objects)
@@ -78,7 +101,10 @@ def feasibility_kernel(
     deep = depth > max_penetration
     kept = np.flatnonzero(objects.fixed | ~deep)
     displacement, rotation = np.zeros(len(objects)), np.zeros(len(objects))
-    displacement[kept], rotation[kept], lost = motion(physics, objects[kept], pairs.among(kept), duration)
+    budgets = _budgets(physics, chunk, objects)
+    displacement[kept], rotation[kept], lost = motion(
+        physics, objects[kept], pairs.among(kept), duration, budgets, tilt
+    )
     feasible = ~objects.fixed & ~deep & (displacement <= max_displacement) & (rotation <= max_rotation)
     valid = np.ones(len(chunk), dtype=bool)
     valid[lost] = False
@@ -88,6 +114,7 @@ def feasibility_kernel(
         "displacement": _scatter(chunk, objects, displacement),
         "rotation": _scatter(chunk, objects, rotation),
         "valid": valid,
+        "spent": _spent(budgets),
     }
 
 
@@ -99,7 +126,11 @@ def equilibrium_kernel(chunk: Chunk, *, duration: float) -> dict[str, Any]:
     kept = np.flatnonzero(~np.isin(objects.scene, invalid))
     displacement, rotation = np.zeros(len(objects)), np.zeros(len(objects))
     displacement[kept], rotation[kept], lost = motion(
-        physics, objects[kept], physics.collider.pairs(objects[kept]), duration
+        physics,
+        objects[kept],
+        physics.collider.pairs(objects[kept]),
+        duration,
+        _budgets(physics, chunk, objects),
     )
     valid = np.ones(len(chunk), dtype=bool)
     valid[invalid] = False
@@ -136,17 +167,29 @@ def settle_kernel(chunk: Chunk, *, duration: float, iterations: int) -> dict[str
     physics = physics_of(chunk.scene_type)
     translations, rotations = chunk.translations.copy(), chunk.rotations.copy()
     valid = np.ones(len(chunk), dtype=bool)
+    finished, spent = np.ones(len(chunk), dtype=bool), np.zeros(len(chunk))
     bottom = chunk.scene_type.workspace[0][2] - _FALLEN
     for index in range(len(chunk)):
-        objects = _objects(physics, chunk.row(index))
+        row = chunk.row(index)
+        objects = _objects(physics, row)
         valid[index] = not _is_heap(physics, objects)
         if not valid[index]:
             continue
-        new_rotation, new_translation, valid[index] = settle_scene(physics, objects, duration, iterations, bottom)
+        (budget,) = _budgets(physics, row, objects)
+        new_rotation, new_translation, valid[index] = settle_scene(
+            physics, objects, duration, iterations, bottom, budget
+        )
+        finished[index], spent[index] = not budget.is_spent, budget.spent
         if valid[index]:
             translations[index, objects.slot] = new_translation
             rotations[index, objects.slot] = new_rotation
-    return {"translations": translations, "rotations": rotations, "valid": valid}
+    return {
+        "translations": translations,
+        "rotations": rotations,
+        "finished": finished & valid,
+        "spent": spent,
+        "valid": valid,
+    }
 
 
 def projection_kernel(chunk: Chunk) -> dict[str, Any]:
@@ -168,6 +211,14 @@ def projection_kernel(chunk: Chunk) -> dict[str, Any]:
     }
 
 
+def units_kernel(chunk: Chunk) -> dict[str, Any]:
+    """Units of simulation that each scene may spend."""
+    physics = physics_of(chunk.scene_type)
+    objects = _objects(physics, chunk)
+    units = np.array([budget.limit for budget in _budgets(physics, chunk, objects)])
+    return {"units": units, "valid": np.ones(len(chunk), dtype=bool)}
+
+
 def _scatter(chunk: Chunk, objects: Objects, values: NDArray[Any]) -> NDArray[Any]:
     """Values (n,) of objects as a (b, N) array, 0 in empty slots."""
     out = np.zeros(chunk.categories.shape, dtype=values.dtype)
@@ -181,5 +232,6 @@ KERNELS: dict[str, Kernel] = {
     "penetration": penetration_kernel,
     "project": projection_kernel,
     "settle": settle_kernel,
+    "units": units_kernel,
 }
 """What workers can be asked to run."""
