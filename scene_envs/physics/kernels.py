@@ -75,9 +75,7 @@ def _budgets(physics: Physics, chunk: Chunk, objects: Objects) -> list[Budget]:
     """What the simulation of each scene may spend."""
     if chunk.units is not None:
         return [Budget(units) for units in chunk.units.tolist()]
-    return [
-        Budget(simulation_units(physics.library, objects[objects.scene == index])) for index in range(len(chunk))
-    ]
+    return [Budget(simulation_units(physics.library, objects[objects.scene == index])) for index in range(len(chunk))]
 
 
 def _spent(budgets: list[Budget]) -> Array:

@@ -130,8 +130,8 @@ class ReadyResult:
         batch: projected and settled scenes, of the best round each.
         ready: (B, N) bool; free objects that are simulation-ready there (see :func:`make_ready`).
         counts: (B,) int64, ready objects per scene.
-        finished: (B,) bool; False where the scene's work budget was spent before the last round was judged: the batch is
-            the best effort, and objects that were not judged are not ready. False also where ``valid`` is.
+        finished: (B,) bool; False where the scene's work budget was spent first: the batch is the best effort, and
+            objects that were not judged are not ready. False also where ``valid`` is.
         valid: (B,) bool, of the first round.
     """
 

@@ -75,9 +75,9 @@ class World:
             budget: units of simulation; when they are spent, everything stays where it is.
 
         Returns:
-            rotation (n, 3, 3) and translation (n, 3) m afterwards, the angle turned (n,) in radians, and which
-            objects (n,) left before the end: those at rest, or all when the budget was spent. Objects that Bullet lost to a numerical failure
-            come back as NaN.
+            rotation (n, 3, 3) and translation (n, 3) m afterwards, the angle turned (n,) in radians, and which objects
+            (n,) left before the end: those at rest, or all when the budget was spent. Objects that Bullet lost to a
+            numerical failure come back as NaN.
         """
         bullet, client = self._pool.bullet, self._pool.client
         category, fixed, count = objects.category, objects.fixed, len(objects)
