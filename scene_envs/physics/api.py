@@ -26,7 +26,7 @@ from scene_envs.scene import SceneBatch
 _READY_DEPTH = 1e-4
 """How deep a ready object may overlap another one (m)."""
 _LEAN = 0.12
-"""Angle (rad) by which gravity may lean before a ready object gives way: what leans on others and only just holds in one
+"""Angle (rad) by which gravity may lean before a ready object gives way: what leans and only just holds in one
 simulator creeps in the next."""
 _STAYS: dict[str, Any] = {"max_displacement": 1e-3, "max_rotation": 1e-2}
 _HOLDS: dict[str, Any] = {"max_displacement": 2e-3, "max_rotation": 2e-2, "duration": 0.5}
@@ -129,8 +129,8 @@ def settle(
     Simulates up to ``duration`` seconds, and stops earlier when nothing moves any more. Objects that fall off
     their support are where they fell to, outside the workspace; those more than a metre below it stay there. A heap
     of objects so deep in each other that its simulation would take long is invalid: project it first. The work on a
-    scene is bounded, and less where many objects coincide exactly (:mod:`scene_envs.physics.budget`): when it is done,
-    objects stay where they have got to, and ``finished`` is False.
+    scene is bounded, the more so where many objects are deep in each other (:mod:`scene_envs.physics.budget`). When it
+    does not suffice, objects stay where they have got to, and ``finished`` is False.
 
     Args:
         batch: B scenes of N slots.

@@ -5,16 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from scene_envs.physics.geometry import LibraryGeometry
-from scene_envs.physics.placement import Objects, object_boxes, place
+from scene_envs.physics.collision import ObjectPairs
+from scene_envs.physics.placement import Objects
 
 PER_SCENE, PER_OBJECT = 1_000.0, 10_000.0
 """Units of simulation (see :class:`Budget`) that a scene may take: so many, and so many more for each free object by
-which those that coincide with no other outnumber those that do."""
+which those that stand clear of the others outnumber those that do not."""
 _COINCIDENT = 0.9
 """Two objects coincide when the common part of their boxes is at least this share of the larger box."""
+_DEEP = 1e-2
+"""A free object deeper than this (m) in another one, or that coincides with it, does not stand clear."""
 
 
 @dataclass
@@ -42,23 +43,19 @@ class Budget:
         return self.spent >= self.limit
 
 
-def simulation_units(library: LibraryGeometry, objects: Objects) -> float:
+def simulation_units(objects: Objects, pairs: ObjectPairs) -> float:
     """Units of simulation that one scene may take.
 
     Args:
-        library: geometry of the assets.
         objects: of one scene.
+        pairs: their near pairs.
     """
-    free = np.flatnonzero(~objects.fixed)
-    coincident = int(_coincident(library, objects[free]).sum())
-    return PER_SCENE + PER_OBJECT * max(0, len(free) - 2 * coincident)
-
-
-def _coincident(library: LibraryGeometry, objects: Objects) -> NDArray[np.bool_]:
-    """(n,) objects whose box is nearly that of another one."""
-    low, high = object_boxes(place(library, objects, "coarse"))
-    common = np.minimum(high[:, None], high) - np.maximum(low[:, None], low)
-    volume = np.prod(high - low, axis=1)
-    shared = np.prod(np.maximum(common, 0.0), axis=2) >= _COINCIDENT * np.maximum(volume[:, None], volume)
-    np.fill_diagonal(shared, False)
-    return shared.any(axis=1)
+    first, second = pairs.first, pairs.second
+    low = np.maximum(pairs.low[first], pairs.low[second])
+    high = np.minimum(pairs.high[first], pairs.high[second])
+    volume = np.prod(pairs.high - pairs.low, axis=1)
+    common = np.prod(np.maximum(high - low, 0.0), axis=1)
+    close = (pairs.depth > _DEEP) | (common >= _COINCIDENT * np.maximum(volume[first], volume[second]))
+    close &= ~(objects.fixed[first] | objects.fixed[second])
+    crowded = np.isin(np.arange(len(objects)), np.concatenate([first[close], second[close]]))
+    return PER_SCENE + PER_OBJECT * max(0, int((~objects.fixed).sum()) - 2 * int(crowded.sum()))

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_envs.physics.budget import Budget, simulation_units
+from scene_envs.physics.collision import ObjectPairs
 from scene_envs.physics.motion import Physics, motion, physics_of, settle_scene
 from scene_envs.physics.placement import Objects, flatten
 from scene_envs.physics.projection import TOLERANCE, project_objects
@@ -71,11 +72,12 @@ def _objects(physics: Physics, chunk: Chunk) -> Objects:
     return flatten(physics.library, chunk.translations, chunk.rotations, chunk.categories, welded)
 
 
-def _budgets(physics: Physics, chunk: Chunk, objects: Objects) -> list[Budget]:
+def _budgets(chunk: Chunk, objects: Objects, pairs: ObjectPairs) -> list[Budget]:
     """What the simulation of each scene may spend."""
     if chunk.units is not None:
         return [Budget(units) for units in chunk.units.tolist()]
-    return [Budget(simulation_units(physics.library, objects[objects.scene == index])) for index in range(len(chunk))]
+    scenes = [np.flatnonzero(objects.scene == index) for index in range(len(chunk))]
+    return [Budget(simulation_units(objects[rows], pairs.among(rows))) for rows in scenes]
 
 
 def _spent(budgets: list[Budget]) -> Array:
@@ -99,7 +101,7 @@ def feasibility_kernel(
     deep = depth > max_penetration
     kept = np.flatnonzero(objects.fixed | ~deep)
     displacement, rotation = np.zeros(len(objects)), np.zeros(len(objects))
-    budgets = _budgets(physics, chunk, objects)
+    budgets = _budgets(chunk, objects, pairs)
     displacement[kept], rotation[kept], lost = motion(
         physics, objects[kept], pairs.among(kept), duration, budgets, tilt
     )
@@ -122,14 +124,9 @@ def equilibrium_kernel(chunk: Chunk, *, duration: float) -> dict[str, Any]:
     objects = _objects(physics, chunk)
     invalid = [index for index in range(len(chunk)) if _is_heap(physics, objects[objects.scene == index])]
     kept = np.flatnonzero(~np.isin(objects.scene, invalid))
-    displacement, rotation = np.zeros(len(objects)), np.zeros(len(objects))
-    displacement[kept], rotation[kept], lost = motion(
-        physics,
-        objects[kept],
-        physics.collider.pairs(objects[kept]),
-        duration,
-        _budgets(physics, chunk, objects),
-    )
+    objects = objects[kept]
+    pairs = physics.collider.pairs(objects)
+    displacement, rotation, lost = motion(physics, objects, pairs, duration, _budgets(chunk, objects, pairs))
     valid = np.ones(len(chunk), dtype=bool)
     valid[invalid] = False
     valid[lost] = False
@@ -173,9 +170,10 @@ def settle_kernel(chunk: Chunk, *, duration: float, iterations: int) -> dict[str
         valid[index] = not _is_heap(physics, objects)
         if not valid[index]:
             continue
-        (budget,) = _budgets(physics, row, objects)
+        pairs = physics.collider.pairs(objects)
+        (budget,) = _budgets(row, objects, pairs)
         new_rotation, new_translation, valid[index] = settle_scene(
-            physics, objects, duration, iterations, bottom, budget
+            physics, objects, pairs, duration, iterations, bottom, budget
         )
         finished[index], spent[index] = not budget.is_spent, budget.spent
         if valid[index]:
@@ -213,7 +211,7 @@ def units_kernel(chunk: Chunk) -> dict[str, Any]:
     """Units of simulation that each scene may spend."""
     physics = physics_of(chunk.scene_type)
     objects = _objects(physics, chunk)
-    units = np.array([budget.limit for budget in _budgets(physics, chunk, objects)])
+    units = np.array([budget.limit for budget in _budgets(chunk, objects, physics.collider.pairs(objects))])
     return {"units": units, "valid": np.ones(len(chunk), dtype=bool)}
 
 

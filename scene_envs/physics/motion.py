@@ -281,13 +281,20 @@ def _merge(objects: Objects, pairs: ObjectPairs, group: Index, first: Index, sec
 
 
 def settle_scene(
-    physics: Physics, objects: Objects, duration: float, iterations: int, bottom: float, budget: Budget
+    physics: Physics,
+    objects: Objects,
+    pairs: ObjectPairs,
+    duration: float,
+    iterations: int,
+    bottom: float,
+    budget: Budget,
 ) -> tuple[Array, Array, bool]:
     """Let one scene come to rest: rotation (n, 3, 3), translation (n, 3) m, and whether it stayed finite.
 
     Args:
         physics: of the scene's assets.
         objects: of one scene.
+        pairs: their near pairs.
         duration: s, the longest time to simulate.
         iterations: of the solver per step.
         bottom: height (m) below which objects are left where they are.
@@ -299,7 +306,6 @@ def settle_scene(
     while remaining > 1e-9 and not budget.is_spent:
         span = min(_SEGMENT, remaining)
         remaining -= span
-        pairs = physics.collider.pairs(current)
         rest = physics.rest(current, pairs, span)
         active = ~(rest.still | current.fixed)
         fallen = active & (current.translation[:, 2] < bottom)
@@ -313,6 +319,8 @@ def settle_scene(
         far = np.linalg.norm(moved.translation - current.translation, axis=1)
         calm = (far < _STILL) & (moved.angle < _STILL_ANGLE)
         current = replace(current, rotation=moved.rotation, translation=moved.translation)
+        if remaining > 1e-9 and not budget.is_spent:
+            pairs = physics.collider.pairs(current)
     return current.rotation, current.translation, True
 
 
