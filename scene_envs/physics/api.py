@@ -58,7 +58,8 @@ def feasibility(
     A free object is feasible when it is in no object pair that overlaps deeper than ``max_penetration`` and,
     with all such objects removed, moves and turns no further than the limits in ``duration`` seconds of
     simulation under gravity. Welded objects hold others but are not judged. A scene whose simulation takes more work
-    than :func:`settle` may spend is invalid.
+    than :func:`settle` may spend is invalid. In heaps whose exact depths would take long, depths are those of shapes that
+    enclose the objects.
 
     Args:
         batch: B scenes of N slots.
@@ -93,7 +94,9 @@ def feasibility(
 def penetration(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> PenetrationResult:
     """Overlap of every object pair, and in total over pairs of convex parts.
 
-    Needs no simulator. Raises InvalidInputError as :func:`feasibility` does.
+    Needs no simulator. A heap of objects whose depths would take long is invalid.
+
+    Raises InvalidInputError as :func:`feasibility` does.
     """
     rows = run_kernel("penetration", batch, {}, pool)
     pairs = tuple(

@@ -10,8 +10,9 @@ from scene_envs.physics.collision import ObjectPairs
 from scene_envs.physics.placement import Objects
 
 PER_SCENE, PER_OBJECT = 1_000.0, 10_000.0
-"""Units of simulation (see :class:`Budget`) that a scene may take: so many, and so many more for each free object by
-which those that stand clear of the others outnumber those that do not."""
+"""Units of simulation (see :class:`Budget`) that a scene may take: so many, and so many more for each free object,"""
+_CROWDED = 0.75
+"""unless more than this share of them do not stand clear of each other."""
 _COINCIDENT = 0.9
 """Two objects coincide when the common part of their boxes is at least this share of the larger box."""
 _DEEP = 1e-2
@@ -58,4 +59,5 @@ def simulation_units(objects: Objects, pairs: ObjectPairs) -> float:
     close = (pairs.depth > _DEEP) | (common >= _COINCIDENT * np.maximum(volume[first], volume[second]))
     close &= ~(objects.fixed[first] | objects.fixed[second])
     crowded = np.isin(np.arange(len(objects)), np.concatenate([first[close], second[close]]))
-    return PER_SCENE + PER_OBJECT * max(0, int((~objects.fixed).sum()) - 2 * int(crowded.sum()))
+    free = int((~objects.fixed).sum())
+    return PER_SCENE + PER_OBJECT * free * (int(crowded.sum()) <= _CROWDED * free)

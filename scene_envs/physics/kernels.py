@@ -142,6 +142,10 @@ def penetration_kernel(chunk: Chunk) -> dict[str, Any]:
     physics = physics_of(chunk.scene_type)
     objects = _objects(physics, chunk)
     pairs = physics.collider.pairs(objects, totals=True)
+    valid = np.ones(len(chunk), dtype=bool)
+    valid[objects.scene[pairs.first[pairs.rough]]] = False
+    if not valid.all():
+        _LOGGER.warning("objects of a scene overlap too much to be measured one by one; its row is invalid")
     depth = pairs.deepest()
     listed: list[list[tuple[int, int, float, float, int]]] = [[] for _ in range(len(chunk))]
     for row in np.flatnonzero(pairs.depth > 0):
@@ -153,7 +157,7 @@ def penetration_kernel(chunk: Chunk) -> dict[str, Any]:
         "depth": _scatter(chunk, objects, depth),
         "total_per_pair": np.array([sum(entry[2] for entry in scene) for scene in listed]),
         "total_per_geometry": np.array([sum(entry[3] for entry in scene) for scene in listed]),
-        "valid": np.ones(len(chunk), dtype=bool),
+        "valid": valid,
     }
 
 
@@ -211,7 +215,8 @@ def units_kernel(chunk: Chunk) -> dict[str, Any]:
     """Units of simulation that each scene may spend."""
     physics = physics_of(chunk.scene_type)
     objects = _objects(physics, chunk)
-    units = np.array([budget.limit for budget in _budgets(chunk, objects, physics.collider.pairs(objects))])
+    pairs = physics.collider.pairs(objects)
+    units = np.array([budget.limit for budget in _budgets(chunk, objects, pairs)])
     return {"units": units, "valid": np.ones(len(chunk), dtype=bool)}
 
 
