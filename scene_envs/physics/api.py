@@ -58,8 +58,8 @@ def feasibility(
     A free object is feasible when it is in no object pair that overlaps deeper than ``max_penetration`` and,
     with all such objects removed, moves and turns no further than the limits in ``duration`` seconds of
     simulation under gravity. Welded objects hold others but are not judged. A scene whose simulation takes more work
-    than :func:`settle` may spend is invalid. In heaps whose exact depths would take long, depths are those of shapes that
-    enclose the objects.
+    than :func:`settle` may spend is invalid. Where exact depths of a heap would take long, ``depth`` is that of shapes
+    that enclose the objects.
 
     Args:
         batch: B scenes of N slots.

@@ -212,11 +212,13 @@ def projection_kernel(chunk: Chunk) -> dict[str, Any]:
 
 
 def units_kernel(chunk: Chunk) -> dict[str, Any]:
-    """Units of simulation that each scene may spend."""
+    """Units of simulation that each scene may spend; none for heaps, which are not simulated."""
     physics = physics_of(chunk.scene_type)
-    objects = _objects(physics, chunk)
-    pairs = physics.collider.pairs(objects)
-    units = np.array([budget.limit for budget in _budgets(chunk, objects, pairs)])
+    units = np.zeros(len(chunk))
+    for index in range(len(chunk)):
+        objects = _objects(physics, chunk.row(index))
+        if not heaps(physics.collider, objects).any():
+            units[index] = simulation_units(objects, physics.collider.pairs(objects))
     return {"units": units, "valid": np.ones(len(chunk), dtype=bool)}
 
 
