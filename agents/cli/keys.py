@@ -225,8 +225,8 @@ def _hint(config: type, key: str) -> Any:
 def _override(word: str, hint: Any) -> str:
     """The word as Hydra reads it, text quoted so that any character may stand in it."""
     key, _, value = word.partition("=")
-    options = (hint,) if get_origin(hint) is list else get_args(hint) or (hint,)
-    is_list = any(get_args(option) for option in options) and value.startswith("[")
+    options = (hint,) if get_origin(hint) in (list, dict) else get_args(hint) or (hint,)
+    is_list = any(get_origin(option) is list for option in options) and value.startswith("[")
     if str in options and not is_list and not (type(None) in options and value == "null"):
         value = _quoted(value)
     elif is_list and str in options:

@@ -6,7 +6,12 @@ from scene_envs.lazy import lazy_names
 
 if TYPE_CHECKING:
     from agents.post_training.advantages import compute_advantages
-    from agents.post_training.algorithms import AlgorithmSettings, list_algorithms, register_algorithm
+    from agents.post_training.algorithms import (
+        AlgorithmSettings,
+        DDPOSFSettings,
+        list_algorithms,
+        register_algorithm,
+    )
     from agents.post_training.base import Algorithm
     from agents.post_training.comparison_run import post_train_and_compare
     from agents.post_training.config import PostTrainConfig
@@ -24,6 +29,7 @@ __all__ = [
     "Algorithm",
     "AlgorithmSettings",
     "DDPOSFLoss",
+    "DDPOSFSettings",
     "DenoisingPolicy",
     "ForwardProcess",
     "ForwardProcessLoss",
@@ -44,7 +50,12 @@ __getattr__ = lazy_names(
     __name__,
     {
         "agents.post_training.advantages": ("compute_advantages",),
-        "agents.post_training.algorithms": ("AlgorithmSettings", "list_algorithms", "register_algorithm"),
+        "agents.post_training.algorithms": (
+            "AlgorithmSettings",
+            "DDPOSFSettings",
+            "list_algorithms",
+            "register_algorithm",
+        ),
         "agents.post_training.base": ("Algorithm",),
         "agents.post_training.comparison_run": ("post_train_and_compare",),
         "agents.post_training.config": ("PostTrainConfig",),

@@ -26,7 +26,7 @@ NOISE = (0.004, 0.015, 0.03)
 def crowded(name: str, seed: int = 5) -> SceneBatch:
     """Three scenes with as many objects as three draws of six have, thrown about by 4, 15 and 30 mm."""
     drawn = get_grammar(name).sample(np.random.default_rng(seed), 6)
-    clean = drawn[drawn.counts.argsort(descending=True)[:3]]
+    clean = drawn[drawn.counts.argsort(descending=True)[: len(NOISE)]]
     scale = torch.tensor(NOISE)[:, None, None]
     noise = scale * torch.randn(clean.translations.shape, generator=torch.Generator().manual_seed(seed))
     return clean.with_poses(clean.translations + noise * clean.is_free.unsqueeze(-1), clean.rotations)
@@ -102,3 +102,14 @@ def test_the_order_of_slots_changes_no_verdict() -> None:
     order = torch.randperm(batch.tensor.shape[1], generator=torch.Generator().manual_seed(0))
     shuffled = SceneBatch(batch.tensor[:, order], batch.scene_type)
     assert torch.equal(feasibility(shuffled).feasible, feasibility(batch).feasible[:, order])
+
+
+def test_a_spent_budget_ends_at_the_same_step(pool: PhysicsPool) -> None:
+    """Coincident objects: the simulation is cut short, after another one, and in workers, at the same poses."""
+    clean = get_grammar("dimsum_table").sample(np.random.default_rng(2), 4)
+    batch = SceneBatch(torch.cat([clean.tensor, clean.tensor[:, 1:]], dim=1), clean.scene_type)
+    first = settle(batch)
+    assert not bool(first.finished.any())
+    settled(crowded("dimsum_table", seed=10))
+    for again in (settle(batch), settle(batch, pool=pool)):
+        assert same([first.batch.tensor, first.finished], [again.batch.tensor, again.finished])

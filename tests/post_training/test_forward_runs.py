@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 import torch
-from small_runs import count_objects
 
 from agents.post_training import PostTrainConfig, PostTrainer, post_train
 from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError, UnknownNameError
+from tests.helpers.small_runs import count_objects
 
 ALGORITHMS = ("nft", "awm", "reward_weighted")
 
