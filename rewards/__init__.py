@@ -9,6 +9,7 @@ from rewards.composite import Clip, Gate, Product, WeightedSum
 from rewards.contract import check_reward
 from rewards.evaluation import evaluate_reward
 from rewards.feasible_objects import FeasibleObjects
+from rewards.feasible_share import FeasibleShare
 from rewards.object_count import ObjectCount
 from rewards.prompt_match import PromptMatch
 from rewards.registry import (
@@ -25,6 +26,7 @@ from rewards.registry import (
 __all__ = [
     "Clip",
     "FeasibleObjects",
+    "FeasibleShare",
     "Gate",
     "ObjectCount",
     "Product",

@@ -14,10 +14,11 @@ from scene_envs.scene import SceneBatch
 @register_reward("feasible_objects")
 @dataclass(frozen=True)
 class FeasibleObjects:
-    """Number of free objects that neither penetrate another object nor move when simulated.
+    """Number of free objects in the workspace that neither penetrate another object nor move when simulated.
 
-    An object is feasible when no pair it is in is deeper than ``max_penetration`` and, with the penetrating objects
-    removed, it moves and turns less than the limits while simulated. Welded objects are not counted.
+    An object is feasible when its frame is in the workspace, no pair it is in is deeper than ``max_penetration`` and,
+    with the penetrating objects removed, it moves and turns less than the limits while simulated. Welded objects are
+    not counted.
 
     Attributes:
         max_penetration: deepest allowed overlap with any other object, m.
@@ -35,7 +36,7 @@ class FeasibleObjects:
     def __post_init__(self) -> None:
         for setting in ("max_penetration", "max_displacement", "max_rotation", "duration"):
             if not getattr(self, setting) > 0:
-                raise InvalidInputError(f"feasible_objects: {setting}={getattr(self, setting)} must be positive")
+                raise InvalidInputError(f"{self.name}: {setting}={getattr(self, setting)} must be positive")
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Count feasible objects; rows that physics could not judge are invalid.

@@ -50,9 +50,9 @@ def feasibility(
 ) -> FeasibilityResult:
     """Judge every object: does it overlap another, and does it stay where it is.
 
-    A free object is feasible when it is in no object pair that overlaps deeper than ``max_penetration`` and,
-    with all such objects removed, moves and turns no further than the limits in ``duration`` seconds of
-    simulation under gravity. Welded objects hold others but are not judged.
+    A free object is feasible when its frame is in the workspace, it is in no object pair that overlaps deeper than
+    ``max_penetration`` and, with all such objects removed, moves and turns no further than the limits in ``duration``
+    seconds of simulation under gravity. Welded objects hold others but are not judged.
 
     Args:
         batch: B scenes of N slots.
@@ -73,7 +73,7 @@ def feasibility(
         "duration": duration,
     }
     rows = _run("feasibility", batch, options, pool)
-    feasible = _stack(rows, batch, "feasible", torch.bool)
+    feasible = _stack(rows, batch, "feasible", torch.bool) & batch.in_workspace.cpu()
     return FeasibilityResult(
         feasible=feasible,
         depth=_stack(rows, batch, "depth"),
