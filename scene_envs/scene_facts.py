@@ -83,7 +83,7 @@ class AssetFacts:
         """
         categories, device = self.categories, self.translations.device
         boxes = torch.zeros(*categories.shape, 2, 3, dtype=torch.float64, device=device)
-        for category, corners in enumerate(_hull_corners(self.scene_type.library)):
+        for category, corners in enumerate(hull_corners(self.scene_type.library)):
             here = categories == category
             if not bool(here.any()):
                 continue
@@ -155,7 +155,7 @@ def _measures(library: AssetLibrary) -> tuple[Tensor, Tensor, Tensor]:
 
 
 @lru_cache(maxsize=32)
-def _hull_corners(library: AssetLibrary) -> tuple[Tensor, ...]:
+def hull_corners(library: AssetLibrary) -> tuple[Tensor, ...]:
     """Corners (V, 3) of each asset's convex hull, m, float64."""
     from scene_envs.assets.shapes import hull_of
 
