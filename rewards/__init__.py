@@ -18,6 +18,7 @@ from rewards.normalised import Normalised
 from rewards.object_count import ObjectCount
 from rewards.penetration import Penetration
 from rewards.prompt_match import PromptMatch
+from rewards.reachability import Reachability
 from rewards.realism import Realism
 from rewards.registry import (
     RewardInfo,
@@ -46,6 +47,7 @@ __all__ = [
     "Penetration",
     "Product",
     "PromptMatch",
+    "Reachability",
     "Realism",
     "Relation",
     "Reward",
