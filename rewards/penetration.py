@@ -14,6 +14,8 @@ from scene_envs.scene import SceneBatch
 
 MEASURES = ("total", "deepest")
 """What is counted: the sum over object pairs, or the deepest pair."""
+_TOUCHING = 1e-4
+"""Objects in each other up to this depth (m) touch, and are not counted as overlapping."""
 
 
 @register_reward("penetration")
@@ -38,7 +40,9 @@ class Penetration:
             raise unknown_name("measure of penetration", self.measure, MEASURES)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
-        """Terms: ``total_mm``, ``deepest_mm``, ``overlapping_pairs``. ``object_flags["overlapping"]`` (B, N).
+        """Terms: ``total_mm``, ``deepest_mm``, and ``overlapping_pairs`` deeper than 0.1 mm.
+
+        ``object_flags["overlapping"]`` (B, N) marks objects deeper than 0.1 mm in others.
 
         ``per_object`` (B, N): with ``"total"`` a pair's depth is shared between its two objects, or falls to the free
         one of a free and a welded object, so that credits add up to the value; with ``"deepest"`` it is minus the
@@ -50,7 +54,7 @@ class Penetration:
         free = batch.is_free.cpu()
         shared, count = torch.zeros(free.shape), torch.zeros(len(batch))
         for row, pairs in enumerate(result.pairs):
-            count[row] = len(pairs)
+            count[row] = sum(pair.depth > _TOUCHING for pair in pairs)
             for pair in pairs:
                 blamed = [slot for slot in pair.slots if free[row, slot]] or list(pair.slots)
                 for slot in blamed:
@@ -67,5 +71,5 @@ class Penetration:
                 "overlapping_pairs": count.to(device),
             },
             valid=result.valid.to(device),
-            object_flags={"overlapping": (result.depth > 0).to(device)},
+            object_flags={"overlapping": (result.depth > _TOUCHING).to(device)},
         )
