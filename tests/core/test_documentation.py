@@ -79,7 +79,12 @@ def test_the_committed_drawing_is_that_of_the_script() -> None:
 
 
 @pytest.mark.parametrize(
-    "page", ["planners/uct", "planners/best_of", "rewards/object_count", "rewards/feasible_objects"]
+    "page",
+    [
+        "planners/uct",
+        "planners/best_of",
+        *(f"rewards/{path.stem}" for path in sorted((ROOT / "docs" / "rewards").glob("*.md")) if path.stem != "README"),
+    ],
 )
 def test_code_of_a_page_runs(page: str) -> None:
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8"), re.DOTALL)
