@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -130,40 +130,47 @@ class _Hand:
 
     def reach(self, objects: Objects, back: Array) -> Index:
         """Rows of the free objects of one scene that the gripper reaches from the direction ``back`` (3,)."""
-        back = back / np.linalg.norm(back)
-        open_rows = np.flatnonzero(~objects.fixed)
+        free = np.flatnonzero(~objects.fixed)
+        if not len(free):
+            return free
+        owner, rotation, low, high = self._extents(objects, free, back / np.linalg.norm(back))
+        open_rows = free
         for place_along in PLACES:
             for reach in self.gripper.reaches:
-                owner, rotation, translation = self._poses(objects, open_rows, back, place_along, reach)
-                if len(owner):
-                    good = self._is_grasp(objects, owner, rotation, translation)
-                    good[good] = ~self._is_blocked(objects, rotation[good], translation[good])
-                    open_rows = np.setdiff1d(open_rows, owner[good])
-        return np.setdiff1d(np.flatnonzero(~objects.fixed), open_rows)
+                tried = np.flatnonzero(np.isin(owner, open_rows))
+                across = low[tried, 0] + place_along * (high[tried, 0] - low[tried, 0])
+                deep = np.maximum(high[tried, 2] - reach, low[tried, 2])
+                tips = np.stack([across, 0.5 * (low[tried, 1] + high[tried, 1]), deep], axis=1)
+                good = self._succeed(
+                    objects, owner[tried], rotation[tried], np.einsum("gij,gj->gi", rotation[tried], tips)
+                )
+                open_rows = np.setdiff1d(open_rows, owner[tried[good]])
+        return np.setdiff1d(free, open_rows)
 
-    def _poses(
-        self, objects: Objects, rows: Index, back: Array, place_along: float, reach: float
-    ) -> tuple[Index, Array, Array]:
-        """Gripper poses for some objects: owner (G,), rotation (G, 3, 3), translation of the tips (G, 3) m."""
-        owner, rotation, translation = [], [], []
-        for row in rows.tolist():
+    def _extents(self, objects: Objects, rows: Index, back: Array) -> tuple[Index, Array, Array, Array]:
+        """Gripper frames for some objects, and how far these extend along them.
+
+        Returns:
+            owner (G,), rotation (G, 3, 3) gripper to world, lowest and highest coordinate (G, 3), (G, 3) m along the
+            axes of the gripper.
+        """
+        rotation = _frames(objects.rotation[rows], back)  # (n, T, 3, 3)
+        low, high = np.empty(rotation.shape[:3]), np.empty(rotation.shape[:3])
+        for index, row in enumerate(rows.tolist()):
             points = self.corners[objects.category[row]] @ objects.rotation[row].T + objects.translation[row]
-            for closing in _closing_directions(objects.rotation[row], back):
-                axes = np.stack([closing, np.cross(back, closing), back])  # rows
-                along = points @ axes.T
-                low, high = along.min(axis=0), along.max(axis=0)
-                across = low[0] + place_along * (high[0] - low[0])
-                tips = np.array([across, 0.5 * (low[1] + high[1]), max(high[2] - reach, low[2])])
-                owner.append(row)
-                rotation.append(axes.T)
-                translation.append(tips @ axes)
-        return np.array(owner, dtype=np.int64), np.array(rotation), np.array(translation)
+            along = points @ rotation[index]  # (T, V, 3)
+            low[index], high[index] = along.min(axis=1), along.max(axis=1)
+        owner = np.repeat(rows, len(TURNS))
+        return owner, rotation.reshape(-1, 3, 3), low.reshape(-1, 3), high.reshape(-1, 3)
 
-    def _is_grasp(self, objects: Objects, owner: Index, rotation: Array, translation: Array) -> Mask:
-        """(G,) whether some of the object is between the fingers."""
-        both = _concatenate(objects, self.grasp, rotation, translation)
-        first = len(objects) + np.arange(len(owner))
-        return self._overlap(both, first, owner)
+    def _succeed(self, objects: Objects, owner: Index, rotation: Array, translation: Array) -> Index:
+        """Which of G poses have some of the object between the fingers, and the gripper overlapping nothing."""
+        left = np.arange(len(owner))
+        for tool, wanted in ((self.grasp, True), (self.body, False)):
+            both = _concatenate(objects, tool, rotation[left], translation[left])
+            first = len(objects) + np.arange(len(left))
+            left = left[self._overlap(both, first, owner[left]) == wanted]
+        return left[~self._is_blocked(objects, rotation[left], translation[left])]
 
     def _is_blocked(self, objects: Objects, rotation: Array, translation: Array) -> Mask:
         """(G,) whether the gripper overlaps anything."""
@@ -191,14 +198,21 @@ class _Hand:
         return overlap
 
 
-def _closing_directions(rotation: Array, back: Array) -> Iterator[Array]:
-    """Unit vectors across ``back`` (3,) at :data:`TURNS` from the object's x or z axis, whichever lies more across."""
-    across = [axis - (axis @ back) * back for axis in (rotation[:, 0], rotation[:, 2])]
-    start = max(across, key=lambda vector: float(np.linalg.norm(vector)))
-    start = start / np.linalg.norm(start)
+def _frames(rotation: Array, back: Array) -> Array:
+    """(n, T, 3, 3) gripper to world: z along ``back`` (3,), x at :data:`TURNS` from an axis of each object across it.
+
+    That is the object's x or z axis, whichever lies more across.
+    """
+    axes = rotation[:, :, [0, 2]].swapaxes(1, 2)  # (n, 2, 3)
+    across = axes - (axes @ back)[..., None] * back
+    length = np.linalg.norm(across, axis=-1)
+    best = length.argmax(axis=1)
+    rows = np.arange(len(rotation))
+    start = across[rows, best] / length[rows, best, None]
     side = np.cross(back, start)
-    for turn in TURNS:
-        yield np.cos(turn) * start + np.sin(turn) * side
+    turns = np.array(TURNS)[:, None]
+    closing = np.cos(turns) * start[:, None] + np.sin(turns) * side[:, None]  # (n, T, 3)
+    return np.stack([closing, np.cross(back, closing), np.broadcast_to(back, closing.shape)], axis=-1)
 
 
 def _concatenate(objects: Objects, category: int, rotation: Array, translation: Array) -> Objects:
