@@ -122,11 +122,13 @@ def log_probabilities(name: str) -> Figures:
 
 def pretraining(process: str) -> Figures:
     """Five steps on fresh scenes of a grammar; the mixed prior learns to read prompts."""
+    encoder = "vocabulary" if process == "mixed" else "none"
     with TemporaryDirectory() as output:
         config = PretrainConfig(
-            data="grammar", output=output, iterations=5, batch_size=8, hidden=32, depth=2, heads=2, warmup=2,
-            log_every=1, evaluate_every=5, checkpoint_every=5, process=process, seed=7, text=process == "mixed",
-            text_width=32, text_depth=1, text_latents=4, text_warmup=3,
+            data="grammar", output=output, iterations=5, batch_size=8, seed=7, process=process, optimizer={"warmup": 2},
+            network={"hidden": 32, "depth": 2, "heads": 2},
+            logger={"log_every": 1, "evaluate_every": 5, "checkpoint_every": 5},
+            text={"encoder": encoder, "width": 32, "depth": 1, "latents": 4, "warmup": 3},
         )  # fmt: skip
         pretrain(config)
         prior = ScenePrior.load(output)
@@ -137,9 +139,9 @@ def post_training(name: str) -> Figures:
     """Two iterations toward more objects."""
     with TemporaryDirectory() as output:
         config = PostTrainConfig(
-            prior=name, reward="object_count", output=output, iterations=2, batch_size=4, num_steps=4,
-            gradient_steps=2, regularisation_batch=4, bank_size=24, guard_scenes=8, guard_every=1,
-            guard_limit=100.0, checkpoint_every=2, seed=11, progress="none",
+            prior=name, reward="object_count", output=output, iterations=2, batch_size=4, num_steps=4, seed=11,
+            algorithm={"gradient_steps": 2}, regularisation={"batch_size": 4, "bank_size": 24},
+            guard={"scenes": 8, "every": 1, "limit": 100.0}, logger={"checkpoint_every": 2, "progress": "none"},
         )  # fmt: skip
         result = post_train(config)
         return log_figures(Path(output) / "log.csv") | weight_figures(result.prior)

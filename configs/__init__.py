@@ -1,1 +1,1 @@
-"""Hydra configurations, packaged so that an installed wheel finds them: one file per command."""
+"""Hydra configurations, packaged so that an installed wheel finds them: groups of options, recipes."""

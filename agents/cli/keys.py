@@ -1,4 +1,4 @@
-"""Keys of a command: their meaning from the docstring, their values from Hydra."""
+"""Keys of a command: their meaning from the docstrings, their values from Hydra."""
 
 from __future__ import annotations
 
@@ -8,21 +8,16 @@ import shutil
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
-from typing import Any, get_type_hints
+from pathlib import Path
+from typing import Any, get_args, get_origin, get_type_hints
 
+from agents.configuration.compose import check_option, choice_word, compose_tree, group_options
+from agents.configuration.tree import build, check_not_moved, dotted_keys
 from agents.utils.docstrings import attribute_meanings
-from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
 
 _FIRST = ("scene", "prior", "scenes", "data", "reward", "objective", "count", "output")
 """Keys that a listing starts with, in this order."""
-_WANTED = {
-    int: "a whole number",
-    int | None: "a whole number or null",
-    float: "a number",
-    float | None: "a number or null",
-    bool: "true or false",
-}
 _OPENING = "[{('\""
 
 
@@ -31,7 +26,7 @@ class KeyHelp:
     """One key of a command.
 
     Attributes:
-        name: what stands before ``=``.
+        name: what stands before ``=``, a group's name and a dot before it where it is of one.
         default: its default, as it would be typed.
         meaning: one sentence.
     """
@@ -41,14 +36,66 @@ class KeyHelp:
     meaning: str
 
 
-def describe_fields(config: type) -> list[KeyHelp]:
-    """The keys of a config dataclass; meanings stand under ``Attributes:`` in its docstrings."""
-    meanings = attribute_meanings(config)
-    keys = [
-        KeyHelp(field.name, _typed(_default(field)), meanings.get(field.name, ""))
-        for field in dataclasses.fields(config)
-    ]
-    return sorted(keys, key=lambda key: _FIRST.index(key.name) if key.name in _FIRST else len(_FIRST))
+@dataclass(frozen=True)
+class Sources:
+    """Where the values of a command come from, beside its words.
+
+    Attributes:
+        config_dir: a folder with further groups and experiments; empty for none.
+        config: a ``config.yaml`` whose values take the place of the defaults; empty for none.
+    """
+
+    config_dir: str = ""
+    config: str = ""
+
+
+def describe_fields(config: type | Any, prefix: str = "") -> list[KeyHelp]:
+    """The keys of a config, or of the default one of its class, those of groups last.
+
+    Meanings stand under ``Attributes:`` in the docstrings.
+    """
+    made = config() if isinstance(config, type) else config
+    meanings = attribute_meanings(type(made))
+    keys, groups = [], []
+    for field in dataclasses.fields(made):
+        value = getattr(made, field.name)
+        if dataclasses.is_dataclass(value):
+            groups += describe_fields(value, f"{prefix}{field.name}.")
+        else:
+            keys.append(KeyHelp(prefix + field.name, _typed(value), meanings.get(field.name, "")))
+    keys.sort(key=lambda key: _FIRST.index(key.name) if key.name in _FIRST else len(_FIRST))
+    return keys + groups
+
+
+def help_text(config: type | Any, words: Sequence[str] = (), config_dir: str = "") -> str:
+    """All keys with their values and meanings, a paragraph for each group with its options.
+
+    Args:
+        config: the config that ``words`` make, or its class.
+        words: options of groups among them stand in the headings.
+        config_dir: a folder with further options.
+    """
+    chosen = dict(word.partition("=")[::2] for word in words)
+    keys = describe_fields(config)
+    plain = [key for key in keys if "." not in key.name]
+    parts = [format_rows([(f"{key.name}={key.default}", key.meaning) for key in plain])] if plain else []
+    for field in dataclasses.fields(config):
+        rows = [(f"{k.name}={k.default}", k.meaning) for k in keys if k.name.startswith(f"{field.name}.")]
+        if rows:
+            known = getattr(field.default_factory, "KNOWN", ())
+            heading = _heading(field, chosen.get(field.name, ""), known, config_dir)
+            parts.append(f"{heading}\n{format_rows(rows)}")
+    return "\n\n".join(parts) or "  no keys"
+
+
+def _heading(field: dataclasses.Field[Any], chosen: str, known: Sequence[str], config_dir: str) -> str:
+    folder = field.metadata.get("folder")
+    if not folder:
+        return f"{field.name}:"
+    option = chosen or field.metadata["option"]
+    offered = [other for other in group_options(folder, config_dir) if not known or other in known]
+    others = [other for other in offered if other != option]
+    return f"{field.name}={option}" + (f" (or {', '.join(others)}):" if others else ":")
 
 
 def format_rows(rows: Sequence[tuple[str, str]]) -> str:
@@ -67,80 +114,146 @@ def format_rows(rows: Sequence[tuple[str, str]]) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-def compose(command: str, config: type, words: Sequence[str]) -> Any:
-    """An instance of ``config`` from ``key=value`` words over the packaged configuration of ``command``, if any.
+def compose(command: str, config: type, words: Sequence[str], sources: Sources = Sources()) -> Any:
+    """An instance of ``config`` from ``key=value`` words, options of groups and ``+experiment=NAME``.
 
     Values are written as in Hydra: numbers, ``true``, ``null``, ``[1, 2]``, ``{name: clip, high: 20}``; the brackets of
     a list may be left out.
 
     Raises:
-        UnknownNameError: no such key; the nearest one is offered.
+        UnknownNameError: no such key or option; the nearest one is offered.
         InvalidInputError: a word is not ``key=value``, or the value is not of the key's type.
     """
-    from hydra import compose as hydra_compose
-    from hydra import initialize_config_module
-    from hydra.core.config_store import ConfigStore
+    fields = {field.name: field for field in dataclasses.fields(config)}
+    base = _without_output(read_config(sources.config)) if sources.config else None
+    late: dict[str, Any] = {}
+    read = []
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not equals or not key:
+            raise InvalidInputError(f"{command}: expected key=value, got {word!r}; --help lists the keys")
+        if key.startswith("+experiment"):
+            check_option("experiment", value, sources.config_dir)
+            read.append(word)
+            continue
+        check_not_moved(config, word, command)
+        head = key.partition(".")[0]
+        if head not in fields:
+            check_not_moved(config, key, command)
+            raise unknown_name(f"{command} key", key, dotted_keys(config()))
+        if key == head and fields[key].metadata.get("folder"):
+            read += _component(command, fields[key], value, sources.config_dir, late)
+        elif key == "recipe":
+            check_option("recipe", value, sources.config_dir)
+            read.append(word)
+        elif group_options(key, sources.config_dir):  # a plain key that is called like a group of other commands
+            late[key] = _parsed(command, key, _override(word, _hint(config, key)).partition("=")[2])
+        else:
+            read.append(_override(word, _hint(config, key)))
+    tree = compose_tree(command, config, read, base=base, config_dir=sources.config_dir)
+    return build(config, {**tree, **late}, command=command)
+
+
+def read_config(path: str) -> dict[str, Any]:
+    """The values of a ``config.yaml``.
+
+    Raises:
+        InvalidInputError: there is no such file.
+        CorruptFileError: it holds no mapping.
+    """
+    import yaml
+
+    try:
+        found = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InvalidInputError(f"--config {path}: {error.strerror}; name the config.yaml of a run") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise CorruptFileError(f"--config {path} is not YAML ({str(error).splitlines()[0]})") from error
+    if not isinstance(found, dict):
+        raise CorruptFileError(f"--config {path} holds no keys")
+    return found
+
+
+def _without_output(values: dict[str, Any]) -> dict[str, Any]:
+    """A run that is started again has a folder of its own."""
+    return {key: value for key, value in values.items() if key != "output"}
+
+
+def _component(
+    command: str, field: dataclasses.Field[Any], value: str, config_dir: str, late: dict[str, Any]
+) -> list[str]:
+    """The word that chooses a component; what is no name goes into ``late``."""
+    name = field.name
+    if value in group_options(field.metadata["folder"], config_dir):
+        return [f"{name}={value}"]
+    if field.metadata.get("named"):
+        if value.isidentifier() and value not in ("null", "true", "false"):
+            return [f"{name}={{name: {value}}}"]
+        if not value.startswith("{"):
+            late[name] = _parsed(command, name, value)
+            return []
+        _parsed(command, name, value)
+    elif not value.startswith("{"):
+        return [choice_word(field, value, config_dir)]
+    return [f"{name}={value}"]
+
+
+def _parsed(command: str, key: str, value: str) -> Any:
+    from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
 
-    name = command.replace("-", "_")
-    known = get_type_hints(config)
-    hints = {field.name: known[field.name] for field in dataclasses.fields(config)}
-    renamed: dict[str, str] = getattr(config, "RENAMED", {})
-    overrides = [_override(command, word, hints, renamed) for word in words]
-    keys = OmegaConf.structured(config)
-    OmegaConf.set_readonly(keys, False)  # a frozen dataclass starts out read-only
-    packaged = (resources.files("configs") / f"{name}.yaml").is_file()
-    ConfigStore.instance().store(name=f"{name}_keys" if packaged else name, node=keys)
+    if "," in value and value[:1] not in _OPENING:
+        value = f"[{value}]"  # a,b is a list, where Hydra would see a sweep
     try:
-        with initialize_config_module("configs", version_base="1.3"):
-            tree = hydra_compose(name, overrides=overrides)
-        values = OmegaConf.to_container(tree, resolve=True)
-    except (HydraException, OmegaConfBaseException) as error:
-        raise InvalidInputError(f"{command}: {_plain_reason(error, words, hints)}") from error
-    assert isinstance(values, dict)
-    return config(**{str(key): value for key, value in values.items()})
+        found = OverridesParser.create().parse_override(f"{key}={value}").value()
+    except HydraException:
+        raise InvalidInputError(f"{command}: a value cannot be read: {key}={value}") from None
+    return OmegaConf.to_container(OmegaConf.create({"value": found}))["value"]  # type: ignore[index, call-overload]
 
 
-def _override(command: str, word: str, hints: dict[str, Any], renamed: dict[str, str]) -> str:
+def _hint(config: type, key: str) -> Any:
+    """The type of a dotted key, Any where only the component knows it."""
+    kind: Any = config
+    for part in key.split("."):
+        if not dataclasses.is_dataclass(kind) or part not in (hints := get_type_hints(kind)):
+            return Any
+        kind = hints[part]
+    return kind
+
+
+def _override(word: str, hint: Any) -> str:
     """The word as Hydra reads it, text quoted so that any character may stand in it."""
-    key, equals, value = word.partition("=")
-    if not equals or not key:
-        raise InvalidInputError(f"{command}: expected key=value, got {word!r}; --help lists the keys")
-    if key in renamed:
-        raise InvalidInputError(f"the {command} key {key!r} has another name now: {renamed[key]}")
-    if key not in hints:
-        raise unknown_name(f"{command} key", key, hints)
-    if hints[key] is str or (hints[key] == (str | None) and value != "null"):
+    key, _, value = word.partition("=")
+    options = (hint,) if get_origin(hint) is list else get_args(hint) or (hint,)
+    is_list = any(get_args(option) for option in options) and value.startswith("[")
+    if str in options and not is_list and not (type(None) in options and value == "null"):
         value = _quoted(value)
+    elif is_list and str in options:
+        value = _text_list(word, value)
     elif "," in value and value[0] not in _OPENING:
         value = f"[{value}]"  # a,b is a list, where Hydra would see a sweep
     return f"{key}={value}"
 
 
+def _text_list(word: str, value: str) -> str:
+    """A list of texts in YAML as Hydra reads it."""
+    import yaml
+
+    try:
+        texts = yaml.safe_load(value)
+    except yaml.YAMLError:
+        texts = None
+    if not isinstance(texts, list) or not all(isinstance(text, str) for text in texts):
+        raise InvalidInputError(
+            f'{word} is no list of texts; write \'["A scene with two cups.", "A scene with 9 objects."]\''
+        )
+    return f"[{','.join(map(_quoted, texts))}]"
+
+
 def _quoted(text: str) -> str:
     """``text`` in Hydra's quotes, where backslashes count only before a quote."""
     return "'" + re.sub(r"(\\*)('|$)", lambda found: 2 * found[1] + ("\\'" if found[2] else ""), text) + "'"
-
-
-def _plain_reason(error: BaseException, words: Sequence[str], hints: dict[str, Any]) -> str:
-    """What the key wants, or the first line of the innermost explanation."""
-    while error.__cause__ is not None:
-        error = error.__cause__
-    reason = str(error).splitlines()[0].strip().rstrip(".")
-    typed = {word.partition("=")[0]: word for word in words}
-    key = getattr(error, "full_key", None) or next((key for key, word in typed.items() if word in reason), "")
-    if key not in typed:
-        return f"{key}: {reason}" if key else f"a value cannot be read: {reason}"
-    wanted = _WANTED.get(hints[key])
-    return f"{typed[key]} is not {wanted}" if wanted else f"{typed[key]}: {reason}"
-
-
-def _default(field: dataclasses.Field[Any]) -> Any:
-    if field.default_factory is not dataclasses.MISSING:
-        return field.default_factory()
-    return None if field.default is dataclasses.MISSING else field.default
 
 
 def _typed(value: Any) -> str:

@@ -12,10 +12,14 @@ import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib import import_module
+from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from agents.cli.commands import COMMANDS, RENAMED
-from agents.cli.keys import compose, describe_fields, format_rows
+from agents.cli.keys import Sources, compose, format_rows, help_text
+from agents.cli.sweep import expand_sweeps
+from agents.configuration.tree import config_text
 from scene_envs import __version__
 from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError, UnknownNameError, unknown_name
 
@@ -27,6 +31,8 @@ usage: scene-envs COMMAND key=value ...
 {commands}
 
 scene-envs COMMAND --help lists the keys of a command; --traceback shows where an error came from.
+--cfg job prints the keys and runs nothing; --config FILE starts the run of a config.yaml again;
+--config-dir FOLDER adds groups and experiments (+experiment=NAME); --multirun seed=0,1,2 makes a run of each.
 A command writes into output=FOLDER, by default runs/COMMAND-TIME.
 """
 
@@ -95,21 +101,29 @@ def _dispatch(words: list[str]) -> int:
 
 
 def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str]) -> int:
-    if any(word in ("-h", "--help") for word in words):
-        print(_help(program, meaning, module))
+    words = list(words)
+    config_dir, file = _option(words, "--config-dir"), _option(words, "--config")
+    shown, sweep, asked = _option(words, "--cfg", "-c"), _flag(words, "--multirun", "-m"), _flag(words, "-h", "--help")
+    if shown not in ("", "job"):
+        raise InvalidInputError(f"--cfg {shown}: only --cfg job is known, which prints the keys and runs nothing")
+    command, sources = program.removeprefix("scene-envs "), Sources(config_dir, file)
+    named = _named(words, getattr(module, "POSITIONAL", ()))
+    if asked:
+        config = module.config() if sweep or not named else compose(command, module.config(), named, sources)
+        print(f"{program}: {meaning}.\n\n{help_text(config, named, config_dir)}")
         return DONE
-    return _run(program.removeprefix("scene-envs "), module, words)
+    if not sweep:
+        return _run(command, module, compose(command, module.config(), named, sources), bool(shown))
+    runs = [(compose(command, module.config(), variant, sources), label) for variant, label in expand_sweeps(named)]
+    return _run_all(command, module, runs, bool(shown))
 
 
-def _help(program: str, meaning: str, module: ModuleType) -> str:
-    rows = [(f"{field.name}={field.default}", field.meaning) for field in describe_fields(module.config())]
-    return f"{program}: {meaning}.\n\n{format_rows(rows) if rows else '  no keys'}"
-
-
-def _run(command: str, module: ModuleType, words: list[str]) -> int:
+def _run(command: str, module: ModuleType, settings: Any, only_show: bool) -> int:
     from agents.cli.run_folder import Run, fresh_directory
 
-    settings = compose(command, module.config(), _named(words, getattr(module, "POSITIONAL", ())))
+    if only_show:
+        print(config_text(settings), end="")
+        return DONE
     if not getattr(module, "WRITES", True):
         module.run(settings)
         return DONE
@@ -118,6 +132,44 @@ def _run(command: str, module: ModuleType, words: list[str]) -> int:
     with Run(command, settings) as run:
         module.run(settings, run)
     return DONE
+
+
+def _run_all(command: str, module: ModuleType, runs: Sequence[tuple[Any, str]], only_show: bool) -> int:
+    """One run after the other, each in a folder of its own below ``output``; the first that fails ends them."""
+    from agents.cli.run_folder import fresh_directory
+
+    if not getattr(module, "WRITES", True):
+        raise InvalidInputError(f"--multirun: {command} writes no folder; run it once for each value")
+    folder = ""
+    for settings, label in runs:
+        folder = settings.output or folder or fresh_directory(command)
+        own = replace(settings, output=str(Path(folder) / label))
+        print(f"{'# ' * only_show}{command} {label}", flush=True)
+        _run(command, module, own, only_show)
+    return DONE
+
+
+def _option(words: list[str], *names: str) -> str:
+    """The value of ``--name VALUE`` or ``--name=VALUE``, taken out of the words; empty where it is not given."""
+    for position, word in enumerate(words):
+        name, equals, value = word.partition("=")
+        if name not in names:
+            continue
+        del words[position]
+        if not equals:
+            if position == len(words):
+                raise InvalidInputError(f"{name} needs a value behind it, as in {name} VALUE")
+            value = words.pop(position)
+        return value
+    return ""
+
+
+def _flag(words: list[str], *names: str) -> bool:
+    """Whether a flag is among the words; takes it out."""
+    found = [word for word in words if word in names]
+    for word in found:
+        words.remove(word)
+    return bool(found)
 
 
 def _named(words: Sequence[str], keys: Sequence[str]) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import sys
 import time
@@ -11,6 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from agents.configuration.tree import config_text
 from agents.utils.process_group import is_first_process
 from scene_envs.errors import InvalidInputError
 from scene_envs.files import write_json, write_text
@@ -85,11 +85,8 @@ class Run:
             write_json(self.directory / "metrics.json", metrics)
 
     def _write_config(self) -> None:
-        import yaml
-
         if self._is_first:
-            text = yaml.safe_dump(dataclasses.asdict(self.settings), sort_keys=False)
-            write_text(self.directory / "config.yaml", text)
+            write_text(self.directory / "config.yaml", config_text(self.settings))
 
     def _start_logging(self) -> None:
         screen = logging.StreamHandler(sys.stderr)

@@ -16,7 +16,6 @@ from agents.networks.pooled_text import PooledTextConfig
 from agents.networks.relations import RelationsConfig
 from agents.networks.rotation_features import RotationFeaturesConfig
 from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.scene import POSE_FEATURES
 
 TEXT_REACHES = ("all", "double")
 """Blocks in which slots meet text."""
@@ -92,7 +91,7 @@ class MixedFluxConfig:
             raise unknown_name("time input", self.time_input, TIME_INPUTS)
         object.__setattr__(self, "unit", tuple(self.unit))  # lists, when they come from JSON
         object.__setattr__(self, "rotations", tuple(tuple(numbers) for numbers in self.rotations))
-        object.__setattr__(self, "modules", tuple(_module(entry) for entry in self.modules))
+        object.__setattr__(self, "modules", tuple(make_module(entry) for entry in self.modules))
         if self.hidden % self.heads:
             raise InvalidInputError(f"hidden={self.hidden} is not a multiple of heads={self.heads}")
         before: list[str] = []
@@ -128,28 +127,14 @@ class MixedFluxConfig:
                 raise unknown_name("module of the network", name, present)
         return replace(self, modules=tuple(module for module in self.modules if module.name not in names))
 
-    @classmethod
-    def paper(cls, categories: int, text_width: int = 768) -> MixedFluxConfig:
-        """The size and the details of the paper: 88.3 M parameters with text, no module."""
-        return cls(
-            categories,
-            hidden=512,
-            double_blocks=5,
-            single_blocks=10,
-            heads=16,
-            embedding=256,
-            pose_head=POSE_FEATURES,
-            text_width=text_width,
-            time_scale=1000.0,
-        )
-
 
 def module_states(config: MixedFluxConfig) -> list[dict[str, Any]]:
     """The modules for a file: their names and fields."""
     return [{"name": module.name, **vars(module)} for module in config.modules]
 
 
-def _module(entry: ModuleConfig | Mapping[str, Any]) -> ModuleConfig:
+def make_module(entry: ModuleConfig | Mapping[str, Any]) -> ModuleConfig:
+    """A module's configuration, itself or from ``{"name": …, **fields}``."""
     if isinstance(entry, ModuleConfig):
         return entry
     options = {key: value for key, value in entry.items() if key != "name"}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
 from typing import Any
 
@@ -10,10 +10,13 @@ from torch import nn
 
 from agents.networks.diffuscene import DiffuScene, DiffuSceneConfig, MixedDiffuScene, MixedDiffuSceneConfig
 from agents.networks.flux import FluxConfig, FluxDenoiser
+from agents.networks.flux_modules import ModuleConfig
+from agents.networks.fourier_features import FourierFeaturesConfig
+from agents.networks.given_flags import GivenFlagsConfig
 from agents.networks.midiffusion import MiDiffusion, MiDiffusionConfig, MixedMiDiffusion, MixedMiDiffusionConfig
 from agents.networks.mixed_flux import MixedFlux
-from agents.networks.mixed_flux_config import MixedFluxConfig, module_states
-from agents.networks.mixed_flux_files import FLAT_FIELDS, current_fields
+from agents.networks.mixed_flux_config import MODULES, MixedFluxConfig, make_module, module_states
+from agents.networks.mixed_flux_files import current_fields
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.plugins import load_plugins
 
@@ -123,17 +126,14 @@ def network_config(
     depth: int,
     heads: int,
     text_width: int = 0,
-    attention: str = "plain",
-    relation_blur: str = "axis",
     frequencies: int = 8,
-    unit: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    double_blocks: int | None = None,
+    embedding: int | None = None,
+    pose_head: int = 64,
+    time_scale: float = 1.0,
     text_reach: str = "all",
-    pooled_text: int = 0,
-    count_embedding: int = 0,
-    count_conditioning: int = 0,
-    kinds: tuple[int, ...] = (),
-    rotation_features: int = 0,
-    contacts: int = 0,
+    modules: Sequence[ModuleConfig | Mapping[str, Any]] | None = None,
+    unit: tuple[float, float, float] = (1.0, 1.0, 1.0),
     rotations: tuple[tuple[float, ...], tuple[float, ...]] = ((1.0,) * 9, (0.0,) * 9),
 ) -> NetworkConfig:
     """The size of a network from the keys that all networks share.
@@ -148,11 +148,14 @@ def network_config(
             ``diffuscene`` has a third as many residual blocks per level.
         heads: attention heads.
         text_width: width of the text tokens; 0 for none. The continuous ``flux`` reads none.
-        attention, relation_blur: read by the mixed ``flux`` alone, see :class:`~agents.networks.MixedFluxConfig`.
-        frequencies: read by ``flux`` alone: the others are as published, unless their configuration is made by hand.
-        unit: read by the mixed ``flux`` alone.
-        text_reach, pooled_text, count_embedding, count_conditioning, kinds: read by the mixed ``flux`` alone.
-        rotation_features, contacts, rotations: read by the mixed ``flux`` alone.
+        frequencies: octaves of Fourier features, read by ``flux`` alone: the others are as published, unless their
+            configuration is made by hand.
+        double_blocks: read by the mixed ``flux`` alone; None for a third of ``depth``.
+        embedding: read by the mixed ``flux`` alone; None for ``hidden``.
+        pose_head, time_scale, text_reach, unit, rotations: read by the mixed ``flux`` alone, see
+            :class:`~agents.networks.MixedFluxConfig`.
+        modules: of the mixed ``flux``, but for the Fourier features, which stand before those that come later in
+            :data:`~agents.networks.mixed_flux_config.MODULES`; None for the flags of inpainting alone.
 
     Raises:
         UnknownNameError: no network or no process has that name.
@@ -168,17 +171,14 @@ def network_config(
         "depth": depth,
         "heads": heads,
         "text_width": text_width,
-        "attention": attention,
-        "relation_blur": relation_blur,
         "frequencies": frequencies,
-        "unit": unit,
+        "double_blocks": double_blocks,
+        "embedding": embedding,
+        "pose_head": pose_head,
+        "time_scale": time_scale,
         "text_reach": text_reach,
-        "pooled_text": pooled_text,
-        "count_embedding": count_embedding,
-        "count_conditioning": count_conditioning,
-        "kinds": kinds,
-        "rotation_features": rotation_features,
-        "contacts": contacts,
+        "modules": modules,
+        "unit": unit,
         "rotations": rotations,
     }
     entry = _entry(name, process)
@@ -257,11 +257,20 @@ def _continuous_flux(keys: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _mixed_flux(keys: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of the Flux core, and its modules from the keys that ask for them."""
-    core = ("categories", "hidden", "heads", "text_width", "text_reach", "unit", "rotations")
-    chosen = current_fields({name: keys[name] for name in (*core, *FLAT_FIELDS) if name in keys})
-    depth = keys["depth"]
-    return {**chosen, "double_blocks": max(1, depth // 3), "single_blocks": depth, "embedding": keys["hidden"]}
+    """Fields of the Flux core, and its modules in the order of ``MODULES``."""
+    core = ("categories", "hidden", "heads", "text_width", "text_reach", "pose_head", "time_scale", "unit", "rotations")
+    given = keys["modules"] if keys["modules"] is not None else [GivenFlagsConfig()]
+    octaves = keys["frequencies"]
+    modules = [make_module(entry) for entry in given] + ([FourierFeaturesConfig(octaves)] if octaves else [])
+    order = list(MODULES)
+    return {
+        **{name: keys[name] for name in core},
+        "double_blocks": max(1, keys["depth"] // 3) if keys["double_blocks"] is None else keys["double_blocks"],
+        "single_blocks": keys["depth"],
+        "embedding": keys["hidden"] if keys["embedding"] is None else keys["embedding"],
+        "time_input": "log_noise" if octaves else "timestep",
+        "modules": tuple(sorted(modules, key=lambda module: order.index(module.name))),
+    }
 
 
 def _midiffusion(features: str) -> Callable[[Mapping[str, Any]], dict[str, Any]]:

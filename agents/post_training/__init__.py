@@ -1,14 +1,23 @@
 """Post-training of a prior by reinforcement learning: DDPO-SF with regularisation on real scenes."""
 
-from agents.post_training.advantages import compute_advantages
-from agents.post_training.comparison_run import post_train_and_compare
-from agents.post_training.config import PostTrainConfig
-from agents.post_training.guard import Guard
-from agents.post_training.losses import DDPOSFLoss
-from agents.post_training.policy import DenoisingPolicy
-from agents.post_training.trainer import PostTrainer, PostTrainResult, post_train
+from typing import TYPE_CHECKING
+
+from scene_envs.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from agents.post_training.advantages import compute_advantages
+    from agents.post_training.algorithms import AlgorithmSettings, list_algorithms, register_algorithm
+    from agents.post_training.comparison_run import post_train_and_compare
+    from agents.post_training.config import PostTrainConfig
+    from agents.post_training.ddpo import DDPO
+    from agents.post_training.guard import Guard
+    from agents.post_training.losses import DDPOSFLoss
+    from agents.post_training.policy import DenoisingPolicy
+    from agents.post_training.trainer import PostTrainer, PostTrainResult, post_train
 
 __all__ = [
+    "DDPO",
+    "AlgorithmSettings",
     "DDPOSFLoss",
     "DenoisingPolicy",
     "Guard",
@@ -16,6 +25,23 @@ __all__ = [
     "PostTrainResult",
     "PostTrainer",
     "compute_advantages",
+    "list_algorithms",
     "post_train",
     "post_train_and_compare",
+    "register_algorithm",
 ]
+
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "agents.post_training.advantages": ("compute_advantages",),
+        "agents.post_training.algorithms": ("AlgorithmSettings", "list_algorithms", "register_algorithm"),
+        "agents.post_training.comparison_run": ("post_train_and_compare",),
+        "agents.post_training.config": ("PostTrainConfig",),
+        "agents.post_training.ddpo": ("DDPO",),
+        "agents.post_training.guard": ("Guard",),
+        "agents.post_training.losses": ("DDPOSFLoss",),
+        "agents.post_training.policy": ("DenoisingPolicy",),
+        "agents.post_training.trainer": ("PostTrainer", "PostTrainResult", "post_train"),
+    },
+)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from agents.post_training.algorithms import BASELINES
 from agents.utils.process_group import gather_rows
 from scene_envs.errors import InvalidInputError
 
-BASELINES = ("leave_one_out", "mean")
 _MIN_STD = 1e-8
 
 

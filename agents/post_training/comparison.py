@@ -103,18 +103,17 @@ def write_comparison(
     Returns:
         What ``metrics.json`` holds: the run's metrics, ``before``, ``after`` and ``change`` (relative).
     """
-    directory, config = result.directory, result.metrics["config"]
+    directory, settings = result.directory, result.config.plain()
     names = [name for name in ("objects", "feasible_objects", "ready_objects") if name in before.figures]
     change = {name: _relative(before.figures[name], after.figures.get(name)) for name in names}
     metrics = {"before": before.figures, "after": after.figures, "change": change, **result.metrics, **(extra or {})}
-    reward = reward_name(config["reward"]).replace("_", " ")
     pictures = {
         "before": draw_gallery(before.raw, directory / "before.png"),
         "after": draw_gallery(after.raw, directory / "after.png"),
         "before_ready": draw_gallery(before.ready, directory / "before_ready.png", before.is_ready),
         "after_ready": draw_gallery(after.ready, directory / "after_ready.png", after.is_ready),
     }
-    write_report(directory / "report.html", _page(title, metrics, directory / "curve.png", pictures, reward))
+    write_report(directory / "report.html", _page(title, metrics, directory / "curve.png", pictures, settings))
     write_metrics(directory, metrics)
     return metrics
 
@@ -144,11 +143,15 @@ def draw_gallery(batch: SceneBatch, path: Path, is_ready: Tensor | None = None) 
     return path
 
 
-def _page(title: str, metrics: Mapping[str, Any], curve: Path, pictures: Mapping[str, Path], reward: str) -> Page:
+def _page(
+    title: str, metrics: Mapping[str, Any], curve: Path, pictures: Mapping[str, Path], settings: Mapping[str, Any]
+) -> Page:
+    reward = reward_name(settings["reward"]).replace("_", " ")
+    algorithm = settings["algorithm"]["name"].upper().replace("_", "-")
     before, after, guard = metrics["before"], metrics["after"], metrics["guard"]
     count = int(before["scenes"])
     lead = (
-        f"{metrics['iterations']} iterations of DDPO-SF on {reward}, with the pretraining loss on real scenes as "
+        f"{metrics['iterations']} iterations of {algorithm} on {reward}, with the pretraining loss on real scenes as "
         f"regularisation. All numbers are means over {count} fresh, seeded samples of each prior; none was selected."
     )
     tiles = [
@@ -177,7 +180,7 @@ def _page(title: str, metrics: Mapping[str, Any], curve: Path, pictures: Mapping
         ),
         Section("Numbers", table=_rows(before, after)),
     ]
-    return Page(title, lead, tiles, sections, metrics["config"])
+    return Page(title, lead, tiles, sections, settings)
 
 
 _LABELS = {

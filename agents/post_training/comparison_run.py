@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 from torch import Generator
@@ -76,7 +75,7 @@ def _measured_prompts(config: PostTrainConfig, prior: ScenePrior, count: int) ->
     """A prompt for each measured sample, from where the run has its own; None for a run without prompts."""
     if config.prompt is None:
         return None
-    directory = Path(config.output)
+    directory = config.directory
     batch = SceneBatch.load(directory / SCENES_NAME)
     real = prompts_beside(directory, batch, stream_seed(config.seed, "bank"))
     slots = prior.config.slots if config.slots is None else config.slots
@@ -85,5 +84,5 @@ def _measured_prompts(config: PostTrainConfig, prior: ScenePrior, count: int) ->
 
 
 def _say(config: PostTrainConfig, text: str) -> None:
-    if config.progress != "none":
+    if config.logger.progress != "none":
         print(text, file=sys.stderr, flush=True)

@@ -1,19 +1,104 @@
-"""All knobs of one post-training run."""
+"""All knobs of one post-training run; imports no torch."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
-from typing import Any
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar
 
-from agents.post_training.prompts import check_prompt
-from rewards import reward_name
+from agents.configuration.checks import at_least, one_of, positive
+from agents.configuration.fields import composed, moved, named, nested
+from agents.configuration.settings import LoggerSettings, OptimizerSettings
+from agents.configuration.tree import plain_tree
+from agents.post_training.algorithms import AlgorithmSettings, DDPOSFSettings, algorithm_settings, list_algorithms
+from scene_envs.envs.settings import PROMPT_SOURCES
 from scene_envs.errors import InvalidInputError
 
-CREDITS = ("auto", "scene", "object")
-RESUMABLE = ("iterations", "output", "workers", "progress", "checkpoint_every")
+RESUMABLE = ("recipe", "iterations", "output", "workers", "logger")
 """Fields that may change between a run and its continuation."""
 
 
+@dataclass
+class PostTrainOptimizerSettings(OptimizerSettings):
+    """The optimiser of a post-training run; its steps are updates.
+
+    Attributes:
+        chunk: scenes per forward and backward pass; null takes the whole batch at once.
+    """
+
+    lr: float = 5e-5
+    chunk: int | None = None
+
+
+@dataclass
+class RegularisationSettings:
+    """The pretraining loss on real scenes, which keeps a prior a prior.
+
+    Attributes:
+        weight: coefficient of the pretraining loss.
+        batch_size: real scenes per update.
+        scenes: ``grammar``, or the directory of a dataset.
+        bank_size: how many real scenes are drawn (grammar) or read (dataset), the held-out ones included.
+    """
+
+    weight: float = 0.5
+    batch_size: int = 48
+    scenes: str = "grammar"
+    bank_size: int = 4096
+
+    def __post_init__(self) -> None:
+        at_least(self, 1, "batch_size")
+        if self.weight < 0:
+            raise InvalidInputError(f"regularisation.weight={self.weight} must not be negative")
+
+
+@dataclass
+class GuardSettings:
+    """What watches over a run.
+
+    Attributes:
+        every: iterations between guard checks.
+        scenes: held-out real scenes of the guard.
+        limit: largest held-out loss, as a ratio to the base prior's, of a checkpoint worth keeping.
+        action: ``report`` goes on beyond the limit, ``stop`` ends the run there.
+        max_invalid: consecutive batches without one valid reward after which the run stops.
+    """
+
+    every: int = 5
+    scenes: int = 256
+    limit: float = 1.5
+    action: str = "report"
+    max_invalid: int = 3
+
+    def __post_init__(self) -> None:
+        at_least(self, 1, "every", "scenes", "max_invalid")
+        positive(self, "limit")
+        one_of(self, "action", ("report", "stop"))
+
+
+@dataclass
+class PostTrainLoggerSettings(LoggerSettings):
+    """What a post-training run shows and keeps.
+
+    Attributes:
+        progress: ``bar``, ``lines`` or ``none``.
+        report_scenes: fresh samples of the prior before and after that the command measures and pictures in
+            report.html; 0 for no report.
+    """
+
+    progress: str = "bar"
+    report_scenes: int = 256
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        one_of(self, "progress", ("bar", "lines", "none"))
+        if self.report_scenes < 0:
+            raise InvalidInputError(f"report_scenes={self.report_scenes} must not be negative; 0 writes no report")
+
+
+@composed
 @dataclass
 class PostTrainConfig:
     """One post-training run.
@@ -21,142 +106,112 @@ class PostTrainConfig:
     The gradient that AdamW sees is that of
 
         - step_scale * sum over gradient steps of mean over scenes of  A * log p(x_{t-1} | x_t)
-        + regularisation * pretraining loss on real scenes
+        + regularisation.weight * pretraining loss on real scenes
 
     with ``step_scale = steps with weight > 0 / gradient_steps``, log p reduced over a scene's entries as
-    ``log_prob_reduction`` says, and the pretraining loss a mean over scenes and entries. ``regularisation`` means
+    ``algorithm.log_prob_reduction`` says, and the pretraining loss a mean over scenes and entries. The weight means
     nothing without these reductions: with ``"sum"`` the same balance needs one larger by the number of random
     entries of a scene.
 
     Attributes:
         prior: the prior to start from, a shipped name or a path.
         reward: registered name, or a mapping with ``name`` and settings.
-        output: run directory; an interrupted run found there goes on where it stopped.
-        seed: of x_T, the chain's noise, the steps drawn and the real scenes.
-        iterations: policy updates, that is batches of fresh scenes.
-        batch_size: scenes sampled per iteration.
-        num_steps: denoising steps per scene.
-        gradient_steps: how many of the eligible steps are drawn into the gradient per iteration.
-        min_std: steps with a smaller sigma (normalised units) stay out of the gradient.
-        skip_first: fraction of the chain, from its noisy end, that stays out of the gradient.
-        step_weighting: ``"uniform"``, or weights proportional to a step's ``"std"`` or ``"variance"``.
-        log_prob_reduction: ``"mean"`` or ``"sum"`` of log p over the random entries of a scene.
-        clip_epsilon: half-width of the probability-ratio clip (DDPO-IS); null for the score function (DDPO-SF).
-        updates: optimiser steps per batch; more than one needs ``clip_epsilon``.
-        credit: ``"scene"`` gives every slot the scene's advantage, ``"object"`` its own (rewards with ``per_object``),
-            ``"auto"`` takes ``"object"`` where the reward allows it.
-        baseline: ``"leave_one_out"`` or ``"mean"``.
-        advantage_clip: advantages are kept within plus and minus this.
-        regularisation: coefficient of the pretraining loss on real scenes.
-        regularisation_batch: real scenes per update.
-        real_scenes: ``"grammar"``, or the directory of a dataset.
-        prompt: what the scenes should hold, for priors that read prompts: one text, a list of texts, ``"data"`` for the
-            prompts of the real scenes, or ``"grammar"`` for descriptions of the grammar's; null for anything.
+        output: run directory; an interrupted run found there goes on where it stopped; empty for runs/COMMAND-TIME
+            on the command line, runs/post-train in Python.
+        prompt: what the scenes should hold, for priors that read prompts: one text, a list such as
+            '["A scene with two cups.", "A scene with 9 objects."]', ``data`` for the prompts of the real scenes, or
+            ``grammar`` for descriptions of the grammar's; null for anything.
         guidance: weight of classifier-free guidance in the policy, 0 for none; needs a prompt.
-        scenes_per_prompt: scenes of a batch that share a prompt; advantages are taken among them.
-        bank_size: how many real scenes are drawn (grammar) or read (dataset), the held-out ones included.
-        learning_rate: of AdamW.
-        warmup: updates over which the learning rate rises linearly.
-        weight_decay: decoupled weight decay of AdamW.
-        clip: largest norm of the summed gradient.
-        ema: decay of the weight average that is evaluated and saved; 0 takes the weights themselves.
+        num_steps: denoising steps per scene.
         slots: slots per scene; null means as many as the prior was trained on.
-        chunk: scenes per forward and backward pass; null takes the whole batch at once.
-        guard_every: iterations between guard checks.
-        guard_scenes: held-out real scenes of the guard.
-        guard_limit: largest held-out loss, as a ratio to the base prior's, of a checkpoint worth keeping.
-        guard_action: ``"report"`` goes on beyond the limit, ``"stop"`` ends the run there.
-        checkpoint_every: iterations between resumable checkpoints.
-        max_invalid: consecutive batches without one valid reward after which the run stops.
-        workers: physics worker processes; 0 computes rewards in this process.
+        seed: of x_T, the chain's noise, the steps drawn and the real scenes.
         device: torch device.
-        progress: ``"bar"``, ``"lines"`` or ``"none"``.
+        workers: physics worker processes; 0 computes rewards in this process.
+        batch_size: scenes sampled per iteration.
+        iterations: policy updates, that is batches of fresh scenes.
+        recipe: a named set of the other keys: ``ours``, or ``demo`` for the demonstration; keys given beside it win.
+        algorithm: of the policy gradient.
+        optimizer: of the weights.
+        regularisation: on real scenes.
+        guard: held-out real scenes.
+        logger: files and screen.
     """
 
+    RENAMED: ClassVar[Mapping[str, str]] = {
+        **moved("optimizer", "warmup", "weight_decay", "clip", "ema", "chunk", learning_rate="lr"),
+        **moved("algorithm", "gradient_steps", "min_std", "skip_first", "step_weighting", "log_prob_reduction"),
+        **moved("algorithm", "credit", "baseline", "advantage_clip", "scenes_per_prompt"),
+        **moved("guard", "max_invalid", guard_every="every", guard_scenes="scenes", guard_limit="limit"),
+        **moved("guard", guard_action="action"),
+        **moved("regularisation", "bank_size", regularisation_batch="batch_size", real_scenes="scenes"),
+        **moved("logger", "progress", "checkpoint_every", "report_scenes"),
+        "clip_epsilon": "algorithm.clip_epsilon, of algorithm=ddpo_is",
+        "updates": "algorithm.updates, of algorithm=ddpo_is",
+    }
+    """Keys of earlier versions, and their names."""
+
     prior: str = "dimsum_table_continuous"
-    reward: Any = "object_count"
-    output: str = "runs/post-train"
-    seed: int = 0
-    iterations: int = 60
-    batch_size: int = 48
-    num_steps: int = 25
-    gradient_steps: int = 8
-    min_std: float = 0.03
-    skip_first: float = 0.0
-    step_weighting: str = "uniform"
-    log_prob_reduction: str = "mean"
-    clip_epsilon: float | None = None
-    updates: int = 1
-    credit: str = "auto"
-    baseline: str = "leave_one_out"
-    advantage_clip: float = 5.0
-    regularisation: float = 0.5
-    regularisation_batch: int = 48
-    real_scenes: str = "grammar"
-    prompt: Any = None
+    reward: Any = named("object_count", "reward")
+    output: str = ""
+    prompt: str | list[str] | None = None
     guidance: float = 0.0
-    scenes_per_prompt: int = 8
-    bank_size: int = 4096
-    learning_rate: float = 5e-5
-    warmup: int = 0
-    weight_decay: float = 0.0
-    clip: float = 1.0
-    ema: float = 0.0
+    num_steps: int = 25
     slots: int | None = None
-    chunk: int | None = None
-    guard_every: int = 5
-    guard_scenes: int = 256
-    guard_limit: float = 1.5
-    guard_action: str = "report"
-    checkpoint_every: int = 10
-    max_invalid: int = 3
-    workers: int = 0
+    seed: int = 0
     device: str = "cpu"
-    progress: str = "bar"
+    workers: int = 0
+    batch_size: int = 48
+    iterations: int = 60
+    recipe: str = "ours"
+    algorithm: AlgorithmSettings = nested(
+        DDPOSFSettings, folder="algorithm", option="ddpo_sf", kinds=algorithm_settings, registered=list_algorithms
+    )
+    optimizer: PostTrainOptimizerSettings = nested(PostTrainOptimizerSettings, folder="optimizer", option="adamw")
+    regularisation: RegularisationSettings = nested(RegularisationSettings)
+    guard: GuardSettings = nested(GuardSettings)
+    logger: PostTrainLoggerSettings = nested(PostTrainLoggerSettings, folder="logger", option="csv")
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "num_steps", "gradient_steps", "updates", "regularisation_batch", "guard_every"):
-            self._at_least(name, 1)
-        self._at_least("batch_size", 2)
-        self._at_least("scenes_per_prompt", 2)
+        at_least(self, 1, "iterations", "num_steps")
+        at_least(self, 2, "batch_size")
         self.prompt = list(self.prompt) if isinstance(self.prompt, tuple) else self.prompt
         check_prompt(self.prompt, self.guidance)
-        self._at_least("guard_scenes", 1)
-        self._at_least("checkpoint_every", 1)
-        self._at_least("max_invalid", 1)
-        for name in ("learning_rate", "clip", "guard_limit", "advantage_clip", "min_std"):
-            if not getattr(self, name) > 0:
-                raise InvalidInputError(f"{name}={getattr(self, name)} must be positive")
-        if self.regularisation < 0:
-            raise InvalidInputError(f"regularisation={self.regularisation} must not be negative")
-        if not 0 <= self.ema < 1 or not 0 <= self.skip_first < 1:
-            raise InvalidInputError(f"ema={self.ema} and skip_first={self.skip_first} must lie in [0, 1)")
-        self._one_of("credit", CREDITS)
-        self._one_of("guard_action", ("report", "stop"))
-        self._one_of("progress", ("bar", "lines", "none"))
-        if self.updates > 1 and self.clip_epsilon is None:
-            raise InvalidInputError(f"updates={self.updates} per batch needs clip_epsilon, such as 1e-4")
-        if self.bank_size < self.guard_scenes + 1:
+        if self.regularisation.bank_size < self.guard.scenes + 1:
             raise InvalidInputError(
-                f"bank_size={self.bank_size} must exceed guard_scenes={self.guard_scenes}, which are held out of it"
+                f"regularisation.bank_size={self.regularisation.bank_size} must exceed guard.scenes="
+                f"{self.guard.scenes}, which are held out of it"
             )
 
-    def _at_least(self, name: str, low: int) -> None:
-        if getattr(self, name) < low:
-            raise InvalidInputError(f"{name}={getattr(self, name)} must be at least {low}")
-
-    def _one_of(self, name: str, known: tuple[str, ...]) -> None:
-        if getattr(self, name) not in known:
-            raise InvalidInputError(f"{name}={getattr(self, name)!r} is not known; use one of {', '.join(known)}")
+    @property
+    def directory(self) -> Path:
+        """The run directory."""
+        return Path(self.output or "runs/post-train")
 
     def plain(self) -> dict[str, Any]:
         """As numbers, strings and lists; a reward given as an object becomes its name."""
-        state = asdict(self) if _is_plain(self.reward) else {**_shallow(self), "reward": reward_name(self.reward)}
-        return state
+        if _is_plain(self.reward):
+            return plain_tree(self)
+        from rewards import reward_name
+
+        return {**plain_tree(replace(self, reward="")), "reward": reward_name(self.reward)}
 
 
-def _shallow(config: PostTrainConfig) -> dict[str, Any]:
-    return {field.name: getattr(config, field.name) for field in fields(config)}
+def check_prompt(prompt: Any, guidance: float) -> None:
+    """Refuse what is neither a prompt, a list of them, a source of prompts nor None, and guidance without one."""
+    texts = [prompt] if isinstance(prompt, str) else prompt
+    good = prompt is None or (
+        isinstance(texts, list | tuple) and texts and all(isinstance(t, str) and t for t in texts)
+    )
+    if not good:
+        raise InvalidInputError(
+            f"prompt={prompt!r} must be a text, a list of texts, one of {', '.join(PROMPT_SOURCES)}, or null"
+        )
+    if not math.isfinite(guidance):
+        raise InvalidInputError(f"guidance={guidance} must be a finite number; 0 follows the prompt as it is")
+    if guidance and prompt is None:
+        raise InvalidInputError(
+            f"guidance={guidance:g} strengthens a prompt, and prompt is null; give prompt=, or leave guidance=0"
+        )
 
 
 def _is_plain(value: Any) -> bool:

@@ -10,24 +10,6 @@ from agents.post_training.comparison_run import post_train_and_compare
 from agents.post_training.config import PostTrainConfig
 from agents.priors.base import ScenePrior
 
-RECIPE = PostTrainConfig(
-    prior="dimsum_table_continuous",
-    reward="object_count",
-    iterations=24,
-    batch_size=32,
-    num_steps=25,
-    gradient_steps=8,
-    min_std=0.1,
-    credit="object",
-    regularisation=0.5,
-    regularisation_batch=32,
-    learning_rate=5e-5,
-    guard_every=5,
-    guard_limit=1.4,
-    checkpoint_every=10,
-)
-"""What ``make demo`` runs: two minutes of training on two cores."""
-
 
 def run_demo(
     output: str | Path = "runs/demo",
@@ -47,12 +29,12 @@ def run_demo(
         workers: physics worker processes.
         scenes: fresh samples measured of each prior.
         num_steps: denoiser evaluations per measured sample.
-        recipe: in place of :data:`RECIPE`.
+        recipe: in place of that of ``configs/recipe/demo.yaml``: two minutes of training on two cores.
         prior: in place of the recipe's.
 
     Returns:
         The numbers of ``metrics.json``: ``before`` and ``after`` (``objects``, ``feasible_objects`` raw,
         ``ready_objects``), ``change``, ``guard``.
     """
-    config = replace(recipe or RECIPE, output=str(output), seed=seed, workers=workers)
+    config = replace(recipe or PostTrainConfig(recipe="demo"), output=str(output), seed=seed, workers=workers)
     return post_train_and_compare(config, scenes=scenes, num_steps=num_steps, prior=prior)

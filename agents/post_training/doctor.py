@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from agents.configuration.tree import changed
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.gradients import accumulate_policy_gradient
 from agents.post_training.learner import Learner
@@ -109,8 +110,10 @@ def diagnose(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> Doc
         prior: in place of the one that ``config.prior`` names.
     """
     with TemporaryDirectory() as scratch:
-        bank = min(config.bank_size, config.guard_scenes + 4 * config.regularisation_batch)
-        trainer = PostTrainer(replace(config, output=str(Path(scratch) / "run"), bank_size=bank), prior=prior)
+        real = config.regularisation
+        bank = min(real.bank_size, config.guard.scenes + 4 * real.batch_size)
+        small = changed(config, {"output": str(Path(scratch) / "run"), "regularisation.bank_size": bank})
+        trainer = PostTrainer(small, prior=prior)
         try:
             return _examine(trainer)
         finally:
@@ -175,25 +178,26 @@ def _advice(report: DoctorReport, config: PostTrainConfig) -> list[str]:
     if config.prompt is not None and report.reward_std > 0 and report.policy_gradient_norm == 0:
         advice.append(
             "The rewards differ between prompts but not within any: there is nothing to learn. Raise scenes_per_prompt "
-            f"from {config.scenes_per_prompt}, or use a reward that differs between scenes of one prompt."
+            f"from {config.algorithm.scenes_per_prompt}, or use a reward that differs between scenes of one prompt."
         )
-    if config.regularisation > 0 and report.policy_gradient_norm > 0:
+    if config.regularisation.weight > 0 and report.policy_gradient_norm > 0:
         if report.gradient_ratio < QUIET:
             advice.append(
                 f"Regularisation drowns the reward (ratio {report.gradient_ratio:.2g}): "
-                f"lower regularisation from {config.regularisation:g}, or change log_prob_reduction."
+                f"lower regularisation.weight from {config.regularisation.weight:g}, or change "
+                "algorithm.log_prob_reduction."
             )
         if report.gradient_ratio > LOUD:
             advice.append(
                 f"The reward drowns the regularisation (ratio {report.gradient_ratio:.2g}): "
-                f"raise regularisation from {config.regularisation:g}, or expect the guard to stop you."
+                f"raise regularisation.weight from {config.regularisation.weight:g}, or expect the guard to stop you."
             )
     worst = max(report.steps, key=lambda row: row.gradient_norm)
     total = sum(row.gradient_norm**2 for row in report.steps)
     if total > 0 and worst.gradient_norm**2 > DOMINANT * total and sum(row.weight > 0 for row in report.steps) > 2:
         advice.append(
             f"Step {worst.step} (sigma {worst.std:.3g}) alone is {worst.gradient_norm**2 / total:.0%} of the squared "
-            f"policy gradient: raise min_std from {config.min_std:g} or set step_weighting=std."
+            f"policy gradient: raise algorithm.min_std or set algorithm.step_weighting=std."
         )
     return advice
 

@@ -4,23 +4,16 @@ from __future__ import annotations
 
 import math
 from copy import deepcopy
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Generator, Tensor, nn
 
-from agents.post_training.advantages import compute_advantages
+from agents.post_training.algorithms import make_algorithm
 from agents.post_training.config import PostTrainConfig
-from agents.post_training.gradients import (
-    accumulate_policy_gradient,
-    add_regularisation_gradient,
-    credited_reward,
-    draw_steps,
-)
-from agents.post_training.losses import DDPOSFLoss
-from agents.post_training.policy import DenoisingPolicy, gradient_weights
-from agents.post_training.prompts import PromptDeck, prompt_groups
+from agents.post_training.gradients import add_regularisation_gradient
+from agents.post_training.policy import DenoisingPolicy
+from agents.post_training.prompts import PromptDeck
 from agents.post_training.rollouts import Rollout, collect, stream_seed
 from agents.post_training.run_files import CHECKPOINT_NAME
 from agents.post_training.scene_bank import SceneBank
@@ -51,17 +44,15 @@ class Learner:
         self.config = config
         self.prior = deepcopy(prior).to(config.device).eval()
         if config.prompt is not None and not self.prior.conditional:
-            raise no_text(self.prior.scene_type, config.prompt)
+            raise no_text(self.prior.scene_type, str(config.prompt))
         self.prior.freeze_text()
         self.slots = self.prior.config.slots if config.slots is None else config.slots
-        self.policy = DenoisingPolicy(self.prior, config.num_steps, chunk=config.chunk, guidance=config.guidance)
-        self.stds = self.policy.stds(self.slots).cpu()
-        weights = gradient_weights(
-            self.stds, min_std=config.min_std, skip_first=config.skip_first, weighting=config.step_weighting
+        self.policy = DenoisingPolicy(
+            self.prior, config.num_steps, chunk=config.optimizer.chunk, guidance=config.guidance
         )
-        self.loss = DDPOSFLoss(
-            self.policy, step_weights=weights, reduction=config.log_prob_reduction, clip_epsilon=config.clip_epsilon
-        ).to(config.device)
+        self.stds = self.policy.stds(self.slots).cpu()
+        self.algorithm = make_algorithm(config.algorithm, self.policy, self.stds)
+        self.loss = self.algorithm.loss
         self.env = DenoisingTorchRLEnv(
             config.batch_size,
             scene=self.prior.scene_type,
@@ -75,9 +66,9 @@ class Learner:
         self.deck: PromptDeck | None = None
         self.parameters = [p for p in self.prior.parameters() if p.requires_grad]
         self.optimizer = torch.optim.AdamW(
-            self.parameters, lr=config.learning_rate, weight_decay=config.weight_decay, betas=(0.9, 0.999)
+            self.parameters, lr=config.optimizer.lr, weight_decay=config.optimizer.weight_decay, betas=(0.9, 0.999)
         )
-        self.average = WeightAverage(self.prior, config.ema) if config.ema else None
+        self.average = WeightAverage(self.prior, config.optimizer.ema) if config.optimizer.ema else None
 
     def close(self) -> None:
         """Stop physics workers, if any."""
@@ -87,8 +78,9 @@ class Learner:
         """Make the deck from which the prompts of batches come; nothing without prompts."""
         config = self.config
         if config.prompt is not None and scenes.prompts is not None:
+            together = config.algorithm.scenes_per_prompt
             self.deck = PromptDeck.of(
-                self.prior, config.prompt, config.scenes_per_prompt, self.slots, scenes.prompts, len(scenes.train)
+                self.prior, config.prompt, together, self.slots, scenes.prompts, len(scenes.train)
             )
 
     def rollout(self, iteration: int) -> Rollout:
@@ -99,11 +91,9 @@ class Learner:
         return collect(self.env, self.policy, seed=self.config.seed, iteration=iteration, prompts=prompts)
 
     def advantage(self, rollout: Rollout) -> Tensor:
-        """(B,) or (B, N), as ``credit`` says; among the scenes of the same prompt where there are prompts."""
-        config = self.config
-        reward, valid = credited_reward(rollout, config.credit)
-        groups = None if rollout.prompts is None else prompt_groups(rollout.prompts).to(reward.device)
-        return compute_advantages(reward, valid, baseline=config.baseline, clip=config.advantage_clip, groups=groups)
+        """(B,) or (B, N), as the algorithm says."""
+        advantage: Tensor = self.algorithm.advantage(rollout)
+        return advantage
 
     def accumulate(self, rollout: Rollout, advantage: Tensor, scenes: SceneBank, index: int) -> dict[str, float]:
         """Put both gradients into ``.grad`` and measure them apart.
@@ -115,14 +105,12 @@ class Learner:
             index: number of the update in the run; steps and real scenes are drawn by it.
         """
         config = self.config
-        weights = self.loss.step_weights.cpu()
-        steps, scale = draw_steps(weights, config.gradient_steps, self._generator("steps", index))
         self.optimizer.zero_grad(set_to_none=True)
-        policy = accumulate_policy_gradient(self.loss, rollout, advantage, steps, scale=scale)
+        policy = self.algorithm.accumulate(rollout, advantage, self._generator("steps", index))
         generator = self._generator("real", index)
-        x0, prompts = scenes.batch(config.regularisation_batch, generator)
+        x0, prompts = scenes.batch(config.regularisation.batch_size, generator)
         real_loss, real_norm = add_regularisation_gradient(
-            self.prior, x0, config.regularisation, generator, chunk=config.chunk, prompts=prompts
+            self.prior, x0, config.regularisation.weight, generator, chunk=config.optimizer.chunk, prompts=prompts
         )
         return {
             "policy_loss": policy.loss,
@@ -139,13 +127,13 @@ class Learner:
         Raises:
             NonFiniteGradient: the gradient is not finite; nothing was changed.
         """
-        config = self.config
+        config = self.config.optimizer
         row = self.accumulate(rollout, advantage, scenes, index)
         row["gradient_norm"] = float(nn.utils.clip_grad_norm_(self.parameters, config.clip))
         if not all(is_finite(row[name]) for name in ("gradient_norm", "policy_loss", "pretraining_loss")):
             self.optimizer.zero_grad(set_to_none=True)
             raise NonFiniteGradient(row)
-        row["learning_rate"] = config.learning_rate * min(1.0, (index + 1) / max(1, config.warmup))
+        row["learning_rate"] = config.lr * min(1.0, (index + 1) / max(1, config.warmup))
         for group in self.optimizer.param_groups:
             group["lr"] = row["learning_rate"]
         self.optimizer.step()
@@ -169,7 +157,7 @@ class Learner:
         Raises:
             InvalidInputError: the weights are of another network, such as an earlier version's.
         """
-        check_tensors(self.prior, state["prior"], Path(self.config.output) / CHECKPOINT_NAME)
+        check_tensors(self.prior, state["prior"], self.config.directory / CHECKPOINT_NAME)
         self.prior.load_state_dict(state["prior"])
         self.optimizer.load_state_dict(state["optimizer"])
         if self.average is not None:

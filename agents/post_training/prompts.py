@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,8 +14,7 @@ from torch import Generator, Tensor
 
 from agents.priors.base import ScenePrior
 from scene_envs.datasets.prompts import describe_all
-from scene_envs.envs.prompts import PROMPT_SOURCES, grammar_prompts
-from scene_envs.errors import InvalidInputError
+from scene_envs.envs.prompts import grammar_prompts
 from scene_envs.files import write_text
 from scene_envs.scene import SceneBatch
 
@@ -25,24 +23,6 @@ _PER_SCENE = 3
 
 PromptSets = Callable[[int], Sequence[str]]
 """All prompts of a real scene, by its index."""
-
-
-def check_prompt(prompt: Any, guidance: float) -> None:
-    """Refuse what is neither a prompt, a list of them, a source of prompts nor None, and guidance without one."""
-    texts = [prompt] if isinstance(prompt, str) else prompt
-    good = prompt is None or (
-        isinstance(texts, list | tuple) and texts and all(isinstance(t, str) and t for t in texts)
-    )
-    if not good:
-        raise InvalidInputError(
-            f"prompt={prompt!r} must be a text, a list of texts, one of {', '.join(PROMPT_SOURCES)}, or null"
-        )
-    if not math.isfinite(guidance):
-        raise InvalidInputError(f"guidance={guidance} must be a finite number; 0 follows the prompt as it is")
-    if guidance and prompt is None:
-        raise InvalidInputError(
-            f"guidance={guidance:g} strengthens a prompt, and prompt is null; give prompt=, or leave guidance=0"
-        )
 
 
 class GrammarPrompts:

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from agents.configuration.tree import config_text, dotted
 from agents.post_training.config import RESUMABLE, PostTrainConfig
 from agents.utils.checkpoints import load_checkpoint
 from scene_envs import files
@@ -34,9 +35,7 @@ def write_text(path: Path, text: str) -> None:
 
 def write_config(directory: Path, config: PostTrainConfig) -> None:
     """``config.yaml``, every field."""
-    import yaml
-
-    write_text(directory / "config.yaml", yaml.safe_dump(config.plain(), sort_keys=False))
+    write_text(directory / "config.yaml", config_text(config.plain()))
 
 
 def write_metrics(directory: Path, metrics: Mapping[str, Any]) -> None:
@@ -65,8 +64,10 @@ def load_resumable(directory: Path, config: PostTrainConfig) -> dict[str, Any] |
     if not path.exists():
         return None
     state = load_checkpoint(path)
-    before, now = state.get("config", {}), config.plain()
-    changed = [name for name in now if name not in RESUMABLE and before.get(name, now[name]) != now[name]]
+    before, now = _flat(state.get("config", {})), _flat(config.plain())
+    changed = [
+        name for name in now if name.partition(".")[0] not in RESUMABLE and before.get(name, now[name]) != now[name]
+    ]
     if changed:
         differences = "; ".join(f"{name} was {before[name]!r}, is {now[name]!r}" for name in changed)
         raise InvalidInputError(
@@ -74,3 +75,8 @@ def load_resumable(directory: Path, config: PostTrainConfig) -> dict[str, Any] |
             "give another output, or the same settings to resume it"
         )
     return state
+
+
+def _flat(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Keys behind dots; a reward is one value, whether it is a name or a mapping."""
+    return {**dotted({key: value for key, value in config.items() if key != "reward"}), "reward": config.get("reward")}

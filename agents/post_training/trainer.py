@@ -28,6 +28,7 @@ from agents.post_training.scene_bank import SceneBank, real_scenes
 from agents.priors.base import ScenePrior
 from agents.priors.prompt_validation import check_object_count
 from agents.utils.checkpoints import save_checkpoint
+from agents.utils.loggers import make_logger
 from rewards import reward_name
 from scene_envs.errors import TrainingError
 from scene_envs.scene import SceneBatch
@@ -42,12 +43,14 @@ class PostTrainResult:
         history: one row per iteration.
         metrics: what ``metrics.json`` holds.
         directory: the run directory.
+        config: what was run; on disk in ``config.yaml``.
     """
 
     prior: ScenePrior
     history: list[dict[str, float]]
     metrics: dict[str, Any]
     directory: Path
+    config: PostTrainConfig
 
 
 def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> PostTrainResult:
@@ -65,8 +68,9 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> P
     >>> from tempfile import TemporaryDirectory
     >>> from agents.priors.testing import tiny_prior
     >>> with TemporaryDirectory() as output:
-    ...     config = PostTrainConfig(output=output, iterations=2, batch_size=4, num_steps=4, gradient_steps=2,
-    ...         bank_size=20, guard_scenes=8, regularisation_batch=4, progress="none")
+    ...     config = PostTrainConfig(output=output, iterations=2, batch_size=4, num_steps=4,
+    ...         algorithm={"gradient_steps": 2}, regularisation={"bank_size": 20, "batch_size": 4},
+    ...         guard={"scenes": 8}, logger={"progress": "none"})
     ...     result = post_train(config, prior=tiny_prior())
     >>> len(result.history), result.history[0]["log_ratio"]
     (2, 0.0)
@@ -91,17 +95,19 @@ class PostTrainer:
 
     def __init__(self, config: PostTrainConfig, *, prior: ScenePrior | None = None) -> None:
         self.config = config
-        self.directory = Path(config.output)
+        self.directory = config.directory
         self.learner = Learner(config, ScenePrior.load(config.prior if prior is None else prior))
         self.prior = self.learner.prior
         self.iteration = 0
         self.invalid_streak = 0
         self.seconds = 0.0
         self.history: list[dict[str, float]] = []
+        self.logger = make_logger(config.logger.name, self.directory)
 
     def close(self) -> None:
-        """Stop physics workers, if any."""
+        """Stop physics workers, if any, and close the logger."""
         self.learner.close()
+        self.logger.close()
 
     # -- the loop -------------------------------------------------------------------------------
 
@@ -118,17 +124,18 @@ class PostTrainer:
             self._save_prior()  # until something better: the base
         title = f"post-train {self.prior.scene_type.name}"
         started = time.perf_counter() - self.seconds
-        with run_progress(title, config.iterations, config.progress, self.iteration) as report:
+        with run_progress(title, config.iterations, config.logger.progress, self.iteration) as report:
             while self.iteration < config.iterations and not self._stopped:
                 rollout, row = self.step()
                 self.seconds = time.perf_counter() - started
                 self.history.append({**row, "seconds": round(self.seconds, 2)})
                 last = self.iteration == config.iterations
-                if self.iteration % config.guard_every == 0 or last:
+                if self.iteration % config.guard.every == 0 or last:
                     self._check(rollout)
-                if self.iteration % config.checkpoint_every == 0 or last or self._stopped:
+                if self.iteration % config.logger.checkpoint_every == 0 or last or self._stopped:
                     self.save()
                 write_log(self.directory, self.history)
+                self.logger.log(self.history[-1], self.iteration)
                 report(self.iteration, row["reward"], self.guard.ratio)
         return self._finish()
 
@@ -140,7 +147,9 @@ class PostTrainer:
             batch = SceneBatch.load(path)
         else:
             slots = self.learner.slots
-            batch, found = real_scenes(self.prior, config.real_scenes, config.bank_size, seed=seed, slots=slots)
+            batch, found = real_scenes(
+                self.prior, config.regularisation.scenes, config.regularisation.bank_size, seed=seed, slots=slots
+            )
             _writing(f"the real scenes {str(path)!r}", lambda: batch.save(path))
             texts.unlink(missing_ok=True)  # of other scenes, by a run that never reached a checkpoint
             if found is not None and self.prior.conditional:
@@ -154,9 +163,9 @@ class PostTrainer:
                     [text for i in large for text in prompts(i)], self.prior.scene_type, self.learner.slots
                 )
         x0 = self.prior.encode(batch.to(config.device))
-        self.scenes = SceneBank.split(x0, config.guard_scenes, prompts)
+        self.scenes = SceneBank.split(x0, config.guard.scenes, prompts)
         asked = self.scenes.heldout_prompts()
-        self.guard = Guard(self.scenes.heldout, config.guard_limit, stream_seed(config.seed, "guard"), asked)
+        self.guard = Guard(self.scenes.heldout, config.guard.limit, stream_seed(config.seed, "guard"), asked)
         self.learner.deal_prompts(self.scenes)
 
     def step(self) -> tuple[Rollout, dict[str, float]]:
@@ -174,8 +183,9 @@ class PostTrainer:
     def _learn(self, rollout: Rollout) -> dict[str, float]:
         row: dict[str, float] = {}
         advantage = self.learner.advantage(rollout)
-        for update in range(self.config.updates):
-            index = self.iteration * self.config.updates + update
+        updates = self.config.algorithm.optimiser_steps
+        for update in range(updates):
+            index = self.iteration * updates + update
             try:
                 row = self.learner.update(rollout, advantage, self.scenes, index)
             except NonFiniteGradient as error:
@@ -186,7 +196,7 @@ class PostTrainer:
 
     @property
     def _stopped(self) -> bool:
-        return self.config.guard_action == "stop" and self.guard.over_limit_at is not None
+        return self.config.guard.action == "stop" and self.guard.over_limit_at is not None
 
     def _check(self, rollout: Rollout) -> None:
         since = self.guard.readings[-1].iteration if self.guard.readings else 0
@@ -200,7 +210,7 @@ class PostTrainer:
 
     def _count_invalid(self) -> None:
         self.invalid_streak += 1
-        if self.invalid_streak < self.config.max_invalid:
+        if self.invalid_streak < self.config.guard.max_invalid:
             return
         raise TrainingError(
             f"the reward {self.config.plain()['reward']!r} scored no scene in {self.invalid_streak} batches in a row, "
@@ -213,8 +223,7 @@ class PostTrainer:
         return TrainingError(
             f"iteration {self.iteration + 1} gave a gradient that is not finite ({numbers}); it was not applied. "
             f"The last good checkpoint is {str(self.directory / CHECKPOINT_NAME)!r}, the best prior so far "
-            f"{str(self.directory / 'prior')!r}. Lower learning_rate (now {self.config.learning_rate:g}) or raise "
-            f"min_std (now {self.config.min_std:g})"
+            f"{str(self.directory / 'prior')!r}. Lower optimizer.lr (now {self.config.optimizer.lr:g})"
         )
 
     # -- files ----------------------------------------------------------------------------------
@@ -263,12 +272,13 @@ class PostTrainer:
                 "best": self.guard.best_reward,
             },
             "guard": self.guard.summary(),
-            "config": self.config.plain(),
         }
         write_metrics(self.directory, metrics)
         name = f"mean {reward_name(self.config.reward).replace('_', ' ')}"
-        draw_curve(self.history, self.directory / "curve.png", reward_name=name, limit=self.config.guard_limit)
-        return PostTrainResult(ScenePrior.load(self.directory / "prior"), self.history, metrics, self.directory)
+        draw_curve(self.history, self.directory / "curve.png", reward_name=name, limit=self.config.guard.limit)
+        return PostTrainResult(
+            ScenePrior.load(self.directory / "prior"), self.history, metrics, self.directory, self.config
+        )
 
 
 def _writing(what: str, write: Any) -> None:

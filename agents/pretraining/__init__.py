@@ -1,6 +1,16 @@
 """Pretraining of scene priors on datasets or on a grammar."""
 
-from agents.pretraining.config import PretrainConfig
-from agents.pretraining.trainer import Pretrainer, pretrain
+from typing import TYPE_CHECKING
+
+from scene_envs.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from agents.pretraining.config import PretrainConfig
+    from agents.pretraining.trainer import Pretrainer, pretrain
 
 __all__ = ["PretrainConfig", "Pretrainer", "pretrain"]
+
+__getattr__ = lazy_names(
+    __name__,
+    {"agents.pretraining.config": ("PretrainConfig",), "agents.pretraining.trainer": ("Pretrainer", "pretrain")},
+)

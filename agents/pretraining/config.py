@@ -1,11 +1,246 @@
-"""The keys of a pretraining run; imports nothing, so that they can be listed quickly."""
+"""All knobs of one pretraining run; imports no torch."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from pathlib import Path
+from typing import Any, ClassVar
+
+from agents.configuration.checks import at_least, one_of, shares
+from agents.configuration.fields import composed, moved, named, nested
+from agents.configuration.settings import LoggerSettings, OptimizerSettings
 
 
+@dataclass
+class ModuleSettings:
+    """What is added to the core of the mixed flux network; other networks do not read it.
+
+    Attributes:
+        given_flags: the network is told which poses and categories are observed, for inpainting.
+        pooled_text: the mean of the text tokens also modulates every block.
+        count_embedding: the network is told how many slots it sees of each category, and how many are masked.
+        relations: slots see where others stand, blurred along x, y and z by the noise of the ``axis`` itself, or of the
+            one where it is ``largest``; ``none`` for plain attention.
+        rotation_features: the network is told how far each rotation is off SO(3), and off upright, in units of the
+            noise.
+        contacts: the network learns at what distance two objects touch, and is told the gap that is left in units of
+            the noise; only with relations.
+    """
+
+    given_flags: bool = True
+    pooled_text: bool = True
+    count_embedding: bool = True
+    relations: str = "axis"
+    rotation_features: bool = True
+    contacts: bool = True
+
+    def __post_init__(self) -> None:
+        one_of(self, "relations", ("axis", "largest", "none"))
+
+
+def _networks() -> list[str]:
+    from agents.networks.registry import NETWORK_PROCESSES, list_networks
+
+    return [name for process in NETWORK_PROCESSES for name in list_networks(process)]
+
+
+@dataclass
+class NetworkSettings:
+    """The network of a fresh prior.
+
+    Attributes:
+        name: ``flux`` (ours), ``midiffusion``, ``diffuscene``, or a registered one.
+        hidden: width of the network.
+        depth: its blocks; single-stream ones where there are both.
+        heads: attention heads.
+        frequencies: octaves of Fourier features of each translation (flux only); 0 for none.
+        double_blocks: double-stream blocks of the mixed flux network with text; null for a third of depth.
+        embedding: width of the embedding of a slot (mixed flux only); null for hidden.
+        pose_head: hidden width of the pose output (mixed flux only).
+        time_scale: what the time is multiplied by before it is embedded (mixed flux only).
+        text_reach: of the mixed flux network: text meets slots in its ``double``-stream blocks alone, which is quicker,
+            or in ``all``, as in the paper's.
+        modules: what is added to the core of the mixed flux network.
+    """
+
+    name: str = "flux"
+    hidden: int = 128
+    depth: int = 6
+    heads: int = 4
+    frequencies: int = 8
+    double_blocks: int | None = None
+    embedding: int | None = None
+    pose_head: int = 64
+    time_scale: float = 1.0
+    text_reach: str = "double"
+    modules: ModuleSettings = nested(ModuleSettings)
+
+    def __post_init__(self) -> None:
+        at_least(self, 1, "hidden", "depth", "heads")
+        at_least(self, 0, "frequencies")
+
+
+@dataclass
+class ProcessSettings:
+    """The diffusion process, and what is made of the network's output.
+
+    Attributes:
+        name: ``mixed`` (categories as discrete states) or ``continuous`` (categories as numbers).
+        prediction: what the network predicts (``edm``, the preconditioning of Karras et al. 2022, ``epsilon``, ``x0``,
+            ``v``).
+        schedule: noise schedule (``karras``, ``linear``, ``cosine``).
+        noise_floor: lowest noise-to-signal ratio of the karras schedule, in normalised units.
+        noise_ceiling: highest noise-to-signal ratio of the karras schedule.
+        moments: whose mean and spread scale what the network says: those of each ``category`` (of each feature, where
+            the process is continuous), of each ``feature``, or of the ``scene`` as a whole.
+        rotation: what a continuous prior diffuses as rotation: ``matrix``, ``quaternion`` or ``axis_angle``.
+        kernel: of the categories of a mixed prior (``mask_and_replace``, ``absorbing``, ``early_absorbing``,
+            ``squared_absorbing``, ``uniform``).
+        empty_slots: whether slots known to be empty are ``attended`` (the paper's) or ``dropped`` from the network of a
+            mixed prior, which needs an absorbing kernel and saves most of the work.
+        unmasking: which masked slots a sampling step of an absorbing kernel unmasks: ``even``, as near to the expected
+            number as can be, so that few categories are decided at once, or ``independent``.
+        denoised_clip: bound on denoised scenes while sampling, normalised units; 0 for none.
+    """
+
+    name: str = "mixed"
+    prediction: str = "edm"
+    schedule: str = "karras"
+    noise_floor: float = 0.002
+    noise_ceiling: float = 20.0
+    moments: str = "category"
+    rotation: str = "matrix"
+    kernel: str = "early_absorbing"
+    empty_slots: str = "dropped"
+    unmasking: str = "even"
+    denoised_clip: float = 0.0
+
+
+@dataclass
+class LossSettings:
+    """The pretraining loss.
+
+    Attributes:
+        noise_mean: mean of ln(noise-to-signal) over training timesteps. Rooms, whose normalised unit is metres, need
+            less noise than tables: about -2.6, with a floor of 0.0004.
+        noise_std: its standard deviation.
+        timesteps: distribution of training timesteps, ``lognormal`` (of the noise-to-signal ratio), ``uniform``, or
+            ``both`` in equal parts: categories are decided at high noise, which the first rarely draws.
+        weighting: of the loss by timestep, ``none`` or ``min_snr``.
+        translation_weight: weight of x, y, z in the loss, rotations having 1.
+        category: of a mixed prior, ``cross_entropy`` of the clean category, or ``bound``, the paper's.
+        category_weight: weight of the loss of the categories beside that of the poses.
+        given_share: share of a mixed prior's training scenes in which some poses or categories are given, for
+            inpainting.
+    """
+
+    noise_mean: float = -1.8
+    noise_std: float = 2.1
+    timesteps: str = "lognormal"
+    weighting: str = "none"
+    translation_weight: float = 3.0
+    category: str = "cross_entropy"
+    category_weight: float = 2.0
+    given_share: float = 0.3
+
+
+@dataclass
+class TextSettings:
+    """What a mixed prior reads.
+
+    Attributes:
+        encoder: ``none`` for a prior that reads no prompts; ``vocabulary`` for a small encoder with a closed
+            vocabulary, trained with the prior; or the folder or hub name of a BERT model, which stays as it is.
+        width: width of the small text encoder.
+        depth: its blocks.
+        latents: tokens that it condenses a prompt to; 0 for one per word.
+        window: of the small text encoder: words that are read together before they attend to each other, odd; 1
+            reads each by itself.
+        lr_share: learning rate of the small text encoder, as a fraction of optimizer.lr.
+        count_conditioning: whether the small text encoder also says what is asked of each kind of object, which
+            joins the logits of the mixed flux network beside what it sees; needs latents.
+        warmup: steps in which the text encoder learns how many of each kind its prompts ask for, before a fresh
+            prior takes the first of its own; at most iterations.
+        numbers: of the small text encoder: whether words that are numbers say how many they are, so that counts
+            need not be learned number by number.
+        dropout: share of training scenes whose prompt is withheld, for classifier-free guidance.
+    """
+
+    encoder: str = "none"
+    width: int = 128
+    depth: int = 2
+    latents: int = 16
+    window: int = 3
+    lr_share: float = 0.5
+    count_conditioning: bool = True
+    warmup: int = 400
+    numbers: bool = True
+    dropout: float = 0.1
+
+    @property
+    def is_read(self) -> bool:
+        """Whether there is an encoder."""
+        return self.encoder != "none"
+
+
+@dataclass
+class PretrainOptimizerSettings(OptimizerSettings):
+    """The optimiser of a pretraining run.
+
+    Attributes:
+        name: ``adamw``, or ``muon`` for Muon on the matrices inside blocks and AdamW on the rest.
+        final_lr: where the learning rate ends, as a fraction of the peak; 1 for no decay.
+        decay_share: share of the steps, the last ones, over which it goes there along a cosine; 1 from the warm-up on.
+        accumulate: parts in which a process takes its scenes, one after the other, to save memory.
+        precision: number format of the network in training, ``float32`` or ``bfloat16`` (autocast).
+        matmul_precision: of float32 products on GPUs, ``highest``, ``high`` (TF32) or ``medium``.
+        compile: compile the network with ``torch.compile`` (needs a C++ compiler on CPU).
+    """
+
+    KNOWN = ("adamw", "muon")
+
+    name: str = "muon"
+    warmup: int = 100
+    weight_decay: float = 0.01
+    ema: float = 0.999
+    final_lr: float = 0.01
+    decay_share: float = 0.3
+    accumulate: int = 1
+    precision: str = "float32"
+    matmul_precision: str = "highest"
+    compile: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        shares(self, "final_lr", "decay_share")
+        at_least(self, 1, "accumulate")
+        one_of(self, "precision", ("float32", "bfloat16"))
+        one_of(self, "matmul_precision", ("highest", "high", "medium"))
+
+
+@dataclass
+class PretrainLoggerSettings(LoggerSettings):
+    """What a pretraining run writes, and how often.
+
+    Attributes:
+        log_every: steps between log rows.
+        evaluate_every: steps between held-out evaluations.
+        pictures_every: steps between pictures of samples; 0 draws none.
+    """
+
+    checkpoint_every: int = 250
+    log_every: int = 20
+    evaluate_every: int = 250
+    pictures_every: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, 1, "log_every", "evaluate_every")
+        at_least(self, 0, "pictures_every")
+
+
+@composed
 @dataclass
 class PretrainConfig:
     """One pretraining run.
@@ -18,161 +253,64 @@ class PretrainConfig:
             with several datasets it must be empty.
         prior: shipped name, or folder of a prior or a run, that training starts from, whatever the keys of its size
             and kind say; empty for a fresh one.
-        output: run directory; an interrupted run in it goes on where it stopped.
+        output: run directory; an interrupted run in it goes on where it stopped; empty for runs/COMMAND-TIME on the
+            command line, runs/pretrain in Python.
         iterations: optimiser steps.
         batch_size: scenes per step, over all processes and parts.
-        accumulate: parts in which a process takes its scenes, one after the other, to save memory.
-        precision: number format of the network in training, ``float32`` or ``bfloat16`` (autocast).
-        optimizer: ``adamw``, or ``muon`` for Muon on the matrices inside blocks and AdamW on the rest.
-        learning_rate: peak learning rate.
-        final_learning_rate: where the learning rate ends, as a fraction of the peak; 1 for no decay.
-        decay_share: share of the steps, the last ones, over which it goes there along a cosine; 1 from the warm-up on.
-        warmup: steps of linear warm-up.
-        weight_decay: decoupled weight decay.
-        clip: largest gradient norm.
-        ema: decay of the weight average that is evaluated and saved.
-        hidden: width of the network.
-        depth: blocks of the network.
-        heads: attention heads.
-        recipe: a named set of the other keys: ``ours``, or ``paper`` for the paper's setting; keys given beside it win.
-        network: ``flux`` (ours), ``midiffusion``, ``diffuscene``, or ``paper`` for the paper's flux network of 88.3 M
-            parameters, whatever hidden, depth, heads, attention and frequencies say.
-        attention: of the mixed flux network: ``plain``, or ``relative``, which sees where other objects stand.
-        relation_blur: with attention=relative: the noise that blurs what is seen along x, y and z, of the ``axis``
-            itself, or of the one where it is ``largest``.
-        frequencies: octaves of Fourier features of each translation (flux only); 0 for none.
-        rotation_features: the mixed flux network is told how far each rotation is off SO(3), and off upright, in units
-            of the noise.
-        contacts: with attention=relative: the network learns at what distance two objects touch, and is told the gap
-            that is left in units of the noise.
-        prediction: what the network predicts (``edm``, the preconditioning of Karras et al. 2022, ``epsilon``,
-            ``x0``, ``v``).
-        schedule: noise schedule (``karras``, ``linear``, ``cosine``).
-        noise_floor: lowest noise-to-signal ratio of the karras schedule, in normalised units.
-        noise_ceiling: highest noise-to-signal ratio of the karras schedule.
-        noise_mean: mean of ln(noise-to-signal) over training timesteps. Rooms, whose normalised unit is metres, need
-            less noise than tables: about -2.6, with a floor of 0.0004.
-        noise_std: its standard deviation.
-        timesteps: distribution of training timesteps, ``lognormal`` (of the noise-to-signal ratio), ``uniform``, or
-            ``both`` in equal parts: categories are decided at high noise, which the first rarely draws.
-        loss_weighting: of the loss by timestep, ``none`` or ``min_snr``.
-        moments: whose mean and spread scale what the network says: those of each ``category`` (of each feature, where
-            the process is continuous), of each ``feature``, or of the ``scene`` as a whole.
-        translation_weight: weight of x, y, z in the loss, rotations having 1.
-        category_loss: of a mixed prior, ``cross_entropy`` of the clean category, or ``bound``, the paper's.
-        category_weight: weight of the loss of the categories beside that of the poses.
-        given_share: share of a mixed prior's training scenes in which some poses or categories are given, for
-            inpainting.
-        denoised_clip: bound on denoised scenes while sampling, normalised units; 0 for none.
-        rotation: what a continuous prior diffuses as rotation: ``matrix``, ``quaternion`` or ``axis_angle``.
-        matmul_precision: of float32 products on GPUs, ``highest``, ``high`` (TF32) or ``medium``.
-        compile: compile the network with ``torch.compile`` (needs a C++ compiler on CPU).
-        process: ``continuous`` (categories as numbers) or ``mixed`` (categories as discrete states).
-        kernel: of the categories of a mixed prior (``mask_and_replace``, ``absorbing``, ``early_absorbing``,
-            ``squared_absorbing``, ``uniform``).
-        empty_slots: whether slots known to be empty are ``attended`` (the paper's) or ``dropped`` from the network of a
-            mixed prior, which needs an absorbing kernel and saves most of the work.
-        unmasking: which masked slots a sampling step of an absorbing kernel unmasks: ``even``, as near to the expected
-            number as can be, so that few categories are decided at once, or ``independent``.
-        text: whether a mixed prior reads prompts.
-        text_encoder: ``vocabulary`` for a small one with a closed vocabulary, trained with the prior; or the folder or
-            hub name of a BERT model, which stays as it is.
-        text_width: width of the small text encoder.
-        text_depth: its blocks.
-        text_latents: tokens that it condenses a prompt to; 0 for one per word.
-        text_learning_rate: of the small text encoder, as a fraction of learning_rate.
-        text_reach: of the mixed flux network: text meets slots in its ``double``-stream blocks alone, which is quicker,
-            or in ``all``, as in the paper's.
-        pooled_text: whether the mean of the text tokens also modulates every block of the mixed flux network.
-        count_embedding: whether the mixed flux network is told how many slots it sees of each category, and how many
-            are masked.
-        text_window: of the small text encoder: words that are read together before they attend to each other, odd; 1
-            reads each by itself.
-        text_count_conditioning: whether the small text encoder also says what is asked of each kind of object, which
-            joins the logits of the mixed flux network beside what it sees; needs text_latents.
-        text_warmup: steps in which the text encoder learns how many of each kind its prompts ask for, before a fresh
-            prior takes the first of its own; at most iterations.
-        text_numbers: of the small text encoder: whether words that are numbers say how many they are, so that counts
-            need not be learned number by number.
-        prompt_dropout: share of training scenes whose prompt is withheld, for classifier-free guidance.
         seed: of weights, batches and noise.
-        log_every: steps between log rows.
-        evaluate_every: steps between held-out evaluations.
-        checkpoint_every: steps between checkpoints.
-        pictures_every: steps between pictures of samples; 0 draws none.
-        tensorboard: also log for TensorBoard.
         device: torch device.
+        recipe: a named set of the other keys: ``ours``, or ``paper`` for the paper's setting; keys given beside it win.
+        network: what denoises.
+        process: of noise and denoising.
+        loss: what is learned.
+        text: what is read.
+        optimizer: of the weights.
+        logger: files.
     """
 
-    RENAMED: ClassVar[dict[str, str]] = {"tally": "count_embedding", "text_requests": "text_count_conditioning"}
+    RENAMED: ClassVar[Mapping[str, str]] = {
+        **moved("network", "hidden", "depth", "heads", "frequencies", "text_reach"),
+        **moved("network.modules", "rotation_features", "contacts", "pooled_text", "count_embedding"),
+        **moved("network.modules", tally="count_embedding", relation_blur="relations"),
+        "attention": "network.modules.relations, none for plain attention",
+        "text=true": "text=vocabulary",
+        "text=false": "text=none",
+        **moved("process", "prediction", "schedule", "noise_floor", "noise_ceiling", "moments", "rotation", "kernel"),
+        **moved("process", "empty_slots", "unmasking", "denoised_clip"),
+        **moved("loss", "noise_mean", "noise_std", "timesteps", "translation_weight", "category_weight"),
+        **moved("loss", "given_share", loss_weighting="weighting", category_loss="category"),
+        **moved("text", text_encoder="encoder", text_width="width", text_depth="depth", text_latents="latents"),
+        **moved("text", text_window="window", text_learning_rate="lr_share", text_warmup="warmup"),
+        **moved("text", text_numbers="numbers", prompt_dropout="dropout"),
+        **moved("text", text_count_conditioning="count_conditioning", text_requests="count_conditioning"),
+        **moved("optimizer", "decay_share", "warmup", "weight_decay", "clip", "ema", "accumulate", "precision"),
+        **moved("optimizer", "matmul_precision", "compile", learning_rate="lr", final_learning_rate="final_lr"),
+        **moved("logger", "log_every", "evaluate_every", "checkpoint_every", "pictures_every"),
+        "tensorboard": "logger=tensorboard",
+    }
     """Keys of earlier versions, and their names."""
 
-    scene: str = "dimsum_table"
+    scene: Any = named("dimsum_table", "scene")
     data: str = "data/dimsum_table"
     heldout: str = ""
     prior: str = ""
-    output: str = "runs/pretrain"
+    output: str = ""
     iterations: int = 5000
     batch_size: int = 128
-    accumulate: int = 1
-    precision: str = "float32"
-    optimizer: str = "muon"
-    learning_rate: float = 1e-3
-    final_learning_rate: float = 0.01
-    decay_share: float = 0.3
-    warmup: int = 100
-    weight_decay: float = 0.01
-    clip: float = 1.0
-    ema: float = 0.999
-    hidden: int = 128
-    depth: int = 6
-    heads: int = 4
-    recipe: str = "ours"
-    network: str = "flux"
-    attention: str = "relative"
-    relation_blur: str = "axis"
-    frequencies: int = 8
-    rotation_features: bool = True
-    contacts: bool = True
-    prediction: str = "edm"
-    schedule: str = "karras"
-    noise_floor: float = 0.002
-    noise_ceiling: float = 20.0
-    noise_mean: float = -1.8
-    noise_std: float = 2.1
-    timesteps: str = "lognormal"
-    loss_weighting: str = "none"
-    moments: str = "category"
-    translation_weight: float = 3.0
-    category_loss: str = "cross_entropy"
-    category_weight: float = 2.0
-    given_share: float = 0.3
-    denoised_clip: float = 0.0
-    rotation: str = "matrix"
-    matmul_precision: str = "highest"
-    process: str = "mixed"
-    kernel: str = "early_absorbing"
-    empty_slots: str = "dropped"
-    unmasking: str = "even"
-    text: bool = False
-    text_encoder: str = "vocabulary"
-    text_width: int = 128
-    text_depth: int = 2
-    text_latents: int = 16
-    text_learning_rate: float = 0.5
-    text_reach: str = "double"
-    pooled_text: bool = True
-    count_embedding: bool = True
-    text_window: int = 3
-    text_count_conditioning: bool = True
-    text_warmup: int = 400
-    text_numbers: bool = True
-    prompt_dropout: float = 0.1
-    compile: bool = False
     seed: int = 0
-    log_every: int = 20
-    evaluate_every: int = 250
-    checkpoint_every: int = 250
-    pictures_every: int = 0
-    tensorboard: bool = False
     device: str = "cpu"
+    recipe: str = "ours"
+    network: NetworkSettings = nested(NetworkSettings, folder="network", option="flux", registered=_networks)
+    process: ProcessSettings = nested(ProcessSettings, folder="process", option="mixed")
+    loss: LossSettings = nested(LossSettings)
+    text: TextSettings = nested(TextSettings, folder="text", option="none")
+    optimizer: PretrainOptimizerSettings = nested(PretrainOptimizerSettings, folder="optimizer", option="muon")
+    logger: PretrainLoggerSettings = nested(PretrainLoggerSettings, folder="logger", option="csv")
+
+    def __post_init__(self) -> None:
+        at_least(self, 1, "batch_size")
+
+    @property
+    def directory(self) -> Path:
+        """The run directory."""
+        return Path(self.output or "runs/pretrain")

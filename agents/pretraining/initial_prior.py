@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,8 +11,16 @@ from torch import Tensor
 
 from agents.diffusion import Preconditioning
 from agents.diffusion.moments import CategoryMoments
-from agents.networks import MixedFluxConfig, TextConfig
+from agents.networks import TextConfig
+from agents.networks.contacts import ContactsConfig
+from agents.networks.count_conditioning import CountConditioningConfig
+from agents.networks.count_embedding import CountEmbeddingConfig
+from agents.networks.flux_modules import ModuleConfig
+from agents.networks.given_flags import GivenFlagsConfig
+from agents.networks.pooled_text import PooledTextConfig
 from agents.networks.registry import NetworkConfig, network_config
+from agents.networks.relations import RelationsConfig
+from agents.networks.rotation_features import RotationFeaturesConfig
 from agents.networks.text_encoders import VOCABULARY, AnyTextConfig, text_config
 from agents.pretraining.config import PretrainConfig
 from agents.priors.base import ScenePrior
@@ -45,13 +53,13 @@ def build_prior(
     """
     if config.prior:
         return _started(config, raw, prompts)
-    if config.moments not in MOMENTS:
-        raise unknown_name("moments", config.moments, MOMENTS)
-    if config.process == "continuous":
+    if config.process.moments not in MOMENTS:
+        raise unknown_name("moments", config.process.moments, MOMENTS)
+    if config.process.name == "continuous":
         return _continuous(config, raw, normalizer)
-    if config.process == "mixed":
+    if config.process.name == "mixed":
         return _mixed(config, raw, normalizer, prompts)
-    raise unknown_name("process", config.process, PROCESSES)
+    raise unknown_name("process", config.process.name, PROCESSES)
 
 
 def _started(config: PretrainConfig, raw: Tensor, prompts: Sequence[Sequence[str]]) -> ScenePrior:
@@ -66,7 +74,7 @@ def _started(config: PretrainConfig, raw: Tensor, prompts: Sequence[Sequence[str
     slots = raw.shape[1]
     prior = ScenePrior.load(config.prior)
     found = (prior.scene_type.name, prior.config.slots, prior.conditional)
-    asked = (config.scene, slots, config.text)
+    asked = (config.scene, slots, config.text.is_read)
     if found != asked:
         names = ("scene type", "slots", "text")
         wrong = ", ".join(f"{n} {f!r}, not {a!r}" for n, f, a in zip(names, found, asked, strict=True) if f != a)
@@ -92,25 +100,30 @@ def _check_constants(prior: ScenePrior, free: Tensor, name: str) -> None:
 
 
 def _continuous(config: PretrainConfig, raw: Tensor, normalizer: Normalizer) -> ContinuousPrior:
-    if config.text:
-        raise InvalidInputError("text=true needs process=mixed: the continuous prior reads no prompts")
-    code = SceneCode(get_scene_type(config.scene), config.rotation, normalizer)
+    if config.text.is_read:
+        raise InvalidInputError(
+            f"text.encoder={config.text.encoder} needs process=mixed: the continuous prior reads no prompts"
+        )
+    rotation, moments = config.process.rotation, config.process.moments
+    code = SceneCode(get_scene_type(config.scene), rotation, normalizer)
     prior_config = PriorConfig(
         config.scene,
         raw.shape[1],
         _network(config, code.features, normalizer, raw.shape[1]),  # type: ignore[arg-type]
-        rotation=config.rotation,
+        rotation=rotation,
         **_chain(config),
     )
     torch.manual_seed(config.seed)
-    moments = "feature" if config.moments == "category" else config.moments
-    return ContinuousPrior.fitted(prior_config, normalizer, raw[:FITTED_ON], moments)
+    return ContinuousPrior.fitted(
+        prior_config, normalizer, raw[:FITTED_ON], "feature" if moments == "category" else moments
+    )
 
 
 def _mixed(config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts: Sequence[Sequence[str]]) -> MixedPrior:
-    if config.rotation != "matrix":
+    process = config.process
+    if process.rotation != "matrix":
         raise InvalidInputError(
-            f"rotation={config.rotation!r} needs process=continuous: mixed priors diffuse rotation matrices"
+            f"rotation={process.rotation!r} needs process=continuous: mixed priors diffuse rotation matrices"
         )
     scene_type = get_scene_type(config.scene)
     text = _text(config, prompts)
@@ -119,39 +132,50 @@ def _mixed(config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts:
         config.scene,
         raw.shape[1],
         network,  # type: ignore[arg-type]
-        kernel=config.kernel,
-        category_loss=config.category_loss,
-        category_weight=config.category_weight,
-        given_share=config.given_share,
+        kernel=process.kernel,
+        category_loss=config.loss.category,
+        category_weight=config.loss.category_weight,
+        given_share=config.loss.given_share,
         text=text,
-        empty_slots=config.empty_slots,
-        unmasking=config.unmasking,
+        empty_slots=process.empty_slots,
+        unmasking=process.unmasking,
         **_chain(config),
     )
     torch.manual_seed(config.seed)
     free = raw[:FITTED_ON, len(scene_type.fixed) :]
-    return MixedPrior(prior_config, normalizer, _pose_moments(config.moments, free, normalizer))
+    return MixedPrior(prior_config, normalizer, _pose_moments(process.moments, free, normalizer))
 
 
 def _chain(config: PretrainConfig) -> dict[str, Any]:
     """What both kinds of prior are told of noise and loss."""
-    same = ("schedule", "prediction", "translation_weight", "timesteps", "loss_weighting")
-    noise = ("noise_floor", "noise_ceiling", "noise_mean", "noise_std")
-    return {key: getattr(config, key) for key in same + noise} | {"clip": config.denoised_clip}
+    process, loss = config.process, config.loss
+    return {
+        "schedule": process.schedule,
+        "prediction": process.prediction,
+        "noise_floor": process.noise_floor,
+        "noise_ceiling": process.noise_ceiling,
+        "noise_mean": loss.noise_mean,
+        "noise_std": loss.noise_std,
+        "timesteps": loss.timesteps,
+        "loss_weighting": loss.weighting,
+        "translation_weight": loss.translation_weight,
+        "clip": process.denoised_clip,
+    }
 
 
 def _text(config: PretrainConfig, prompts: Sequence[Sequence[str]]) -> AnyTextConfig | None:
-    if not config.text:
+    text = config.text
+    if not text.is_read:
         return None
-    encoder = text_config(config.text_encoder, (prompt for group in prompts for prompt in group))
+    encoder = text_config(text.encoder, (prompt for group in prompts for prompt in group))
     if isinstance(encoder, TextConfig):
         return replace(
             encoder,
-            width=config.text_width,
-            depth=config.text_depth,
-            latents=config.text_latents,
-            window=config.text_window,
-            numbers=config.text_numbers,
+            width=text.width,
+            depth=text.depth,
+            latents=text.latents,
+            window=text.window,
+            numbers=text.numbers,
             asked=max(_kinds(config.scene)) + 2 if _conditions_counts(config) else 0,
         )
     return encoder
@@ -160,33 +184,31 @@ def _text(config: PretrainConfig, prompts: Sequence[Sequence[str]]) -> AnyTextCo
 def _network(
     config: PretrainConfig, features: int, normalizer: Normalizer, slots: int, text_width: int = 0
 ) -> NetworkConfig:
-    categories = get_scene_type(config.scene).num_assets + 1
-    if config.network == "paper":
-        if config.process != "mixed":
-            raise InvalidInputError("network='paper' is mixed; with process=continuous take network=flux")
-        return MixedFluxConfig.paper(categories, text_width)
     return network_config(
-        config.network,
-        config.process,
+        process=config.process.name,
         features=features,
-        categories=categories,
-        hidden=config.hidden,
-        depth=config.depth,
-        heads=config.heads,
+        categories=get_scene_type(config.scene).num_assets + 1,
         text_width=text_width,
-        attention=config.attention,
-        relation_blur=config.relation_blur,
-        frequencies=config.frequencies,
-        rotation_features=int(config.rotation_features),
-        contacts=int(config.contacts),
+        **{**vars(config.network), "modules": _modules(config, slots, text_width)},
         unit=_unit(normalizer),
         rotations=_rotations(normalizer),
-        text_reach=config.text_reach,
-        pooled_text=int(config.pooled_text),
-        count_embedding=int(config.count_embedding),
-        count_conditioning=slots if _conditions_counts(config) else 0,
-        kinds=_kinds(config.scene) if _conditions_counts(config) else (),
     )
+
+
+def _modules(config: PretrainConfig, slots: int, text_width: int) -> list[ModuleConfig]:
+    """The modules of the mixed flux network but for its Fourier features."""
+    chosen = config.network.modules
+    relations = chosen.relations != "none"
+    offered: list[tuple[bool, Callable[[], ModuleConfig]]] = [
+        (chosen.given_flags, GivenFlagsConfig),
+        (chosen.pooled_text and text_width > 0, PooledTextConfig),
+        (chosen.count_embedding, CountEmbeddingConfig),
+        (_conditions_counts(config), lambda: CountConditioningConfig(slots, _kinds(config.scene))),
+        (relations, lambda: RelationsConfig(chosen.relations)),
+        (chosen.rotation_features, RotationFeaturesConfig),
+        (relations and chosen.contacts, ContactsConfig),
+    ]
+    return [make() for used, make in offered if used]
 
 
 def _kinds(scene: str) -> tuple[int, ...]:
@@ -199,10 +221,10 @@ def _kinds(scene: str) -> tuple[int, ...]:
 def _conditions_counts(config: PretrainConfig) -> bool:
     """Whether the network is told what a prompt asks of each kind of object."""
     return (
-        config.text_count_conditioning
-        and config.network == "flux"
-        and config.text_encoder == VOCABULARY
-        and config.text_latents > 0
+        config.text.count_conditioning
+        and config.network.name == "flux"
+        and config.text.encoder == VOCABULARY
+        and config.text.latents > 0
     )
 
 

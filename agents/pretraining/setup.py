@@ -33,7 +33,9 @@ def prepare(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
         grammar = get_grammar(config.scene)
         sample = grammar.sample(np.random.default_rng([config.seed, _SAMPLE]), _SAMPLE)
         prompts = (
-            describe_all(sample, np.random.default_rng(config.seed), count=PROMPTS_PER_SCENE) if config.text else []
+            describe_all(sample, np.random.default_rng(config.seed), count=PROMPTS_PER_SCENE)
+            if config.text.is_read
+            else []
         )
         prior = build_prior(config, sample.tensor, fixed_normalizer(grammar), prompts)
         if config.heldout:

@@ -14,6 +14,7 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
+from agents.configuration.tree import config_text, dotted
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.data import TrainingData
 from agents.pretraining.log import TrainingLog
@@ -26,23 +27,23 @@ from agents.utils.loggers import make_logger
 from agents.utils.process_group import ProcessGroup
 from agents.utils.seeds import derived_generator
 from agents.utils.weight_average import AveragedWeights, WeightAverage
-from scene_envs.errors import InvalidInputError, MissingDependencyError, TrainingError, unknown_name
-from scene_envs.files import write_json
+from scene_envs.errors import InvalidInputError, MissingDependencyError, TrainingError
+from scene_envs.files import write_json, write_text
 
 logger = logging.getLogger(__name__)
 
 _PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
-_MATMUL_PRECISIONS = ("highest", "high", "medium")
 
 
 def learning_rate_at(step: int, config: PretrainConfig) -> float:
-    """Linear warm-up, the peak, and in the last ``decay_share`` of the steps a cosine to ``final_learning_rate``."""
-    if step < config.warmup:
-        return config.learning_rate * (step + 1) / config.warmup
-    start = max(config.warmup, config.iterations * (1.0 - config.decay_share))
+    """Linear warm-up, the peak, and in the last ``decay_share`` of the steps a cosine to ``final_lr``."""
+    optimizer = config.optimizer
+    if step < optimizer.warmup:
+        return optimizer.lr * (step + 1) / optimizer.warmup
+    start = max(optimizer.warmup, config.iterations * (1.0 - optimizer.decay_share))
     progress = (step - start) / max(1.0, config.iterations - start)
     cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, max(0.0, progress))))
-    return config.learning_rate * (config.final_learning_rate + (1 - config.final_learning_rate) * cosine)
+    return optimizer.lr * (optimizer.final_lr + (1 - optimizer.final_lr) * cosine)
 
 
 @torch.no_grad()
@@ -70,29 +71,24 @@ class Pretrainer:
         self.config = config
         self.data, self.heldout_data = data, heldout
         self.processes = ProcessGroup.join(config.device)
-        self.parts = self.processes.size * config.accumulate
+        self.parts = self.processes.size * config.optimizer.accumulate
         if config.batch_size % self.parts:
             raise InvalidInputError(
                 f"batch_size={config.batch_size} is not a multiple of {self.parts}, "
-                f"the {self.processes.size} process(es) times accumulate={config.accumulate}"
+                f"the {self.processes.size} process(es) times accumulate={config.optimizer.accumulate}"
             )
-        if not 0.0 <= config.decay_share <= 1.0:
-            raise InvalidInputError(f"decay_share={config.decay_share} is outside 0..1: it is a share of the steps")
         self.prior = prior.to(config.device).train()
         self.network: nn.Module = prior.denoiser
-        if config.precision not in _PRECISIONS:
-            raise unknown_name("precision", config.precision, _PRECISIONS)
-        prior.denoiser.precision = _PRECISIONS[config.precision]
-        self.average = WeightAverage(self.network, config.ema)
-        self.optimizer = build_optimizer(config.optimizer, self.network, config.weight_decay, config.text_learning_rate)
-        if config.matmul_precision not in _MATMUL_PRECISIONS:
-            raise unknown_name("matmul_precision", config.matmul_precision, _MATMUL_PRECISIONS)
-        torch.set_float32_matmul_precision(config.matmul_precision)
+        settings = config.optimizer
+        prior.denoiser.precision = _PRECISIONS[settings.precision]
+        self.average = WeightAverage(self.network, settings.ema)
+        self.optimizer = build_optimizer(settings.name, self.network, settings.weight_decay, config.text.lr_share)
+        torch.set_float32_matmul_precision(settings.matmul_precision)
         self.step = 0
         self.schedule = self._schedule()
         self.seconds = 0.0
-        self.directory = Path(config.output)
-        chosen = "tensorboard" if config.tensorboard and self.processes.is_first else "csv"
+        self.directory = config.directory
+        chosen = config.logger.name if self.processes.is_first else "csv"
         self.log = TrainingLog(self.directory, make_logger(chosen, self.directory))
         self.evaluations: list[dict[str, float]] = []
 
@@ -108,7 +104,7 @@ class Pretrainer:
             self._load()
         elif not self.config.prior:
             self._warm_up_text()
-        if self.config.compile:
+        if self.config.optimizer.compile:
             self.prior.denoiser.network.compile()
         for row in self._steps():
             if self.processes.is_first:
@@ -123,10 +119,10 @@ class Pretrainer:
 
     def _warm_up_text(self) -> None:
         """Every process learns the same, and begins with the weights of the first."""
-        steps = min(self.config.text_warmup, self.config.iterations)
+        steps = min(self.config.text.warmup, self.config.iterations)
         if warm_up_text(self.prior, self.data, steps, self.config.batch_size, self.config.seed) is not None:
             self.processes.share(self.network.parameters())
-            self.average = WeightAverage(self.network, self.config.ema)
+            self.average = WeightAverage(self.network, self.config.optimizer.ema)
 
     def _steps(self) -> Iterator[dict[str, float]]:
         config, started = self.config, time.perf_counter() - self.seconds
@@ -138,23 +134,23 @@ class Pretrainer:
             self.seconds = time.perf_counter() - started
             last = self.step == config.iterations
             row: dict[str, float] = {}
-            if self.step % config.evaluate_every == 0 or last:
+            if self.step % config.logger.evaluate_every == 0 or last:
                 row["heldout"] = self._evaluate()
-            if self.step % config.log_every == 0 or row:
+            if self.step % config.logger.log_every == 0 or row:
                 row |= {"step": self.step, "loss": sum(running) / len(running), "gradient_norm": norm}
                 row |= {"learning_rate": learning_rate_at(self.step - 1, config), "seconds": round(self.seconds, 1)}
                 running.clear()
                 yield row
-            if config.pictures_every and self.step % config.pictures_every == 0:
+            if config.logger.pictures_every and self.step % config.logger.pictures_every == 0:
                 self._draw_samples()
-            if self.step % config.checkpoint_every == 0 or last:
+            if self.step % config.logger.checkpoint_every == 0 or last:
                 self._save()
 
     def _update(self) -> tuple[float, float]:
         config = self.config
         total = torch.zeros((), device=config.device)
-        for part in range(config.accumulate):
-            generator = part_generator(config.seed, self.step, self.processes.rank * config.accumulate + part)
+        for part in range(config.optimizer.accumulate):
+            generator = part_generator(config.seed, self.step, self.processes.rank * config.optimizer.accumulate + part)
             loss = self._part_loss(config.batch_size // self.parts, generator) / self.parts
             loss.backward()  # type: ignore[no-untyped-call]
             total += loss.detach()
@@ -162,10 +158,10 @@ class Pretrainer:
         if not math.isfinite(value):
             raise TrainingError(
                 f"the pretraining loss became {value} at step {self.step}; the last good state is "
-                f"{str(self.checkpoint_path)!r}: lower learning_rate (now {config.learning_rate}) and run again"
+                f"{str(self.checkpoint_path)!r}: lower optimizer.lr (now {config.optimizer.lr}) and run again"
             )
         self.processes.sum_gradients(self.network.parameters())
-        norm = nn.utils.clip_grad_norm_(self.network.parameters(), config.clip)
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), config.optimizer.clip)
         self.optimizer.step()
         self.schedule.step()
         self.optimizer.zero_grad(set_to_none=True)
@@ -181,7 +177,7 @@ class Pretrainer:
             return self.prior.pretraining_loss(x0, generator)
         choice = torch.rand(2, count, generator=generator).tolist()
         texts = [
-            "" if dropped < self.config.prompt_dropout else group[int(pick * len(group))]
+            "" if dropped < self.config.text.dropout else group[int(pick * len(group))]
             for group, pick, dropped in zip(prompts, *choice, strict=True)
         ]
         return self.prior.pretraining_loss(x0, generator, text=self.prior.encode_prompts(texts))
@@ -247,7 +243,7 @@ class Pretrainer:
             check_tensors(self.network, state["network"], self.checkpoint_path)
         try:
             self.network.load_state_dict({**state["network"], **state["average"]})  # gives weights their present names
-            average = WeightAverage(self.network, self.config.ema)
+            average = WeightAverage(self.network, self.config.optimizer.ema)
             self.network.load_state_dict(state["network"])
             self.optimizer.load_state_dict(state["optimizer"])
         except (RuntimeError, ValueError, KeyError) as error:
@@ -264,9 +260,9 @@ class Pretrainer:
 
     def _started_with(self, state: dict[str, Any]) -> str:
         """The keys of the run in a checkpoint that are not those of this one; empty when all are the same."""
-        now = asdict(self.config)
-        now |= {"iterations": state["config"]["iterations"], "output": state["config"]["output"]}  # may differ
-        keys = [f"{key}={value}" for key, value in state["config"].items() if value != now.get(key, value)]
+        before, now = dotted(state["config"]), dotted(asdict(self.config))
+        now |= {"iterations": before["iterations"], "output": before["output"]}  # may differ
+        keys = [f"{key}={value}" for key, value in before.items() if value != now.get(key, value)]
         return ", ".join(keys)
 
     def save_prior(self) -> ScenePrior:
@@ -294,13 +290,14 @@ def pretrain(config: PretrainConfig) -> dict[str, Any]:
     """Train a prior as ``config`` says; resumes a run found in ``config.output``.
 
     Returns:
-        The numbers of ``metrics.json``, which is written beside the prior.
+        The numbers of ``metrics.json``, which is written beside the prior and ``config.yaml``.
     """
     prior, data, heldout = prepare(config)
     trainer = Pretrainer(config, data, heldout, prior)
     trained = trainer.run()
-    metrics = {**trained.card, "evaluations": trainer.evaluations, "config": asdict(config)}
+    metrics = {**trained.card, "evaluations": trainer.evaluations}
     if not trainer.processes.is_first:
         return metrics
+    write_text(trainer.directory / "config.yaml", config_text(config))
     write_json(trainer.directory / "metrics.json", metrics)
     return metrics

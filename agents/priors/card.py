@@ -268,13 +268,21 @@ def _training(card: Mapping[str, Any]) -> str:
 
 
 def _training_of(source: Path) -> dict[str, Any]:
-    """How a run was trained, from the metrics beside its prior."""
+    """How a run was trained, from the ``config.yaml`` beside its prior."""
+    import yaml
+
     folder = source.parent if source.name == "prior" else source
-    if not (folder / "metrics.json").is_file():
+    if not (folder / "config.yaml").is_file():
         return {}
-    config = _read_json(folder / "metrics.json").get("config")
-    wanted = ("optimizer", "learning_rate", "ema", "warmup", "weight_decay", "seed", "precision")
-    return {"training": {key: config[key] for key in wanted if key in config}} if isinstance(config, dict) else {}
+    config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
+    optimizer = config.get("optimizer") if isinstance(config, dict) else None
+    if not isinstance(optimizer, dict):
+        return {}
+    wanted = {"name": "optimizer", "lr": "learning_rate"} | {
+        key: key for key in ("ema", "warmup", "weight_decay", "precision")
+    }
+    trained = {name: optimizer[key] for key, name in wanted.items() if key in optimizer}
+    return {"training": {**trained, "seed": config.get("seed")}}
 
 
 def _without_folders(state: dict[str, Any]) -> dict[str, Any]:

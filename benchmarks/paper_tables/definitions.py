@@ -62,7 +62,7 @@ def rotation() -> Table:
     base = plain_row("flux", "continuous")
     entries = [Entry("matrix (R⁹ and SVD)", base)]
     for name, label in (("quaternion", "quaternion"), ("axis_angle", "axis-angle")):
-        entries.append(Entry(label, Row(f"{base.name}_{name}", {**base.overrides, "rotation": name})))
+        entries.append(Entry(label, Row(f"{base.name}_{name}", {**base.overrides, "process.rotation": name})))
     return Table(
         "rotation", "Rotation representation",
         "What the continuous prior diffuses as rotation; all else is equal.",

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import Any
 
+from agents.configuration.tree import dotted_values
 from agents.pretraining.config import PretrainConfig
 from benchmarks.paper_tables.rows import COSTS, PAPER, Entry, Row, Table, plain_row
 
@@ -31,31 +31,30 @@ def _each(title: str, key: str, *values: Any) -> list[Setting]:
 
 
 def _predictions(weighting: str, note: str, *names: str) -> list[Setting]:
-    return [(f"prediction {name}{note}", {"prediction": name, "loss_weighting": weighting}) for name in names]
+    return [(f"prediction {name}{note}", {"process.prediction": name, "loss.weighting": weighting}) for name in names]
 
 
 def _categories(kernel: str, empty_slots: str, loss: str) -> dict[str, Any]:
-    return {"kernel": kernel, "empty_slots": empty_slots, "category_loss": loss}
+    return {"process.kernel": kernel, "process.empty_slots": empty_slots, "loss.category": loss}
 
 
 FACTORS: tuple[Setting, ...] = (
     *_predictions("none", "", "edm", "epsilon", "v", "x0"),
     *_predictions("min_snr", ", min-SNR", "epsilon", "v", "x0"),
-    *_each("schedule", "schedule", "karras", "cosine", "linear"),
-    *_each("noise floor", "noise_floor", 0.01, 0.002, 0.0005),
-    *_each("noise ceiling", "noise_ceiling", 20.0, 80.0),
-    *_each("timesteps", "timesteps", "lognormal", "uniform", "both"),
-    *_each("moments per", "moments", "scene", "feature", "category"),
-    *_each("translation weight", "translation_weight", 1.0, 3.0),
-    *_each("attention", "attention", "plain", "relative"),
-    *_each("Fourier octaves", "frequencies", 0, 8),
-    *_each("features of rotations", "rotation_features", False, True),
-    *_each("contacts", "contacts", False, True),
-    *_each("relations blurred by the noise of the", "relation_blur", "largest", "axis"),
-    ("no learning-rate decay", {"final_learning_rate": 1.0}),
-    ("learning rate decays from the warm-up on", {"decay_share": 1.0}),
-    *_each("optimizer", "optimizer", "muon", "adamw"),
-    *_each("empty slots", "empty_slots", "dropped", "attended"),
+    *_each("schedule", "process.schedule", "karras", "cosine", "linear"),
+    *_each("noise floor", "process.noise_floor", 0.01, 0.002, 0.0005),
+    *_each("noise ceiling", "process.noise_ceiling", 20.0, 80.0),
+    *_each("timesteps", "loss.timesteps", "lognormal", "uniform", "both"),
+    *_each("moments per", "process.moments", "scene", "feature", "category"),
+    *_each("translation weight", "loss.translation_weight", 1.0, 3.0),
+    *_each("relations of slots, blurred by the noise of the", "network.modules.relations", "none", "largest", "axis"),
+    *_each("Fourier octaves", "network.frequencies", 0, 8),
+    *_each("features of rotations", "network.modules.rotation_features", False, True),
+    *_each("contacts", "network.modules.contacts", False, True),
+    ("no learning-rate decay", {"optimizer.final_lr": 1.0}),
+    ("learning rate decays from the warm-up on", {"optimizer.decay_share": 1.0}),
+    *_each("optimizer", "optimizer.name", "muon", "adamw"),
+    *_each("empty slots", "process.empty_slots", "dropped", "attended"),
     ("categories: early absorbing, dropped, cross-entropy", _categories("early_absorbing", "dropped", "cross_entropy")),
     ("categories: absorbed along a square", _categories("squared_absorbing", "dropped", "cross_entropy")),
     ("categories: absorbing, dropped, cross-entropy", _categories("absorbing", "dropped", "cross_entropy")),
@@ -65,27 +64,26 @@ FACTORS: tuple[Setting, ...] = (
 """What the precision table changes, one at a time."""
 
 _NEEDS = {
-    "noise_floor": ("schedule", "karras"),
-    "noise_ceiling": ("schedule", "karras"),
-    "moments": ("prediction", "edm"),
-    "contacts": ("attention", "relative"),
-    "relation_blur": ("attention", "relative"),
+    "process.noise_floor": ("process.schedule", "karras"),
+    "process.noise_ceiling": ("process.schedule", "karras"),
+    "process.moments": ("process.prediction", "edm"),
+    "network.modules.contacts": ("network.modules.relations", "axis"),
 }
 """Keys that are read only where another key has a value."""
 
 
 def one_factor_at_a_time(prefix: str, base: Mapping[str, Any], title: str) -> tuple[Entry, ...]:
     """``base``, then every setting of every factor that differs from it and that it reads, and two capacities."""
-    standard = {key.name: key.default for key in fields(PretrainConfig)}
+    standard = dotted_values(PretrainConfig())
     here, group = {**standard, **base}, f"from {title}"
     entries = [Entry(title, Row(prefix, base), group=group)]
     for label, keys in FACTORS:
         changed = {key: value for key, value in keys.items() if here[key] != value}
         if not changed or any(here[_NEEDS[key][0]] != _NEEDS[key][1] for key in keys if key in _NEEDS):
             continue
-        if changed == {"empty_slots": "dropped"} and here["kernel"] == "mask_and_replace":
+        if changed == {"process.empty_slots": "dropped"} and here["process.kernel"] == "mask_and_replace":
             continue
-        name = "_".join([prefix, *(f"{key}_{value}" for key, value in changed.items())])
+        name = "_".join([prefix, *(f"{key.rpartition('.')[2]}_{value}" for key, value in changed.items())])
         entries.append(Entry(label, Row(name, {**base, **changed}), group=group))
     for capacity, label in ((0.5, "half the parameters"), (2.0, "twice the parameters")):
         entries.append(Entry(label, Row(f"{prefix}_capacity_{capacity:g}", base, capacity), group=group))

@@ -6,6 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from agents.configuration.tree import dotted_values
+from agents.pretraining.config import PretrainConfig
+
 
 @dataclass(frozen=True)
 class Row:
@@ -60,36 +63,27 @@ class Table:
     plotted: tuple[str, ...]
 
 
-_TEXT: dict[str, Any] = {"process": "mixed", "text": True, "prompt_dropout": 0.1}
+_TEXT: dict[str, Any] = {"process.name": "mixed", "text.encoder": "vocabulary", "text.dropout": 0.1}
+
+_OF_SIZE = (
+    *("recipe", "network.hidden", "network.depth", "network.heads", "network.double_blocks", "network.embedding"),
+    *("network.pose_head", "optimizer.lr", "optimizer.warmup", "optimizer.decay_share"),
+)
+"""Keys of a recipe that belong to a network and a run of another size."""
 
 PAPER: dict[str, Any] = {
-    "process": "mixed",
-    "network": "flux",
-    "prediction": "epsilon",
-    "schedule": "linear",
-    "timesteps": "uniform",
-    "loss_weighting": "none",
-    "moments": "feature",
-    "translation_weight": 1.0,
-    "category_loss": "bound",
-    "category_weight": 1.0,
-    "given_share": 0.0,
-    "denoised_clip": 1.0,
-    "kernel": "mask_and_replace",
-    "empty_slots": "attended",
-    "attention": "plain",
-    "frequencies": 0,
-    "rotation_features": False,
-    "contacts": False,
-    "optimizer": "adamw",
+    key: value
+    for key, value in dotted_values(PretrainConfig(recipe="paper")).items()
+    if value != dotted_values(PretrainConfig())[key] and key not in _OF_SIZE
 }
-"""The paper's setting: noise prediction under a linear schedule, the variational bound of masked and replaced
-categories, AdamW, and a network without features or relations between slots."""
+"""The paper's setting, ``configs/recipe/paper.yaml``, for a network of the tables' size and a run of their length."""
+
+_AS_PUBLISHED = {"network.modules.relations": "none", "network.frequencies": 0, "process.empty_slots": "attended"}
 
 NETWORKS: dict[str, dict[str, Any]] = {
-    "flux": {"network": "flux"},
-    "midiffusion": {"network": "midiffusion", "attention": "plain", "frequencies": 0, "empty_slots": "attended"},
-    "diffuscene": {"network": "diffuscene", "attention": "plain", "frequencies": 0, "empty_slots": "attended"},
+    "flux": {"network.name": "flux"},
+    "midiffusion": {"network.name": "midiffusion", **_AS_PUBLISHED},
+    "diffuscene": {"network.name": "diffuscene", **_AS_PUBLISHED},
 }
 """Ours with its defaults; the others read poses as they are, as published."""
 NETWORK_LABELS = {"flux": "ours (flux)", "midiffusion": "MiDiffusion", "diffuscene": "DiffuScene"}
@@ -106,4 +100,4 @@ def text_row(network: str) -> Row:
 
 def plain_row(network: str, process: str) -> Row:
     """A prior that reads no prompts."""
-    return Row(f"{network}_{process}", {"process": process, **NETWORKS[network]})
+    return Row(f"{network}_{process}", {"process.name": process, **NETWORKS[network]})

@@ -1,4 +1,4 @@
-"""The keys of the program that makes tables, and the sizes it knows; imports nothing heavy."""
+"""The keys of the program that makes tables, and the sizes it knows; imports no torch."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from agents.configuration.tree import dotted, dotted_values
+from agents.pretraining.config import PretrainConfig
 from scene_envs.errors import InvalidInputError, unknown_name
 
 
@@ -32,12 +34,15 @@ class Size:
     pretraining: Mapping[str, Any] = field(default_factory=dict)
 
 
+_PAPER = dotted_values(PretrainConfig(recipe="paper"))
+_OF_SIZE = ("network.depth", "network.heads", "optimizer.warmup", "optimizer.lr")
+
 SIZES: dict[str, Size] = {
-    "tiny": Size(3, 4, 60_000, 6, 2, 1, {"depth": 1, "heads": 2, "warmup": 1}),
-    "small": Size(600, 64, 700_000, 256, pretraining={"depth": 4, "heads": 4, "warmup": 50}),
+    "tiny": Size(3, 4, 60_000, 6, 2, 1, {"network.depth": 1, "network.heads": 2, "optimizer.warmup": 1}),
+    "small": Size(600, 64, 700_000, 256, pretraining={"network.depth": 4, "network.heads": 4, "optimizer.warmup": 50}),
     "paper": Size(
         100_000, 256, 88_300_000, 2000,
-        pretraining={"depth": 10, "heads": 16, "warmup": 1000, "learning_rate": 1e-4, "matmul_precision": "high"},
+        pretraining={**{key: _PAPER[key] for key in _OF_SIZE}, "optimizer.matmul_precision": "high"},
     ),
 }  # fmt: skip
 """``tiny`` is for tests, ``small`` for a CPU, ``paper`` has the size of the paper's network and wants a GPU."""
@@ -71,7 +76,7 @@ class TablesConfig:
         count: samples of each prior that are measured, and real scenes to compare with; null takes the size's.
         num_steps: denoising steps per sample; null takes the size's.
         guidance: w of classifier-free guidance where prompts are followed, 0 for none.
-        pretraining: further keys of pretrain for every row, such as {learning_rate: 5e-4}; null for none.
+        pretraining: further keys of pretrain for every row, such as {optimizer: {lr: 5e-4}}; null for none.
         seed: of weights, batches, noise and samples.
         device: torch device.
         workers: physics worker processes; 0 computes in this one.
@@ -105,7 +110,9 @@ class TablesConfig:
         if not self.tables:
             raise InvalidInputError(f"tables=[] asks for nothing; name some of {', '.join(ALL_TABLES)}")
         if self.pretraining is not None and not isinstance(self.pretraining, Mapping):
-            raise InvalidInputError(f"pretraining={self.pretraining!r} is no mapping; write it like {{hidden: 64}}")
+            raise InvalidInputError(
+                f"pretraining={self.pretraining!r} is no mapping; write it like {{network: {{hidden: 64}}}}"
+            )
         taken = [f"{key} ({why})" for key, why in _NOT_OF_PRETRAINING.items() if key in (self.pretraining or {})]
         if taken:
             raise InvalidInputError(f"pretraining cannot set {', '.join(taken)}")
@@ -148,9 +155,9 @@ class TablesConfig:
             "batch_size": preset.batch_size if self.batch_size is None else self.batch_size,
             "seed": self.seed,
             "device": self.device,
-            "log_every": max(1, iterations // 5),
-            "evaluate_every": max(1, iterations // 2),
-            "checkpoint_every": max(1, min(250, iterations // 5)),
+            "logger.log_every": max(1, iterations // 5),
+            "logger.evaluate_every": max(1, iterations // 2),
+            "logger.checkpoint_every": max(1, min(250, iterations // 5)),
             **preset.pretraining,
-            **(self.pretraining or {}),
+            **dotted(self.pretraining or {}),
         }

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
+from agents.configuration.tree import changed, dotted_keys, dotted_values
 from agents.pretraining.config import PretrainConfig
 from benchmarks.paper_tables.data import RowData, trained_numbers
 from benchmarks.paper_tables.rows import Row
@@ -16,20 +16,28 @@ from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
 from scene_envs.files import write_json
 
 CONFIG_NAME, METRICS_NAME = "row.json", "metrics.json"
-_RUN_ONLY = ("output", "device", "log_every", "evaluate_every", "checkpoint_every", "pictures_every", "tensorboard")
+_RUN_ONLY = (
+    "output",
+    "device",
+    "logger.log_every",
+    "logger.evaluate_every",
+    "logger.checkpoint_every",
+    "logger.pictures_every",
+    "logger.name",
+)
 """Keys that may change between the parts of a resumed run."""
 _SHAPING = (
-    "network",
-    "process",
-    "text",
-    "rotation",
-    "attention",
-    "frequencies",
-    "rotation_features",
-    "contacts",
-    "hidden",
-    "depth",
-    "heads",
+    "network.name",
+    "process.name",
+    "text.encoder",
+    "process.rotation",
+    "network.frequencies",
+    "network.modules.relations",
+    "network.modules.rotation_features",
+    "network.modules.contacts",
+    "network.hidden",
+    "network.depth",
+    "network.heads",
 )
 """Keys that the number of parameters depends on."""
 
@@ -41,13 +49,13 @@ def run_config(row: Row, settings: TablesConfig, hidden: int | None = None) -> P
         UnknownNameError: a key that ``pretrain`` does not have.
     """
     keys: dict[str, Any] = {**settings.common(), **row.overrides}
-    known = {key.name for key in fields(PretrainConfig)}
+    known = dotted_keys(PretrainConfig())
     for key in keys:
         if key not in known:
             raise unknown_name("pretrain key", key, known)
     if hidden is not None:
-        keys["hidden"] = hidden
-    return PretrainConfig(**{**keys, "output": str(run_folder(row, settings))})
+        keys["network.hidden"] = hidden
+    return changed(PretrainConfig(), {**keys, "output": str(run_folder(row, settings))})
 
 
 def run_folder(row: Row, settings: TablesConfig) -> Path:
@@ -88,19 +96,19 @@ class Sizes:
         """The run of ``row``, as wide as its parameters ask for; a run that exists keeps its width."""
         before = read_json(run_folder(row, self.settings) / CONFIG_NAME)
         if before is not None:
-            return run_config(row, self.settings, int(before["config"]["hidden"]))
+            return run_config(row, self.settings, int(before["config"]["network.hidden"]))
         config = run_config(row, self.settings)
-        if "hidden" in self.settings.common():
+        if "network.hidden" in self.settings.common():
             return config
         width = match_width(
             target_parameters(row, self.settings),
-            config.heads,
-            lambda hidden: self._count(replace(config, hidden=hidden)),
+            config.network.heads,
+            lambda hidden: self._count(changed(config, {"network.hidden": hidden})),
         )
-        return replace(config, hidden=width)
+        return changed(config, {"network.hidden": width})
 
     def _count(self, config: PretrainConfig) -> int:
-        shape = tuple(getattr(config, key) for key in _SHAPING)
+        shape = tuple(dotted_values(config)[key] for key in _SHAPING)
         if shape not in self._counted:
             self._counted[shape] = self.data.count_parameters(config)
         return self._counted[shape]
@@ -115,7 +123,7 @@ def check_runs(rows: Iterable[Row], settings: TablesConfig) -> None:
     for row in rows:
         before = read_json(run_folder(row, settings) / CONFIG_NAME)
         if before is not None:
-            config = run_config(row, settings, int(before["config"]["hidden"]))
+            config = run_config(row, settings, int(before["config"]["network.hidden"]))
             _check_unchanged(before, config, target_parameters(row, settings))
 
 
@@ -145,7 +153,6 @@ def train(config: PretrainConfig, target: int, data: RowData) -> dict[str, Any]:
         "seconds": trainer.seconds,
         "parameters": trained_numbers(trained),
         "evaluations": trainer.evaluations,
-        "config": asdict(config),
     }
     write_json(directory / METRICS_NAME, metrics)
     trainer.checkpoint_path.unlink(missing_ok=True)
@@ -166,14 +173,14 @@ def read_json(path: Path) -> dict[str, Any] | None:
 
 
 def _compared(config: PretrainConfig) -> dict[str, Any]:
-    return {key: value for key, value in asdict(config).items() if key not in _RUN_ONLY}
+    return {key: value for key, value in dotted_values(config).items() if key not in _RUN_ONLY}
 
 
 def _check_unchanged(before: Mapping[str, Any], config: PretrainConfig, target: int) -> None:
     old, new = {**before["config"], "parameters": before["parameters"]}, {**_compared(config), "parameters": target}
-    changed = [key for key in new if key in old and old[key] != new[key]]
-    if changed:
-        differences = "; ".join(f"{key} was {old[key]!r}, is {new[key]!r}" for key in changed)
+    differing = [key for key in new if key in old and old[key] != new[key]]
+    if differing:
+        differences = "; ".join(f"{key} was {old[key]!r}, is {new[key]!r}" for key in differing)
         raise InvalidInputError(
             f"{config.output!r} holds a run with other keys ({differences}); give another output, or the same keys to "
             "resume it"

@@ -1,1 +1,1 @@
-"""Named sets of the keys of ``scene-envs pretrain``."""
+"""Options of the group ``recipe``."""

@@ -14,7 +14,7 @@ ROWS: tuple[dict[str, tuple[int, str]], ...] = (
         "agents.diffusion": (3, "forward and reverse processes"),
         "agents.utils": (4, "shared helpers"),
     },
-    {"scene_envs.scene_types": (0, "assets, workspace, camera")},
+    {"scene_envs.scene_types": (0, "assets, workspace, camera"), "agents.configuration": (4, "groups of keys")},
     {"scene_envs.scene": (0, "SceneBatch, normalizer")},
     {"scene_envs.physics": (0, "overlap, settling, projection"), "scene_envs.render": (1, "pictures, viewer")},
     {"scene_envs.grammars": (0, "structures and exact poses"), "scene_envs.export": (1, "files for simulators")},

@@ -11,12 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from scene_envs.envs.settings import PROMPT_SOURCES
 from scene_envs.errors import InvalidInputError
 from scene_envs.protocols import PriorLike, PromptedPriorLike
 from scene_envs.scene_types import SceneType
 
-PROMPT_SOURCES = ("data", "grammar")
-"""Values of ``prompt`` that stand for prompts of scenes; all others are prompts themselves."""
 _BANK = 64
 """Scenes of a grammar that prompts are drawn from, with three prompts each."""
 _MOST_ROWS = 4096

@@ -13,6 +13,8 @@ from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.scene_types import SceneType
 
 ACTION_MODES = ("next_sample", "noise")
+PROMPT_SOURCES = ("data", "grammar")
+"""Values of ``prompt`` that stand for prompts of scenes; all others are prompts themselves."""
 
 Init = TypeVar("Init", bound=Callable[..., None])
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import csv
 import io
 from collections import defaultdict
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
+from agents.configuration.tree import dotted_values
 from agents.pretraining.config import PretrainConfig
 from benchmarks.paper_tables import ALL_TABLES, Entry, Row, Table, TablesConfig, list_rows, make_tables
 from benchmarks.paper_tables.columns import COLUMNS, Column, error, expand, text
@@ -19,7 +19,7 @@ from benchmarks.paper_tables.tables import FilledTable, Line, csv_text, markdown
 from benchmarks.paper_tables.training import match_width, run_config, target_parameters
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
-STANDARD = {key.name: key.default for key in fields(PretrainConfig)}
+STANDARD = dotted_values(PretrainConfig())
 
 
 def filled(*lines: Line, columns: tuple[str, ...] = ("feasible_fraction", "category_kl")) -> FilledTable:
@@ -58,7 +58,10 @@ def test_every_precision_row_changes_one_thing_of_the_first_of_its_part() -> Non
         if entry.row.capacity != 1:
             assert not changed
         else:
-            together = ({"prediction", "loss_weighting"}, {"kernel", "category_loss", "empty_slots"})
+            together = (
+                {"process.prediction", "loss.weighting"},
+                {"process.kernel", "loss.category", "process.empty_slots"},
+            )
             assert len(changed) == 1 or any(changed <= keys for keys in together), changed
 
 
@@ -67,14 +70,18 @@ def test_every_factor_is_asked() -> None:
     asked = {(key, value) for row in ours for key, value in row.overrides.items()} | {
         (key, value) for key, value in STANDARD.items() if isinstance(value, str | int | float)
     }
-    assert {("prediction", name) for name in ("epsilon", "v", "x0", "edm")} <= asked
-    assert {("schedule", name) for name in ("linear", "cosine", "karras")} <= asked
-    assert {("moments", name) for name in ("scene", "feature", "category")} <= asked
-    assert {("noise_floor", value) for value in (0.01, 0.002, 0.0005)} <= asked
-    assert {("translation_weight", 1.0), ("translation_weight", 3.0)} <= asked
-    assert {("final_learning_rate", 1.0), ("decay_share", 1.0)} <= asked
-    assert {("rotation_features", True), ("rotation_features", False)} <= asked
-    assert {("attention", "plain"), ("attention", "relative"), ("frequencies", 0), ("frequencies", 8)} <= asked
+    assert {("process.prediction", name) for name in ("epsilon", "v", "x0", "edm")} <= asked
+    assert {("process.schedule", name) for name in ("linear", "cosine", "karras")} <= asked
+    assert {("process.moments", name) for name in ("scene", "feature", "category")} <= asked
+    assert {("process.noise_floor", value) for value in (0.01, 0.002, 0.0005)} <= asked
+    assert {("loss.translation_weight", 1.0), ("loss.translation_weight", 3.0)} <= asked
+    assert {("optimizer.final_lr", 1.0), ("optimizer.decay_share", 1.0)} <= asked
+    assert {("network.modules.rotation_features", True), ("network.modules.rotation_features", False)} <= asked
+    assert {
+        *(("network.modules.relations", name) for name in ("none", "largest", "axis")),
+        ("network.frequencies", 0),
+        ("network.frequencies", 8),
+    } <= asked
     assert {row.capacity for row in ours} == {0.5, 1.0, 2.0}
     assert [entry.row.overrides for entry in make_tables(["precision"], ["paper"])[0].entries] == [PAPER]
 
@@ -88,14 +95,17 @@ def test_rows_are_chosen_by_pattern() -> None:
 
 def test_keys_of_a_row_win_over_those_of_all_rows(tmp_path: Path) -> None:
     settings = TablesConfig(
-        size="tiny", iterations=7, pretraining={"depth": 3, "schedule": "cosine"}, output=str(tmp_path)
+        size="tiny",
+        iterations=7,
+        pretraining={"network": {"depth": 3}, "process.schedule": "cosine"},
+        output=str(tmp_path),
     )
-    config = run_config(Row("one", {"schedule": "linear"}), settings)
-    assert (config.schedule, config.depth, config.iterations, config.batch_size) == ("linear", 3, 7, 4)
+    config = run_config(Row("one", {"process.schedule": "linear"}), settings)
+    assert (config.process.schedule, config.network.depth, config.iterations, config.batch_size) == ("linear", 3, 7, 4)
     assert config.output == str(tmp_path / "runs" / "one")
     assert target_parameters(Row("two", capacity=2.0), settings) == 120_000
-    with pytest.raises(UnknownNameError, match="did you mean 'schedule'"):
-        run_config(Row("one", {"shedule": "linear"}), settings)
+    with pytest.raises(UnknownNameError, match=r"did you mean 'process\.schedule'"):
+        run_config(Row("one", {"process.shedule": "linear"}), settings)
 
 
 @pytest.mark.parametrize(
@@ -107,7 +117,7 @@ def test_keys_of_a_row_win_over_those_of_all_rows(tmp_path: Path) -> None:
         ({"iterations": 0}, "iterations=0 must be at least 1"),
         ({"count": 1}, "measure at least 2"),
         ({"pretraining": "hidden"}, "is no mapping"),
-        ({"pretraining": {"recipe": "paper", "hidden": 8}}, r"cannot set recipe \(it is a set of keys"),
+        ({"pretraining": {"recipe": "paper", "network.hidden": 8}}, r"cannot set recipe \(it is a set of keys"),
         ({"pretraining": {"iterations": 5}}, r"cannot set iterations \(a key of tables itself"),
     ],
 )

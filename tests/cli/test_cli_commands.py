@@ -54,15 +54,15 @@ def test_generate_pretrain_post_train_and_sample_the_result(tmp_path, capsys):
     data, trained, steered = (tmp_path / name for name in ("data", "trained", "steered"))
     assert main(["generate", "count=8", "shard_size=8", "workers=0", "progress=false", f"output={data}"]) == 0
     assert metrics(data)["scenes"] == 8
-    small = ["hidden=16", "depth=1", "heads=1", "batch_size=2", "iterations=2"]
+    small = ["network.hidden=16", "network.depth=1", "network.heads=1", "batch_size=2", "iterations=2"]
     assert main(["pretrain", f"data={data}", *small, f"output={trained}"]) == 0
     assert metrics(trained)["trained_steps"] == 2
-    words = ["iterations=1", "batch_size=2", "num_steps=3", "gradient_steps=2", "regularisation_batch=2"]
+    words = ["iterations=1", "batch_size=2", "num_steps=3", "algorithm.gradient_steps=2", "regularisation.batch_size=2"]
     words += [
-        "bank_size=8",
-        "guard_scenes=2",
-        "report_scenes=1",
-        "progress=none",
+        "regularisation.bank_size=8",
+        "guard.scenes=2",
+        "logger.report_scenes=1",
+        "logger.progress=none",
         "reward={name: clip, reward: object_count, high: 30}",
     ]
     assert main(["post-train", f"prior={trained}", *words, f"output={steered}"]) == 0
@@ -74,8 +74,14 @@ def test_generate_pretrain_post_train_and_sample_the_result(tmp_path, capsys):
 
 
 def test_the_doctor_prints_its_screen_and_keeps_the_numbers(prior, tmp_path, capsys):
-    words = ["batch_size=2", "num_steps=3", "gradient_steps=2", "regularisation_batch=2", "bank_size=8"]
-    assert main(["doctor", f"prior={prior}", *words, "guard_scenes=2", "slots=20", f"output={tmp_path}"]) == 0
+    words = [
+        "batch_size=2",
+        "num_steps=3",
+        "algorithm.gradient_steps=2",
+        "regularisation.batch_size=2",
+        "regularisation.bank_size=8",
+    ]
+    assert main(["doctor", f"prior={prior}", *words, "guard.scenes=2", "slots=20", f"output={tmp_path}"]) == 0
     assert metrics(tmp_path)["log_ratio"] == 0
     assert "log-ratio at the start" in capsys.readouterr().out
 

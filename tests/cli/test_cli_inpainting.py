@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from agents.cli import main
 from agents.priors.base import ScenePrior
@@ -68,14 +69,21 @@ def test_search_and_post_training_take_prompts(reader: Path, tmp_path: Path) -> 
     words = ["search", f"prior={reader}", "objective=prompt_match", "prompt=A scene with two cups.", "guidance=1"]
     assert main([*words, "budget=3", "branching=2", "num_steps=2", f"output={tmp_path / 'search'}"]) == 0
     metrics = json.loads((tmp_path / "search" / "metrics.json").read_text())
-    assert metrics["config"]["prompt"] == "A scene with two cups."
+    config = yaml.safe_load((tmp_path / "search" / "config.yaml").read_text())
+    assert config["prompt"] == "A scene with two cups."
     assert metrics["nfe"] == 3 * 2 * 2
     assert 0.0 <= metrics["search"]["objective"] <= 1.0
     words = ["post-train", f"prior={reader}", "reward=prompt_match", "iterations=1", "batch_size=4", "num_steps=2"]
-    words += ["regularisation_batch=2", "bank_size=9", "guard_scenes=4", "report_scenes=0", "progress=none"]
-    words += ["prompt=[A scene with two cups., A scene with 9 objects.]", "scenes_per_prompt=2", "min_std=0.0001"]
+    words += ["regularisation.batch_size=2", "regularisation.bank_size=9", "guard.scenes=4"]
+    words += [
+        "prompt=[A scene with two cups., A scene with 9 objects.]",
+        "algorithm.scenes_per_prompt=2",
+        "algorithm.min_std=0.0001",
+        "logger.progress=none",
+        "logger.report_scenes=0",
+    ]
     assert main([*words, f"output={tmp_path / 'run'}"]) == 0
-    config = json.loads((tmp_path / "run" / "metrics.json").read_text())["config"]
+    config = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
     assert config["prompt"] == ["A scene with two cups.", "A scene with 9 objects."]
 
 

@@ -11,13 +11,13 @@ from agents.networks import parameter_count
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.initial_prior import build_prior
 from agents.priors.mixed import MixedPrior
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import UnknownNameError
 from scene_envs.grammars import get_grammar
 from scene_envs.normalizer import Normalizer
 
 
 def test_the_paper_s_recipe_is_its_setting() -> None:
-    config = compose("pretrain", PretrainConfig, ["recipe=paper", "text=true"])
+    config = compose("pretrain", PretrainConfig, ["recipe=paper", "text=vocabulary"])
     raw = torch.from_numpy(get_grammar("dimsum_table").sample_array(np.random.default_rng(0), 40))
     prior = build_prior(config, raw, Normalizer.fit(raw), [["A scene with 8 objects."]])
     assert isinstance(prior, MixedPrior)
@@ -31,11 +31,11 @@ def test_the_paper_s_recipe_is_its_setting() -> None:
 
 
 def test_keys_given_beside_a_recipe_win() -> None:
-    config = compose("pretrain", PretrainConfig, ["learning_rate=0.5", "recipe=paper"])
-    assert (config.recipe, config.learning_rate, config.schedule) == ("paper", 0.5, "linear")
-    assert compose("pretrain", PretrainConfig, []) == PretrainConfig(output="")
+    config = compose("pretrain", PretrainConfig, ["optimizer.lr=0.5", "recipe=paper"])
+    assert (config.recipe, config.optimizer.lr, config.process.schedule) == ("paper", 0.5, "linear")
+    assert compose("pretrain", PretrainConfig, []) == PretrainConfig()
 
 
 def test_an_unknown_recipe_is_refused() -> None:
-    with pytest.raises(InvalidInputError, match="recipe/papr"):
+    with pytest.raises(UnknownNameError, match="did you mean 'paper'"):
         compose("pretrain", PretrainConfig, ["recipe=papr"])

@@ -150,7 +150,7 @@ def test_environments_play_it(prior: ScenePrior, tmp_path: Path) -> None:
 
 def test_a_prior_of_it_is_built_trained_saved_and_sampled(folder: Path, tmp_path: Path) -> None:
     dataset = SceneDataset.load(folder)
-    config = PretrainConfig(scene=NAME, hidden=32, depth=1, heads=2)
+    config = PretrainConfig(scene=NAME, network={"hidden": 32, "depth": 1, "heads": 2})
     prior = build_prior(config, dataset.tensor, dataset.normalizer)
     loss = prior.pretraining_loss(dataset.normalizer.normalize(dataset.tensor), torch.Generator().manual_seed(0))
     loss.backward()

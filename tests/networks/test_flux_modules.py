@@ -10,6 +10,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from agents import PretrainConfig
 from agents.diffusion.gaussian import check_prediction
 from agents.networks import MixedFlux, MixedFluxConfig, build_network, network_config
 from agents.networks.contacts import ContactsConfig
@@ -23,12 +24,15 @@ from scene_envs.errors import InvalidInputError, UnknownNameError
 
 SIZES: dict[str, Any] = {"features": 20, "categories": 8, "hidden": 16, "depth": 2, "heads": 2}
 ALL: dict[str, Any] = {
-    "attention": "relative",
-    "contacts": 1,
-    "rotation_features": 1,
-    "pooled_text": 1,
-    "count_embedding": 1,
-    "count_conditioning": 9,
+    "modules": [
+        {"name": "given_flags"},
+        {"name": "pooled_text"},
+        {"name": "count_embedding"},
+        {"name": "count_conditioning", "largest": 9},
+        {"name": "relations"},
+        {"name": "rotation_features"},
+        {"name": "contacts"},
+    ],
     "text_width": 12,
 }
 
@@ -57,7 +61,9 @@ def test_an_ablation_leaves_out_one_module_and_its_weights_alone(name: str) -> N
 
 def test_the_core_alone_is_the_network_of_the_paper() -> None:
     core = build_network(everything().without(*(module.name for module in everything().modules)))
-    paper = MixedFluxConfig.paper(categories=8)
+    sizes = {**vars(PretrainConfig(recipe="paper").network), "modules": ()}
+    paper = network_config(process="mixed", features=20, categories=8, text_width=768, **sizes)
+    assert isinstance(paper, MixedFluxConfig)
     assert paper.modules == ()
     first = {name.partition(".")[0] for name in core.state_dict()}
     with torch.device("meta"):

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from agents import PretrainConfig
 from agents.networks import (
     NETWORKS,
     DiffuSceneConfig,
@@ -41,6 +42,10 @@ EQUIVARIANT = ("flux", "midiffusion")
 BASELINES = ("midiffusion", "diffuscene")
 
 
+SEEN = [{"name": name} for name in ("given_flags", "count_embedding", "relations", "rotation_features", "contacts")]
+READ: list[dict[str, Any]] = [{"name": "pooled_text"}, {"name": "count_conditioning", "largest": 9}]
+
+
 def make(
     name: str, process: str, text_width: int = TEXT, zero: bool = False, attention: bool = True, **fields: Any
 ) -> nn.Module:
@@ -56,12 +61,7 @@ def make(
         heads=2,
         text_width=text_width,
         frequencies=2,
-        rotation_features=1,
-        contacts=1,
-        attention="relative",
-        pooled_text=1,
-        count_embedding=1,
-        count_conditioning=9,
+        modules=[*SEEN, *(READ if text_width else [])],
     )
     if isinstance(config, MixedFluxConfig) and not attention:
         config = config.without("contacts", "relations")
@@ -262,7 +262,7 @@ def test_flags_and_time_are_read(name: str) -> None:
 @pytest.mark.parametrize("name", BASELINES)
 def test_fourier_features_are_off_as_published_and_need_positions(name: str) -> None:
     keys: dict[str, Any] = {"features": FEATURES, "categories": CATEGORIES, "hidden": 16, "depth": 2, "heads": 2}
-    config = network_config(name, "mixed", frequencies=8, attention="relative", **keys)
+    config = network_config(name, "mixed", frequencies=8, **keys)
     assert config.frequencies == 0
     arguments = {key: inputs("mixed", 6, text=False)[key].to(kind) for key, kind in _PLAIN.items()}
     assert build_network(config)(**arguments)[0].shape == (2, 6, 12)
@@ -326,7 +326,9 @@ def test_sizes_with_equal_parameters(name: str, process: str) -> None:
 
 
 def test_counts_agree_with_the_papers_size_and_with_a_sum_by_hand() -> None:
-    assert parameter_count(MixedFluxConfig.paper(categories=21)) == pytest.approx(88.3e6, rel=2e-3)
+    paper = {**vars(PretrainConfig(network="paper").network), "modules": ()}
+    size = network_config(process="mixed", features=33, categories=21, text_width=768, **paper)
+    assert parameter_count(size) == pytest.approx(88.3e6, rel=2e-3)
     distance = MixedFluxConfig(categories=8, hidden=16, heads=2, single_blocks=3, modules=(RelationsConfig(),))
     plain = MixedFluxConfig(categories=8, hidden=16, heads=2, single_blocks=3)
     assert parameter_count(distance) > parameter_count(plain)

@@ -46,9 +46,9 @@ def test_it_is_listed_without_an_import_of_its_package() -> None:
 
 def test_two_steps_train_it_and_its_files_give_it_back(tmp_path: Path) -> None:
     config = PretrainConfig(
-        data="grammar", output=str(tmp_path / "run"), iterations=2, batch_size=4, hidden=16, depth=3, warmup=1,
-        log_every=1, evaluate_every=2, checkpoint_every=2, process="mixed", network="deep_sets",
-        empty_slots="attended",
+        data="grammar", output=str(tmp_path / "run"), iterations=2, batch_size=4,
+        network={"name": "deep_sets", "hidden": 16, "depth": 3}, process={"empty_slots": "attended"},
+        optimizer={"warmup": 1}, logger={"log_every": 1, "evaluate_every": 2, "checkpoint_every": 2},
     )  # fmt: skip
     pretrain(config)
     prior = ScenePrior.load(tmp_path / "run")
@@ -66,9 +66,7 @@ def test_its_size_is_matched_like_any_other() -> None:
 
 
 def test_slots_that_it_cannot_ignore_are_refused(tmp_path: Path) -> None:
-    config = PretrainConfig(
-        data="grammar", output=str(tmp_path), iterations=1, process="mixed", network="deep_sets", empty_slots="dropped"
-    )
+    config = PretrainConfig(data="grammar", output=str(tmp_path), iterations=1, network="deep_sets", process="mixed")
     with pytest.raises(InvalidInputError, match="empty_slots='attended'"):
         pretrain(config)
 

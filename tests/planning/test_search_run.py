@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import yaml
 
 from agents.planning import SearchOutcome, UCTPlanner, run_search
 from agents.priors.base import ScenePrior
@@ -89,11 +90,11 @@ def test_children_keep_what_is_not_masked_bit_for_bit(run: Run) -> None:
 
 def test_files_hold_what_was_found(run: Run) -> None:
     names = {path.name for path in run.output.iterdir()}
-    assert names == {"curve.png", "before.png", "after.png", "best.safetensors", "metrics.json"}
+    assert names == {"curve.png", "before.png", "after.png", "best.safetensors", "metrics.json", "config.yaml"}
     assert torch.equal(SceneBatch.load(run.output / "best.safetensors").tensor, run.outcome.best.tensor)
     metrics = json.loads((run.output / "metrics.json").read_text())
     assert metrics["search"]["curve"][-1] == metrics["search"]["value"] == run.outcome.search.best_value
-    assert metrics["config"]["budget"] == 24
+    assert yaml.safe_load((run.output / "config.yaml").read_text())["budget"] == 24
     for name in ("curve.png", "before.png", "after.png"):
         assert (run.output / name).read_bytes().startswith(b"\x89PNG")
 

@@ -7,30 +7,29 @@ from typing import Any
 
 import torch
 
+from agents.configuration.tree import changed
 from agents.post_training import PostTrainConfig
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.scene import SceneBatch
 
 
 def small_config(output: Path | str, **changes: Any) -> PostTrainConfig:
-    """Four iterations in about a second."""
-    settings: dict[str, Any] = {
-        "reward": count_objects,
-        "output": str(output),
-        "iterations": 4,
-        "batch_size": 6,
-        "num_steps": 5,
-        "gradient_steps": 2,
-        "regularisation": 1.0,
-        "regularisation_batch": 4,
-        "bank_size": 24,
-        "guard_scenes": 8,
-        "guard_every": 2,
-        "checkpoint_every": 2,
-        "learning_rate": 1e-3,
-        "progress": "none",
-    }
-    return PostTrainConfig(**(settings | changes))
+    """Four iterations in about a second; ``changes`` are keys, those of a group by one name."""
+    config = PostTrainConfig(
+        reward=changes.pop("reward", count_objects),
+        output=str(output),
+        iterations=4,
+        batch_size=6,
+        num_steps=5,
+        algorithm={"gradient_steps": 2},
+        regularisation={"weight": 1.0, "batch_size": 4, "bank_size": 24},
+        guard={"scenes": 8, "every": 2},
+        logger={"checkpoint_every": 2, "progress": "none"},
+        optimizer={"lr": 1e-3},
+        **{key: changes.pop(key) for key in ("prompt", "guidance") if key in changes},
+    )
+    places = {**PostTrainConfig.RENAMED, "regularisation": "regularisation.weight", "lr": "optimizer.lr"}
+    return changed(config, {places.get(key, key): value for key, value in changes.items()})
 
 
 def count_objects(batch: SceneBatch, context: RewardContext) -> RewardOutput:

@@ -18,7 +18,7 @@ from agents.post_training import learner as learner_module
 from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards.base import RewardContext, RewardOutput
-from scene_envs.errors import CorruptFileError, InvalidInputError, TrainingError
+from scene_envs.errors import CorruptFileError, InvalidInputError, TrainingError, UnknownNameError
 from scene_envs.scene import SceneBatch
 
 
@@ -81,7 +81,17 @@ def test_run_leaves_a_prior_a_log_and_metrics(tmp_path: Path) -> None:
     assert "reward: " in (tmp_path / "config.yaml").read_text()
 
 
-@pytest.mark.parametrize("changes", [{}, {"ema": 0.5, "credit": "scene"}, {"updates": 2, "clip_epsilon": 1e-3}])
+def test_rows_go_to_the_logger_that_is_named(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    config = small_config(tmp_path, iterations=2, **{"logger.name": "tensorboard"})
+    rewards = [row["reward"] for row in post_train(config, prior=tiny_prior()).history]
+    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert [event.value for event in events.Scalars("reward")] == pytest.approx(rewards)
+
+
+@pytest.mark.parametrize("changes", [{}, {"ema": 0.5, "credit": "scene"}, {"algorithm": "ddpo_is"}])
 def test_stopped_and_resumed_run_equals_the_uninterrupted_one(tmp_path: Path, changes: dict) -> None:
     whole = post_train(small_config(tmp_path / "whole", iterations=4, **changes), prior=tiny_prior())
     post_train(small_config(tmp_path / "parts", iterations=2, **changes), prior=tiny_prior())
@@ -134,7 +144,7 @@ def test_killed_run_resumes_bit_for_bit(tmp_path: Path) -> None:
 
 def test_other_settings_do_not_continue_a_run(tmp_path: Path) -> None:
     post_train(small_config(tmp_path, iterations=2), prior=tiny_prior())
-    with pytest.raises(InvalidInputError, match=r"learning_rate was 0\.001, is 0\.5"):
+    with pytest.raises(InvalidInputError, match=r"lr was 0\.001, is 0\.5"):
         post_train(small_config(tmp_path, learning_rate=0.5), prior=tiny_prior())
 
 
@@ -185,7 +195,7 @@ def test_nan_gradient_stops_the_run_and_keeps_what_was_good(tmp_path: Path, monk
         return value, norm
 
     monkeypatch.setattr(learner_module, "add_regularisation_gradient", broken)
-    with pytest.raises(TrainingError, match=r"iteration 4 .*not finite.*checkpoint\.pt.*learning_rate"):
+    with pytest.raises(TrainingError, match=r"iteration 4 .*not finite.*checkpoint\.pt.*lr"):
         post_train(small_config(tmp_path), prior=tiny_prior())
     state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
     assert state["iteration"] == 2
@@ -263,14 +273,13 @@ def test_credit_per_object_needs_such_a_reward(tmp_path: Path) -> None:
     "changes",
     [
         {"batch_size": 1},
-        {"learning_rate": 0.0},
+        {"lr": 0.0},
         {"credit": "slot"},
-        {"updates": 2},
-        {"guard_scenes": 24},
+        {"bank_size": 8},
         {"ema": 1.0},
         {"regularisation": -1.0},
     ],
 )
 def test_wrong_settings_are_named(tmp_path: Path, changes: dict) -> None:
-    with pytest.raises(InvalidInputError, match=next(iter(changes))):
+    with pytest.raises((InvalidInputError, UnknownNameError), match=next(iter(changes))):
         small_config(tmp_path, **changes)

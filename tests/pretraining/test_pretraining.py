@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from agents.configuration.tree import changed
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.data import SceneTable
 from agents.pretraining.initial_prior import build_prior
@@ -40,8 +41,8 @@ def raw() -> torch.Tensor:
 @pytest.fixture
 def config(tmp_path: Path) -> PretrainConfig:
     return PretrainConfig(
-        output=str(tmp_path), iterations=6, batch_size=8, hidden=16, depth=1, heads=2, warmup=2,
-        log_every=1, evaluate_every=3, checkpoint_every=2,
+        output=str(tmp_path), iterations=6, batch_size=8, network={"hidden": 16, "depth": 1, "heads": 2},
+        optimizer={"warmup": 2}, logger={"log_every": 1, "evaluate_every": 3, "checkpoint_every": 2},
     )  # fmt: skip
 
 
@@ -95,9 +96,12 @@ def test_nan_stops_the_run_and_keeps_the_last_checkpoint(config: PretrainConfig,
 
 def test_a_run_does_not_go_on_with_keys_that_do_not_fit_it(config: PretrainConfig, raw: torch.Tensor) -> None:
     make_run(config, raw).run()
-    for other, was in (({"optimizer": "adamw"}, "optimizer=muon"), ({"hidden": 32}, "hidden=16")):
+    for other, was in (
+        ({"optimizer.name": "adamw"}, "optimizer.name=muon"),
+        ({"network.hidden": 32}, "network.hidden=16"),
+    ):
         with pytest.raises(InvalidInputError, match=f"started with {was}"):
-            make_run(replace(config, iterations=8, **other), raw).run()  # type: ignore[arg-type]
+            make_run(changed(config, {"iterations": 8, **other}), raw).run()
 
 
 @pytest.mark.parametrize("process", ["continuous", "mixed"])
@@ -120,7 +124,7 @@ def test_a_checkpoint_that_holds_no_base_rates_resumes_bit_for_bit(
     config: PretrainConfig, raw: torch.Tensor, tmp_path: Path
 ) -> None:
     """The learning rate hangs on the number of the step alone, whatever the optimiser's groups say."""
-    config = replace(config, decay_share=1.0)
+    config = changed(config, {"optimizer.decay_share": 1.0})
     whole = make_run(replace(config, output=str(tmp_path / "whole")), raw)
     whole.run()
     first = make_run(config, raw)
@@ -165,7 +169,7 @@ def test_a_truncated_checkpoint_is_named(config: PretrainConfig, raw: torch.Tens
 
 
 def test_learning_rate_warms_up_and_ends_at_its_floor() -> None:
-    config = PretrainConfig(iterations=1000, warmup=10, learning_rate=1.0, final_learning_rate=0.1, decay_share=1.0)
+    config = PretrainConfig(iterations=1000, optimizer={"warmup": 10, "lr": 1.0, "final_lr": 0.1, "decay_share": 1.0})
     assert learning_rate_at(0, config) == pytest.approx(0.1)
     assert learning_rate_at(9, config) == pytest.approx(1.0)
     assert learning_rate_at(505, config) == pytest.approx(0.55)
@@ -173,19 +177,19 @@ def test_learning_rate_warms_up_and_ends_at_its_floor() -> None:
 
 
 def test_learning_rate_stays_at_its_peak_until_the_decay_begins() -> None:
-    config = PretrainConfig(iterations=1000, warmup=10, learning_rate=1.0, final_learning_rate=0.1, decay_share=0.2)
+    config = PretrainConfig(iterations=1000, optimizer={"warmup": 10, "lr": 1.0, "final_lr": 0.1, "decay_share": 0.2})
     assert {learning_rate_at(step, config) for step in range(9, 801)} == {1.0}
     assert learning_rate_at(900, config) == pytest.approx(0.55)  # half way along the cosine
     assert learning_rate_at(1000, config) == pytest.approx(0.1)
-    assert learning_rate_at(900, replace(config, final_learning_rate=1.0)) == 1.0
-    late = replace(config, warmup=900)  # a decay never begins in the warm-up
+    assert learning_rate_at(900, changed(config, {"optimizer.final_lr": 1.0})) == 1.0
+    late = changed(config, {"optimizer.warmup": 900})  # a decay never begins in the warm-up
     assert learning_rate_at(899, late) == 1.0
     assert learning_rate_at(950, late) == pytest.approx(0.55)
 
 
 def test_a_decay_share_that_is_none_is_refused(config: PretrainConfig, raw: torch.Tensor) -> None:
     with pytest.raises(InvalidInputError, match=r"decay_share=1\.5 is outside 0\.\.1"):
-        make_run(replace(config, decay_share=1.5), raw)
+        make_run(changed(config, {"optimizer.decay_share": 1.5}), raw)
 
 
 def test_the_weight_average_follows_its_closed_form() -> None:
@@ -204,7 +208,7 @@ def test_parts_one_after_the_other_add_up_to_their_batch(
     config: PretrainConfig, raw: torch.Tensor, process: str
 ) -> None:
     """The gradient of a step is the mean over its parts, each with noise of its own."""
-    run = make_run(replace(config, process=process, accumulate=2, clip=1e9), raw)
+    run = make_run(changed(config, {"process.name": process, "optimizer.accumulate": 2, "optimizer.clip": 1e9}), raw)
     losses = [run._part_loss(4, part_generator(0, 0, part)) for part in range(2)]
     expected = torch.autograd.grad(sum(losses) / 2, list(run.network.parameters()), allow_unused=True)  # type: ignore[arg-type]
     norm = torch.stack([g.norm() for g in expected if g is not None]).norm()
@@ -215,13 +219,13 @@ def test_parts_one_after_the_other_add_up_to_their_batch(
 
 def test_a_batch_that_cannot_be_parted_is_refused(config: PretrainConfig, raw: torch.Tensor) -> None:
     with pytest.raises(InvalidInputError, match="not a multiple of 3"):
-        make_run(replace(config, accumulate=3), raw)
+        make_run(changed(config, {"optimizer.accumulate": 3}), raw)
     with pytest.raises(UnknownNameError, match="did you mean 'bfloat16'"):
-        make_run(replace(config, precision="bfloat"), raw)
+        make_run(changed(config, {"optimizer.precision": "bfloat"}), raw)
 
 
 def test_autocast_is_of_the_network_only(config: PretrainConfig, raw: torch.Tensor) -> None:
-    run = make_run(replace(config, precision="bfloat16"), raw)
+    run = make_run(changed(config, {"optimizer.precision": "bfloat16"}), raw)
     x = run.prior.initial(2, 34)
     pose, logits = run.prior.denoiser(x, torch.tensor([5, 900]))
     assert (pose.dtype, logits.dtype) == (torch.float32, torch.float32)
@@ -230,8 +234,9 @@ def test_autocast_is_of_the_network_only(config: PretrainConfig, raw: torch.Tens
 
 def test_a_grammar_without_end_trains_a_prior_that_reads_prompts(tmp_path: Path) -> None:
     config = PretrainConfig(
-        output=str(tmp_path), data="grammar", process="mixed", text=True, iterations=2, batch_size=4, hidden=16,
-        depth=1, heads=2, log_every=1, evaluate_every=2, checkpoint_every=2, pictures_every=2,
+        output=str(tmp_path), data="grammar", text="vocabulary", iterations=2, batch_size=4,
+        network={"hidden": 16, "depth": 1, "heads": 2},
+        logger={"log_every": 1, "evaluate_every": 2, "checkpoint_every": 2, "pictures_every": 2},
     )  # fmt: skip
     prior, data, heldout = prepare(config)
     assert data.size == 0
@@ -249,10 +254,11 @@ def test_two_processes_take_the_steps_of_one_with_twice_the_parts(tmp_path: Path
     generate("dimsum_table", 64, tmp_path / "data", workers=0, verify=False, progress=False)
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
-    keys = ["iterations=4", "batch_size=8", "hidden=16", "depth=1", "heads=2", "warmup=2", "log_every=1", "seed=3"]
+    keys = ["iterations=4", "batch_size=8", "network.hidden=16", "network.depth=1", "network.heads=2", "seed=3"]
+    keys += ["optimizer.warmup=2", "logger.log_every=1"]
     for start, name, accumulate in ((launcher, "two", "1"), ([sys.executable], "one", "2")):
         folders = [f"data={tmp_path / 'data'}", f"heldout={tmp_path / 'data'}", f"output={tmp_path / name}"]
-        command = [*start, "-m", "agents.cli", "pretrain", *folders, *keys, f"accumulate={accumulate}"]
+        command = [*start, "-m", "agents.cli", "pretrain", *folders, *keys, f"optimizer.accumulate={accumulate}"]
         done = subprocess.run(command, env=environment, capture_output=True, timeout=240, text=True)
         assert done.returncode == 0, done.stderr[-3000:]
         assert done.stdout.count("held-out loss") == 1  # the first process alone speaks
@@ -269,8 +275,10 @@ def test_one_prior_is_trained_on_several_scene_types(tmp_path: Path) -> None:
     for scene in ("dimsum_table", "pantry_shelf"):
         generate(scene, 12, tmp_path / scene, workers=0, verify=False, progress=False)
     config = PretrainConfig(
-        output=str(tmp_path / "run"), data=f"{tmp_path / 'dimsum_table'},{tmp_path / 'pantry_shelf'}", process="mixed",
-        text=True, iterations=2, batch_size=8, hidden=16, depth=1, heads=2, log_every=1, evaluate_every=2,
+        output=str(tmp_path / "run"), data=f"{tmp_path / 'dimsum_table'},{tmp_path / 'pantry_shelf'}",
+        text="vocabulary",
+        iterations=2, batch_size=8, network={"hidden": 16, "depth": 1, "heads": 2},
+        logger={"log_every": 1, "evaluate_every": 2},
     )  # fmt: skip
     prior, data, heldout = prepare(config)
     assert prior.scene_type.name == "dimsum_table+pantry_shelf"

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from agents.configuration.tree import changed as changed_config
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.data import SceneTable
 from agents.pretraining.initial_prior import build_prior
@@ -20,8 +21,9 @@ PROMPTS = describe_all(SCENES, np.random.default_rng(0))
 
 
 def fresh(**keys: object) -> tuple[MixedPrior, SceneTable]:
-    small = {"hidden": 32, "depth": 2, "heads": 2, "text_width": 48, "text_depth": 1, "text_latents": 2}
-    config = PretrainConfig(scene="living_room_shelf", text=True, **{**small, **keys})  # type: ignore[arg-type]
+    text = {"encoder": "vocabulary", "width": 48, "depth": 1, "latents": 2}
+    small = PretrainConfig(scene="living_room_shelf", text=text, network={"hidden": 32, "depth": 2, "heads": 2})
+    config = changed_config(small, keys)
     prior = build_prior(config, SCENES.tensor, Normalizer.fit(SCENES.tensor), PROMPTS)
     assert isinstance(prior, MixedPrior)
     return prior, SceneTable(prior.encode(SCENES), PROMPTS)
@@ -66,7 +68,7 @@ def test_the_same_seed_learns_the_same_and_nothing_else_changes() -> None:
 
 
 @pytest.mark.parametrize(
-    "keys", [{"text_count_conditioning": False}, {"network": "midiffusion", "empty_slots": "attended"}]
+    "keys", [{"text.count_conditioning": False}, {"network.name": "midiffusion", "process.empty_slots": "attended"}]
 )
 def test_a_network_without_count_conditioning_has_nothing_to_learn(keys: dict[str, object]) -> None:
     prior, data = fresh(**keys)

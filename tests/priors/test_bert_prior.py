@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from agents.configuration.tree import changed
 from agents.networks.bert_files import FOLDER_VARIABLE, load_bert
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.initial_prior import build_prior
@@ -51,7 +52,7 @@ def _data() -> SceneDataset:
 @pytest.fixture(scope="module")
 def prior(bert: Path) -> MixedPrior:
     data = _data()
-    config = PretrainConfig(process="mixed", text=True, text_encoder=str(bert), hidden=32, depth=2, heads=2)
+    config = PretrainConfig(text={"encoder": str(bert)}, network={"hidden": 32, "depth": 2, "heads": 2})
     made = build_prior(config, data.tensor, data.normalizer, data.prompt_sets)
     assert isinstance(made, MixedPrior)
     generator = torch.Generator().manual_seed(0)
@@ -97,16 +98,18 @@ def test_another_bert_is_refused(prior: MixedPrior, tmp_path: Path, monkeypatch:
 def test_training_reads_prompts_and_resumes_bit_for_bit(bert: Path, tmp_path: Path) -> None:
     _data().save(tmp_path / "data")
     config = PretrainConfig(
-        data=str(tmp_path / "data"), process="mixed", text=True, text_encoder=str(bert), hidden=32, depth=1, heads=2,
-        iterations=4, batch_size=4, evaluate_every=10, checkpoint_every=2, output=str(tmp_path / "whole"),
+        data=str(tmp_path / "data"), text={"encoder": str(bert)}, network={"hidden": 32, "depth": 1, "heads": 2},
+        iterations=4, batch_size=4, logger={"evaluate_every": 10, "checkpoint_every": 2},
+        output=str(tmp_path / "whole"),
     )  # fmt: skip
     pretrain(config)
     halves = replace(config, output=str(tmp_path / "halves"))
     state = torch.load(tmp_path / "whole" / "checkpoint.pt", weights_only=False)
     assert not [name for name in state["network"] if "bert" in name or "embeddings" in name]
-    pretrain(replace(halves, iterations=2, warmup=0, final_learning_rate=1.0))
-    pretrain(replace(halves, warmup=0, final_learning_rate=1.0))
-    straight = replace(config, output=str(tmp_path / "straight"), warmup=0, final_learning_rate=1.0)
+    flat = {"optimizer.warmup": 0, "optimizer.final_lr": 1.0}
+    pretrain(changed(halves, {"iterations": 2, **flat}))
+    pretrain(changed(halves, flat))
+    straight = changed(config, {"output": str(tmp_path / "straight"), **flat})
     pretrain(straight)
     first, second = (ScenePrior.load(tmp_path / name).weights() for name in ("halves", "straight"))
     assert all(torch.equal(first[name], second[name]) for name in first)

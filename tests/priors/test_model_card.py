@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from agents import PretrainConfig
 from agents.cli import main
+from agents.configuration import config_text
 from agents.priors.base import ScenePrior
 from agents.priors.card import OWN_LICENSE, PriorFacts, package_prior, read_measures
 from agents.priors.testing import tiny_prior
@@ -28,7 +30,7 @@ FIGURES = {
 }
 
 
-CONFIG = {"optimizer": "muon", "learning_rate": 2e-3, "ema": 0.99, "hidden": 32, "data": "/somewhere/of/mine"}
+CONFIG = PretrainConfig(optimizer={"lr": 2e-3, "ema": 0.99}, network={"hidden": 32}, data="/somewhere/of/mine")
 
 
 @pytest.fixture
@@ -38,7 +40,8 @@ def run_folder(tmp_path: Path) -> Path:
     prior = tiny_prior(process="mixed")
     prior.card = {"trained_steps": 1200, "batch_size": 96, "seconds": 600, "training_scenes": 131000}
     prior.save(folder / "prior")
-    (folder / "metrics.json").write_text(json.dumps({"config": CONFIG}))
+    (folder / "config.yaml").write_text(config_text(CONFIG))
+    (folder / "metrics.json").write_text(json.dumps(prior.card))
     (folder / "evaluation").mkdir()
     (folder / "evaluation" / "metrics.json").write_text(json.dumps(FIGURES))
     return folder

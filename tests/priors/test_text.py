@@ -30,7 +30,7 @@ PROMPTS = ["A scene with 12 objects.", "A scene with two cups and a table."]
 def prior() -> MixedPrior:
     scenes = get_grammar("dimsum_table").sample(np.random.default_rng(0), 8)
     prompts = describe_all(scenes, np.random.default_rng(0))
-    config = PretrainConfig(process="mixed", text=True, hidden=32, depth=2, heads=2)
+    config = PretrainConfig(text="vocabulary", network={"hidden": 32, "depth": 2, "heads": 2})
     made = build_prior(config, scenes.tensor, Normalizer.fit(scenes.tensor), prompts)
     assert isinstance(made, MixedPrior)
     generator = torch.Generator().manual_seed(0)
@@ -135,7 +135,7 @@ def test_training_further_lists_the_words_that_the_prior_lacks(
 ) -> None:
     prior.save(str(tmp_path))
     scenes = get_grammar("dimsum_table").sample(np.random.default_rng(0), 8)
-    config = PretrainConfig(prior=str(tmp_path), process="mixed", text=True)
+    config = PretrainConfig(prior=str(tmp_path), text="vocabulary")
     with caplog.at_level(logging.WARNING):
         build_prior(config, scenes.tensor, Normalizer.fit(scenes.tensor), [("A zeppelin over 12 cups.",)] * 8)
     assert "over, zeppelin" in caplog.text
@@ -149,7 +149,10 @@ def test_a_short_training_teaches_what_prompts_say() -> None:
     few[:, 3:, -1] = 1.0  # the table and two more
     raw = torch.cat([scenes.tensor, few])
     prompts = [("A scene with many objects.",)] * 64 + [("A scene with 3 objects.",)] * 64
-    config = PretrainConfig(text=True, hidden=32, depth=1, heads=2, text_width=32, text_depth=1, text_latents=4)
+    config = PretrainConfig(
+        network={"hidden": 32, "depth": 1, "heads": 2},
+        text={"encoder": "vocabulary", "width": 32, "depth": 1, "latents": 4},
+    )
     made = build_prior(config, raw, Normalizer.fit(raw), prompts)
     assert isinstance(made, MixedPrior)
     x0 = made.encode(SceneBatch(raw, made.scene_type))

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from agents.configuration.fields import named
+
 WRITES = False
 
 
@@ -18,8 +20,8 @@ class CheckRewardConfig:
         seed: of the scenes it is tried on.
     """
 
-    reward: Any = "object_count"
-    scene: str = "dimsum_table"
+    reward: Any = named("object_count", "reward")
+    scene: Any = named("dimsum_table", "scene")
     seed: int = 0
 
 

@@ -1,49 +1,25 @@
-"""``scene-envs complete`` and what it shares with ``rearrange``."""
+"""``scene-envs complete``."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from agents.cli.commands.scenes import draw_scenes, load_scenes
+from agents.cli.commands.inpainting import InpaintingConfig, load_prior_and_scenes, save_scenes
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
-    from agents.priors.base import ScenePrior
-    from scene_envs.scene import SceneBatch
 
 
 @dataclass
-class CompleteConfig:
+class CompleteConfig(InpaintingConfig):
     """Scenes filled up: what is there stays, bit for bit.
 
     Attributes:
-        scenes: a scene file, the folder of a sample or project run (its simulation-ready scenes if it has any), or
-            a dataset.
-        prior: a shipped name, or the folder of a prior or a run; empty means the shipped prior of the scene type.
-        count: how many of the scenes, from the first; null for all.
-        prompt: what the whole scenes should hold, for priors that read prompts; null for anything.
-        guidance: weight of classifier-free guidance, 0 for none; needs a prompt.
         slots: slots of the result; null keeps those of the scenes.
-        num_steps: denoising steps per scene.
-        seed: of the noise.
-        pictures: how many scenes the galleries show; 0 draws none.
-        device: torch device.
-        output: folder for scenes.safetensors, before.png and gallery.png.
     """
 
-    scenes: str = ""
-    prior: str = ""
-    count: int | None = None
-    prompt: str | None = None
-    guidance: float = 0.0
     slots: int | None = None
-    num_steps: int = 50
-    seed: int = 0
-    pictures: int = 12
-    device: str = "cpu"
-    output: str = ""
 
 
 def config() -> type[CompleteConfig]:
@@ -53,7 +29,7 @@ def config() -> type[CompleteConfig]:
 
 def run(settings: CompleteConfig, run: Run) -> None:
     """Fill the empty slots."""
-    prior, batch = load_prior_and_scenes("complete", settings.scenes, settings.prior, settings.count, settings.device)
+    prior, batch = load_prior_and_scenes("complete", settings)
     filled = prior.complete(
         batch,
         prompt=settings.prompt,
@@ -65,30 +41,3 @@ def run(settings: CompleteConfig, run: Run) -> None:
     added = float((filled.counts - batch.counts).double().mean())
     run.say(f"{len(batch)} scenes, {added:.1f} objects added on average")
     save_scenes(batch, filled.to("cpu"), settings.pictures, run, {"added": added})
-
-
-def load_prior_and_scenes(
-    command: str, scenes: str, prior: str, count: int | None, device: str
-) -> tuple[ScenePrior, SceneBatch]:
-    """The prior and the scenes that a command works on."""
-    from agents.priors.base import ScenePrior
-    from scene_envs.errors import InvalidInputError
-
-    if not scenes:
-        raise InvalidInputError(f"{command}: name a scene file, run or dataset, as in scenes=runs/mine")
-    batch = load_scenes(Path(scenes), count)
-    loaded = ScenePrior.load(prior or batch.scene_type.name).to(device)
-    if loaded.scene_type.name != batch.scene_type.name:
-        raise InvalidInputError(
-            f"{command}: the prior makes scenes of {loaded.scene_type.name!r}, the file holds {batch.scene_type.name!r}"
-        )
-    return loaded, batch
-
-
-def save_scenes(before: SceneBatch, after: SceneBatch, pictures: int, run: Run, figures: dict[str, float]) -> None:
-    """Write the scenes, both galleries and the metrics."""
-    after.save(run.directory / "scenes.safetensors")
-    draw_scenes(before, pictures, run, "before.png")
-    draw_scenes(after, pictures, run, "gallery.png")
-    run.write_metrics({"scenes": len(after), **figures})
-    run.say(f"written to {run.directory}")

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from agents.cli.commands.post_train import PostTrainKeys
+from agents.post_training.config import PostTrainConfig
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
 
 
-def config() -> type[PostTrainKeys]:
+def config() -> type[PostTrainConfig]:
     """The keys of this command: those of post-train."""
-    return PostTrainKeys
+    return PostTrainConfig
 
 
-def run(settings: PostTrainKeys, run: Run) -> None:
+def run(settings: PostTrainConfig, run: Run) -> None:
     """Examine the run that ``post-train`` would make of these settings."""
     from rich.console import Console
 
     from agents.post_training.doctor import diagnose
 
-    report = diagnose(settings.run_config)
+    report = diagnose(settings)
     run.write_metrics(report.metrics())
     Console().print(report)
     for line in report.advice:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from agents.configuration.fields import named
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
@@ -26,7 +28,7 @@ class GenerateConfig:
         output: the dataset folder; finished shards found there are kept.
     """
 
-    scene: str = "dimsum_table"
+    scene: Any = named("dimsum_table", "scene")
     count: int = 1000
     seed: int = 0
     workers: int = 2

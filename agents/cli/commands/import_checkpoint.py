@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
+
+from agents.configuration.fields import named
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
@@ -31,8 +33,8 @@ class ImportCheckpointConfig:
 
     checkpoint: str = ""
     metadata: str = ""
-    scene: str = ""
-    aliases: Any = None
+    scene: Any = named("", "scene")
+    aliases: dict[str, str] = field(default_factory=dict)
     text_encoder: str = ""
     count: int = 4
     num_steps: int = 50

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from agents.cli.commands.export import export_scenes
 from agents.cli.commands.scenes import draw_scenes, make_ready, reward_figures
+from agents.configuration.fields import named
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
@@ -47,7 +48,7 @@ class SampleConfig:
     eta: float = 1.0
     slots: int | None = None
     seed: int = 0
-    reward: Any = "feasible_objects"
+    reward: Any = named("feasible_objects", "reward")
     project: bool = False
     export: Any = None
     pictures: int = 12

@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
-from agents.planning import SearchConfig, run_search
+from agents.configuration.fields import composed, named
+from agents.planning.config import SearchConfig
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
 
 
+@composed
 @dataclass(frozen=True)
 class SearchKeys(SearchConfig):
     """What to search, and how.
@@ -22,7 +24,7 @@ class SearchKeys(SearchConfig):
     """
 
     prior: str = "dimsum_table"
-    objective: Any = "feasible_objects"
+    objective: Any = named("feasible_objects", "reward")
     output: str = ""
 
 
@@ -35,6 +37,8 @@ def run(settings: SearchKeys, run: Run) -> None:
     """Search; the search writes its own metrics and pictures."""
     from rich.console import Console
     from rich.progress import Progress
+
+    from agents.planning import run_search
 
     search = SearchConfig(**{field.name: getattr(settings, field.name) for field in fields(SearchConfig)})
     with Progress(console=Console(stderr=True)) as bar:

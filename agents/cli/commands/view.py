@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from agents.cli.commands.scenes import SCENE_FILES
+from agents.configuration.fields import named
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
@@ -34,7 +35,7 @@ class ViewConfig:
 
     scenes: str = ""
     prior: str = ""
-    scene: str = ""
+    scene: Any = named("", "scene")
     count: int = 16
     first: int = 0
     num_steps: int = 50

@@ -1,0 +1,69 @@
+"""Keys, input and output that ``scene-envs complete`` and ``rearrange`` share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from agents.cli.commands.scenes import draw_scenes, load_scenes
+
+if TYPE_CHECKING:
+    from agents.cli.run_folder import Run
+    from agents.priors.base import ScenePrior
+    from scene_envs.scene import SceneBatch
+
+
+@dataclass
+class InpaintingConfig:
+    """Scenes of which a prior generates a part anew.
+
+    Attributes:
+        scenes: a scene file, the folder of a sample or project run (its simulation-ready scenes if it has any), or
+            a dataset.
+        prior: a shipped name, or the folder of a prior or a run; empty means the shipped prior of the scene type.
+        count: how many of the scenes, from the first; null for all.
+        prompt: what the whole scenes should hold, for priors that read prompts; null for anything.
+        guidance: weight of classifier-free guidance, 0 for none; needs a prompt.
+        num_steps: denoising steps per scene.
+        seed: of the noise.
+        pictures: how many scenes the galleries show; 0 draws none.
+        device: torch device.
+        output: folder for scenes.safetensors, before.png and gallery.png.
+    """
+
+    scenes: str = ""
+    prior: str = ""
+    count: int | None = None
+    prompt: str | None = None
+    guidance: float = 0.0
+    num_steps: int = 50
+    seed: int = 0
+    pictures: int = 12
+    device: str = "cpu"
+    output: str = ""
+
+
+def load_prior_and_scenes(command: str, settings: InpaintingConfig) -> tuple[ScenePrior, SceneBatch]:
+    """The prior and the scenes that a command works on."""
+    from agents.priors.base import ScenePrior
+    from scene_envs.errors import InvalidInputError
+
+    if not settings.scenes:
+        raise InvalidInputError(f"{command}: name a scene file, run or dataset, as in scenes=runs/mine")
+    batch = load_scenes(Path(settings.scenes), settings.count)
+    prior = ScenePrior.load(settings.prior or batch.scene_type.name).to(settings.device)
+    if prior.scene_type.name != batch.scene_type.name:
+        raise InvalidInputError(
+            f"{command}: the prior makes scenes of {prior.scene_type.name!r}, the file holds {batch.scene_type.name!r}"
+        )
+    return prior, batch
+
+
+def save_scenes(before: SceneBatch, after: SceneBatch, pictures: int, run: Run, figures: dict[str, float]) -> None:
+    """Write the scenes, both galleries and the metrics."""
+    after.save(run.directory / "scenes.safetensors")
+    draw_scenes(before, pictures, run, "before.png")
+    draw_scenes(after, pictures, run, "gallery.png")
+    run.write_metrics({"scenes": len(after), **figures})
+    run.say(f"written to {run.directory}")

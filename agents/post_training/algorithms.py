@@ -1,0 +1,171 @@
+"""Policy-gradient algorithms by name: their settings, and where their code is; imports no torch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any, TypeVar
+
+from agents.configuration.checks import at_least, one_of, positive
+from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.plugins import load_plugins
+
+ENTRY_POINT_GROUP = "scene_envs.algorithms"
+"""Entry points of installed packages: modules that call :func:`register_algorithm` when they are imported."""
+CREDITS = ("auto", "scene", "object")
+BASELINES = ("leave_one_out", "mean")
+
+Algorithm = TypeVar("Algorithm", bound=type)
+
+
+@dataclass
+class AlgorithmSettings:
+    """What every algorithm is told.
+
+    Attributes:
+        name: the algorithm, a registered name.
+        scenes_per_prompt: scenes of a batch that share a prompt; advantages are taken among them.
+    """
+
+    name: str = ""
+    scenes_per_prompt: int = 8
+
+    def __post_init__(self) -> None:
+        at_least(self, 2, "scenes_per_prompt")
+
+    @property
+    def optimiser_steps(self) -> int:
+        """Optimiser steps per batch."""
+        return 1
+
+
+@dataclass
+class DDPOSFSettings(AlgorithmSettings):
+    """DDPO-SF: the score-function policy gradient (Black et al. 2024, Eq. 3).
+
+    Attributes:
+        gradient_steps: how many of the eligible steps are drawn into the gradient per iteration.
+        min_std: steps with a smaller sigma (normalised units) stay out of the gradient.
+        skip_first: fraction of the chain, from its noisy end, that stays out of the gradient.
+        step_weighting: ``uniform``, or weights proportional to a step's ``std`` or ``variance``.
+        log_prob_reduction: ``mean`` or ``sum`` of log p over the random entries of a scene.
+        credit: ``scene`` gives every slot the scene's advantage, ``object`` its own (rewards with ``per_object``),
+            ``auto`` takes ``object`` where the reward allows it.
+        baseline: ``leave_one_out`` or ``mean``.
+        advantage_clip: advantages are kept within plus and minus this.
+    """
+
+    name: str = "ddpo_sf"
+    gradient_steps: int = 8
+    min_std: float = 0.03
+    skip_first: float = 0.0
+    step_weighting: str = "uniform"
+    log_prob_reduction: str = "mean"
+    credit: str = "auto"
+    baseline: str = "leave_one_out"
+    advantage_clip: float = 5.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, 1, "gradient_steps")
+        positive(self, "advantage_clip", "min_std")
+        if not 0 <= self.skip_first < 1:
+            raise InvalidInputError(f"skip_first={self.skip_first} must lie in [0, 1)")
+        one_of(self, "credit", CREDITS)
+        one_of(self, "baseline", BASELINES)
+
+
+@dataclass
+class DDPOISSettings(DDPOSFSettings):
+    """DDPO-IS: the same with clipped importance weights, for several updates per batch (Eq. 4).
+
+    Attributes:
+        clip_epsilon: half-width of the clip of the probability ratio.
+        updates: optimiser steps per batch.
+    """
+
+    name: str = "ddpo_is"
+    clip_epsilon: float = 1e-4
+    updates: int = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, 1, "updates")
+        if not 0 < self.clip_epsilon < 1:
+            raise InvalidInputError(f"clip_epsilon={self.clip_epsilon} must lie between 0 and 1")
+
+    @property
+    def optimiser_steps(self) -> int:
+        """Optimiser steps per batch."""
+        return self.updates
+
+
+@dataclass(frozen=True)
+class _Entry:
+    settings: type[AlgorithmSettings]
+    code: Any
+    """The class, or ``module:class`` until it is needed."""
+
+
+_ENTRIES = {
+    "ddpo_sf": _Entry(DDPOSFSettings, "agents.post_training.ddpo:DDPO"),
+    "ddpo_is": _Entry(DDPOISSettings, "agents.post_training.ddpo:DDPO"),
+}
+
+
+def register_algorithm(
+    name: str, settings: type[AlgorithmSettings] = DDPOSFSettings
+) -> Callable[[Algorithm], Algorithm]:
+    """Make an algorithm available as ``algorithm=name``; the same name again replaces it.
+
+    The decorated class is made as ``(settings, policy, stds)`` and has ``loss``, ``advantage(rollout)`` and
+    ``accumulate(rollout, advantage, generator)`` as :class:`agents.post_training.ddpo.DDPO`, which it may extend.
+
+    Args:
+        name: letters, digits and underscores.
+        settings: the dataclass of its keys, with a sentence for each under ``Attributes:``.
+
+    Raises:
+        InvalidInputError: the name is not one word.
+    """
+    if not name.isidentifier():
+        raise InvalidInputError(f"algorithm name {name!r}: use letters, digits and underscores, such as 'my_ddpo'")
+
+    def register(algorithm: Algorithm) -> Algorithm:
+        _ENTRIES[name] = _Entry(settings, algorithm)
+        return algorithm
+
+    return register
+
+
+def list_algorithms() -> list[str]:
+    """Names of all algorithms, those of installed packages included, sorted."""
+    load_plugins(ENTRY_POINT_GROUP)
+    return sorted(_ENTRIES)
+
+
+def algorithm_settings(name: str) -> type[AlgorithmSettings]:
+    """The dataclass of an algorithm's keys.
+
+    Raises:
+        UnknownNameError: no algorithm has that name; the nearest known one is offered.
+    """
+    return _entry(name).settings
+
+
+def make_algorithm(settings: AlgorithmSettings, policy: Any, stds: Any) -> Any:
+    """The algorithm of these settings for a policy, whose steps have the standard deviations ``stds`` (S,)."""
+    code = _entry(settings.name).code
+    if isinstance(code, str):
+        module, _, attribute = code.partition(":")
+        code = getattr(import_module(module), attribute)
+    return code(settings, policy, stds)
+
+
+def _entry(name: str) -> _Entry:
+    if name not in _ENTRIES:
+        load_plugins(ENTRY_POINT_GROUP)
+    if name not in _ENTRIES:
+        raise unknown_name("algorithm", str(name), list_algorithms())
+    return _ENTRIES[name]

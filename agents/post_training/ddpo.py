@@ -1,0 +1,50 @@
+"""DDPO on a denoising policy: its loss, its advantages, its gradient of a batch."""
+
+from __future__ import annotations
+
+from torch import Generator, Tensor
+
+from agents.post_training.advantages import compute_advantages
+from agents.post_training.algorithms import DDPOISSettings, DDPOSFSettings
+from agents.post_training.gradients import PolicyGradient, accumulate_policy_gradient, credited_reward, draw_steps
+from agents.post_training.losses import DDPOSFLoss
+from agents.post_training.policy import DenoisingPolicy, gradient_weights
+from agents.post_training.prompts import prompt_groups
+from agents.post_training.rollouts import Rollout
+
+
+class DDPO:
+    """DDPO-SF, or DDPO-IS with the settings of that (Black et al. 2024).
+
+    Args:
+        settings: its keys.
+        policy: what is optimised.
+        stds: (S,) smallest sigma of every step, normalised units.
+
+    Attributes:
+        loss: of a batch of transitions; its ``step_weights`` (S,) say which steps have part in the gradient.
+    """
+
+    def __init__(self, settings: DDPOSFSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
+        self.settings = settings
+        weights = gradient_weights(
+            stds, min_std=settings.min_std, skip_first=settings.skip_first, weighting=settings.step_weighting
+        )
+        clip = settings.clip_epsilon if isinstance(settings, DDPOISSettings) else None
+        self.loss = DDPOSFLoss(
+            policy, step_weights=weights, reduction=settings.log_prob_reduction, clip_epsilon=clip
+        ).to(next(policy.parameters()).device)
+
+    def advantage(self, rollout: Rollout) -> Tensor:
+        """(B,) or (B, N), as ``credit`` says; among the scenes of the same prompt where there are prompts."""
+        settings = self.settings
+        reward, valid = credited_reward(rollout, settings.credit)
+        groups = None if rollout.prompts is None else prompt_groups(rollout.prompts).to(reward.device)
+        return compute_advantages(
+            reward, valid, baseline=settings.baseline, clip=settings.advantage_clip, groups=groups
+        )
+
+    def accumulate(self, rollout: Rollout, advantage: Tensor, generator: Generator) -> PolicyGradient:
+        """Add the policy gradient of a batch to ``.grad``; ``generator`` draws the steps that have part in it."""
+        steps, scale = draw_steps(self.loss.step_weights.cpu(), self.settings.gradient_steps, generator)
+        return accumulate_policy_gradient(self.loss, rollout, advantage, steps, scale=scale)

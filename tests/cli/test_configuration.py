@@ -1,0 +1,173 @@
+"""Configuration: the same in Python and on the command line, old keys, files, sweeps."""
+
+from __future__ import annotations
+
+import dataclasses
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from agents import PostTrainConfig, PretrainConfig, SearchConfig
+from agents.cli import main
+from agents.cli.commands import COMMANDS
+from agents.cli.keys import compose
+from agents.cli.sweep import expand_sweeps
+from agents.configuration import changed, config_text, dotted_values, group_options
+from scene_envs.errors import InvalidInputError, UnknownNameError
+
+CONFIGS = {name: import_module(f"agents.cli.commands.{name.replace('-', '_')}").config() for name in COMMANDS}
+GROUPS = [
+    "algorithm",
+    "reward",
+    "network",
+    "process",
+    "text",
+    "optimizer",
+    "recipe",
+    "planner",
+    "mask",
+    "scene",
+    "logger",
+]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_defaults_are_those_of_python(command: str) -> None:
+    assert compose(command, CONFIGS[command], []) == CONFIGS[command]()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_key_given_with_its_default_changes_nothing(command: str) -> None:
+    defaults = dotted_values(CONFIGS[command]())
+    words = [f"{key}={'null' if value is None else value}" for key, value in defaults.items()
+             if isinstance(value, str | int | float | None) and (value != "" or "." not in key)]  # fmt: skip
+    assert compose(command, CONFIGS[command], words) == CONFIGS[command]()
+
+
+@pytest.mark.parametrize("kind", [PretrainConfig, PostTrainConfig])
+def test_groups_have_a_dozen_keys_at_most(kind: type) -> None:
+    groups = [value for value in vars(kind()).values() if dataclasses.is_dataclass(value)]
+    assert len(groups) >= 5
+    assert all(len(dataclasses.fields(group)) <= 12 for group in groups)
+    assert len(vars(kind())) - len(groups) <= 13  # the keys of all commands, and recipe
+
+
+@pytest.mark.parametrize(("kind", "recipe"), [(PretrainConfig, "paper"), (PostTrainConfig, "demo")])
+def test_a_recipe_is_the_same_in_python(kind: Any, recipe: str) -> None:
+    assert kind(recipe=recipe) == compose("x", kind, [f"recipe={recipe}"]) != kind()
+    given = kind(recipe=recipe, iterations=3, optimizer={"lr": 0.5})
+    assert given == compose("x", kind, [f"recipe={recipe}", "optimizer.lr=0.5", "iterations=3"])
+    assert dataclasses.replace(given, seed=4) == changed(given, {"seed": 4})
+
+
+@pytest.mark.parametrize("folder", GROUPS)
+def test_every_group_has_options_that_compose(folder: str) -> None:
+    options = group_options(folder)
+    assert options
+    for option in options:
+        composed = []
+        for command, kind in CONFIGS.items():
+            if folder in {field.name for field in dataclasses.fields(kind)}:
+                try:
+                    composed.append(compose(command, kind, [f"{folder}={option}"]))
+                except (InvalidInputError, UnknownNameError):  # an option of another command
+                    continue
+        assert composed, option
+
+
+@pytest.mark.parametrize("command", ["pretrain", "post-train", "search"])
+def test_old_keys_name_the_new_ones(command: str) -> None:
+    kind = CONFIGS[command]
+    known = {*dotted_values(kind()), "algorithm.clip_epsilon", "algorithm.updates"}
+    for old, new in kind.RENAMED.items():
+        word = old if "=" in old else f"{old}=1"
+        with pytest.raises(InvalidInputError, match="has another name now: " + new.split(",")[0]):
+            compose(command, kind, [word])
+        assert new.split(",")[0].split("=")[0] in known | {"text", "logger"}
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: PretrainConfig(hidden=3), "another name now: network.hidden"),
+        (lambda: PretrainConfig(network={"hiden": 3}), "did you mean 'network.hidden'"),
+        (lambda: PretrainConfig(network={"hidden": "wide"}), "network.hidden=wide is not a whole number"),
+        (lambda: PretrainConfig(optimizer="sgd"), "sgd"),
+        (lambda: PretrainConfig(text=True), "text is a group of keys; give one of text.encoder"),
+        (lambda: PostTrainConfig(rewrad="x"), "did you mean 'reward'"),
+        (lambda: PostTrainConfig(guard={"action": "halt"}), "unknown action 'halt'. Known: report, stop"),
+        (lambda: SearchConfig(planner={"name": "uctt"}), "did you mean 'uct'"),
+    ],
+)
+def test_wrong_values_in_python_are_named(make: Any, message: str) -> None:
+    with pytest.raises((InvalidInputError, UnknownNameError), match=message):
+        make()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_written_config_gives_the_same_settings(command: str, tmp_path: Path) -> None:
+    from agents.cli.keys import Sources
+
+    kind = CONFIGS[command]
+    (tmp_path / "config.yaml").write_text(config_text(kind()))
+    assert compose(command, kind, [], Sources(config=str(tmp_path / "config.yaml"))) == kind()
+
+
+def test_words_win_over_a_file(tmp_path: Path) -> None:
+    from agents.cli.keys import Sources
+
+    settings = PostTrainConfig(recipe="demo", algorithm="ddpo_is", reward={"name": "clip", "high": 3})
+    (tmp_path / "config.yaml").write_text(config_text(settings))
+    source = Sources(config=str(tmp_path / "config.yaml"))
+    assert compose("post-train", PostTrainConfig, [], source) == settings
+    words = ["algorithm=ddpo_sf", "seed=3", "reward=object_count", "optimizer.lr=0.5"]
+    found = compose("post-train", PostTrainConfig, words, source)
+    assert (found.algorithm.name, found.seed, found.reward, found.optimizer.lr) == ("ddpo_sf", 3, "object_count", 0.5)
+    assert found.iterations == settings.iterations
+
+
+def test_cfg_job_prints_and_runs_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["post-train", "optimizer.lr=1e-4", "--cfg", "job"]) == 0
+    assert yaml.safe_load(capsys.readouterr().out)["optimizer"]["lr"] == 1e-4
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_multirun_has_a_folder_for_each(tmp_path: Path) -> None:
+    words = ["generate", "count=2", "shard_size=2", "workers=0", "progress=false", f"output={tmp_path}"]
+    assert main([*words, "--multirun", "seed=0,1"]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"seed=0", "seed=1"}
+    assert yaml.safe_load((tmp_path / "seed=1" / "config.yaml").read_text())["seed"] == 1
+
+
+def test_sweeps_are_every_combination() -> None:
+    runs = expand_sweeps(["seed=0,1", "prompt='a, b'", "optimizer.lr=1e-4,1e-3"])
+    assert [label for _, label in runs] == [
+        "seed=0,optimizer.lr=0.0001", "seed=0,optimizer.lr=0.001", "seed=1,optimizer.lr=0.0001",
+        "seed=1,optimizer.lr=0.001",
+    ]  # fmt: skip
+    assert runs[0][0][1] == "prompt='a, b'"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--config", "none.yaml"], "none.yaml: No such file"),
+        (["--config-dir", "nowhere", "seed=1"], "no such folder"),
+        (["--cfg", "hydra"], "only --cfg job is known"),
+        (["--config"], "needs a value behind it"),
+        (["+experiment=none"], "unknown experiment 'none'"),
+        (["algorithm=ppo"], "unknown algorithm 'ppo'"),
+        (["recipe=paper"], "recipe=paper is not for post-train"),
+        (["optimizer=muon"], "unknown optimizer 'muon'. Known: adamw."),
+        (["regularisation=0.5"], "give one of regularisation.weight"),
+    ],
+)
+def test_wrong_flags_are_said(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["post-train", *words]) == 2
+    assert message in capsys.readouterr().err
