@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from rewards import RewardContext, evaluate_reward, list_rewards, resolve_reward
+from rewards.verdicts import forget_verdicts
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch
 
@@ -45,6 +46,7 @@ def seconds(reward: Any, batch: SceneBatch) -> float:
     context = RewardContext(prompts=(prompt,) * len(batch))
     resolved = resolve_reward(reward)
     evaluate_reward(resolved, batch, context, strict=True)
+    forget_verdicts()
     start = time.process_time()
     evaluate_reward(resolved, batch, context, strict=True)
     return (time.process_time() - start) / len(batch)

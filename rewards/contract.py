@@ -11,6 +11,7 @@ from torch import Generator, Tensor
 from rewards.base import RewardContext, RewardOutput, depends_on_batch
 from rewards.evaluation import evaluate_reward
 from rewards.registry import resolve_reward, reward_name
+from rewards.verdicts import forget_verdicts
 from scene_envs.errors import RewardError
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
@@ -70,6 +71,7 @@ class _Subject:
         self._random_output: RewardOutput | None = None
 
     def score(self, batch: SceneBatch) -> RewardOutput:
+        forget_verdicts()  # what is kept from an earlier call would prove nothing
         context = self.given_context
         if context is None:
             counts = batch.counts.tolist()

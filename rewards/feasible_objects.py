@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from rewards.base import RewardContext, RewardOutput
 from rewards.registry import register_reward
+from rewards.verdicts import verdicts
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
@@ -44,17 +45,14 @@ class FeasibleObjects:
         Terms: ``free_objects``; ``feasible_fraction`` of them (1 in a scene without free objects); ``deepest_mm``,
         the deepest overlap. ``object_flags["feasible"]`` (B, N) marks the objects that count, ``per_object`` likewise.
         """
-        from scene_envs.physics import feasibility
-
         device = batch.tensor.device
-        result = feasibility(
-            batch,
-            max_penetration=self.max_penetration,
-            max_displacement=self.max_displacement,
-            max_rotation=self.max_rotation,
-            duration=self.duration,
-            pool=context.pool,
-        )
+        limits = {
+            "max_penetration": self.max_penetration,
+            "max_displacement": self.max_displacement,
+            "max_rotation": self.max_rotation,
+            "duration": self.duration,
+        }
+        result = verdicts(batch, limits, context.pool)
         feasible = result.feasible.to(device)
         count = feasible.sum(dim=-1).float()
         free = batch.is_free.sum(dim=-1).float()

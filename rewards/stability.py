@@ -9,6 +9,7 @@ import torch
 
 from rewards.base import RewardContext, RewardOutput
 from rewards.registry import register_reward
+from rewards.verdicts import verdicts
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
@@ -46,10 +47,14 @@ class Stability:
         ``per_object`` (B, N) is the score of each object. Terms: ``free_objects``; ``simulated_objects``, those that
         overlap nothing; ``moved_mm`` and ``turned_rad``, the means over these.
         """
-        from scene_envs.physics import feasibility
-
         device = batch.tensor.device
-        result = feasibility(batch, max_penetration=self.max_penetration, duration=self.duration, pool=context.pool)
+        limits = {
+            "max_penetration": self.max_penetration,
+            "max_displacement": 1e-3,
+            "max_rotation": 1e-2,
+            "duration": self.duration,
+        }  # those of feasible_objects, so that beside it nothing is simulated twice
+        result = verdicts(batch, limits, context.pool)
         moved, turned = result.displacement.to(device), result.rotation.to(device)
         simulated = batch.is_free & (result.depth.to(device) <= self.max_penetration)
         score = torch.exp(-(moved / self.scale + turned / self.scale_rotation)) * (simulated & batch.in_workspace)
