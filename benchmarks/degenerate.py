@@ -1,45 +1,99 @@
-"""Time of every physics function on degenerate scenes: all objects at one point, in pairs, nested, outside, buried.
+"""Time of physics, rewards and search on degenerate scenes, such as all objects at one point, in pairs or nested.
 
-    python benchmarks/degenerate.py [TYPE ...] [--count 2] [--seed 0]
+    python benchmarks/degenerate.py [TYPE ...] [--count 2] [--seed 0] [--one-asset]
 
-Scenes are the heaps of ``projection.py --heaps``: all slots of a type taken, by random assets. Printed is the CPU time
-of one scene, the slowest of ``--count``, and whether each object has a finite answer.
+Scenes are the heaps of ``projection.py --heaps``: all slots of a type taken, by random assets; further, four pairs of
+objects of which the upper one stands with a corner on a corner of the lower one, and a scene with a NaN. *search* is
+the evaluation of a root with the objective `feasible_objects`. Printed is the CPU time of one scene, the slowest of
+``--count``, as soon as a row is known, and at the end the largest of each function. A star: the scene was refused with
+an error of this package, or its row is invalid. An exclamation mark: what came back is not finite.
 """
 
 from __future__ import annotations
 
 import argparse
+import logging
 import time
 from collections.abc import Callable
 
+import gymnasium as gym
 import numpy as np
 import torch
 from projection import HEAPS, heap
-from rich.console import Console
-from rich.table import Table
+from scipy.spatial.transform import Rotation
 
 from rewards import evaluate_reward, make_reward
+from scene_envs.errors import SceneEnvsError
+from scene_envs.grammars import get_grammar
 from scene_envs.physics import equilibrium, feasibility, make_ready, penetration, project, settle
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import list_scene_types
 
-FUNCTIONS: dict[str, Callable[[SceneBatch], object]] = {
+Function = Callable[[SceneBatch], object]
+
+REWARDS = {
+    "object_count": make_reward("object_count"),
+    "feasible_objects": make_reward("feasible_objects"),
+    "prompt_match": make_reward("prompt_match", prompt="A scene with two cups on a table."),
+    "clip": make_reward("clip", reward="feasible_objects", high=3.0),
+    "product": make_reward("product", rewards=["object_count", "feasible_objects"]),
+    "weighted_sum": make_reward("weighted_sum", rewards=["object_count", "feasible_objects"], weights=[1.0, 1.0]),
+}
+PHYSICS: dict[str, Function] = {
     "penetration": penetration,
     "feasibility": feasibility,
     "equilibrium": equilibrium,
     "project": project,
     "settle": settle,
     "make_ready": make_ready,
-    "reward": lambda batch: evaluate_reward(make_reward("feasible_objects"), batch),
 }
 
 
-def seconds(function: Callable[[SceneBatch], object], batch: SceneBatch) -> tuple[float, bool]:
-    """CPU time of a call, and whether the scene that it gave back, if any, is finite."""
+def on_corners(name: str, rng: np.random.Generator) -> SceneBatch:
+    """Four pairs of objects over the workspace, turned at random; a highest corner meets a lowest one."""
+    batch = heap(name, "point", rng, one_asset=False)
+    scene_type, slots = batch.scene_type, batch.is_free[0].nonzero()[:8, 0].tolist()
+    low, high = (np.array(corner) for corner in scene_type.workspace)
+    translations, rotations, categories = batch.translations.clone(), batch.rotations.clone(), batch.categories.clone()
+    categories[0, batch.is_free[0]] = scene_type.num_assets
+    for number, slot in enumerate(slots):
+        asset = scene_type.library.assets[int(batch.categories[0, slot])]
+        turn = Rotation.random(random_state=rng).as_matrix()
+        corners = np.concatenate([part.vertices for part in asset.fine]) @ turn.T
+        if number % 2 == 0:
+            place = rng.uniform(low, high)
+            meeting = place + corners[corners[:, 2].argmax()]
+        else:
+            place = meeting - corners[corners[:, 2].argmin()]
+        translations[0, slot], rotations[0, slot] = torch.from_numpy(place).float(), torch.from_numpy(turn).float()
+        categories[0, slot] = batch.categories[0, slot]
+    return SceneBatch.from_parts(translations, rotations, categories, scene_type)
+
+
+def degenerate(name: str, kind: str, rng: np.random.Generator, *, one_asset: bool) -> SceneBatch:
+    """One scene of a kind."""
+    if kind == "corners":
+        return on_corners(name, rng)
+    if kind != "NaN":
+        return heap(name, kind, rng, one_asset=one_asset)
+    batch = get_grammar(name).sample(rng, 1)
+    batch.tensor[0, int(batch.is_free[0].nonzero()[0, 0]), 1] = float("nan")
+    return batch
+
+
+def seconds(function: Function, batch: SceneBatch) -> tuple[float, str]:
+    """CPU time of a call, and a mark for what came of it."""
     start = time.process_time()
-    result = function(batch)
+    try:
+        result = function(batch)
+    except SceneEnvsError:
+        return time.process_time() - start, "*"
     spent = time.process_time() - start
-    return spent, bool(torch.isfinite(getattr(result, "batch", batch).tensor).all())
+    valid = getattr(result, "valid", None)
+    if valid is not None and not bool(valid.all()):
+        return spent, "*"
+    answer = result.batch.tensor if hasattr(result, "batch") else getattr(result, "value", torch.zeros(1))
+    return spent, "" if bool(torch.isfinite(answer).all()) else "!"
 
 
 def main() -> None:
@@ -50,21 +104,31 @@ def main() -> None:
     parser.add_argument("--one-asset", action="store_true", help="all of the asset with most convex parts")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    table = Table(title="slowest scene, CPU s")
-    for column in ("scene type", "kind", *FUNCTIONS):
-        table.add_column(column)
+    logging.disable(logging.WARNING)
+    names = [*PHYSICS, *REWARDS, "search"]
+    print(" | ".join(("scene type", "kind", *names)), flush=True)
+    largest = dict.fromkeys(names, (0.0, ""))
     for name in options.types or list_scene_types():
-        for kind in HEAPS:
+        env = gym.make("scene_envs:SceneEnvs/Search-v0", scene=name, objective="feasible_objects", num_steps=2)
+        functions = PHYSICS | {
+            key: lambda batch, reward=reward: evaluate_reward(reward, batch) for key, reward in REWARDS.items()
+        }
+        functions["search"] = lambda batch, env=env: env.reset(seed=0, options={"scene": batch})
+        clean = get_grammar(name).sample(np.random.default_rng(options.seed), 1)
+        for function in (*PHYSICS.values(), functions["search"]):
+            function(clean)  # builds what is needed
+        for kind in (*HEAPS, "corners", "NaN"):
             rng = np.random.default_rng(options.seed)
-            batches = [heap(name, kind, rng, one_asset=options.one_asset) for _ in range(options.count)]
+            batches = [degenerate(name, kind, rng, one_asset=options.one_asset) for _ in range(options.count)]
             cells = []
-            for function in FUNCTIONS.values():
-                results = [seconds(function, batch) for batch in batches]
-                cells.append(
-                    f"{max(r[0] for r in results):.2f}" + ("" if all(r[1] for r in results) else " not finite")
-                )
-            table.add_row(name, kind, *cells)
-    Console(width=130).print(table)
+            for key, function in functions.items():
+                slowest = max(seconds(function, batch) for batch in batches)
+                cells.append(f"{slowest[0]:.2f}{slowest[1]}")
+                largest[key] = max(largest[key], (slowest[0], f"{name}, {kind}"))
+            print(" | ".join((name, kind, *cells)), flush=True)
+        env.close()
+    for key, (spent, where) in largest.items():
+        print(f"largest of {key}: {spent:.2f} s ({where})")
 
 
 if __name__ == "__main__":

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from scene_envs.errors import InvalidInputError
-from scene_envs.physics.kernels import Chunk
+from scene_envs.physics.batches import poses_after, run_kernel, spent, stack, valid_rows
 from scene_envs.physics.motion import CONVERGED, ITERATIONS
-from scene_envs.physics.pool import PhysicsPool, run_in_process
+from scene_envs.physics.pool import PhysicsPool
 from scene_envs.physics.results import (
     EquilibriumResult,
     FeasibilityResult,
@@ -22,21 +21,27 @@ from scene_envs.physics.results import (
     ReadyResult,
     SettleResult,
 )
-from scene_envs.rotations import geodesic_angle, project_to_so3
 from scene_envs.scene import SceneBatch
 
 _READY_DEPTH = 1e-4
 """How deep a ready object may overlap another one (m)."""
-_READY_DURATIONS = (0.1, 0.5, 2.0, 2.0)
-"""Times (s) for which it stays where it is, judged one after the other."""
+_LEAN = 0.12
+"""Angle (rad) by which gravity may lean before a ready object gives way: what leans and only just holds in one
+simulator creeps in the next."""
+_STAYS: dict[str, Any] = {"max_displacement": 1e-3, "max_rotation": 1e-2}
+_HOLDS: dict[str, Any] = {"max_displacement": 2e-3, "max_rotation": 2e-2, "duration": 0.5}
+_TRIALS: tuple[dict[str, Any], ...] = (
+    {"duration": 0.1} | _STAYS,
+    {"duration": 0.5} | _STAYS,
+    *({"tilt": (x * _LEAN / math.sqrt(2), y * _LEAN / math.sqrt(2))} | _HOLDS for x in (-1, 1) for y in (-1, 1)),
+    {"duration": 2.0} | _STAYS,
+    {"duration": 2.0} | _STAYS,
+)
+"""Times (s), limits of motion (m, rad) and directions of gravity by which it is judged, one after the other."""
 _PATIENCE = 2
 """Rounds without more ready objects after which a scene is left as it is."""
 _UNMOVED = 1e-4
 """Motion (m) below which an object is believed not to depend on others that move."""
-_CHUNK = 8
-"""Scenes per message to a worker."""
-_ORTHOGONAL = 1e-3
-"""Largest entry of R^T R - I that still passes for a rotation."""
 
 
 def feasibility(
@@ -52,7 +57,9 @@ def feasibility(
 
     A free object is feasible when its frame is in the workspace, it is in no object pair that overlaps deeper than
     ``max_penetration`` and, with all such objects removed, moves and turns no further than the limits in ``duration``
-    seconds of simulation under gravity. Welded objects hold others but are not judged.
+    seconds of simulation under gravity. Welded objects hold others but are not judged. A scene whose simulation takes
+    more work than :func:`settle` may spend is invalid. Where exact depths of a heap would take long, ``depth`` is that
+    of shapes that enclose the objects.
 
     Args:
         batch: B scenes of N slots.
@@ -72,14 +79,14 @@ def feasibility(
         "max_rotation": max_rotation,
         "duration": duration,
     }
-    rows = _run("feasibility", batch, options, pool)
-    feasible = _stack(rows, batch, "feasible", torch.bool) & batch.in_workspace.cpu()
+    rows = run_kernel("feasibility", batch, options, pool)
+    feasible = stack(rows, batch, "feasible", torch.bool) & batch.in_workspace.cpu()
     return FeasibilityResult(
         feasible=feasible,
-        depth=_stack(rows, batch, "depth"),
-        displacement=_stack(rows, batch, "displacement"),
-        rotation=_stack(rows, batch, "rotation"),
-        valid=_valid(rows),
+        depth=stack(rows, batch, "depth"),
+        displacement=stack(rows, batch, "displacement"),
+        rotation=stack(rows, batch, "rotation"),
+        valid=valid_rows(rows),
         counts=feasible.sum(dim=-1),
     )
 
@@ -87,31 +94,34 @@ def feasibility(
 def penetration(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> PenetrationResult:
     """Overlap of every object pair, and in total over pairs of convex parts.
 
-    Needs no simulator. Raises InvalidInputError as :func:`feasibility` does.
+    Needs no simulator. A heap of objects whose depths would take long is invalid.
+
+    Raises InvalidInputError as :func:`feasibility` does.
     """
-    rows = _run("penetration", batch, {}, pool)
+    rows = run_kernel("penetration", batch, {}, pool)
     pairs = tuple(
         tuple(ObjectPair((a, b), depth, total, parts) for a, b, depth, total, parts in (row["pairs"] if row else ()))
         for row in rows
     )
     return PenetrationResult(
         pairs=pairs,
-        depth=_stack(rows, batch, "depth"),
-        total_per_pair=_stack(rows, batch, "total_per_pair", shape=()),
-        total_per_geometry=_stack(rows, batch, "total_per_geometry", shape=()),
-        valid=_valid(rows),
+        depth=stack(rows, batch, "depth"),
+        total_per_pair=stack(rows, batch, "total_per_pair", shape=()),
+        total_per_geometry=stack(rows, batch, "total_per_geometry", shape=()),
+        valid=valid_rows(rows),
     )
 
 
 def equilibrium(batch: SceneBatch, *, duration: float = 0.1, pool: PhysicsPool | None = None) -> EquilibriumResult:
     """Displacement of every object under gravity in ``duration`` seconds, nothing removed.
 
-    A heap of objects so deep in each other that its simulation would take long is invalid: project it first.
+    A heap of objects so deep in each other that its simulation would take long is invalid: project it first. So is a
+    scene that takes more work than :func:`settle` may spend.
 
     Raises InvalidInputError and MissingDependencyError as :func:`feasibility` does.
     """
-    rows = _run("equilibrium", batch, {"duration": duration}, pool)
-    return EquilibriumResult(_stack(rows, batch, "displacement"), _stack(rows, batch, "rotation"), _valid(rows))
+    rows = run_kernel("equilibrium", batch, {"duration": duration}, pool)
+    return EquilibriumResult(stack(rows, batch, "displacement"), stack(rows, batch, "rotation"), valid_rows(rows))
 
 
 def settle(
@@ -121,7 +131,9 @@ def settle(
 
     Simulates up to ``duration`` seconds, and stops earlier when nothing moves any more. Objects that fall off
     their support are where they fell to, outside the workspace; those more than a metre below it stay there. A heap
-    of objects so deep in each other that its simulation would take long is invalid: project it first.
+    of objects so deep in each other that its simulation would take long is invalid: project it first. The work on a
+    scene is bounded, the more so where many objects are deep in each other (:mod:`scene_envs.physics.budget`). When it
+    does not suffice, objects stay where they have got to, and ``finished`` is False.
 
     Args:
         batch: B scenes of N slots.
@@ -134,9 +146,10 @@ def settle(
     """
     if iterations < 1:
         raise InvalidInputError(f"iterations={iterations} must be at least 1")
-    rows = _run("settle", batch, {"duration": duration, "iterations": iterations}, pool)
-    settled, displacement, rotation = _moved(rows, batch)
-    return SettleResult(settled, displacement, rotation, _valid(rows))
+    rows = run_kernel("settle", batch, {"duration": duration, "iterations": iterations}, pool)
+    settled, displacement, rotation = poses_after(rows, batch)
+    finished = stack(rows, batch, "finished", torch.bool, shape=())
+    return SettleResult(settled, displacement, rotation, finished, valid_rows(rows))
 
 
 def project(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> ProjectionResult:
@@ -147,15 +160,15 @@ def project(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> Projection
 
     Raises InvalidInputError as :func:`feasibility` does.
     """
-    rows = _run("project", batch, {}, pool)
-    projected, moved, _ = _moved(rows, batch)
+    rows = run_kernel("project", batch, {}, pool)
+    projected, moved, _ = poses_after(rows, batch)
     return ProjectionResult(
         batch=projected,
-        converged=_stack(rows, batch, "converged", torch.bool, shape=()),
-        residual_depth=_stack(rows, batch, "residual_depth", shape=()),
+        converged=stack(rows, batch, "converged", torch.bool, shape=()),
+        residual_depth=stack(rows, batch, "residual_depth", shape=()),
         moved=moved,
-        heap=_stack(rows, batch, "heap", torch.bool, shape=()),
-        valid=_valid(rows),
+        heap=stack(rows, batch, "heap", torch.bool, shape=()),
+        valid=valid_rows(rows),
     )
 
 
@@ -165,11 +178,14 @@ def make_ready(
     """Project, settle, then count the simulation-ready objects.
 
     A free object is ready when it is inside the workspace, overlaps nothing deeper than 0.1 mm, and stays within 1 mm
-    and 0.01 rad of where it is for 2 s of simulation, also without the objects that are not ready. Scenes with objects
+    and 0.01 rad of where it is for 2 s of simulation, also without the objects that are not ready. For half a second
+    it has to stay within 2 mm and 0.02 rad when gravity leans by 0.12 rad, in each of four directions: a stack that
+    leans and only just holds is not ready. Objects whose rest has a closed form need no simulation. Scenes with objects
     in the workspace that are not ready go through projection and settling again, with more solver iterations, up to
     ``rounds`` times in all, until two in a row have made no more of them ready. The round with most ready objects is
     kept, the earliest of equal ones. A heap, whose objects are so deep in each other that projection has to spread
-    them, is invalid.
+    them, is invalid. All rounds of a scene together do as much work as :func:`settle` may do; where it does not
+    suffice, the scene is as far as it got, what was not judged is not ready, and ``finished`` is False.
 
     Args:
         batch: B scenes of N slots.
@@ -181,23 +197,27 @@ def make_ready(
     """
     if rounds < 1:
         raise InvalidInputError(f"rounds={rounds} must be at least 1: each projects and settles once")
-    best = last = _make_ready_once(batch, duration, ITERATIONS, pool)
+    units = stack(run_kernel("units", batch, {}, pool), batch, "units", torch.float64, shape=())
+    best = last = _make_ready_once(batch, duration, ITERATIONS, units, pool)
     tensor, ready, counts = best.batch.tensor.clone(), best.ready.clone(), best.counts.clone()
     scenes = torch.arange(len(batch))  # that went through the last round
     without_gain = torch.zeros(len(batch), dtype=torch.int64)  # rounds in a row
     for _ in range(rounds - 1):
         unready = last.batch.is_free & last.batch.in_workspace & ~last.ready
-        again = (last.valid & (without_gain[scenes] < _PATIENCE) & unready.any(dim=-1)).nonzero()[:, 0]
-        if not len(again):
+        again = last.finished & (without_gain[scenes] < _PATIENCE) & unready.any(dim=-1)
+        if not again.any():
             break
         scenes = scenes[again]
-        last = _make_ready_once(last.batch[again], duration, CONVERGED, pool)
+        left = units[scenes]
+        last = _make_ready_once(last.batch[again.nonzero()[:, 0]], duration, CONVERGED, left, pool)
+        units[scenes] = left
         better = last.counts > counts[scenes]
         without_gain[scenes] = (without_gain[scenes] + 1) * ~better
         improved = scenes[better]
         tensor[improved], ready[improved] = last.batch.tensor[better], last.ready[better]
         counts[improved] = last.counts[better]
-    return ReadyResult(SceneBatch(tensor, best.batch.scene_type), ready, counts, best.valid)
+    finished = best.valid & (units > 0)
+    return ReadyResult(SceneBatch(tensor, best.batch.scene_type), ready, counts, finished, best.valid)
 
 
 def _keep(batch: SceneBatch, kept: Tensor) -> SceneBatch:
@@ -206,109 +226,51 @@ def _keep(batch: SceneBatch, kept: Tensor) -> SceneBatch:
     return SceneBatch.from_parts(batch.translations, batch.rotations, categories, batch.scene_type)
 
 
-def _make_ready_once(batch: SceneBatch, duration: float, iterations: int, pool: PhysicsPool | None) -> ReadyResult:
-    """One round of :func:`make_ready`."""
+def _make_ready_once(
+    batch: SceneBatch, duration: float, iterations: int, units: Tensor, pool: PhysicsPool | None
+) -> ReadyResult:
+    """One round of :func:`make_ready`; takes the work done off ``units`` (B,), in place."""
     projected = project(batch, pool=pool)
     rows = (projected.valid & ~projected.heap).nonzero()[:, 0]
-    settled = settle(projected.batch[rows], duration=duration, iterations=iterations, pool=pool)
+    options = {"duration": duration, "iterations": iterations}
+    settling = run_kernel("settle", projected.batch[rows], options, pool, units[rows])
+    settled, settled_valid = poses_after(settling, projected.batch[rows])[0], valid_rows(settling)
+    left = units[rows] - spent(settling)
     tensor, ready = projected.batch.tensor.clone(), torch.zeros_like(projected.batch.is_empty)
-    tensor[rows], ready[rows] = settled.batch.tensor, _judge_ready(settled.batch, pool) & settled.valid[:, None]
+    tensor[rows], ready[rows] = settled.tensor, _judge_ready(settled, left, pool) & settled_valid[:, None]
+    units[rows] = left
     valid = torch.zeros(len(batch), dtype=torch.bool)
-    valid[rows] = settled.valid
-    return ReadyResult(SceneBatch(tensor, batch.scene_type), ready, ready.sum(dim=-1), valid)
+    valid[rows] = settled_valid
+    return ReadyResult(SceneBatch(tensor, batch.scene_type), ready, ready.sum(dim=-1), valid & (units > 0), valid)
 
 
-def _judge_ready(batch: SceneBatch, pool: PhysicsPool | None) -> Tensor:
-    """(B, N) free objects that are simulation-ready; see :func:`make_ready`.
+def _judge_ready(batch: SceneBatch, units: Tensor, pool: PhysicsPool | None) -> Tensor:
+    """(B, N) free objects that are simulation-ready (see :func:`make_ready`); takes work off ``units`` (B,), in place.
 
     What moves at once is struck first, then what moves later or without what was struck. Where the last judgement
     still strikes something, everything that moved is struck with it.
     """
-    ready = batch.is_free & batch.in_workspace
+    ready = batch.is_free & batch.in_workspace & (units > 0)[:, None]
     scenes = ready.any(dim=-1).nonzero()[:, 0]
-    for duration in _READY_DURATIONS:
+    for number, trial in enumerate(_TRIALS, start=1):
         if not len(scenes):
             break
-        kept = _keep(batch[scenes], ready[scenes])
-        judged = feasibility(kept, max_penetration=_READY_DEPTH, duration=duration, pool=pool)
-        feasible = judged.feasible & judged.valid[:, None]
+        feasible, displacement = _judge(_keep(batch[scenes], ready[scenes]), scenes, trial, units, pool)
         struck = (ready[scenes] & ~feasible).any(dim=-1)
         ready[scenes] &= feasible
-        still = judged.displacement < _UNMOVED
-        if duration == _READY_DURATIONS[-1]:
+        still = displacement < _UNMOVED
+        if number == len(_TRIALS):
             scenes, still = scenes[struck], still[struck]
     if len(scenes):
         ready[scenes] &= still
     return ready
 
 
-# -- from and to tensors ------------------------------------------------------------------------
-
-
-def _run(
-    kernel: str, batch: SceneBatch, options: dict[str, Any], pool: PhysicsPool | None
-) -> list[dict[str, Any] | None]:
-    _check(batch)
-    translations = batch.translations.double().cpu().numpy()
-    rotations = batch.rotations.double().cpu().numpy()
-    categories = batch.categories.cpu().numpy()
-    workers = max(1, pool.workers) if pool else 1
-    size = max(1, min(_CHUNK, -(-len(batch) // workers)))
-    chunks = [
-        Chunk(batch.scene_type, translations[i : i + size], rotations[i : i + size], categories[i : i + size])
-        for i in range(0, len(batch), size)
-    ]
-    run: Callable[..., list[dict[str, Any] | None]] = pool.run if pool else run_in_process
-    return run(kernel, chunks, options)
-
-
-def _check(batch: SceneBatch) -> None:
-    present = ~batch.is_empty
-    finite = torch.isfinite(batch.tensor[..., :12]).all(dim=-1)
-    product = batch.rotations.transpose(-1, -2) @ batch.rotations - torch.eye(3, device=batch.tensor.device)
-    rotation = (product.abs().amax(dim=(-1, -2)) < _ORTHOGONAL) & (torch.linalg.det(batch.rotations) > 0)
-    for good, what in ((finite, "a pose that is not finite"), (rotation, "a matrix that is not a rotation")):
-        bad = torch.nonzero(present & ~good)
-        if len(bad):
-            scene, slot = bad[0].tolist()
-            raise InvalidInputError(
-                f"scene {scene}, slot {slot} holds {what}: {batch.tensor[scene, slot, :12].tolist()}; "
-                "SceneBatch.from_tensor makes valid poses of a sampler's output"
-            )
-
-
-def _valid(rows: list[dict[str, Any] | None]) -> Tensor:
-    return torch.tensor([row is not None and bool(row["valid"]) for row in rows], dtype=torch.bool)
-
-
-def _stack(
-    rows: list[dict[str, Any] | None],
-    batch: SceneBatch,
-    name: str,
-    dtype: torch.dtype = torch.float32,
-    shape: tuple[int, ...] | None = None,
-) -> Tensor:
-    """(B, N) tensor of a named result (or (B, *shape)), zeros where a row is invalid."""
-    shape = (batch.tensor.shape[1],) if shape is None else shape
-    out = torch.zeros(len(rows), *shape, dtype=dtype)
-    for index, row in enumerate(rows):
-        if row is not None and row["valid"]:
-            out[index] = torch.as_tensor(np.asarray(row[name]), dtype=dtype)
-    return out
-
-
-def _moved(rows: list[dict[str, Any] | None], batch: SceneBatch) -> tuple[SceneBatch, Tensor, Tensor]:
-    """The batch at its new poses, with displacement (B, N) m and rotation (B, N) rad of each object; all on the CPU."""
-    batch = batch.to("cpu")
-    translations, rotations = batch.translations.clone(), batch.rotations.clone()
-    for index, row in enumerate(rows):
-        if row is not None and row["valid"]:
-            translations[index] = torch.from_numpy(row["translations"]).float()
-            if "rotations" in row:
-                rotations[index] = torch.from_numpy(row["rotations"]).float()
-    present = ~batch.is_empty
-    displacement = (translations - batch.translations).norm(dim=-1) * present
-    identity = torch.eye(3).expand_as(rotations)
-    before = torch.where(present[..., None, None], batch.rotations, identity)
-    after = torch.where(present[..., None, None], project_to_so3(rotations), identity)
-    return batch.with_poses(translations, after), displacement, geodesic_angle(before, after) * present
+def _judge(
+    kept: SceneBatch, scenes: Tensor, trial: dict[str, Any], units: Tensor, pool: PhysicsPool | None
+) -> tuple[Tensor, Tensor]:
+    """Which objects (b, N) stay where they are, none where invalid, and their displacement (b, N) m."""
+    options = {"max_penetration": _READY_DEPTH} | trial
+    rows = run_kernel("feasibility", kept, options, pool, units[scenes])
+    units[scenes] -= spent(rows)
+    return stack(rows, kept, "feasible", torch.bool), stack(rows, kept, "displacement")

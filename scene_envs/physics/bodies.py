@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from scene_envs.errors import MissingDependencyError, PhysicsError
-from scene_envs.physics.constants import FRICTION, GRAVITY
+from scene_envs.physics.constants import FRICTION
 from scene_envs.physics.geometry import LevelGeometry, LibraryGeometry, inset_hull
 
 Array = NDArray[np.float64]
@@ -139,7 +139,6 @@ class BodyPool:
     def _build(self, sizes: Mapping[BodyKey, int]) -> None:
         bullet, client = self.bullet, self.client
         bullet.resetSimulation(flags=bullet.RESET_USE_SIMPLE_BROADPHASE, physicsClientId=client)
-        bullet.setGravity(0.0, 0.0, -GRAVITY * SCALE, physicsClientId=client)
         bullet.setPhysicsEngineParameter(
             numSubSteps=0,
             contactBreakingThreshold=2e-3 * SCALE,

@@ -24,6 +24,8 @@ NEAR = 3e-3
 """Object pairs whose boxes are at most this far apart (m) are listed,"""
 NEAR_FIXED = 0.06
 """and up to this far (m) in height where one of the two is fixed: what falls onto it has a closed form."""
+_TOO_MANY = 20_000_000
+"""Corner tests in the overlapping object pairs of one scene from which its depths are upper bounds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +89,8 @@ class ObjectPairs:
         low: (n, 3) lowest corner of each object's box, m.
         high: (n, 3) highest corner of each object's box, m.
         contacts: near pairs of their coarse parts.
+        rough: (P,) bool; the depth is an upper bound, from face planes of the coarse parts, because exact depths of the
+            scene would take too long.
     """
 
     first: Index
@@ -99,6 +103,7 @@ class ObjectPairs:
     low: Array
     high: Array
     contacts: Contacts
+    rough: Mask
 
     def among(self, rows: Index) -> ObjectPairs:
         """The pairs of the objects ``rows`` (m,), ascending, renumbered to 0..m-1."""
@@ -117,6 +122,7 @@ class ObjectPairs:
             self.low[rows],
             self.high[rows],
             self.contacts.among(number),
+            self.rough[kept],
         )
 
     def deepest(self) -> Array:
@@ -153,9 +159,15 @@ class Collider:
         depth, total = np.zeros(len(first)), np.zeros(len(first))
         part_count = np.zeros(len(first), dtype=np.int64)
         overlapping = np.flatnonzero(gap < 0)
+        rough = np.zeros(len(first), dtype=bool)
         if len(overlapping):
-            self._fine_depths(objects, first, second, overlapping, gap, depth, total, part_count, totals)
-        return ObjectPairs(first, second, gap, direction, depth, total, part_count, low, high, contacts)
+            a, b = first[overlapping], second[overlapping]
+            tests = np.bincount(objects.scene[a], weights=corner_tests(self.library, objects, a, b))
+            rough[overlapping] = tests[objects.scene[a]] > _TOO_MANY
+            depth[rough] = -gap[rough]
+            exact = overlapping[~rough[overlapping]]
+            self._fine_depths(objects, first, second, exact, gap, depth, total, part_count, totals)
+        return ObjectPairs(first, second, gap, direction, depth, total, part_count, low, high, contacts, rough)
 
     def contacts(self, objects: Objects, pairs: ObjectPairs, fine: Mask) -> Contacts:
         """Near parts: the fine ones of some object pairs, the coarse ones of the others.
@@ -243,6 +255,12 @@ class Collider:
             np.maximum.at(depth, target[rows[meet]], value[meet])
             np.add.at(total, target[rows[meet]], value[meet])
             np.add.at(part_count, target[rows[meet]], 1)
+
+
+def corner_tests(library: LibraryGeometry, objects: Objects, first: Index, second: Index) -> Array:
+    """(P,) corners of one object's parts times face directions of the other's, both ways: the work of one test."""
+    corners, directions = library.corners[objects.category], library.directions[objects.category]
+    return (corners[first] * directions[second] + directions[first] * corners[second]).astype(np.float64)
 
 
 def _rounds(target: Index, bound: Array, depth: Array, every: bool) -> Iterator[Index]:

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scene_envs.physics.budget import Budget, simulation_units
+from scene_envs.physics.collision import ObjectPairs
 from scene_envs.physics.motion import Physics, motion, physics_of, settle_scene
 from scene_envs.physics.placement import Objects, flatten
 from scene_envs.physics.projection import TOLERANCE, project_objects
@@ -33,12 +35,14 @@ class Chunk:
         translations: (b, N, 3) float64 m.
         rotations: (b, N, 3, 3) float64.
         categories: (b, N) int64.
+        units: (b,) of simulation that each scene may spend; None leaves that to its objects.
     """
 
     scene_type: SceneType
     translations: Array
     rotations: Array
     categories: Index
+    units: Array | None = None
 
     def __len__(self) -> int:
         return len(self.categories)
@@ -46,7 +50,8 @@ class Chunk:
     def row(self, index: int) -> Chunk:
         """One scene as a chunk."""
         rows = slice(index, index + 1)
-        return Chunk(self.scene_type, self.translations[rows], self.rotations[rows], self.categories[rows])
+        units = None if self.units is None else self.units[rows]
+        return Chunk(self.scene_type, self.translations[rows], self.rotations[rows], self.categories[rows], units)
 
 
 Kernel = Callable[..., dict[str, Any]]
@@ -67,10 +72,28 @@ def _objects(physics: Physics, chunk: Chunk) -> Objects:
     return flatten(physics.library, chunk.translations, chunk.rotations, chunk.categories, welded)
 
 
+def _budgets(chunk: Chunk, objects: Objects, pairs: ObjectPairs) -> list[Budget]:
+    """What the simulation of each scene may spend."""
+    if chunk.units is not None:
+        return [Budget(units) for units in chunk.units.tolist()]
+    scenes = [np.flatnonzero(objects.scene == index) for index in range(len(chunk))]
+    return [Budget(simulation_units(objects[rows], pairs.among(rows))) for rows in scenes]
+
+
+def _spent(budgets: list[Budget]) -> Array:
+    return np.array([budget.spent for budget in budgets])
+
+
 def feasibility_kernel(
-    chunk: Chunk, *, max_penetration: float, max_displacement: float, max_rotation: float, duration: float
+    chunk: Chunk,
+    *,
+    max_penetration: float,
+    max_displacement: float,
+    max_rotation: float,
+    duration: float,
+    tilt: tuple[float, float] = (0.0, 0.0),
 ) -> dict[str, Any]:
-    """See :func:`scene_envs.physics.feasibility`."""
+    """See :func:`scene_envs.physics.feasibility`; gravity leans by ``tilt`` (rad) toward the x and the y axis."""
     physics = physics_of(chunk.scene_type)
     objects = _objects(physics, chunk)
     pairs = physics.collider.pairs(objects)
@@ -78,7 +101,10 @@ def feasibility_kernel(
     deep = depth > max_penetration
     kept = np.flatnonzero(objects.fixed | ~deep)
     displacement, rotation = np.zeros(len(objects)), np.zeros(len(objects))
-    displacement[kept], rotation[kept], lost = motion(physics, objects[kept], pairs.among(kept), duration)
+    budgets = _budgets(chunk, objects, pairs)
+    displacement[kept], rotation[kept], lost = motion(
+        physics, objects[kept], pairs.among(kept), duration, budgets, tilt
+    )
     feasible = ~objects.fixed & ~deep & (displacement <= max_displacement) & (rotation <= max_rotation)
     valid = np.ones(len(chunk), dtype=bool)
     valid[lost] = False
@@ -88,6 +114,7 @@ def feasibility_kernel(
         "displacement": _scatter(chunk, objects, displacement),
         "rotation": _scatter(chunk, objects, rotation),
         "valid": valid,
+        "spent": _spent(budgets),
     }
 
 
@@ -97,10 +124,9 @@ def equilibrium_kernel(chunk: Chunk, *, duration: float) -> dict[str, Any]:
     objects = _objects(physics, chunk)
     invalid = [index for index in range(len(chunk)) if _is_heap(physics, objects[objects.scene == index])]
     kept = np.flatnonzero(~np.isin(objects.scene, invalid))
-    displacement, rotation = np.zeros(len(objects)), np.zeros(len(objects))
-    displacement[kept], rotation[kept], lost = motion(
-        physics, objects[kept], physics.collider.pairs(objects[kept]), duration
-    )
+    objects = objects[kept]
+    pairs = physics.collider.pairs(objects)
+    displacement, rotation, lost = motion(physics, objects, pairs, duration, _budgets(chunk, objects, pairs))
     valid = np.ones(len(chunk), dtype=bool)
     valid[invalid] = False
     valid[lost] = False
@@ -116,6 +142,10 @@ def penetration_kernel(chunk: Chunk) -> dict[str, Any]:
     physics = physics_of(chunk.scene_type)
     objects = _objects(physics, chunk)
     pairs = physics.collider.pairs(objects, totals=True)
+    valid = np.ones(len(chunk), dtype=bool)
+    valid[objects.scene[pairs.first[pairs.rough]]] = False
+    if not valid.all():
+        _LOGGER.warning("objects of a scene overlap too much to be measured one by one; its row is invalid")
     depth = pairs.deepest()
     listed: list[list[tuple[int, int, float, float, int]]] = [[] for _ in range(len(chunk))]
     for row in np.flatnonzero(pairs.depth > 0):
@@ -127,7 +157,7 @@ def penetration_kernel(chunk: Chunk) -> dict[str, Any]:
         "depth": _scatter(chunk, objects, depth),
         "total_per_pair": np.array([sum(entry[2] for entry in scene) for scene in listed]),
         "total_per_geometry": np.array([sum(entry[3] for entry in scene) for scene in listed]),
-        "valid": np.ones(len(chunk), dtype=bool),
+        "valid": valid,
     }
 
 
@@ -136,17 +166,30 @@ def settle_kernel(chunk: Chunk, *, duration: float, iterations: int) -> dict[str
     physics = physics_of(chunk.scene_type)
     translations, rotations = chunk.translations.copy(), chunk.rotations.copy()
     valid = np.ones(len(chunk), dtype=bool)
+    finished, spent = np.ones(len(chunk), dtype=bool), np.zeros(len(chunk))
     bottom = chunk.scene_type.workspace[0][2] - _FALLEN
     for index in range(len(chunk)):
-        objects = _objects(physics, chunk.row(index))
+        row = chunk.row(index)
+        objects = _objects(physics, row)
         valid[index] = not _is_heap(physics, objects)
         if not valid[index]:
             continue
-        new_rotation, new_translation, valid[index] = settle_scene(physics, objects, duration, iterations, bottom)
+        pairs = physics.collider.pairs(objects)
+        (budget,) = _budgets(row, objects, pairs)
+        new_rotation, new_translation, valid[index] = settle_scene(
+            physics, objects, pairs, duration, iterations, bottom, budget
+        )
+        finished[index], spent[index] = not budget.is_spent, budget.spent
         if valid[index]:
             translations[index, objects.slot] = new_translation
             rotations[index, objects.slot] = new_rotation
-    return {"translations": translations, "rotations": rotations, "valid": valid}
+    return {
+        "translations": translations,
+        "rotations": rotations,
+        "finished": finished & valid,
+        "spent": spent,
+        "valid": valid,
+    }
 
 
 def projection_kernel(chunk: Chunk) -> dict[str, Any]:
@@ -168,6 +211,17 @@ def projection_kernel(chunk: Chunk) -> dict[str, Any]:
     }
 
 
+def units_kernel(chunk: Chunk) -> dict[str, Any]:
+    """Units of simulation that each scene may spend; none for heaps, which are not simulated."""
+    physics = physics_of(chunk.scene_type)
+    units = np.zeros(len(chunk))
+    for index in range(len(chunk)):
+        objects = _objects(physics, chunk.row(index))
+        if not heaps(physics.collider, objects).any():
+            units[index] = simulation_units(objects, physics.collider.pairs(objects))
+    return {"units": units, "valid": np.ones(len(chunk), dtype=bool)}
+
+
 def _scatter(chunk: Chunk, objects: Objects, values: NDArray[Any]) -> NDArray[Any]:
     """Values (n,) of objects as a (b, N) array, 0 in empty slots."""
     out = np.zeros(chunk.categories.shape, dtype=values.dtype)
@@ -181,5 +235,6 @@ KERNELS: dict[str, Kernel] = {
     "penetration": penetration_kernel,
     "project": projection_kernel,
     "settle": settle_kernel,
+    "units": units_kernel,
 }
 """What workers can be asked to run."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scene_envs.physics.budget import Budget
 from scene_envs.physics.collision import Collider, ObjectPairs
 from scene_envs.physics.geometry import LibraryGeometry, library_geometry
 from scene_envs.physics.placement import Objects, object_boxes, place
@@ -105,7 +107,14 @@ class Moved:
         return bool(np.isfinite(self.rotation).all() and np.isfinite(self.translation).all())
 
 
-def motion(physics: Physics, objects: Objects, pairs: ObjectPairs, duration: float) -> tuple[Array, Array, Index]:
+def motion(
+    physics: Physics,
+    objects: Objects,
+    pairs: ObjectPairs,
+    duration: float,
+    budgets: Sequence[Budget],
+    tilt: tuple[float, float] = (0.0, 0.0),
+) -> tuple[Array, Array, Index]:
     """Displacement of the objects of several scenes in ``duration`` seconds.
 
     Args:
@@ -113,18 +122,21 @@ def motion(physics: Physics, objects: Objects, pairs: ObjectPairs, duration: flo
         objects: the objects.
         pairs: their near pairs.
         duration: s.
+        budgets: units of simulation that each scene may spend.
+        tilt: (x, y) rad by which gravity leans in simulations.
 
     Returns:
-        displacement (n,) m, rotation (n,) rad, and the scenes whose simulation diverged.
+        displacement (n,) m, rotation (n,) rad, and the scenes whose simulation diverged or was too much work.
     """
     rest = physics.rest(objects, pairs, duration)
     displacement, rotation = np.abs(rest.rise), rest.tilt.copy()
     lost: list[int] = []
     for scene in np.unique(objects.scene[~(rest.still | objects.fixed)]):
         rows = np.flatnonzero(objects.scene == scene)
-        moved = advance(physics, objects[rows], pairs.among(rows), rest[rows], duration)
-        if not moved.is_finite:
-            _LOGGER.warning("the simulation of a scene diverged; its row is invalid")
+        moved = advance(physics, objects[rows], pairs.among(rows), rest[rows], duration, budgets[scene], tilt=tilt)
+        if budgets[scene].is_spent or not moved.is_finite:
+            why = "diverged" if not moved.is_finite else "takes more work than a scene may"
+            _LOGGER.warning("the simulation of a scene %s; its row is invalid", why)
             lost.append(int(scene))
             continue
         displacement[rows] = np.linalg.norm(moved.translation - objects.translation[rows], axis=1)
@@ -140,8 +152,10 @@ def advance(
     pairs: ObjectPairs,
     rest: Rest,
     duration: float,
+    budget: Budget,
     *,
     settling: int | None = None,
+    tilt: tuple[float, float] = (0.0, 0.0),
 ) -> Moved:
     """The objects of one scene ``duration`` seconds later.
 
@@ -155,7 +169,9 @@ def advance(
         pairs: their near pairs.
         rest: which of them have a closed form.
         duration: s.
+        budget: units of simulation; when they are spent, objects stay where they have got to.
         settling: solver iterations per step of a damped motion; None judges undamped, and looks again in doubt.
+        tilt: (x, y) rad by which gravity leans in simulations.
     """
     translation = objects.translation.copy()
     translation[:, 2] += rest.rise
@@ -166,8 +182,8 @@ def advance(
     group[rows] = clusters(objects[rows], pairs.low[rows], pairs.high[rows])
     due = chosen
     for _ in range(_MEETINGS):
-        left = _simulate(physics, objects, pairs, due, group, duration, moved, settling=settling)
-        if not moved.is_finite:
+        left = _simulate(physics, objects, pairs, due, group, duration, moved, budget, settling=settling, tilt=tilt)
+        if budget.is_spent or not moved.is_finite:
             break
         hits = _meetings(physics, objects, pairs, due, group, left, moved)
         if hits is None:
@@ -184,8 +200,10 @@ def _simulate(
     group: Index,
     duration: float,
     moved: Moved,
+    budget: Budget,
     *,
     settling: int | None,
+    tilt: tuple[float, float],
 ) -> Mask:
     """Simulate the objects ``due`` (n,), write where they get into ``moved``, and say which left early (n,)."""
     left = np.zeros(len(objects), dtype=bool)
@@ -197,10 +215,13 @@ def _simulate(
     np.maximum.at(tallest, group[due], height[due])
 
     def run(members: Mask, settings: SolverSettings) -> None:
+        if budget.is_spent:
+            return
         if settling is not None:
             settings = SolverSettings(settings.time_step, settling, _DAMPING, _DAMPING)
+        settings = replace(settings, tilt=tilt)
         rows = np.flatnonzero(objects.fixed | members)
-        end = physics.world.simulate(objects[rows], fine[rows], group[rows], duration, settings)
+        end = physics.world.simulate(objects[rows], fine[rows], group[rows], duration, settings, budget)
         free = ~objects.fixed[rows]
         moved.rotation[rows[free]], moved.translation[rows[free]] = end[0][free], end[1][free]
         moved.angle[rows[free]], left[rows[free]] = end[2][free], end[3][free]
@@ -260,24 +281,31 @@ def _merge(objects: Objects, pairs: ObjectPairs, group: Index, first: Index, sec
 
 
 def settle_scene(
-    physics: Physics, objects: Objects, duration: float, iterations: int, bottom: float
+    physics: Physics,
+    objects: Objects,
+    pairs: ObjectPairs,
+    duration: float,
+    iterations: int,
+    bottom: float,
+    budget: Budget,
 ) -> tuple[Array, Array, bool]:
     """Let one scene come to rest: rotation (n, 3, 3), translation (n, 3) m, and whether it stayed finite.
 
     Args:
         physics: of the scene's assets.
         objects: of one scene.
+        pairs: their near pairs.
         duration: s, the longest time to simulate.
         iterations: of the solver per step.
         bottom: height (m) below which objects are left where they are.
+        budget: units of simulation; when they are spent, objects stay where they have got to.
     """
     current = objects
     calm = np.zeros(len(objects), dtype=bool)  # was simulated, and did not move
     remaining = duration
-    while remaining > 1e-9:
+    while remaining > 1e-9 and not budget.is_spent:
         span = min(_SEGMENT, remaining)
         remaining -= span
-        pairs = physics.collider.pairs(current)
         rest = physics.rest(current, pairs, span)
         active = ~(rest.still | current.fixed)
         fallen = active & (current.translation[:, 2] < bottom)
@@ -285,12 +313,14 @@ def settle_scene(
         rest = Rest(rest.still | done, rest.rise, rest.tilt)
         if not (active & ~done).any() and (np.abs(rest.rise) < _STILL).all():
             break
-        moved = advance(physics, current, pairs, rest, span, settling=iterations)
+        moved = advance(physics, current, pairs, rest, span, budget, settling=iterations)
         if not moved.is_finite:
             return objects.rotation, objects.translation, False
         far = np.linalg.norm(moved.translation - current.translation, axis=1)
         calm = (far < _STILL) & (moved.angle < _STILL_ANGLE)
         current = replace(current, rotation=moved.rotation, translation=moved.translation)
+        if remaining > 1e-9 and not budget.is_spent:
+            pairs = physics.collider.pairs(current)
     return current.rotation, current.translation, True
 
 

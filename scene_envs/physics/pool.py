@@ -182,7 +182,13 @@ class PhysicsPool:
         else:
             worker.task = tasks.popleft()
             chunk = worker.task.chunk
-            message = ("run", kernel, key, (chunk.translations, chunk.rotations, chunk.categories), options)
+            message = (
+                "run",
+                kernel,
+                key,
+                (chunk.translations, chunk.rotations, chunk.categories, chunk.units),
+                options,
+            )
             worker.deadline = time.monotonic() + self.timeout
         with contextlib.suppress(OSError):  # a dead worker is noticed by _collect, which sees the end of its pipe
             worker.outbox.send(message)

@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_envs.physics.budget import Budget
-from scene_envs.physics.collision import Collider
+from scene_envs.physics.collision import Collider, corner_tests
 from scene_envs.physics.minimum_translation import Tried, minimum_translations
 from scene_envs.physics.placement import Objects
 from scene_envs.physics.planes import Planes, near_pairs, nearest, separating_planes
-from scene_envs.physics.spreading import corner_tests, heaps, spread
+from scene_envs.physics.spreading import heaps, spread
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

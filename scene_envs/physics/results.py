@@ -89,12 +89,15 @@ class SettleResult:
         batch: the scenes at their new poses; invalid rows as they were.
         displacement: (B, N) m, from the given poses.
         rotation: (B, N) rad.
+        finished: (B,) bool; False where the scene's work budget was spent first: objects are where they had got to, and
+            may be moving. False also where ``valid`` is.
         valid: (B,) bool.
     """
 
     batch: SceneBatch
     displacement: Tensor
     rotation: Tensor
+    finished: Tensor
     valid: Tensor
 
 
@@ -127,10 +130,13 @@ class ReadyResult:
         batch: projected and settled scenes, of the best round each.
         ready: (B, N) bool; free objects that are simulation-ready there (see :func:`make_ready`).
         counts: (B,) int64, ready objects per scene.
+        finished: (B,) bool; False where the scene's work budget was spent first: the batch is the best effort, and
+            objects that were not judged are not ready. False also where ``valid`` is.
         valid: (B,) bool, of the first round.
     """
 
     batch: SceneBatch
     ready: Tensor
     counts: Tensor
+    finished: Tensor
     valid: Tensor

@@ -18,6 +18,9 @@ from scene_envs.physics.geometry import LibraryGeometry
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+_BLOCK = 1 << 16
+"""Face-corner combinations looked at together: their arrays stay in the cache."""
+
 
 @dataclass(frozen=True, eq=False)
 class PlacedParts:
@@ -59,11 +62,21 @@ def separations(library: LibraryGeometry, placed: PlacedParts, first: Index, sec
     classes = library.size_class[placed.part]
     groups = classes[first] * len(library.tables) + classes[second]
     for group in np.unique(groups):
+        class_a, class_b = divmod(int(group), len(library.tables))
         rows = np.flatnonzero(groups == group)
-        gap[rows], direction[rows] = _one_group(
-            library, placed, first[rows], second[rows], *divmod(int(group), len(library.tables))
-        )
+        step = max(1, _BLOCK // _combinations(library, class_a, class_b))
+        for start in range(0, len(rows), step):
+            some = rows[start : start + step]
+            gap[some], direction[some] = _one_group(library, placed, first[some], second[some], class_a, class_b)
     return gap, direction
+
+
+def _combinations(library: LibraryGeometry, class_a: int, class_b: int) -> int:
+    """Faces of one part times corners of the other, both ways, for parts of two size classes."""
+    a, b = library.tables[class_a], library.tables[class_b]
+    assert a is not None
+    assert b is not None
+    return a.normals.shape[1] * b.vertices.shape[1] + b.normals.shape[1] * a.vertices.shape[1]
 
 
 def _one_group(
@@ -123,20 +136,33 @@ def _face_gaps(
     normals: Array, offsets: Array, rotation: Array, vertices: Array, other: Array, shift: Array
 ) -> tuple[Array, Array]:
     """Best face of the owner: (P,) gap and (P, 3) world normal; ``shift`` leads to the other part."""
-    gaps, world = _all_face_gaps(normals, offsets, rotation, vertices, other, shift)
+    own = rotation.swapaxes(-1, -2)
+    seen = rotate(rotate(other.swapaxes(-1, -2), own).swapaxes(-1, -2), normals)  # (P, K, 3) in the other's frame
+    away = rotate(other.swapaxes(-1, -2), shift[:, None])[:, 0]
+    gaps = _lowest(seen, vertices) + _along(seen, away) - offsets
     best = gaps.argmax(axis=1)
     rows = np.arange(len(best))
-    return gaps[rows, best], world[rows, best]
+    return gaps[rows, best], rotate(rotation, normals[rows, best][:, None])[:, 0]
 
 
 def _all_face_gaps(
     normals: Array, offsets: Array, rotation: Array, vertices: Array, other: Array, shift: Array
 ) -> tuple[Array, Array]:
     """Every face of the owner: (P, K) gaps and (P, K, 3) world normals."""
-    world = rotate(rotation, normals)  # (P, K, 3)
-    local = rotate(other.swapaxes(-1, -2), world)  # in the frame of the other part
-    height = local[:, :, None, 0] * vertices[:, None, :, 0]
-    height += local[:, :, None, 1] * vertices[:, None, :, 1]
-    height += local[:, :, None, 2] * vertices[:, None, :, 2]
-    along = world[..., 0] * shift[:, None, 0] + world[..., 1] * shift[:, None, 1] + world[..., 2] * shift[:, None, 2]
-    return height.min(axis=2) + along - offsets, world
+    world = rotate(rotation, normals)
+    seen = rotate(other.swapaxes(-1, -2), world)
+    return _lowest(seen, vertices) + _along(world, shift) - offsets, world
+
+
+def _lowest(directions: Array, vertices: Array) -> Array:
+    """(P, K) m: least height of vertices (P, V, 3) along directions (P, K, 3) of the same frame."""
+    height = directions[:, :, None, 0] * vertices[:, None, :, 0]
+    height += directions[:, :, None, 1] * vertices[:, None, :, 1]
+    height += directions[:, :, None, 2] * vertices[:, None, :, 2]
+    return height.min(axis=2)  # type: ignore[no-any-return]
+
+
+def _along(directions: Array, vector: Array) -> Array:
+    """(P, K) m: components of vectors (P, 3) along directions (P, K, 3)."""
+    x, y, z = vector[:, None, 0], vector[:, None, 1], vector[:, None, 2]
+    return directions[..., 0] * x + directions[..., 1] * y + directions[..., 2] * z  # type: ignore[no-any-return]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_envs.physics.collision import Collider, scene_pairs
+from scene_envs.physics.collision import Collider, corner_tests, scene_pairs
 from scene_envs.physics.geometry import LibraryGeometry
 from scene_envs.physics.placement import Objects, object_boxes, place
 from scene_envs.physics.planes import CLEARANCE
@@ -58,12 +58,6 @@ def heaps(collider: Collider, objects: Objects) -> Mask:
         if collider.pairs(looked_at).depth.max(initial=0.0) > _DEEP:
             chosen |= free & (group == number)
     return chosen
-
-
-def corner_tests(library: LibraryGeometry, objects: Objects, first: Index, second: Index) -> Array:
-    """(P,) corners of one object's parts times face directions of the other's, both ways: the work of one test."""
-    corners, directions = library.corners[objects.category], library.directions[objects.category]
-    return (corners[first] * directions[second] + directions[first] * corners[second]).astype(np.float64)
 
 
 def spread(

@@ -11,7 +11,10 @@ import torch
 
 from rewards import evaluate_reward, make_reward
 from scene_envs.errors import InvalidInputError
+from scene_envs.grammars import get_grammar
 from scene_envs.physics import equilibrium, feasibility, make_ready, penetration, project, settle
+from scene_envs.physics.batches import run_kernel, spent, stack
+from scene_envs.physics.budget import PER_OBJECT, PER_SCENE
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type
 from scene_envs.scene_types.built_in import BUILT_IN
@@ -97,6 +100,32 @@ def test_every_function_answers(name: str, kind: str) -> None:
         after = getattr(result, "batch", batch)
         assert bool(torch.isfinite(after.tensor).all())
         assert torch.equal(after.categories, batch.categories)
+
+
+@pytest.mark.parametrize("name", ["dimsum_table", "restaurant_high_clutter"])
+def test_the_simulation_of_coincident_pairs_is_bounded(name: str) -> None:
+    """What a scene spends exceeds its budget by twelve steps of its objects at most, and the results say so."""
+    batch = in_pairs(name)
+    rows = run_kernel("settle", batch, {"duration": 1.0, "iterations": 35}, None)
+    assert PER_SCENE <= float(spent(rows)) <= PER_SCENE + 12 * COUNT
+    assert not bool(settle(batch).finished)
+    assert not bool(equilibrium(batch, duration=1.0).valid)
+    result = make_ready(batch)
+    assert not bool(result.finished)
+    assert int(result.counts) == 0
+    assert bool(torch.isfinite(result.batch.tensor).all())
+
+
+def test_ordinary_scenes_finish() -> None:
+    clean = get_grammar("dimsum_table").sample(np.random.default_rng(0), 3)
+    noise = 0.01 * torch.randn(clean.translations.shape, generator=torch.Generator().manual_seed(0))
+    batch = clean.with_poses(clean.translations + noise * clean.is_free.unsqueeze(-1), clean.rotations)
+    units = stack(run_kernel("units", batch, {}, None), batch, "units", shape=())
+    assert units.tolist() == [PER_SCENE + PER_OBJECT * int(count) for count in batch.is_free.sum(dim=-1)]
+    assert bool(settle(batch).finished.all())
+    result = make_ready(batch)
+    assert bool(result.finished.all())
+    assert torch.equal(result.counts, batch.is_free.sum(dim=-1))
 
 
 @pytest.mark.parametrize("kind", SCENES)

@@ -102,3 +102,14 @@ def test_the_order_of_slots_changes_no_verdict() -> None:
     order = torch.randperm(batch.tensor.shape[1], generator=torch.Generator().manual_seed(0))
     shuffled = SceneBatch(batch.tensor[:, order], batch.scene_type)
     assert torch.equal(feasibility(shuffled).feasible, feasibility(batch).feasible[:, order])
+
+
+def test_a_spent_budget_ends_at_the_same_step(pool: PhysicsPool) -> None:
+    """Coincident objects: the simulation is cut short, after another one, and in workers, at the same poses."""
+    clean = get_grammar("dimsum_table").sample(np.random.default_rng(2), 4)
+    batch = SceneBatch(torch.cat([clean.tensor, clean.tensor[:, 1:]], dim=1), clean.scene_type)
+    first = settle(batch)
+    assert not bool(first.finished.any())
+    settled(crowded("dimsum_table", seed=10))
+    for again in (settle(batch), settle(batch, pool=pool)):
+        assert same([first.batch.tensor, first.finished], [again.batch.tensor, again.finished])

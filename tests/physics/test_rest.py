@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from simple_scenes import SIDE, scene, turned
 
 from scene_envs.grammars import get_grammar
-from scene_envs.physics import FeasibilityResult, equilibrium, feasibility, settle
+from scene_envs.physics import FeasibilityResult, equilibrium, feasibility, make_ready, settle
 from scene_envs.physics.collision import ObjectPairs
 from scene_envs.physics.motion import Physics, physics_of
 from scene_envs.physics.placement import Objects
@@ -129,3 +129,11 @@ def test_settled_stacks_touch_exactly() -> None:
     """Gaps of 2 mm close to nothing: what is at rest is put where it belongs."""
     result = settle(scene(("cube", 0.0, 0.0, 0.002), ("cube", 0.0, 0.0, SIDE + 0.004)))
     assert result.batch.translations[0, 1:3, 2].tolist() == pytest.approx([0.0, SIDE], abs=1e-6)
+
+
+@pytest.mark.parametrize(("shift", "holds"), [(0.03, True), (0.048, False)])
+def test_a_stack_that_only_just_stands_is_not_ready(shift: float, holds: bool) -> None:
+    """The upper box stands with its centre 2 mm from the edge; gravity that leans by 0.12 rad takes it 4 mm further."""
+    batch = scene(("cube", 0.0, 0.0, 0.0), ("cube", shift, 0.0, SIDE))
+    assert feasibility(batch, duration=2.0).feasible[0, 1:3].tolist() == [True, True]
+    assert make_ready(batch, rounds=1).ready[0, 1:3].tolist() == [True, holds]

@@ -199,7 +199,7 @@ def test_a_dataset_without_prompts_cannot_train_a_prior_that_reads_them(
     bad = tmp_path / "bad"
     change_column(folder / "data", tmp_path / "half", "language_annotation")
     change_column(tmp_path / "half", bad, "language_annotations")
-    err = refused(capsys, "pretrain", f"data={bad}", "process=mixed", "text=true", f"output={tmp_path / 'out'}")
+    err = refused(capsys, "pretrain", f"data={bad}", "process=mixed", "text=vocabulary", f"output={tmp_path / 'out'}")
     assert "language_annotation" in err
 
 
