@@ -1,5 +1,5 @@
 # make demo      steer the shipped prior and write runs/demo/report.html
-# make test      run the tests; JOBS=8 for more processes, SEED=1 for one order
+# make test      run the tests; JOBS=8 for more processes, SEED=1 for one order, ARGS="-m 'not slow'" for pytest
 # make lint      check style, formatting and types
 # make docs      build the documentation into site/index.html
 # make check     run all of this as continuous integration does
@@ -23,7 +23,7 @@ demo: install
 	.venv/bin/scene-envs demo output=runs/demo
 
 test: install-dev
-	$(ENV) .venv/bin/python -m pytest --randomly-seed=$(SEED) -n $(JOBS) --dist worksteal --doctest-modules scene_envs rewards agents configs tests
+	$(ENV) .venv/bin/python -m pytest --randomly-seed=$(SEED) -n $(JOBS) --dist worksteal --doctest-modules scene_envs rewards agents configs tests $(ARGS)
 
 lint: install-dev
 	.venv/bin/ruff check .

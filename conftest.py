@@ -14,6 +14,9 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 
 def _registries() -> list[dict[str, Any]]:
     """Every registry that users add to by name, the built-in entries in place."""
+    from agents.networks.registry import _ENTRIES as networks
+    from agents.planning.config import _PLANNERS as planners
+    from agents.post_training.algorithms import _ENTRIES as algorithms
     from rewards.registry import _registry as rewards
     from scene_envs.envs.masks import _MASKS
     from scene_envs.export.formats import _FORMATS
@@ -22,7 +25,7 @@ def _registries() -> list[dict[str, Any]]:
     from scene_envs.scene_types.registry import _REGISTRY
 
     list_grammars()  # registers the built-in ones, which happens once per process
-    return [_REGISTRY, GRAMMARS, _MASKS, _FORMATS, rewards]
+    return [_REGISTRY, GRAMMARS, _MASKS, _FORMATS, rewards, networks, planners, algorithms]
 
 
 @contextmanager

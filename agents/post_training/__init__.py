@@ -6,7 +6,12 @@ from scene_envs.lazy import lazy_names
 
 if TYPE_CHECKING:
     from agents.post_training.advantages import compute_advantages
-    from agents.post_training.algorithms import AlgorithmSettings, list_algorithms, register_algorithm
+    from agents.post_training.algorithms import (
+        AlgorithmSettings,
+        DDPOSFSettings,
+        list_algorithms,
+        register_algorithm,
+    )
     from agents.post_training.comparison_run import post_train_and_compare
     from agents.post_training.config import PostTrainConfig
     from agents.post_training.ddpo import DDPO
@@ -19,6 +24,7 @@ __all__ = [
     "DDPO",
     "AlgorithmSettings",
     "DDPOSFLoss",
+    "DDPOSFSettings",
     "DenoisingPolicy",
     "Guard",
     "PostTrainConfig",
@@ -35,7 +41,12 @@ __getattr__ = lazy_names(
     __name__,
     {
         "agents.post_training.advantages": ("compute_advantages",),
-        "agents.post_training.algorithms": ("AlgorithmSettings", "list_algorithms", "register_algorithm"),
+        "agents.post_training.algorithms": (
+            "AlgorithmSettings",
+            "DDPOSFSettings",
+            "list_algorithms",
+            "register_algorithm",
+        ),
         "agents.post_training.comparison_run": ("post_train_and_compare",),
         "agents.post_training.config": ("PostTrainConfig",),
         "agents.post_training.ddpo": ("DDPO",),

@@ -16,6 +16,7 @@ from scene_envs.datasets import generate
 
 pytest.importorskip("pybullet")
 
+pytestmark = pytest.mark.slow
 ROWS = ("flux_mixed", "flux_continuous")
 
 

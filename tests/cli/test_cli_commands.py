@@ -50,6 +50,7 @@ def test_the_same_seed_draws_the_same_scenes(prior, tmp_path):
     assert first == again != other
 
 
+@pytest.mark.slow
 def test_generate_pretrain_post_train_and_sample_the_result(tmp_path, capsys):
     data, trained, steered = (tmp_path / name for name in ("data", "trained", "steered"))
     assert main(["generate", "count=8", "shard_size=8", "workers=0", "progress=false", f"output={data}"]) == 0
@@ -61,6 +62,7 @@ def test_generate_pretrain_post_train_and_sample_the_result(tmp_path, capsys):
     words += [
         "regularisation.bank_size=8",
         "guard.scenes=2",
+        "slots=6",
         "logger.report_scenes=1",
         "logger.progress=none",
         "reward={name: clip, reward: object_count, high: 30}",

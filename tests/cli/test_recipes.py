@@ -16,6 +16,7 @@ from scene_envs.grammars import get_grammar
 from scene_envs.normalizer import Normalizer
 
 
+@pytest.mark.slow
 def test_the_paper_s_recipe_is_its_setting() -> None:
     config = compose("pretrain", PretrainConfig, ["recipe=paper", "text=vocabulary"])
     raw = torch.from_numpy(get_grammar("dimsum_table").sample_array(np.random.default_rng(0), 40))

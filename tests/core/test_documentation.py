@@ -11,7 +11,8 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-from test_import_graph import GRAPH
+
+from tests.helpers.import_graph import GRAPH
 
 ROOT = Path(__file__).parents[2]
 API = sorted(path.stem for path in (ROOT / "docs" / "api").glob("*.md") if path.stem != "README")
@@ -76,22 +77,6 @@ def test_arrows_of_the_drawing_are_imports() -> None:
 
 def test_the_committed_drawing_is_that_of_the_script() -> None:
     assert ARCHITECTURE.FILE.read_text(encoding="utf-8") == ARCHITECTURE.drawing()
-
-
-@pytest.mark.parametrize(
-    "page",
-    [
-        "planners/uct",
-        "planners/best_of",
-        *(f"rewards/{path.stem}" for path in sorted((ROOT / "docs" / "rewards").glob("*.md")) if path.stem != "README"),
-    ],
-)
-def test_code_of_a_page_runs(page: str) -> None:
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8"), re.DOTALL)
-    names: dict[str, object] = {}
-    assert blocks
-    for block in blocks:
-        exec(block, names)
 
 
 def test_make_help_lists_every_target() -> None:

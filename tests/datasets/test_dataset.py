@@ -10,11 +10,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
-from toy_grammars import TYPE, toy_scenes
 
 from scene_envs.datasets import SceneDataset, describe_all, read_metadata
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.normalizer import Normalizer
+from tests.helpers.toy_grammars import TYPE, toy_scenes
 
 
 @pytest.fixture(scope="module")

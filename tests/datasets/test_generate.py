@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from toy_grammars import TYPE, ToyGrammar, toy_cups
 
 from scene_envs.datasets import SceneDataset, StorageError, generate, judge_scenes
 from scene_envs.datasets import shards as shards_module
@@ -27,9 +26,10 @@ from scene_envs.datasets.verification import verify_scenes
 from scene_envs.errors import CorruptFileError, InvalidInputError, PhysicsError, UnknownNameError
 from scene_envs.grammars import get_grammar, register_grammar
 from scene_envs.scene import SceneBatch
+from tests.helpers.toy_grammars import TYPE, ToyGrammar, toy_cups
 
 COUNT, SHARD = 70, 30
-HERE = str(Path(__file__).parent)
+ROOT = str(Path(__file__).parents[2])
 
 
 def _hashes(folder: Path) -> dict[str, str]:
@@ -84,8 +84,8 @@ def test_kept_scenes_pass_physics_and_thrown_ones_are_accounted_for(reference: P
 
 _SLOW = f"""
 import sys, time
-sys.path.insert(0, {HERE!r})
-import toy_grammars
+sys.path.insert(0, {ROOT!r})
+from tests.helpers import toy_grammars
 from scene_envs.datasets import generate, shards
 judge = shards.judge_scenes
 def slowly(batch):
@@ -97,6 +97,7 @@ generate("toy_cups", {COUNT}, sys.argv[1], seed=3, shard_size={SHARD}, workers=0
 """
 
 
+@pytest.mark.slow
 def test_killed_at_any_point_and_started_again_the_files_are_the_same(reference: Path, tmp_path: Path) -> None:
     """Killed in the middle of the first shard, and the next run in the middle of the second."""
     for shard in (0, 1):
@@ -165,6 +166,7 @@ def test_the_result_does_not_depend_on_the_size_of_chunks(
     assert _hashes(tmp_path) == _hashes(reference)
 
 
+@pytest.mark.slow
 def test_two_workers_write_the_same_files_and_a_dying_one_is_replaced(
     reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -225,18 +227,6 @@ def test_a_broken_shard_is_named_before_work_starts(reference: Path, tmp_path: P
     shard.unlink()
     _generate(tmp_path)
     assert _hashes(tmp_path) == _hashes(reference)
-
-
-# -- Ray --------------------------------------------------------------------------------------------
-
-
-def test_ray_writes_the_same_files(reference: Path, tmp_path: Path) -> None:
-    ray = pytest.importorskip("ray")
-    assert not ray.is_initialized()
-    report = _generate(tmp_path, workers=1, backend="ray")  # one CPU is enough: each worker takes seconds to start
-    assert report.scenes == 70
-    assert _hashes(tmp_path) == _hashes(reference)
-    assert not ray.is_initialized()
 
 
 def test_an_unknown_backend_is_refused(tmp_path: Path) -> None:

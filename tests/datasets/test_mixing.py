@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from toy_grammars import TYPE, cup_row, toy_scenes
 
 from scene_envs.datasets import MixedDataset, Part, SceneDataset, SceneStream, from_union, mix, to_union
 from scene_envs.datasets import files as files_module
@@ -20,6 +19,7 @@ from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type, union_scene_type
+from tests.helpers.toy_grammars import TYPE, cup_row, toy_scenes
 
 
 def _dataset(count: int, seed: int = 0) -> SceneDataset:

@@ -7,7 +7,6 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from prompts_scenes import BOTTOM, TOP, UPPER, build
 
 from scene_envs.datasets.prompts import (
     NameCount,
@@ -25,6 +24,7 @@ from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type
+from tests.helpers.prompts_scenes import BOTTOM, TOP, UPPER, build
 
 BUILT_IN = (
     "breakfast_table_high_clutter",

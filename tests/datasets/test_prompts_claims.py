@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-from prompts_scenes import TOP, build
 
 from scene_envs.datasets.prompts import (
     NameCount,
@@ -22,6 +21,7 @@ from scene_envs.datasets.prompts import (
 )
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
+from tests.helpers.prompts_scenes import TOP, build
 
 SHELF = Reference("shelf")
 

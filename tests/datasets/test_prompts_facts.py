@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 import torch
-from prompts_scenes import BOTTOM, LOWER, TOP, UPPER, build, jittered, pitch, yaw
 
 from scene_envs.datasets.prompts import SceneFacts, Tolerances, parse_prompt, scene_facts, viewer_axes
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import Camera, SceneType, get_scene_type
+from tests.helpers.prompts_scenes import BOTTOM, LOWER, TOP, UPPER, build, jittered, pitch, yaw
 
 
 def claims(scene: SceneBatch, *texts: str) -> list[bool]:

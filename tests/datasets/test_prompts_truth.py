@@ -7,12 +7,12 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from prompts_oracle import Oracle
-from prompts_scenes import jittered, moved, without
 
 from scene_envs.datasets.prompts import ObjectCount, SideClaim, describe, describe_all, parse_prompt, scene_facts
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch
+from tests.helpers.prompts_oracle import Oracle
+from tests.helpers.prompts_scenes import jittered, moved, without
 
 SCENES = {
     "breakfast_table_high_clutter": 10,
@@ -46,6 +46,7 @@ def many(name: str) -> SceneBatch:
     return SceneBatch.concatenate(result)
 
 
+@pytest.mark.slow
 @types
 def test_all_prompts_parse_back_and_hold(name: str) -> None:
     batch = many(name)

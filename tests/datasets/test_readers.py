@@ -12,12 +12,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
-from toy_grammars import TYPE, cup_row, toy_scenes
 
 from scene_envs.datasets import DatasetInfo, SceneDataset
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch
+from tests.helpers.toy_grammars import TYPE, cup_row, toy_scenes
 
 ROWS = 7
 LOW = torch.tensor([-0.5, -0.4, -0.02] + [-1.0] * 9 + [0.0] * 4)

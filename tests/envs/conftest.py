@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from toy_prior import ToyPrior
 
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.scene import SceneBatch
+from tests.helpers.toy_prior import ToyPrior
 
 
 class MeanHeight:

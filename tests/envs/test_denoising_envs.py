@@ -211,13 +211,3 @@ def test_wrappers_of_gymnasium_work_on_the_vector_face(prior, height):
         _, rewards, _, _, info = env.step(action)
     np.testing.assert_allclose(info["episode"]["r"], rewards, rtol=1e-6)
     assert info["episode"]["l"].tolist() == [3, 3]
-
-
-def test_stable_baselines3_trains_on_noise_mode():
-    sb3 = pytest.importorskip("stable_baselines3")
-    env = gym.make(ID, prior=tiny_prior(slots=6), slots=6, reward="object_count", num_steps=2, action_mode="noise")
-    model = sb3.PPO("MultiInputPolicy", env, n_steps=8, batch_size=8, n_epochs=1, seed=0, device="cpu")
-    before = [p.detach().clone() for p in model.policy.parameters()]
-    model.learn(16)
-    assert model.num_timesteps == 16
-    assert any(not p.equal(q) for p, q in zip(model.policy.parameters(), before, strict=True))

@@ -10,7 +10,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from toy_prior import ToyPrior
 
 from agents.planning.search_run import SearchConfig
 from rewards import RewardOutput
@@ -19,6 +18,7 @@ from scene_envs.envs.masks import CulpritsMask, MaskGenerator, cover, infeasible
 from scene_envs.envs.scoring import RewardScorer, Score
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.scene import SceneBatch
+from tests.helpers.toy_prior import ToyPrior
 
 ID = "scene_envs:SceneEnvs/Search-v0"
 

@@ -169,15 +169,6 @@ def test_prompts_that_cannot_be_followed_are_refused(reader, prior, caplog):
     assert caplog.text.count("zeppelin") == 1
 
 
-def test_stable_baselines_trains_on_prompts(reader):
-    sb3 = pytest.importorskip("stable_baselines3")
-    env = make(reader, prompt=PROMPTS, action_mode="noise", reward="prompt_match")
-    from stable_baselines3.common.env_checker import check_env as check_sb3
-
-    check_sb3(env.unwrapped)
-    sb3.PPO("MultiInputPolicy", env, n_steps=4, batch_size=4, n_epochs=1, device="cpu").learn(4)
-
-
 # -- search ------------------------------------------------------------------------------------------
 
 

@@ -17,6 +17,7 @@ from scene_envs.errors import MissingDependencyError, UnknownNameError
 ID = "scene_envs:SceneEnvs/Denoising-v0"
 
 
+@pytest.mark.slow
 def test_gym_make_needs_no_other_import() -> None:
     code = (
         "import sys, gymnasium as gym; "

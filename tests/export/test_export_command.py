@@ -6,13 +6,13 @@ import json
 
 import numpy as np
 import pytest
-from export_scenes import all_scenes, jittered_scene, laid_scene
 
 from agents.cli import main
 from agents.priors.testing import tiny_prior
 from scene_envs.datasets import SceneDataset
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch
+from tests.helpers.export_scenes import all_scenes, jittered_scene, laid_scene
 
 
 @pytest.fixture(scope="module")

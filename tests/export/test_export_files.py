@@ -7,13 +7,13 @@ import json
 import re
 import sys
 from dataclasses import replace
+from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
 import torch
 import trimesh
-from export_scenes import DIMSUM, laid_scene
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -24,6 +24,7 @@ from scene_envs.export.formats import get_format
 from scene_envs.export.placed import angle_axis, exact_rotations, identifiers, quaternion
 from scene_envs.physics.parts import PartGeometry
 from scene_envs.scene import SceneBatch
+from tests.helpers.export_scenes import DIMSUM, laid_scene
 
 TEXT = ("urdf", "sdf", "drake", "mjcf")
 
@@ -279,3 +280,9 @@ def test_textures_become_colours_and_photographs_few_enough_of_them():
     assert np.abs(shown.astype(int) - colors[:, :3]).max() <= 16
     textured = textured_mesh(odd_asset(ball))
     np.testing.assert_allclose(textured.triangles, ball.triangles)
+
+
+def test_the_page_on_exports_shows_every_target() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "export.md").read_text(encoding="utf-8")
+    for name in ("mujoco", "pydrake", "pybullet", "pxr", "numpy"):
+        assert f"import {name}" in page or f"from {name}" in page, name

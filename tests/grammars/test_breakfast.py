@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 import pytest
-from drawn_scenes import Thing, apart, contents_of, every, things_of
 
 from scene_envs.grammars import Cluster, Gaussian, Grammar, Node, Surface, Yaw
 from scene_envs.grammars.breakfast import TABLE, crock, facing_pair, place_setting, shared_bowls, shared_plates
 from scene_envs.scene_types import get_scene_type
+from tests.helpers.drawn_scenes import Thing, apart, contents_of, every, things_of
 
 SCENE_TYPE = get_scene_type("breakfast_table_low_clutter")
 FLAT = {"plate": 0.071, "shared_plate": 0.079, "bowl": 0.034}

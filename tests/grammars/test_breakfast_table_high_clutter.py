@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from drawn_scenes import Thing, check_physics, check_slots, check_support, counts, things_of
 from numpy.typing import NDArray
 
 from scene_envs.grammars import get_grammar
 from scene_envs.scene_types import get_scene_type
+from tests.helpers.drawn_scenes import Thing, check_physics, check_slots, check_support, counts, things_of
 
 NAME = "breakfast_table_high_clutter"
 SCENE_TYPE = get_scene_type(NAME)

@@ -4,12 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from drawn_scenes import Thing, apart, check_physics, check_slots, check_support, contents_of, counts, every, things_of
 from numpy.typing import NDArray
 
 from scene_envs.grammars import get_grammar
 from scene_envs.grammars.shelf import TIER_HEIGHTS
 from scene_envs.scene_types import get_scene_type
+from tests.helpers.drawn_scenes import (
+    Thing,
+    apart,
+    check_physics,
+    check_slots,
+    check_support,
+    contents_of,
+    counts,
+    every,
+    things_of,
+)
 
 NAME = "living_room_shelf"
 SCENE_TYPE = get_scene_type(NAME)

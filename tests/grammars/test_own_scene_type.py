@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
-import sys
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
@@ -27,28 +24,18 @@ from scene_envs.export import export
 from scene_envs.grammars import get_grammar, list_grammars
 from scene_envs.physics import PhysicsPool, feasibility, make_ready
 from scene_envs.render import render, write_viewer
+from tests.helpers.outside_package import installed
 
-PACKAGE = Path(__file__).parents[1] / "scene_type_package"
 DOCS = Path(__file__).parents[2] / "docs" / "grammars.md"
+pytestmark = pytest.mark.slow
 NAME = "tea_table"
 
 
 @pytest.fixture(scope="module", autouse=True)
 def tea_house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The package installed by pip, without network, on the path of this process; forgotten afterwards."""
-    copy, site = tmp_path_factory.mktemp("source") / "package", tmp_path_factory.mktemp("site")
-    shutil.copytree(PACKAGE, copy)  # pip leaves build products beside the source
-    options = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--disable-pip-version-check"]
-    command = [sys.executable, "-m", "pip", "install", *options, "--target", str(site), str(copy)]
-    subprocess.run(command, check=True, capture_output=True, text=True)
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.syspath_prepend(str(site))
-        plugins.load_plugins.cache_clear()
-        list_scene_types()  # imports what is installed, once per process
+    """The package of examples/extending on the path of this process; forgotten afterwards."""
+    with installed(tmp_path_factory.mktemp("site"), missing="tea_house.not_there") as site:
         yield site
-    plugins.load_plugins.cache_clear()
-    for name in [name for name in sys.modules if name.startswith("tea_house")]:
-        del sys.modules[name]
 
 
 @pytest.fixture(scope="module")

@@ -6,13 +6,13 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from drawn_scenes import Thing, apart, check_physics, check_slots, contents_of, counts, every, things_of
 from numpy.typing import NDArray
 
 from scene_envs.grammars import get_grammar
 from scene_envs.grammars.pantry_shelf import FRUIT
 from scene_envs.grammars.shelf import TIER_HEIGHTS
 from scene_envs.scene_types import get_scene_type
+from tests.helpers.drawn_scenes import Thing, apart, check_physics, check_slots, contents_of, counts, every, things_of
 
 NAME = "pantry_shelf"
 SCENE_TYPE = get_scene_type(NAME)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from unittest.mock import patch
@@ -15,26 +12,15 @@ import torch
 from agents import PretrainConfig, ScenePrior, pretrain
 from agents.networks import MixedFluxConfig, list_networks, match_parameters, parameter_count, registry
 from agents.networks.registry import register_network
-from scene_envs import plugins
 from scene_envs.errors import InvalidInputError, UnknownNameError
-
-PACKAGE = Path(__file__).parents[1] / "network_package"
+from tests.helpers.outside_package import installed
 
 
 @pytest.fixture(scope="module", autouse=True)
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """The package installed by pip, without network, on the path of this process; forgotten afterwards."""
-    copy, site = tmp_path_factory.mktemp("source") / "package", tmp_path_factory.mktemp("site")
-    shutil.copytree(PACKAGE, copy)  # pip leaves build products beside the source
-    options = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--disable-pip-version-check"]
-    command = [sys.executable, "-m", "pip", "install", *options, "--target", str(site), str(copy)]
-    subprocess.run(command, check=True, capture_output=True, text=True)
-    with pytest.MonkeyPatch.context() as monkeypatch, patch.dict(registry._ENTRIES):
-        monkeypatch.syspath_prepend(str(site))
-        plugins.load_plugins.cache_clear()
+def package(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """The package of examples/extending on the path; forgotten afterwards."""
+    with patch.dict(registry._ENTRIES), installed(tmp_path_factory.mktemp("site")):
         yield
-    plugins.load_plugins.cache_clear()
-    sys.modules.pop("deep_sets", None)
 
 
 def test_it_is_listed_without_an_import_of_its_package() -> None:
@@ -44,6 +30,7 @@ def test_it_is_listed_without_an_import_of_its_package() -> None:
         match_parameters("deep_set", "mixed", 1000)
 
 
+@pytest.mark.usefixtures("few_grammar_scenes")
 def test_two_steps_train_it_and_its_files_give_it_back(tmp_path: Path) -> None:
     config = PretrainConfig(
         data="grammar", output=str(tmp_path / "run"), iterations=2, batch_size=4,
@@ -65,6 +52,7 @@ def test_its_size_is_matched_like_any_other() -> None:
     assert abs(parameter_count(found) / 30_000 - 1) < 0.1
 
 
+@pytest.mark.usefixtures("few_grammar_scenes")
 def test_slots_that_it_cannot_ignore_are_refused(tmp_path: Path) -> None:
     config = PretrainConfig(data="grammar", output=str(tmp_path), iterations=1, network="deep_sets", process="mixed")
     with pytest.raises(InvalidInputError, match="empty_slots='attended'"):

@@ -7,12 +7,12 @@ import pytest
 import torch
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
-from simple_scenes import SIDE, scene, turned
 
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import penetration
 from scene_envs.scene import SceneBatch
+from tests.helpers.simple_scenes import SIDE, scene, turned
 
 
 def minkowski_depth(first: np.ndarray, second: np.ndarray) -> float:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from simple_scenes import SIDE, TYPE, scene, turned
 
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.grammars import get_grammar
@@ -19,6 +18,7 @@ from scene_envs.physics.placement import Objects
 from scene_envs.physics.rest import Rest
 from scene_envs.physics.world import World
 from scene_envs.scene import SceneBatch
+from tests.helpers.simple_scenes import SIDE, TYPE, scene, turned
 
 
 def tower(height: int, x: float = 0.0) -> list[tuple[str, float, float, float]]:
@@ -171,6 +171,7 @@ def test_what_has_no_support_is_not_ready() -> None:
     assert float(result.batch.translations[0, 2, 2]) < -0.02
 
 
+@pytest.mark.slow
 def test_jittered_scenes_become_ready() -> None:
     batch = jittered(dimsum(6, 10), 3)
     raw, ready = feasibility(batch), make_ready(batch)
@@ -179,6 +180,7 @@ def test_jittered_scenes_become_ready() -> None:
     assert int(ready.counts.sum()) >= 0.95 * free
 
 
+@pytest.mark.slow
 def test_what_is_not_ready_gets_more_rounds_and_the_rest_stays() -> None:
     breakfast = get_grammar("breakfast_table_high_clutter").sample(np.random.default_rng(3), 8)
     batch = jittered(breakfast, 5, times=6.0)
@@ -217,6 +219,7 @@ def test_without_pybullet_only_settling_is_missing(monkeypatch: pytest.MonkeyPat
     assert penetration(scene(*tower(2))).valid.tolist() == [True]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["breakfast_table_high_clutter", "dimsum_table", "pantry_shelf"])
 def test_projection_before_simulation_keeps_objects_closer_to_what_was_asked(name: str) -> None:
     """Scenes moved by 1 cm along every axis (16 mm in the mean): projection and simulation move them less than that.

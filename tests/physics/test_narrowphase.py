@@ -125,6 +125,7 @@ def test_parts_without_thickness() -> None:
     assert depth_of(line, line, (0.0, 0.0, 0.1)) <= 0.0
 
 
+@pytest.mark.slow
 def test_every_kind_of_contact_agrees_with_the_minkowski_difference(
     pairs: tuple[list[Array], PlacedParts, list[str]], depths: tuple[Array, Array]
 ) -> None:

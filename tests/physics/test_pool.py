@@ -11,12 +11,12 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import torch
-from simple_scenes import scene
 
 from scene_envs.errors import InvalidInputError, PhysicsError
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import FeasibilityResult, PhysicsPool, feasibility, penetration, project, settle
 from scene_envs.scene import SceneBatch
+from tests.helpers.simple_scenes import scene
 
 FIELDS = ("feasible", "depth", "displacement", "rotation", "valid", "counts")
 
@@ -43,6 +43,7 @@ def pool() -> Iterator[PhysicsPool]:
         yield pool
 
 
+@pytest.mark.slow
 def test_none_one_and_two_workers_agree_bit_for_bit(
     batch: SceneBatch, expected: FeasibilityResult, pool: PhysicsPool
 ) -> None:
@@ -65,6 +66,7 @@ def test_a_scene_type_that_only_this_process_knows_works_in_workers(pool: Physic
     assert feasibility(batch, pool=pool).counts.tolist() == [1, 1, 1]
 
 
+@pytest.mark.slow
 def test_a_worker_killed_mid_run_costs_nothing(
     batch: SceneBatch, expected: FeasibilityResult, pool: PhysicsPool
 ) -> None:
@@ -81,6 +83,7 @@ def test_a_worker_killed_mid_run_costs_nothing(
     assert victim not in pool.process_ids
 
 
+@pytest.mark.slow
 def test_a_scene_that_fails_twice_is_invalid_and_the_others_are_not(
     batch: SceneBatch, expected: FeasibilityResult
 ) -> None:

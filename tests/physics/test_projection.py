@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial import ConvexHull
-from simple_scenes import SIDE
-from simple_scenes import scene as boxes
 
 from scene_envs.assets import get_library
 from scene_envs.grammars import get_grammar
@@ -15,6 +13,8 @@ from scene_envs.physics import penetration, planes, project, projection
 from scene_envs.physics.budget import Budget
 from scene_envs.rotations import yaw_matrix
 from scene_envs.scene import SceneBatch
+from tests.helpers.simple_scenes import SIDE
+from tests.helpers.simple_scenes import scene as boxes
 
 TYPE = "dimsum_table"
 
@@ -97,12 +97,14 @@ def check_result(batch: SceneBatch) -> None:
     assert torch.equal(project(batch).batch.translations, result.batch.translations)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["point", "outside", "pairs", "nested", "cube", "buried"])
 @pytest.mark.parametrize("name", TYPES)
 def test_heaps_come_back_finite_and_honest(name: str, kind: str) -> None:
     check_result(heap(name, kind))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "asset"),
     [
@@ -119,12 +121,14 @@ def test_heaps_of_one_asset_come_back_finite_and_honest(name: str, asset: str) -
     assert bool(project(batch).converged[0]) == (name != "pantry_shelf")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TYPES)
 def test_heaps_that_have_room_come_apart(name: str) -> None:
     for kind in ("point", "outside"):
         assert project(heap(name, kind)).converged.tolist() == [True]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("asset", ["fruit_bowl", "pear_bosc"])
 def test_the_work_on_a_scene_is_bounded(monkeypatch: pytest.MonkeyPatch, asset: str) -> None:
     """The squared rows of all exact least-distance problems stay within the budget of all searches."""
@@ -214,6 +218,7 @@ def test_scenes_without_overlap_stay_where_they_are() -> None:
     assert float(result.moved.max()) < 2e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TYPES)
 def test_jittered_scenes_come_apart_and_keep_their_rotations(name: str) -> None:
     """Everything moved by 1 and 2 cm at random: no pair deeper than 0.1 mm is left, nothing leaves the workspace."""
@@ -229,6 +234,7 @@ def test_jittered_scenes_come_apart_and_keep_their_rotations(name: str) -> None:
     assert torch.equal(result.batch.translations[batch.is_welded], batch.translations[batch.is_welded])
 
 
+@pytest.mark.slow
 def test_objects_stay_between_the_boards_where_they_were() -> None:
     """A packed pantry moved by 1 cm: out of boards and walls, and each on the board it stood on."""
     batch = get_grammar("pantry_shelf").sample(np.random.default_rng(2), 40)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from simple_scenes import SIDE, scene, turned
 
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import FeasibilityResult, equilibrium, feasibility, make_ready, settle
@@ -18,6 +17,7 @@ from scene_envs.physics.placement import Objects
 from scene_envs.physics.rest import Rest
 from scene_envs.physics.world import World
 from scene_envs.scene import SceneBatch
+from tests.helpers.simple_scenes import SIDE, scene, turned
 
 TYPES = (
     "breakfast_table_low_clutter", "breakfast_table_high_clutter", "dimsum_table", "living_room_shelf", "pantry_shelf",
@@ -51,6 +51,7 @@ def simulations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return counts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TYPES)
 def test_generated_scenes_stand_as_simulation_says(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """As generated and with 2 mm of noise: at most one verdict in a hundred differs from simulating everything."""

@@ -57,6 +57,7 @@ def test_it_trains_and_saves_a_prior(example: ModuleType, tmp_path: Path, kind: 
     assert all(torch.equal(before[name], after[name]) for name in words)  # what words mean stays
 
 
+@pytest.mark.slow
 def test_the_command_in_its_first_lines_runs(
     example: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -6,13 +6,13 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch.distributions import Normal
-from toy_chain import LinearChain
 
 from agents.diffusion.reverse_steps import gaussian_log_prob
 from agents.post_training import DDPOSFLoss, DenoisingPolicy
 from agents.post_training.policy import gradient_weights
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError
+from tests.helpers.toy_chain import LinearChain
 
 THETA, SIGMAS, START = 0.8, (0.5, 0.3), 1.5
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from PIL import Image
 from rich.console import Console
-from small_runs import count_objects, small_config
 
 from agents.post_training.demo import run_demo
 from agents.post_training.doctor import diagnose
@@ -19,6 +18,7 @@ from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.scene import SceneBatch
+from tests.helpers.small_runs import count_objects, small_config
 
 
 def test_doctor_finds_nothing_wrong_with_log_ratio_and_writes_nothing(tmp_path: Path) -> None:
@@ -69,6 +69,7 @@ def test_page_needs_nothing_but_itself_and_escapes_text(tmp_path: Path) -> None:
     assert all(escaped in text for escaped in ("&lt;t&gt;", "&lt;b&gt;", "a &amp; b", "&lt;2&gt;", "&lt;v&gt;"))
 
 
+@pytest.mark.slow
 def test_demonstration_end_to_end(tmp_path: Path) -> None:
     pytest.importorskip("scene_envs.physics")
     recipe = small_config(tmp_path, iterations=2)

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from small_runs import count_objects, not_a_number, small_config
 
 from agents.post_training import PostTrainer, post_train
 from agents.post_training import learner as learner_module
@@ -20,6 +19,7 @@ from agents.priors.testing import tiny_prior
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.errors import CorruptFileError, InvalidInputError, TrainingError, UnknownNameError
 from scene_envs.scene import SceneBatch
+from tests.helpers.small_runs import count_objects, not_a_number, small_config
 
 
 def weights(path: Path) -> dict[str, torch.Tensor]:
@@ -51,6 +51,7 @@ def test_chunks_do_not_change_the_gradient(tmp_path: Path) -> None:
     assert rows[0]["policy_gradient_norm"] == pytest.approx(rows[1]["policy_gradient_norm"], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_more_objects_after_training_on_their_number(tmp_path: Path) -> None:
     config = small_config(
         tmp_path,
@@ -91,6 +92,7 @@ def test_rows_go_to_the_logger_that_is_named(tmp_path: Path) -> None:
     assert [event.value for event in events.Scalars("reward")] == pytest.approx(rewards)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changes", [{}, {"ema": 0.5, "credit": "scene"}, {"algorithm": "ddpo_is"}])
 def test_stopped_and_resumed_run_equals_the_uninterrupted_one(tmp_path: Path, changes: dict) -> None:
     whole = post_train(small_config(tmp_path / "whole", iterations=4, **changes), prior=tiny_prior())
@@ -105,10 +107,10 @@ def test_stopped_and_resumed_run_equals_the_uninterrupted_one(tmp_path: Path, ch
 
 KILLED = """
 import os, signal, sys
-sys.path[:0] = [{root!r}, {here!r}]
+sys.path.insert(0, {root!r})
 import torch
 torch.set_num_threads(1)
-from small_runs import count_objects, small_config
+from tests.helpers.small_runs import count_objects, small_config
 from agents.post_training import post_train
 from agents.priors.testing import tiny_prior
 
@@ -124,9 +126,9 @@ post_train(small_config({output!r}, reward=deadly), prior=tiny_prior())
 """
 
 
+@pytest.mark.slow
 def test_killed_run_resumes_bit_for_bit(tmp_path: Path) -> None:
-    here = Path(__file__).parent
-    script = KILLED.format(root=str(here.parents[1]), here=str(here), output=str(tmp_path / "killed"))
+    script = KILLED.format(root=str(Path(__file__).parents[2]), output=str(tmp_path / "killed"))
     assert subprocess.run([sys.executable, "-c", script]).returncode == -signal.SIGKILL
     assert torch.load(tmp_path / "killed" / "checkpoint.pt", weights_only=True)["iteration"] == 2
     threads = torch.get_num_threads()

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from small_runs import count_objects, small_config
 from torch import Generator
 
 from agents.post_training import (
@@ -29,6 +28,7 @@ from scene_envs.datasets.prompts import parse_prompt, scene_facts
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
+from tests.helpers.small_runs import count_objects, small_config
 
 TWO = ["A scene with two cups.", "A scene with 20 objects."]
 SLOTS = 12
@@ -197,11 +197,12 @@ def test_the_doctor_examines_a_prompted_run(tmp_path: Path) -> None:
     assert any("not within any" in line for line in diagnose(alike, prior=reader()).advice)
 
 
+@pytest.mark.slow
 def test_the_report_compares_samples_with_their_prompts(tmp_path: Path) -> None:
     pytest.importorskip("pybullet")
-    prior = tiny_prior(process="mixed", text=True, slots=SLOTS)
+    prior = tiny_prior(process="mixed", text=True, slots=4)
     metrics = post_train_and_compare(
-        small_config(tmp_path, iterations=1, prompt="A scene with 14 objects.", slots=SLOTS + 2),
+        small_config(tmp_path, iterations=1, prompt="A scene with 5 objects.", slots=5),
         scenes=2,
         num_steps=2,
         prior=prior,

@@ -36,6 +36,7 @@ def read_numbers(prior: MixedPrior, prompt: str) -> torch.Tensor:
         return conditioning.count_logits(prior.encode_prompts([prompt])[0][:, : conditioning.things]).argmax(dim=-1)[0]  # type: ignore[no-any-return]
 
 
+@pytest.mark.slow
 def test_numbers_of_objects_are_read_from_prompts() -> None:
     prior, data = fresh()
     assert warm_up_text(prior, data, 250, 48, seed=0) is not None

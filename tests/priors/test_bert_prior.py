@@ -95,6 +95,7 @@ def test_another_bert_is_refused(prior: MixedPrior, tmp_path: Path, monkeypatch:
         ScenePrior.load(folder).sample(1, prompt=PROMPTS[0], num_steps=1)
 
 
+@pytest.mark.slow
 def test_training_reads_prompts_and_resumes_bit_for_bit(bert: Path, tmp_path: Path) -> None:
     _data().save(tmp_path / "data")
     config = PretrainConfig(

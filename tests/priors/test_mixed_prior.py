@@ -157,6 +157,7 @@ def test_bad_masks_and_names_are_refused(prior: MixedPrior, scenes: SceneBatch) 
         prior.sample(1, num_steps=1001)
 
 
+@pytest.mark.slow
 def test_the_loss_is_finite_everywhere_and_falls_in_training(scenes: SceneBatch) -> None:
     prior = tiny_prior(process="mixed", seed=1)
     x0 = prior.encode(scenes)

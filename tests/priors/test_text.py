@@ -142,6 +142,7 @@ def test_training_further_lists_the_words_that_the_prior_lacks(
     assert "over, zeppelin" in caplog.text
 
 
+@pytest.mark.slow
 def test_a_short_training_teaches_what_prompts_say() -> None:
     """Of two kinds of scenes, told apart by prompts alone, the right prompt explains one better than the wrong one."""
     scenes = get_grammar("dimsum_table").sample(np.random.default_rng(0), 64)

@@ -10,7 +10,6 @@ import re
 import numpy as np
 import pytest
 import torch
-from browser import CHROMIUM, Browser
 
 from scene_envs.errors import InvalidInputError
 from scene_envs.render import write_viewer
@@ -18,6 +17,7 @@ from scene_envs.render.stage import get_stage
 from scene_envs.rotations import matrix_to_quaternion, yaw_matrix
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import Camera, get_scene_type
+from tests.helpers.browser import CHROMIUM, Browser
 
 pytestmark = pytest.mark.slow
 

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from export_scenes import deep_pairs, moved, pose_error, transform
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
+
+from tests.helpers.export_scenes import deep_pairs, moved, pose_error, transform
 
 POSE = 1e-9
 STILL = (2e-4, 5e-3)

@@ -1,0 +1,1 @@
+"""Parts of scenes, of training and of search, each in one file."""

@@ -1,0 +1,12 @@
+"""Fixtures that several folders of tests share."""
+
+from __future__ import annotations
+
+import pytest
+
+
+@pytest.fixture
+def few_grammar_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run on ``data=grammar`` draws 64 scenes for its moments and its vocabulary, and holds 64 out."""
+    monkeypatch.setattr("agents.pretraining.setup._SAMPLE", 64)
+    monkeypatch.setattr("agents.pretraining.setup._HELD_OUT", 64)

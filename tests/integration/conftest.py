@@ -1,0 +1,5 @@
+"""The exported scenes that simulators and viewers read back."""
+
+from tests.helpers.export_fixtures import batch, folder, scenes
+
+__all__ = ["batch", "folder", "scenes"]

@@ -1,1 +1,0 @@
-"""Scenes of a package of its own."""
