@@ -95,7 +95,7 @@ def measure(title: str, batch: SceneBatch, seed: int, console: Console) -> None:
     settled = settle(SceneBatch.concatenate(projected), duration=1.5)
     rate = len(batch) / (time.process_time() - start)
     ready = feasibility(settled.batch)
-    share = float((ready.feasible & settled.batch.in_workspace).sum() / settled.batch.is_free.sum())
+    share = float(ready.feasible.sum() / settled.batch.is_free.sum())
     table.add_row("settling, after projection", f"{rate:.1f}", f"{share:.1%} of objects ready")
     console.print(table)
 

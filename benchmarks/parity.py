@@ -202,7 +202,7 @@ def drake_verdicts(batch: SceneBatch, friction: float, contact: str) -> Verdicts
     """The verdicts of Drake on all slots."""
     rows = [DrakeScene(scene, friction, contact).verdicts() for scene in place(batch)]
     return Verdicts(
-        np.concatenate([row.feasible for row in rows]),
+        np.concatenate([row.feasible for row in rows]) & batch.in_workspace.numpy(),
         np.concatenate([row.depth for row in rows]),
         np.concatenate([row.displacement for row in rows]),
         np.concatenate([row.rotation for row in rows]),

@@ -4,13 +4,22 @@ A reward is any callable ``(SceneBatch, RewardContext) -> RewardOutput``. The sa
 reinforcement learning, search and evaluation.
 """
 
-from rewards.base import Reward, RewardContext, RewardOutput
+from rewards.base import Reward, RewardContext, RewardOutput, depends_on_batch
+from rewards.category_count import CategoryCount
+from rewards.clutter import Clutter
 from rewards.composite import Clip, Gate, Product, WeightedSum
 from rewards.contract import check_reward
+from rewards.coverage import Coverage
+from rewards.diversity import Diversity
 from rewards.evaluation import evaluate_reward
 from rewards.feasible_objects import FeasibleObjects
+from rewards.feasible_share import FeasibleShare
+from rewards.normalised import Normalised
 from rewards.object_count import ObjectCount
+from rewards.penetration import Penetration
 from rewards.prompt_match import PromptMatch
+from rewards.reachability import Reachability
+from rewards.realism import Realism
 from rewards.registry import (
     RewardInfo,
     allow_reward_targets,
@@ -21,21 +30,35 @@ from rewards.registry import (
     reward_info,
     reward_name,
 )
+from rewards.relation import Relation
+from rewards.stability import Stability
 
 __all__ = [
+    "CategoryCount",
     "Clip",
+    "Clutter",
+    "Coverage",
+    "Diversity",
     "FeasibleObjects",
+    "FeasibleShare",
     "Gate",
+    "Normalised",
     "ObjectCount",
+    "Penetration",
     "Product",
     "PromptMatch",
+    "Reachability",
+    "Realism",
+    "Relation",
     "Reward",
     "RewardContext",
     "RewardInfo",
     "RewardOutput",
+    "Stability",
     "WeightedSum",
     "allow_reward_targets",
     "check_reward",
+    "depends_on_batch",
     "evaluate_reward",
     "list_rewards",
     "make_reward",

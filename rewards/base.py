@@ -59,6 +59,19 @@ class RewardOutput:
 
 @runtime_checkable
 class Reward(Protocol):
-    """Anything callable as ``(SceneBatch, RewardContext) -> RewardOutput``."""
+    """Anything callable as ``(SceneBatch, RewardContext) -> RewardOutput``.
+
+    A scene scores the same alone and in any batch, unless the reward says otherwise by an attribute
+    ``depends_on_batch`` that is True (see :func:`depends_on_batch`).
+    """
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput: ...
+
+
+def depends_on_batch(*rewards: object) -> bool:
+    """Whether the score of a scene under one of ``rewards`` depends on the other scenes of its batch.
+
+    >>> depends_on_batch(lambda batch: batch.counts)
+    False
+    """
+    return any(bool(getattr(reward, "depends_on_batch", False)) for reward in rewards)

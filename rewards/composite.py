@@ -1,7 +1,8 @@
 """Composite rewards: weighted sum, product, gate, clip.
 
 Every part may be a name, a mapping, a function or a reward. A scene is valid when every part could score it.
-A part's value is a term under the part's name, and its own terms follow as ``"<part>.<term>"``.
+A composite depends on the batch as soon as a part does. A part's value is a term under the part's name, and its own
+terms follow as ``"<part>.<term>"``.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from rewards.base import Reward, RewardContext, RewardOutput
+from rewards.base import Reward, RewardContext, RewardOutput, depends_on_batch
 from rewards.evaluation import evaluate_reward
 from rewards.registry import register_reward, resolve_reward, reward_name
 from scene_envs.errors import InvalidInputError
@@ -42,6 +43,7 @@ class WeightedSum:
         self.weights = tuple(1.0 for _ in self.rewards) if weights is None else tuple(float(w) for w in weights)
         if len(self.weights) != len(self.rewards):
             raise InvalidInputError(f"weighted_sum: {len(self.rewards)} rewards need as many weights, got {weights!r}")
+        self.depends_on_batch = depends_on_batch(*self.rewards)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score every part and add up."""
@@ -72,6 +74,7 @@ class Product:
 
     def __init__(self, rewards: Sequence[Any]) -> None:
         self.rewards = _resolve_parts(self.name, rewards)
+        self.depends_on_batch = depends_on_batch(*self.rewards)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score every part and multiply."""
@@ -108,6 +111,11 @@ class Gate:
         object.__setattr__(self, "reward", resolve_reward(self.reward))
         object.__setattr__(self, "condition", resolve_reward(self.condition))
 
+    @property
+    def depends_on_batch(self) -> bool:
+        """Whether ``reward`` or ``condition`` does."""
+        return depends_on_batch(self.reward, self.condition)
+
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score both; credit per object is that of ``reward`` where the gate is open, else 0."""
         outputs = _score_parts((self.reward, self.condition), batch, context)
@@ -143,6 +151,11 @@ class Clip:
             raise InvalidInputError("clip: give low, high or both")
         if self.low is not None and self.high is not None and self.low > self.high:
             raise InvalidInputError(f"clip: low={self.low} is above high={self.high}")
+
+    @property
+    def depends_on_batch(self) -> bool:
+        """Whether ``reward`` does."""
+        return depends_on_batch(self.reward)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score and clip; scenes beyond a bound give their objects no credit."""

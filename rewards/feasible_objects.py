@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from rewards.base import RewardContext, RewardOutput
 from rewards.registry import register_reward
+from rewards.verdicts import verdicts
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
@@ -14,10 +15,11 @@ from scene_envs.scene import SceneBatch
 @register_reward("feasible_objects")
 @dataclass(frozen=True)
 class FeasibleObjects:
-    """Number of free objects that neither penetrate another object nor move when simulated.
+    """Number of free objects in the workspace that neither penetrate another object nor move when simulated.
 
-    An object is feasible when no pair it is in is deeper than ``max_penetration`` and, with the penetrating objects
-    removed, it moves and turns less than the limits while simulated. Welded objects are not counted.
+    An object is feasible when its frame is in the workspace, no pair it is in is deeper than ``max_penetration`` and,
+    with the penetrating objects removed, it moves and turns less than the limits while simulated. Welded objects are
+    not counted.
 
     Attributes:
         max_penetration: deepest allowed overlap with any other object, m.
@@ -35,7 +37,7 @@ class FeasibleObjects:
     def __post_init__(self) -> None:
         for setting in ("max_penetration", "max_displacement", "max_rotation", "duration"):
             if not getattr(self, setting) > 0:
-                raise InvalidInputError(f"feasible_objects: {setting}={getattr(self, setting)} must be positive")
+                raise InvalidInputError(f"{self.name}: {setting}={getattr(self, setting)} must be positive")
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Count feasible objects; rows that physics could not judge are invalid.
@@ -43,17 +45,14 @@ class FeasibleObjects:
         Terms: ``free_objects``; ``feasible_fraction`` of them (1 in a scene without free objects); ``deepest_mm``,
         the deepest overlap. ``object_flags["feasible"]`` (B, N) marks the objects that count, ``per_object`` likewise.
         """
-        from scene_envs.physics import feasibility
-
         device = batch.tensor.device
-        result = feasibility(
-            batch,
-            max_penetration=self.max_penetration,
-            max_displacement=self.max_displacement,
-            max_rotation=self.max_rotation,
-            duration=self.duration,
-            pool=context.pool,
-        )
+        limits = {
+            "max_penetration": self.max_penetration,
+            "max_displacement": self.max_displacement,
+            "max_rotation": self.max_rotation,
+            "duration": self.duration,
+        }
+        result = verdicts(batch, limits, context.pool)
         feasible = result.feasible.to(device)
         count = feasible.sum(dim=-1).float()
         free = batch.is_free.sum(dim=-1).float()

@@ -52,7 +52,7 @@ class PromptMatch:
         """
         from scene_envs.datasets.prompts import scene_facts
 
-        asked = self._asked(batch, context.prompts)
+        asked = claims_asked(self.name, self.prompt, batch, context.prompts)
         some = [row for row, prompt in enumerate(asked) if prompt is not None]
         facts = scene_facts(batch[some]) if some else []
         rows = torch.zeros(3, len(batch))
@@ -70,20 +70,33 @@ class PromptMatch:
             value, terms={"claims_hold": held_share, "all_claims_hold": all_hold}, valid=valid.to(batch.tensor.device)
         )
 
-    def _asked(self, batch: SceneBatch, prompts: Sequence[str] | None) -> list[PromptFacts | None]:
-        """What each scene's prompt claims; None where it says nothing or cannot be read."""
-        from scene_envs.datasets.prompts import parse_prompt
 
-        if self.prompt is not None:
-            return [parse_prompt(self.prompt, batch.scene_type)] * len(batch)
-        if prompts is None:
-            raise InvalidInputError(
-                "prompt_match has no prompt to compare with: give prompt= to what makes the scenes, or "
-                "reward='{name: prompt_match, prompt: A scene with 12 objects}'"
-            )
-        if len(prompts) != len(batch):
-            raise InvalidInputError(f"prompt_match: {len(prompts)} prompts for {len(batch)} scenes; give one per scene")
-        return [_claims(prompt, batch.scene_type) for prompt in prompts]
+def claims_asked(
+    name: str, prompt: str | None, batch: SceneBatch, prompts: Sequence[str] | None
+) -> list[PromptFacts | None]:
+    """Claims that a reward called ``name`` compares each scene with; None where a prompt is empty or cannot be read.
+
+    Args:
+        name: of the reward, for errors.
+        prompt: one text for all scenes, in place of ``prompts``.
+        batch: B scenes.
+        prompts: one text per scene.
+
+    Raises:
+        InvalidInputError: no prompt is given, not one per scene, or ``prompt`` cannot be read.
+    """
+    from scene_envs.datasets.prompts import parse_prompt
+
+    if prompt is not None:
+        return [parse_prompt(prompt, batch.scene_type)] * len(batch)
+    if prompts is None:
+        raise InvalidInputError(
+            f"{name} has no prompt to compare with: give prompt= to what makes the scenes, or "
+            f"reward='{{name: {name}, prompt: A scene with 12 objects}}'"
+        )
+    if len(prompts) != len(batch):
+        raise InvalidInputError(f"{name}: {len(prompts)} prompts for {len(batch)} scenes; give one per scene")
+    return [_claims(text, batch.scene_type) for text in prompts]
 
 
 @lru_cache(maxsize=4096)
@@ -96,5 +109,5 @@ def _claims(prompt: str, scene_type: SceneType) -> PromptFacts | None:
     try:
         return parse_prompt(prompt, scene_type)
     except InvalidInputError as error:
-        logger.warning("prompt_match: %s. Scenes made for this prompt count as invalid.", error)
+        logger.warning("%s. Scenes made for this prompt count as invalid.", error)
         return None

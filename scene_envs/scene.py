@@ -13,6 +13,7 @@ from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.files import replacing
 from scene_envs.normalizer import Normalizer
 from scene_envs.rotations import project_to_so3
+from scene_envs.scene_facts import AssetFacts
 from scene_envs.scene_types import SceneType, get_scene_type
 
 POSE_FEATURES = 12
@@ -23,7 +24,7 @@ ROTATION = slice(3, POSE_FEATURES)
 CATEGORY = slice(POSE_FEATURES, None)
 
 
-class SceneBatch:
+class SceneBatch(AssetFacts):
     """B scenes of N slots each, with their scene type.
 
     A slot is translation (m, world frame) | rotation matrix row-major | one-hot over C assets + empty last.

@@ -12,7 +12,14 @@ from torch import Tensor
 
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import SceneType
+from scene_envs.scene_distance import (
+    PlacedObjects,
+    SceneObjects,
+    check_same_assets,
+    counted_objects,
+    cutoff,
+    matching_distance,
+)
 
 DUPLICATE = 0.01
 """Objects this close (m) stand in the same place."""
@@ -32,7 +39,7 @@ class Neighbors:
     """The nearest of some scenes, for each of B others.
 
     Attributes:
-        distance: (B,) m, to the nearest; see :func:`scene_distances`.
+        distance: (B,) m, to the nearest; see :func:`scene_envs.scene_distance.scene_distances`.
         index: (B,) int64, which it is.
         copied: (B,) bool: one of the scenes has the same assets, each within 1 cm of its counterpart.
 
@@ -48,45 +55,9 @@ class Neighbors:
     copied: Tensor
 
 
-def cutoff(scene_type: SceneType) -> float:
-    """The cost (m) of an object without counterpart: a quarter of the longer horizontal side of the workspace.
-
-    >>> from scene_envs.scene_types import get_scene_type
-    >>> cutoff(get_scene_type("dimsum_table"))
-    0.245
-    """
-    low, high = scene_type.workspace
-    return 0.25 * max(high[0] - low[0], high[1] - low[1])
-
-
-def scene_distances(batch: SceneBatch, other: SceneBatch) -> Tensor:
-    """(B,) m: how far each scene is from its counterpart in ``other``, as sets of objects; orientations do not count.
-
-    The OSPA distance of order 1 (Schuhmacher, Vo and Vo, 2008): objects are matched one to one at the least total
-    cost, where a match costs the distance of the two positions, at most c, and c when the assets differ; each object
-    without match costs c. The total is divided by the number of objects of the larger scene. Fixed welded objects
-    are left out; c is :func:`cutoff`. The assignment is exact: what Sinkhorn iterations converge to when their
-    regularisation goes to zero.
-
-    >>> from scene_envs.grammars import get_grammar
-    >>> scenes = get_grammar("dimsum_table").sample(np.random.default_rng(0), 2)
-    >>> shuffled = SceneBatch(scenes.tensor.flip(1), scenes.scene_type)
-    >>> scene_distances(shuffled, scenes)
-    tensor([0., 0.], dtype=torch.float64)
-
-    Raises:
-        InvalidInputError: another number of scenes, or scenes of other assets.
-    """
-    _check_same_assets(batch, other)
-    if len(batch) != len(other):
-        raise InvalidInputError(f"{len(batch)} scenes have no counterparts in {len(other)}; give as many")
-    limit = cutoff(batch.scene_type)
-    pairs = zip(_objects(batch), _objects(other), strict=True)
-    return torch.tensor([_distance(first, second, limit) for first, second in pairs], dtype=torch.float64)
-
-
 def nearest_scenes(batch: SceneBatch, others: SceneBatch, *, candidates: int = CANDIDATES) -> Neighbors:
-    """The scene of ``others`` that is nearest to each scene of ``batch``, by :func:`scene_distances`.
+    """The scene of ``others`` that is nearest to each scene of ``batch``, by its :func:`distance
+    <scene_envs.scene_distance.scene_distances>`.
 
     The distance is computed exactly for the ``candidates`` scenes that are nearest by features: sums over the objects
     of an asset of bounded functions of the position with slope 1, whose differences never exceed the total cost
@@ -95,15 +66,15 @@ def nearest_scenes(batch: SceneBatch, others: SceneBatch, *, candidates: int = C
     Raises:
         InvalidInputError: no scenes, or scenes of other assets.
     """
-    _check_same_assets(batch, others)
+    check_same_assets(batch, others)
     if not len(others) or not len(batch):
         raise InvalidInputError(f"{len(batch)} scenes have no nearest among {len(others)}: both need at least one")
     limit = cutoff(batch.scene_type)
     chosen = _nearest_features(_features(batch, limit), _features(others, limit), min(candidates, len(others)))
-    mine, theirs = _objects(batch), _Lazy(others)
+    mine, theirs = list(SceneObjects(batch)), SceneObjects(others)
     distance, index, copied = torch.zeros(len(batch), dtype=torch.float64), torch.zeros(len(batch)).long(), []
     for row, columns in enumerate(chosen.tolist()):
-        found = [_distance(mine[row], theirs[column], limit) for column in columns]
+        found = [matching_distance(mine[row], theirs[column], limit) for column in columns]
         best = int(np.argmin(found))
         distance[row], index[row] = found[best], columns[best]
         copied.append(any(_is_copy(mine[row], theirs[column]) for column in columns))
@@ -130,7 +101,7 @@ def duplicates(batch: SceneBatch) -> float:
     >>> duplicates(SceneBatch.empty("dimsum_table", 4))
     1.0
     """
-    objects = _objects(batch)
+    objects = list(SceneObjects(batch))
     groups: dict[bytes, list[int]] = {}
     for row, (categories, _) in enumerate(objects):
         groups.setdefault(categories.tobytes(), []).append(row)
@@ -143,54 +114,7 @@ def duplicates(batch: SceneBatch) -> float:
     return len(repeated) / len(batch)
 
 
-# -- one scene: its categories (n,), ascending, and positions (n, 3) m ------------------------------
-
-_Scene = tuple[NDArray[np.int64], Array]
-
-
-def _objects(batch: SceneBatch) -> list[_Scene]:
-    scenes = _Lazy(batch)
-    return [scenes[row] for row in range(len(batch))]
-
-
-class _Lazy:
-    """Scenes as sorted arrays, made when asked for."""
-
-    def __init__(self, batch: SceneBatch) -> None:
-        self.present = _counted(batch).cpu().numpy()
-        self.categories = batch.categories.cpu().numpy()
-        self.positions = batch.translations.double().cpu().numpy()
-        self.known: dict[int, _Scene] = {}
-
-    def __getitem__(self, row: int) -> _Scene:
-        if row not in self.known:
-            slots = np.flatnonzero(self.present[row])
-            slots = slots[np.argsort(self.categories[row, slots], kind="stable")]
-            self.known[row] = self.categories[row, slots], self.positions[row, slots]
-        return self.known[row]
-
-
-def _counted(batch: SceneBatch) -> Tensor:
-    """(B, N) bool: objects, but for the fixed welded ones that are in every scene."""
-    fixed = {item.asset for item in batch.scene_type.fixed} & set(batch.scene_type.welded)
-    categories = torch.tensor([batch.scene_type.assets.index(name) for name in fixed], dtype=torch.long)
-    return ~batch.is_empty & ~torch.isin(batch.categories, categories.to(batch.tensor.device))
-
-
-def _distance(first: _Scene, second: _Scene, limit: float) -> float:
-    from scipy.optimize import linear_sum_assignment
-
-    count, most = len(first[0]), max(len(first[0]), len(second[0]))
-    if not most:
-        return 0.0
-    apart = np.sqrt(((first[1][:, None] - second[1][None]) ** 2).sum(axis=-1))
-    cost = np.where(first[0][:, None] == second[0][None], np.minimum(apart, limit), limit)
-    rows, columns = linear_sum_assignment(cost)
-    matched = float(cost[rows, columns].sum())
-    return (matched + limit * (most - min(count, len(second[0])))) / most
-
-
-def _is_copy(first: _Scene, second: _Scene) -> bool:
+def _is_copy(first: PlacedObjects, second: PlacedObjects) -> bool:
     """Whether the assets are the same and can be matched so that all are within :data:`DUPLICATE`."""
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import maximum_bipartite_matching
@@ -230,7 +154,7 @@ def _features(batch: SceneBatch, limit: float) -> Tensor:
     chunks = []
     for start in range(0, len(batch), 1024):
         part = batch[start : start + 1024].to("cpu")
-        one_hot = part.tensor[..., 12:-1] * _counted(part).unsqueeze(-1)  # (b, N, C)
+        one_hot = part.tensor[..., 12:-1] * counted_objects(part).unsqueeze(-1)  # (b, N, C)
         waves = (limit / 2) * torch.sin(part.translations @ direction / length + phase)  # (b, N, waves)
         waves = torch.cat([torch.full_like(waves[..., :1], limit / 2), waves], dim=-1)
         chunks.append(torch.einsum("bnc,bnw->bcw", one_hot, waves).flatten(1))
@@ -243,11 +167,3 @@ def _nearest_features(features: Tensor, others: Tensor, count: int) -> Tensor:
     features, others = features[:, used], others[:, used]
     chunks = features.split(_ROWS)
     return torch.cat([torch.cdist(chunk, others).topk(count, dim=1, largest=False).indices for chunk in chunks])
-
-
-def _check_same_assets(batch: SceneBatch, other: SceneBatch) -> None:
-    if batch.scene_type.assets != other.scene_type.assets:
-        raise InvalidInputError(
-            f"scenes of {batch.scene_type.name!r} cannot be compared with scenes of {other.scene_type.name!r}: "
-            "their assets differ"
-        )

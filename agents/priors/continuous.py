@@ -133,8 +133,14 @@ class ContinuousPrior(ScenePrior):
         return self.code.encode(batch)
 
     def decode(self, x: Tensor) -> SceneBatch:
-        """Scenes from normalised x_0 (B, N, D); known entries take their exact values."""
-        return self.code.decode(self.clamp(x))
+        """Scenes from normalised x_0 (B, N, D); known entries take their exact values.
+
+        The category of a slot is the arg-max over those that it can hold: the assets of fixed objects are in no other.
+        """
+        x = self.clamp(x)
+        free, barred = len(self.scene_type.fixed), self.scene_type.fixed_categories
+        x[:, free:, [self.code.pose_width + category for category in barred]] = torch.finfo(x.dtype).min
+        return self.code.decode(x)
 
     # -- the reverse chain ----------------------------------------------------------------------
 

@@ -221,6 +221,8 @@ class MixedPrior(TrainableMixedPrior):
     ) -> MixedStep:
         """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters.
 
+        The assets of fixed objects have probability 0 in all other slots.
+
         Args:
             x_t: scenes at ``table.timesteps[step]``.
             step: index in the table.
@@ -248,6 +250,7 @@ class MixedPrior(TrainableMixedPrior):
         mean, std = self.process.posterior(x_t[..., :POSE_FEATURES], pose, t, previous, residual, eta)
         states = x_t[..., POSE_FEATURES:]
         state = state_of(states)
+        logits = logits.masked_fill(self._barred(state), -torch.inf)
         probs = self.categories.posterior(state, logits.softmax(dim=-1), t, previous)
         slots, fixed = x_t.shape[1], len(self.scene_type.fixed)
         random = torch.full((slots,), previous > 0, device=x_t.device)
@@ -260,6 +263,18 @@ class MixedPrior(TrainableMixedPrior):
             probs = torch.cat([certain.expand(len(probs), -1, -1), probs[:, fixed:]], dim=1)
         masked = (state == self.num_categories) & random if self._together else None
         return MixedStep(clamped[..., :POSE_FEATURES], std * (~known).to(mean.dtype), probs, random, masked)
+
+    def _barred(self, state: Tensor) -> Tensor:
+        """(B, N, K) bool: categories of x_0 with probability 0, given states (B, N) of x_t.
+
+        These are the categories of fixed objects, in all slots but theirs. A slot that holds one as an observed entry
+        keeps it where the chain only absorbs.
+        """
+        barred = torch.zeros(*state.shape, self.num_categories, dtype=torch.bool, device=state.device)
+        barred[:, len(self.scene_type.fixed) :, list(self.scene_type.fixed_categories)] = True
+        if self.categories.only_absorbs:
+            barred &= F.one_hot(state, self.num_categories + 1)[..., :-1] == 0
+        return barred
 
     def regenerate(
         self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int,

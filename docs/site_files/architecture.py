@@ -21,10 +21,13 @@ ROWS: tuple[dict[str, tuple[int, str]], ...] = (
     {"scene_envs.datasets": (0, "verified scenes, prompts")},
     {
         "scene_envs.envs": (1, "denoising and search"),
-        "rewards": (2, "what scenes are worth"),
         "agents.networks": (3, "denoisers, text encoders"),
     },
-    {"agents.planning": (3, "UCT, best of N"), "agents.evaluation": (4, "measures of scenes")},
+    {
+        "rewards": (2, "what scenes are worth"),
+        "agents.planning": (3, "UCT, best of N"),
+        "agents.evaluation": (4, "measures of scenes"),
+    },
     {"agents.priors": (3, "sample, inpaint, save")},
     {"agents.pretraining": (3, "teaches a prior the data")},
     {"agents.post_training": (3, "steers it; report.html")},

@@ -2,11 +2,13 @@
 
 from scene_envs.assets.base import Asset, AssetLibrary, ConvexPart
 from scene_envs.assets.built_in import list_assets
+from scene_envs.assets.groups import ASSET_GROUPS, register_asset_group
 from scene_envs.assets.importing import AssetReport, ImportReport, import_report, load_library
 from scene_envs.assets.library import get_library
 from scene_envs.assets.recipe import Model, asset_recipe
 
 __all__ = [
+    "ASSET_GROUPS",
     "Asset",
     "AssetLibrary",
     "AssetReport",
@@ -18,4 +20,5 @@ __all__ = [
     "import_report",
     "list_assets",
     "load_library",
+    "register_asset_group",
 ]

@@ -55,11 +55,11 @@ def feasibility(
 ) -> FeasibilityResult:
     """Judge every object: does it overlap another, and does it stay where it is.
 
-    A free object is feasible when it is in no object pair that overlaps deeper than ``max_penetration`` and,
-    with all such objects removed, moves and turns no further than the limits in ``duration`` seconds of
-    simulation under gravity. Welded objects hold others but are not judged. A scene whose simulation takes more work
-    than :func:`settle` may spend is invalid. Where exact depths of a heap would take long, ``depth`` is that of shapes
-    that enclose the objects.
+    A free object is feasible when its frame is in the workspace, it is in no object pair that overlaps deeper than
+    ``max_penetration`` and, with all such objects removed, moves and turns no further than the limits in ``duration``
+    seconds of simulation under gravity. Welded objects hold others but are not judged. A scene whose simulation takes
+    more work than :func:`settle` may spend is invalid. Where exact depths of a heap would take long, ``depth`` is that
+    of shapes that enclose the objects.
 
     Args:
         batch: B scenes of N slots.
@@ -80,7 +80,7 @@ def feasibility(
         "duration": duration,
     }
     rows = run_kernel("feasibility", batch, options, pool)
-    feasible = stack(rows, batch, "feasible", torch.bool)
+    feasible = stack(rows, batch, "feasible", torch.bool) & batch.in_workspace.cpu()
     return FeasibilityResult(
         feasible=feasible,
         depth=stack(rows, batch, "depth"),

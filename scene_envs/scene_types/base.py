@@ -67,7 +67,8 @@ class SceneType:
         slots: rows of a scene, welded objects included.
         workspace: lowest and highest corner (m) inside which object frames must lie.
         welded: names of assets that are never simulated as free.
-        fixed: welded objects with one constant pose; they take the first slots of a scene.
+        fixed: welded objects with one constant pose; they take the first slots of a scene, and priors put their assets
+            in no other slot.
         camera: the paper's semantic-render camera.
         description: one sentence for listings.
         asset_folders: folders of users' own assets, searched before the built-in ones.
@@ -134,6 +135,16 @@ class SceneType:
     def welded_categories(self) -> tuple[int, ...]:
         """Categories of welded assets."""
         return tuple(self.assets.index(name) for name in self.welded)
+
+    @property
+    def fixed_categories(self) -> tuple[int, ...]:
+        """Categories of the welded assets of fixed objects, ascending.
+
+        >>> from scene_envs import get_scene_type
+        >>> get_scene_type("dimsum_table").fixed_categories
+        (0,)
+        """
+        return tuple(sorted({self.assets.index(f.asset) for f in self.fixed if f.asset in self.welded}))
 
     @property
     def has_geometry(self) -> bool:

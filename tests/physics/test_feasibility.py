@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.grammars import get_grammar
-from scene_envs.physics import equilibrium, feasibility, make_ready, penetration, project, settle
+from scene_envs.physics import PhysicsPool, equilibrium, feasibility, make_ready, penetration, project, settle
 from scene_envs.physics.motion import Physics, physics_of
 from scene_envs.physics.placement import Objects
 from scene_envs.physics.rest import Rest
@@ -238,3 +238,14 @@ def test_projection_before_simulation_keeps_objects_closer_to_what_was_asked(nam
     assert mean_way(both) < mean_way(alone) < 0.012
     ready = feasibility(both).feasible & both.in_workspace
     assert int(ready.sum()) >= 0.97 * int(given.is_free.sum())
+
+
+def test_an_object_at_rest_outside_the_workspace_is_not_feasible() -> None:
+    """Standing on the floor 2 m across, 1 cm within and 1 cm beyond the edge of a workspace 1 m from the middle."""
+    batch = scene(("cube", 0.99, 0.0, 0.0), ("cube", 1.01, 0.5, 0.0))
+    result = feasibility(batch)
+    assert result.feasible[0, 1:3].tolist() == [True, False]
+    assert result.counts.tolist() == [1]
+    assert result.displacement[0, 2].item() == pytest.approx(0.0, abs=1e-6)
+    with PhysicsPool(workers=1) as pool:
+        assert torch.equal(feasibility(batch, pool=pool).feasible, result.feasible)

@@ -6,6 +6,7 @@ import torch
 from rewards import (
     Clip,
     FeasibleObjects,
+    FeasibleShare,
     Gate,
     ObjectCount,
     Product,
@@ -119,3 +120,22 @@ def test_feasible_objects_follows_its_settings(table):
 def test_a_scene_without_free_objects_is_valid_and_scores_zero():
     output = score(FeasibleObjects(), SceneBatch.empty("dimsum_table", 1))
     assert (output.value.item(), output.valid.item(), output.terms["feasible_fraction"].item()) == (0.0, True, 1.0)
+
+
+def test_feasible_share_is_the_verdict_over_the_free_objects(table):
+    output = score(FeasibleShare(), table)
+    assert output.value.tolist() == [0.25]
+    assert output.terms["feasible_objects"].tolist() == [1.0]
+    assert torch.equal(output.per_object, score(FeasibleObjects(), table).per_object)
+    assert score(FeasibleShare(), SceneBatch.empty("dimsum_table", 2)).value.tolist() == [0.0, 0.0]
+
+
+def test_what_stands_outside_the_workspace_counts_for_nothing(table):
+    """The same plate at rest on a second table: welded, and 2 m away."""
+    translations, categories = table.translations.clone(), table.categories.clone()
+    translations[0, 6], categories[0, 6] = torch.tensor([2.0, 0.0, 0.0]), categories[0, 0]
+    translations[0, 1, 0] += 2.0
+    moved = SceneBatch.from_parts(translations, torch.eye(3).expand(1, 8, 3, 3), categories, table.scene_type)
+    assert score(FeasibleObjects(), moved).value.tolist() == [0.0]
+    assert score(FeasibleShare(), moved).value.tolist() == [0.0]
+    assert score(ObjectCount(), moved).value.tolist() == [6.0]

@@ -10,8 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_envs.datasets.prompts.shapes import library_shapes
-from scene_envs.datasets.prompts.supports import LARGEST_CONTACT, Contacts, Holding, Placed
+from scene_envs.datasets.prompts.supports import CONTACT, LARGEST_CONTACT, Contacts, Holding, Placed
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
@@ -44,7 +43,7 @@ class Tolerances:
         InvalidInputError: contact is not in (0, 0.03] m.
     """
 
-    contact: float = 0.01
+    contact: float = CONTACT
     aside: float = 0.02
     cone: float = 1.0
     beside: float = 0.05
@@ -188,21 +187,20 @@ def facts_under(batch: SceneBatch, tolerances: Sequence[Tolerances]) -> list[lis
 
 
 def _chunk(batch: SceneBatch, tolerances: Sequence[Tolerances]) -> list[list[SceneFacts]]:
-    shapes = library_shapes(batch.scene_type.library)
     display = [asset.display_name for asset in batch.scene_type.library]
-    categories = batch.categories.cpu().numpy()
-    scene, slot = np.nonzero(categories != len(display))
-    translations = batch.translations.double().cpu().numpy()[scene, slot]
-    rotations = batch.rotations.double().cpu().numpy()[scene, slot]
-    welded = batch.scene_type.welded_categories
-    placed = Placed.of(shapes, scene, categories[scene, slot], translations, rotations, welded)
+    shapes, placed, slot = Placed.of_scenes(
+        batch.scene_type,
+        batch.categories.cpu().numpy(),
+        batch.translations.double().cpu().numpy(),
+        batch.rotations.double().cpu().numpy(),
+    )
     axes = viewer_axes(batch.scene_type)
     positions = placed.center @ axes.T
     points = axes @ placed.points
     boxes = np.stack([points.min(axis=-1), points.max(axis=-1)], axis=1)
     tiers = np.isfinite(shapes.tiers[placed.category]).sum(axis=1)
     contacts = Contacts.of(shapes, placed)
-    parts = [slice(*np.searchsorted(scene, (row, row + 1))) for row in range(len(batch))]
+    parts = [slice(*np.searchsorted(placed.scene, (row, row + 1))) for row in range(len(batch))]
     return [
         [
             SceneFacts(

@@ -8,12 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_envs.datasets.prompts.shapes import LibraryShapes
+from scene_envs.datasets.prompts.shapes import LibraryShapes, library_shapes
+from scene_envs.scene_types import SceneType
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
+CONTACT = 0.01
+"""Surfaces this far (m) apart, or into each other, touch."""
 LARGEST_CONTACT = 0.03
 """No tolerance of contacts may be larger than this (m)."""
 _FAR = 3.0
@@ -68,6 +71,23 @@ class Placed:
         feet = np.concatenate([feet, feet.mean(axis=1, keepdims=True)], axis=1)
         fixed = shapes.static[category] | np.isin(category, welded)
         return cls(scene, category, rotation, translation, center, points, feet, fixed)
+
+    @classmethod
+    def of_scenes(
+        cls, scene_type: SceneType, categories: Index, translations: Array, rotations: Array
+    ) -> tuple[LibraryShapes, Placed, Index]:
+        """The shapes of the assets, the objects of scenes (B, N), (B, N, 3), (B, N, 3, 3), and the slot of each."""
+        shapes = library_shapes(scene_type.library)
+        scene, slot = np.nonzero(categories != scene_type.num_assets)
+        placed = cls.of(
+            shapes,
+            scene,
+            categories[scene, slot],
+            translations[scene, slot],
+            rotations[scene, slot],
+            scene_type.welded_categories,
+        )
+        return shapes, placed, slot
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +163,7 @@ class Contacts:
             feet[:, -1, 2] - inside,
         )
 
-    def holding(self, tolerance: float) -> Holding:
+    def holding(self, tolerance: float = CONTACT) -> Holding:
         """Supports of objects, where surfaces up to ``tolerance`` (m) apart, or into each other, touch.
 
         For what touches nothing, three times the tolerance decides on the place and tier alone.

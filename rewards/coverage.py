@@ -1,0 +1,74 @@
+"""Reward: what a scene adds to the places and assets that its batch covers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+
+from rewards.base import RewardContext, RewardOutput
+from rewards.registry import register_reward
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import SceneBatch
+
+
+@register_reward("coverage")
+@dataclass(frozen=True)
+class Coverage:
+    """Scene's part in the coverage of its batch: the share of (asset, place) pairs that occur in some scene.
+
+    Places are the cells of a grid over the workspace; pairs are of all assets but those of fixed objects. A pair that
+    occurs in k scenes counts 1/k for each of them, times the number of scenes, so that the mean of the values over the
+    batch is the coverage (Shapley 1953). Only objects in the workspace count.
+
+    Attributes:
+        cells: of the grid along x, y and z.
+
+    >>> Coverage()(SceneBatch.empty("dimsum_table", 2), RewardContext()).value
+    tensor([0., 0.])
+    """
+
+    name: ClassVar[str] = "coverage"
+    depends_on_batch: ClassVar[bool] = True
+    cells: tuple[int, int, int] = (4, 4, 4)
+
+    def __post_init__(self) -> None:
+        cells = tuple(int(number) for number in self.cells)
+        if len(cells) != 3 or min(cells) < 1:
+            raise InvalidInputError(
+                f"coverage: cells={self.cells!r} must be three numbers of at least 1: along x, y, z"
+            )
+        object.__setattr__(self, "cells", cells)
+
+    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        """Count. ``per_object`` (B, N) shares each pair among the objects that make it.
+
+        Terms: ``batch_coverage``, the same for all scenes; ``pairs`` that the scene has.
+        """
+        kind, device = batch.scene_type, batch.tensor.device
+        low, high = (torch.tensor(corner, device=device) for corner in kind.workspace)
+        grid = torch.tensor(self.cells, device=device)
+        place = ((batch.translations - low) / (high - low) * grid).floor().long().clamp(min=torch.zeros_like(grid))
+        place = torch.minimum(place, grid - 1)
+        cell = (place[..., 0] * grid[1] + place[..., 1]) * grid[2] + place[..., 2]
+        places = int(grid.prod())
+        fixed = torch.tensor(kind.fixed_categories, dtype=torch.long, device=device)
+        counts = batch.in_workspace & ~torch.isin(batch.categories, fixed)
+        pair = torch.where(counts, batch.categories * places + cell, kind.num_assets * places)  # (B, N), last: none
+        number = torch.zeros(len(batch), kind.num_assets * places + 1, device=device)
+        number.scatter_add_(1, pair, counts.float())  # objects of each pair
+        present = (number[:, :-1] > 0).float()
+        scenes = present.sum(dim=0)
+        total = (kind.num_assets - len(fixed)) * places
+        share = len(batch) / total * present / scenes.clamp(min=1)  # (B, pairs)
+        share = torch.cat([share, torch.zeros(len(batch), 1, device=device)], dim=1)
+        credit = (share / number.clamp(min=1)).gather(1, pair)
+        return RewardOutput(
+            value=share.sum(dim=1),
+            per_object=credit,
+            terms={
+                "batch_coverage": ((scenes > 0).sum() / total).expand(len(batch)).clone(),
+                "pairs": present.sum(dim=1),
+            },
+        )

@@ -1,0 +1,44 @@
+"""Reward: share of the free objects that are physically feasible as sampled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+from rewards.base import RewardContext, RewardOutput
+from rewards.feasible_objects import FeasibleObjects
+from rewards.registry import register_reward
+from scene_envs.scene import SceneBatch
+
+
+@register_reward("feasible_share")
+@dataclass(frozen=True)
+class FeasibleShare(FeasibleObjects):
+    """Share of the free objects that are in the workspace, overlap nothing and stay where they are; from 0 to 1.
+
+    The verdict is that of ``feasible_objects``, with the same settings. A scene without free objects scores 0, so that
+    nothing is won by emptying scenes.
+
+    Attributes:
+        max_penetration: deepest allowed overlap with any other object, m.
+        max_displacement: largest allowed movement, m.
+        max_rotation: largest allowed rotation, rad.
+        duration: simulated time, s.
+    """
+
+    name: ClassVar[str] = "feasible_share"
+
+    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        """Divide the feasible objects by the free ones; rows that physics could not judge are invalid.
+
+        Terms: ``free_objects``, ``feasible_objects``, ``deepest_mm``. ``per_object`` (B, N) and
+        ``object_flags["feasible"]`` are the verdict.
+        """
+        output = FeasibleObjects.__call__(self, batch, context)
+        free = output.terms["free_objects"]
+        terms = {
+            "free_objects": free,
+            "feasible_objects": output.value,
+            "deepest_mm": output.terms["deepest_mm"],
+        }
+        return replace(output, value=output.value / free.clamp(min=1), terms=terms)

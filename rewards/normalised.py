@@ -1,0 +1,65 @@
+"""Composite reward: another reward in standard deviations from its mean."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import torch
+
+from rewards.base import RewardContext, RewardOutput, depends_on_batch
+from rewards.evaluation import evaluate_reward
+from rewards.registry import register_reward, resolve_reward, reward_name
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import SceneBatch
+
+
+@register_reward("normalised")
+@dataclass(frozen=True)
+class Normalised:
+    """A reward in standard deviations from its mean, so that parts of a weighted sum weigh alike.
+
+    Mean and standard deviation are given, or are those of the valid scenes of the batch. They are not carried from
+    batch to batch: a reward with a memory would score the same scene differently in training, in search and after a
+    run is resumed.
+
+    Attributes:
+        reward: what is scored.
+        mean: value that becomes 0; that of the batch when null.
+        std: spread that becomes 1, above 0; that of the batch when null, where equal values all become 0.
+
+    >>> reward = Normalised("object_count", mean=20.0, std=5.0)
+    >>> reward(SceneBatch.empty("dimsum_table", 1), RewardContext()).value
+    tensor([-3.8000])
+    """
+
+    name: ClassVar[str] = "normalised"
+    reward: Any
+    mean: float | None = None
+    std: float | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "reward", resolve_reward(self.reward))
+        if self.std is not None and not self.std > 0:
+            raise InvalidInputError(f"normalised: std={self.std} must be positive")
+
+    @property
+    def depends_on_batch(self) -> bool:
+        """True unless mean and std are both given and ``reward`` does not depend on the batch either."""
+        return self.mean is None or self.std is None or depends_on_batch(self.reward)
+
+    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        """Score and normalise. Terms: the value before, under the reward's name, and the reward's own terms.
+
+        ``per_object`` is that of ``reward`` over the standard deviation: credit has no mean to be taken off.
+        """
+        output = evaluate_reward(self.reward, batch, context, strict=True)
+        valid = output.value[output.is_valid].double()
+        mean = valid.mean() if self.mean is None and len(valid) else torch.tensor(self.mean or 0.0)
+        spread = valid.std(correction=0) if self.std is None and len(valid) else torch.tensor(self.std or 1.0)
+        scale = torch.where(spread > 0, 1.0 / spread, torch.zeros_like(spread)).to(output.value)
+        label = reward_name(self.reward)
+        terms = {label: output.value, **{f"{label}.{name}": term for name, term in output.terms.items()}}
+        credit = None if output.per_object is None else output.per_object * scale
+        value = (output.value - mean.to(output.value)) * scale
+        return replace(output, value=value, per_object=credit, terms=terms)

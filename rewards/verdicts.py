@@ -1,0 +1,70 @@
+"""Verdicts of feasibility that several rewards share: the same scene is simulated once."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import OrderedDict
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from scene_envs.scene import SceneBatch
+
+if TYPE_CHECKING:
+    from scene_envs.physics import FeasibilityResult, PhysicsPool
+
+_MOST = 4096
+"""Scenes whose verdicts are kept, the latest ones."""
+
+_Verdict = tuple[Tensor, Tensor, Tensor, Tensor]
+"""feasible, depth, displacement, rotation of one scene, (N,) each."""
+_known: OrderedDict[bytes, _Verdict] = OrderedDict()
+
+
+def verdicts(batch: SceneBatch, limits: dict[str, float], pool: PhysicsPool | None) -> FeasibilityResult:
+    """:func:`scene_envs.physics.feasibility` of scenes, computed for those alone that were not judged lately.
+
+    Scenes are recognised by their content: type, poses, categories and order of slots. A verdict depends on its scene
+    alone, bit for bit, so that it may be kept. Those of invalid scenes are not: a worker may only have been slow.
+
+    Args:
+        batch: B scenes of N slots.
+        limits: keyword arguments of ``feasibility``.
+        pool: worker processes; None computes in this process.
+    """
+    from scene_envs.physics import FeasibilityResult, feasibility
+
+    keys = _keys(batch, limits)
+    fresh = {key: row for row, key in enumerate(keys) if key not in _known}
+    found = dict.fromkeys(keys)
+    if fresh:
+        rows = sorted(fresh.values())
+        result = feasibility(batch if len(rows) == len(batch) else batch[rows], pool=pool, **limits)
+        columns = (result.feasible, result.depth, result.displacement, result.rotation)
+        for index, row in enumerate(rows):
+            found[keys[row]] = (bool(result.valid[index]), tuple(column[index] for column in columns))
+    judged = [found[key] or (True, _known[key]) for key in keys]
+    for key, (valid, verdict) in zip(keys, judged, strict=True):
+        if valid:
+            _known[key] = verdict
+            _known.move_to_end(key)
+    while len(_known) > _MOST:
+        _known.popitem(last=False)
+    feasible, depth, displacement, rotation = (
+        torch.stack([verdict[column] for _, verdict in judged]) for column in range(4)
+    )
+    valid = torch.tensor([valid for valid, _ in judged], dtype=torch.bool)
+    return FeasibilityResult(feasible, depth, displacement, rotation, valid, feasible.sum(dim=-1))
+
+
+def forget_verdicts() -> None:
+    """Let every scene be judged anew."""
+    _known.clear()
+
+
+def _keys(batch: SceneBatch, limits: dict[str, float]) -> list[bytes]:
+    """One digest per scene of all that its verdict depends on."""
+    common = repr((batch.scene_type, sorted(limits.items()), tuple(batch.tensor.shape[1:]))).encode()
+    scenes = batch.tensor.detach().cpu().contiguous().numpy()
+    return [hashlib.blake2b(scene.tobytes() + common, digest_size=16).digest() for scene in scenes]

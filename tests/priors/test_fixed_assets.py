@@ -1,0 +1,137 @@
+"""Assets of fixed objects never come up in another slot; log-probabilities are those of what is sampled."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from agents.diffusion import CategoricalProcess
+from agents.diffusion.categorical import make_categorical_schedule
+from agents.diffusion.reverse_steps import one_hot_state
+from agents.priors.base import ScenePrior
+from agents.priors.mixed import MixedPrior
+from agents.priors.testing import tiny_prior
+from scene_envs.scene import SceneBatch
+
+TABLE, KINDS = 0, 8
+KERNELS = ("squared_absorbing", "mask_and_replace", "uniform")
+
+
+class WantsTables(torch.nn.Module):
+    """A denoiser that sees a table in nine of ten slots."""
+
+    drops_empty = False
+    text_encoder = None
+
+    def forward(self, x: torch.Tensor, *_: object) -> tuple[torch.Tensor, torch.Tensor]:
+        probs = torch.full((*x.shape[:2], KINDS), 0.1 / (KINDS - 1))
+        probs[..., TABLE] = 0.9
+        return torch.zeros(*x.shape[:2], 12), probs.log()
+
+
+@pytest.fixture(params=KERNELS)
+def mixed(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> MixedPrior:
+    prior = tiny_prior(process="mixed")
+    assert isinstance(prior, MixedPrior)
+    schedule = make_categorical_schedule(request.param, prior.mixed.num_timesteps)
+    monkeypatch.setattr(prior, "categories", CategoricalProcess(schedule, KINDS))
+    prior._together = prior._together and prior.categories.only_absorbs
+    prior.denoiser = WantsTables()
+    return prior
+
+
+def free_tables(batch: SceneBatch) -> int:
+    return int((batch.categories[:, 1:] == TABLE).sum())
+
+
+def test_no_second_table_is_sampled_or_inpainted(mixed: MixedPrior) -> None:
+    batch = mixed.sample(20, num_steps=7, seed=0)
+    assert free_tables(batch) == 0
+    assert batch.categories[:, 0].tolist() == [TABLE] * 20
+    assert int(batch.is_free.sum()) > 300
+    assert free_tables(mixed.inpaint(batch, batch.is_free, num_steps=5, seed=1)) == 0
+
+
+def test_the_last_step_leaves_no_table_and_probabilities_add_up_to_one(mixed: MixedPrior) -> None:
+    table = mixed.step_table(4)
+    x = mixed.initial(3, 34, torch.Generator().manual_seed(0))
+    for step in range(4):
+        probs = mixed.transition(x, step, table).probs
+        torch.testing.assert_close(probs.sum(dim=-1), torch.ones(3, 34))
+    assert float(probs[:, 1:, TABLE].max()) == 0.0
+    torch.testing.assert_close(probs[:, 1:, 1:KINDS].sum(dim=-1), torch.ones(3, 33))
+
+
+@torch.no_grad()
+def test_log_probabilities_are_those_of_the_states_that_can_be_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over all states of one slot they sum to one, and the table has no share of it."""
+    prior = tiny_prior(process="mixed")
+    assert isinstance(prior, MixedPrior)
+    monkeypatch.setattr(prior, "categories", CategoricalProcess(make_categorical_schedule("absorbing", 1000), KINDS))
+    table = prior.step_table(2)
+    x = prior.initial(1, 34, torch.Generator().manual_seed(0))
+    step = prior.transition(x, 0, table)
+    states = torch.arange(KINDS + 1).unsqueeze(-1).expand(-1, 34)  # (9, 34)
+    drawn = torch.cat([step.mean.expand(KINDS + 1, -1, -1), one_hot_state(states, step.probs)], dim=-1)
+    many = step._replace(mean=step.mean.expand(KINDS + 1, -1, -1), probs=step.probs.expand(KINDS + 1, -1, -1))
+    discrete = many.log_prob(drawn) - many._replace(probs=torch.ones_like(many.probs)).log_prob(drawn)
+    probability = discrete[:, 1:].double().exp()
+    torch.testing.assert_close(probability.sum(dim=0), torch.ones(33, dtype=torch.float64), atol=1e-5, rtol=0)
+    assert float(probability[TABLE].max()) < 1e-20
+
+
+def test_gradients_stay_finite() -> None:
+    prior = tiny_prior(process="mixed")
+    x = prior.initial(2, 34, torch.Generator().manual_seed(0))
+    step = prior.transition(x, 0, prior.step_table(3))
+    step.log_prob(step.from_noise(torch.randn(x.shape)).detach()).sum().backward()
+    gradients = [p.grad for p in prior.parameters() if p.grad is not None]
+    assert gradients
+    assert all(bool(torch.isfinite(gradient).all()) for gradient in gradients)
+
+
+def test_an_observed_second_table_is_kept(mixed: MixedPrior) -> None:
+    batch = mixed.sample(2, num_steps=3, seed=0)
+    categories = batch.categories.clone()
+    categories[:, 5] = TABLE
+    given = SceneBatch.from_parts(batch.translations, torch.eye(3).expand(2, 34, 3, 3), categories, batch.scene_type)
+    mask = torch.ones(2, 34, dtype=torch.bool)
+    mask[:, 5] = False
+    changed = mixed.inpaint(given, mask, num_steps=4, seed=2)
+    assert torch.equal(changed.tensor[:, 5], given.tensor[:, 5])
+    assert free_tables(changed) == 2
+
+
+@pytest.mark.parametrize("rotation", ["matrix", "quaternion"])
+def test_a_continuous_prior_takes_the_next_best_category(rotation: str) -> None:
+    prior = tiny_prior()
+    prior = type(prior).fitted(  # type: ignore[attr-defined]
+        dataclasses.replace(
+            prior.config,
+            rotation=rotation,
+            network=dataclasses.replace(prior.config.network, features=20 if rotation == "matrix" else 15),
+        ),
+        prior.normalizer,
+        SceneBatch.empty("dimsum_table", 4).tensor + 0.01 * torch.randn(4, 34, 20),
+    )
+    assert isinstance(prior, ScenePrior)
+    x = torch.zeros(1, 34, prior.features)
+    x[..., -KINDS + TABLE], x[..., -KINDS + 3], x[..., -1] = 0.9, 0.2, -0.5
+    x[:, 20:, -1] = 1.0
+    before = x.clone()
+    decoded = prior.decode(x)
+    assert decoded.categories[0].tolist() == [TABLE] + [3] * 19 + [7] * 14
+    assert torch.equal(x, before)
+
+
+@torch.no_grad()
+def test_rooms_place_their_tables_where_they_like() -> None:
+    """Only what is fixed is barred: a restaurant's tables are welded, and stand in free slots."""
+    prior = tiny_prior("restaurant_low_clutter", process="mixed")
+    assert isinstance(prior, MixedPrior)
+    floor, table = (prior.scene_type.assets.index(name) for name in ("floor", "cafe_table"))
+    step = prior.transition(prior.initial(1, 20), 0, prior.step_table(1))
+    assert float(step.probs[0, 1:, floor].max()) == 0.0
+    assert float(step.probs[0, 1:, table].min()) > 0.0

@@ -1,0 +1,236 @@
+"""Rewards of places and overlaps, on scenes whose values have closed forms."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from rewards import (
+    CategoryCount,
+    Clutter,
+    Coverage,
+    Diversity,
+    Gate,
+    Normalised,
+    Penetration,
+    RewardContext,
+    RewardOutput,
+    Stability,
+    WeightedSum,
+    check_reward,
+    evaluate_reward,
+    list_rewards,
+)
+from scene_envs import SceneBatch, get_grammar, get_scene_type
+from scene_envs.errors import InvalidInputError, UnknownNameError
+
+COMPOSITES = {"clip", "gate", "product", "weighted_sum", "normalised"}
+SHELF = ["clutter", "penetration", "stability", "category_count", "coverage", "diversity", "feasible_share"]
+
+
+def place(*objects: tuple[str, float, float, float], kind: str = "dimsum_table", slots: int = 8) -> SceneBatch:
+    """One scene of upright objects at (x, y, z)."""
+    batch = SceneBatch.empty(kind, 1, slots=slots)
+    translations, categories = batch.translations.clone(), batch.categories.clone()
+    for slot, (name, *position) in enumerate(objects, start=1):
+        categories[0, slot] = batch.scene_type.assets.index(name)
+        translations[0, slot] = torch.tensor(position)
+    return SceneBatch.from_parts(translations, torch.eye(3).expand(1, slots, 3, 3), categories, batch.scene_type)
+
+
+def score(reward: object, batch: SceneBatch) -> RewardOutput:
+    return evaluate_reward(reward, batch, RewardContext(), strict=True)
+
+
+def outline_area(kind: str, asset: str) -> float:
+    """Area of an asset's outline from above, by trimesh: of its hull, flattened."""
+    vertices = np.concatenate([part.vertices for part in get_scene_type(kind).library[asset].fine])
+    flat = np.concatenate([vertices * (1, 1, 0), vertices * (1, 1, 0) + (0, 0, 1)])
+    return float(trimesh.convex.convex_hull(flat).volume)
+
+
+@pytest.mark.parametrize("name", SHELF)
+@pytest.mark.parametrize("scene_type", ["living_room_shelf"])
+def test_they_keep_the_contract_on_a_shelf(name: str, scene_type: str) -> None:
+    clauses = check_reward(name, scene_type)
+    assert ("scores a scene the same alone and in a batch" in clauses) is (name not in ("coverage", "diversity"))
+
+
+# -- clutter ---------------------------------------------------------------------------------------
+
+
+def test_clutter_is_the_covered_share_of_the_table() -> None:
+    table, plate = outline_area("dimsum_table", "cafe_table"), outline_area("dimsum_table", "dinner_plate")
+    apart = score(Clutter(lines=1000), place(("dinner_plate", 0.3, 0.0, 0.0), ("dinner_plate", -0.3, 0.0, 0.0)))
+    assert apart.value.item() == pytest.approx(2 * plate / table, rel=1e-3)
+    assert apart.terms["surface_area"].item() == pytest.approx(table, rel=1e-3)
+    assert apart.per_object[0, 1:3].tolist() == pytest.approx([plate / table] * 2, rel=1e-3)
+
+
+def test_what_stands_on_others_covers_their_place_once() -> None:
+    """A tower of steamers covers as much as one of them, which they share."""
+    kind = get_scene_type("dimsum_table")
+    height = kind.library["steamer_bottom"].bounds[1, 2]
+    one = score(Clutter(), place(("steamer_bottom", 0.0, 0.0, 0.0)))
+    tower = score(Clutter(), place(*[("steamer_bottom", 0.0, 0.0, level * height) for level in range(3)]))
+    assert tower.value.item() == pytest.approx(one.value.item(), rel=1e-6)
+    assert tower.per_object[0, 1:4].tolist() == pytest.approx([one.value.item() / 3] * 3, rel=1e-5)
+    assert tower.terms["volume_share"].item() == pytest.approx(3 * one.terms["volume_share"].item(), rel=1e-5)
+
+
+def test_what_floats_or_hangs_over_the_edge_covers_less() -> None:
+    """The table is round with radius 0.625 m; a plate in its middle of the edge of the workspace hangs over."""
+    inside = score(Clutter(), place(("dinner_plate", 0.0, 0.0, 0.0))).value.item()
+    corner = score(Clutter(), place(("dinner_plate", 0.42, 0.42, 0.0))).value.item()
+    assert 0.3 * inside < corner < 0.9 * inside
+    assert score(Clutter(), place(("dinner_plate", 0.0, 0.0, 0.3))).value.item() == 0.0
+    assert score(Clutter(), place(("dinner_plate", 0.55, 0.0, 0.0))).value.item() == 0.0  # outside the workspace
+
+
+def test_each_tier_of_a_shelf_is_a_surface() -> None:
+    output = score(Clutter(), SceneBatch.empty("living_room_shelf", 1))
+    assert output.terms["surface_area"].item() == pytest.approx(4 * 0.3 * 0.6, rel=1e-6)
+    scenes = get_grammar("living_room_shelf").sample(np.random.default_rng(0), 2)
+    filled = score(Clutter(), scenes)
+    assert bool((filled.value > 0.02).all())
+    torch.testing.assert_close(filled.per_object.sum(dim=-1), filled.value)
+    low, high = scenes.scene_type.workspace
+    free = (scenes.volumes * scenes.is_free).sum(dim=-1)
+    torch.testing.assert_close(filled.terms["volume_share"], free / float(np.prod(np.subtract(high, low))))
+
+
+# -- penetration and stability -----------------------------------------------------------------------
+
+
+def test_penetration_adds_up_the_depths_of_pairs() -> None:
+    """Boxes of a shelf board game (0.4 x 0.265 x 0.055 m): two overlap by 5 mm, the lower is 2 mm in the shelf."""
+    kind, game = "living_room_shelf", "board_game_l"
+    free_height = get_scene_type(kind).library[game].bounds[1, 2]
+    height = 1.0  # far from the shelf
+    stack = [(game, 0.0, 0.0, height), (game, 0.0, 0.0, height + free_height - 0.005)]
+    stack.append((game, 0.0, 0.0, height + 2 * free_height - 0.008))
+    batch = place(*stack, kind=kind)
+    total, deepest = score(Penetration(), batch), score(Penetration("deepest"), batch)
+    assert total.value.item() == pytest.approx(-8.0, abs=1e-3)
+    assert deepest.value.item() == pytest.approx(-5.0, abs=1e-3)
+    assert total.per_object[0, 1:4].tolist() == pytest.approx([-2.5, -4.0, -1.5], abs=1e-3)
+    assert deepest.per_object[0, 1:4].tolist() == pytest.approx([-5.0, -5.0, -3.0], abs=1e-3)
+    assert total.terms["overlapping_pairs"].item() == 2
+    assert total.object_flags["overlapping"][0].nonzero()[:, 0].tolist() == [1, 2, 3]
+
+
+def test_overlap_with_a_welded_object_falls_to_the_free_one() -> None:
+    output = score(Penetration(), place(("steamer_bottom", 0.0, 0.0, -0.004)))
+    assert output.value.item() == pytest.approx(-4.0, abs=1e-3)
+    assert output.per_object[0, :2].tolist() == pytest.approx([0.0, -4.0], abs=1e-3)
+
+
+def test_stability_falls_with_the_movement() -> None:
+    """Objects a gap above the table fall by that gap: closed form. One in another is removed and scores 0."""
+    gap = 0.003
+    batch = place(("dinner_plate", 0.3, 0.0, 0.0), ("dinner_plate", -0.3, 0.0, gap), ("teapot", 0.0, 0.3, -0.005))
+    output = score(Stability(scale=0.01), batch)
+    assert output.per_object[0, 1:4].tolist() == pytest.approx([1.0, math.exp(-gap / 0.01), 0.0], abs=2e-3)
+    assert output.value.item() == pytest.approx((1.0 + math.exp(-gap / 0.01)) / 3, abs=1e-3)
+    assert output.terms["simulated_objects"].item() == 2
+    assert output.terms["moved_mm"].item() == pytest.approx(1.5, abs=0.01)
+    assert score(Stability(), SceneBatch.empty("dimsum_table", 1)).value.item() == 0.0
+
+
+# -- kinds, coverage, diversity ----------------------------------------------------------------------
+
+
+def test_kinds_are_counted_in_the_workspace() -> None:
+    apples = [("apple_gala", 0.0, 0.1, 0.0), ("apple_gala", 0.1, 0.1, 0.0), ("apple_gala", 2.0, 0.0, 0.0)]
+    batch = place(*apples, ("bread_slice", 0.0, -0.1, 0.0), ("mug", 0.0, 0.3, 0.0), kind="breakfast_table_low_clutter")
+    assert score(CategoryCount("edible"), batch).value.tolist() == [3.0]
+    assert score(CategoryCount("apple"), batch).value.tolist() == [2.0]
+    assert score(CategoryCount(["cups", "bread_slice"]), batch).value.tolist() == [2.0]
+    assert score(CategoryCount("fruit"), batch).per_object[0].tolist() == [0, 1, 1, 0, 0, 0, 0, 0]
+    with pytest.raises(UnknownNameError, match="did you mean 'fruit'"):
+        CategoryCount("fruits")(batch, RewardContext())
+
+
+def test_coverage_of_a_batch_is_the_mean_and_is_shared_fairly() -> None:
+    """Six assets that are not fixed times eight cells. Scene 0 has two pairs, one of them also in scene 1."""
+    both = SceneBatch.concatenate(
+        [
+            place(("teacup", -0.3, -0.3, 0.0), ("teacup", -0.2, -0.3, 0.0), ("teapot", 0.3, 0.3, 0.0)),
+            place(("teacup", -0.3, -0.3, 0.0)),
+        ]
+    )
+    output = score(Coverage((2, 2, 2)), both)
+    pairs = 6 * 8
+    assert output.value.tolist() == pytest.approx([2 * 1.5 / pairs, 2 * 0.5 / pairs])
+    assert output.value.mean().item() == pytest.approx(output.terms["batch_coverage"][0].item())
+    assert output.per_object[0].tolist() == pytest.approx([0, 0.5 / pairs, 0.5 / pairs, 2 / pairs, 0, 0, 0, 0])
+    assert score(Coverage((2, 2, 2)), both[1]).value.item() == pytest.approx(1 / pairs)
+
+
+def test_diversity_is_the_mean_distance_to_the_others() -> None:
+    """Cups 10 cm apart cost 0.1 m of at most 0.245 m; a pot has nothing in common with a cup."""
+    scenes = [place(("teacup", 0.0, 0.0, 0.0)), place(("teacup", 0.1, 0.0, 0.0)), place(("teapot", 0.0, 0.0, 0.0))]
+    output = score(Diversity(), SceneBatch.concatenate(scenes))
+    near = 0.1 / 0.245
+    assert output.value.tolist() == pytest.approx([(near + 1) / 2, (near + 1) / 2, 1.0])
+    assert output.terms["nearest"].tolist() == pytest.approx([near, near, 1.0])
+    assert score(Diversity(), scenes[0]).is_valid.tolist() == [False]
+
+
+def test_composites_depend_on_the_batch_when_a_part_does() -> None:
+    assert WeightedSum(["object_count", "diversity"]).depends_on_batch
+    assert not WeightedSum(["object_count", "clutter"]).depends_on_batch
+    assert Gate("object_count", condition="coverage", threshold=0.0).depends_on_batch
+    assert len(check_reward({"name": "weighted_sum", "rewards": ["object_count", "coverage"]})) == 5
+
+
+# -- normalised --------------------------------------------------------------------------------------
+
+
+def test_normalised_values_have_mean_zero_and_spread_one(cups: SceneBatch) -> None:
+    """Four and two objects; a scene that cannot be scored says nothing of the mean."""
+    output = score(Normalised("object_count"), cups)
+    torch.testing.assert_close(output.value, torch.tensor([1.0, -1.0]))
+    assert output.terms["object_count"].tolist() == [4.0, 2.0]
+    torch.testing.assert_close(output.per_object[0], torch.tensor([1.0, 1, 1, 1, 0, 0]))
+    assert score(Normalised("object_count", mean=2.0, std=4.0), cups).value.tolist() == [0.5, 0.0]
+    three = SceneBatch.concatenate([cups, cups[0]])
+
+    def last_fails(batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        return RewardOutput(torch.tensor([4.0, 2.0, 1e9]), valid=torch.tensor([True, True, False]))
+
+    torch.testing.assert_close(score(Normalised(last_fails), three).value[:2], torch.tensor([1.0, -1.0]))
+    assert score(Normalised("object_count"), three[[0, 2]]).value.tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Normalised("object_count", std=0.0),
+        lambda: Clutter(lines=0),
+        lambda: Stability(scale=0.0),
+        lambda: Coverage((0, 1, 1)),
+        lambda: CategoryCount([]),
+        lambda: Penetration("shallow"),
+    ],
+)
+def test_wrong_settings_are_refused(make) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises((InvalidInputError, UnknownNameError)):
+        make()
+
+
+def test_every_reward_has_its_page_and_its_row() -> None:
+    root = Path(__file__).parents[2]
+    index = (root / "docs" / "rewards" / "README.md").read_text()
+    sources = [path.read_text() for path in (root / "rewards").glob("*.py")]
+    names = [name for text in sources for name in re.findall(r'^@register_reward\("(\w+)"\)', text, re.MULTILINE)]
+    assert set(names) <= set(list_rewards())
+    for name in names:
+        assert f"`{name}`" in index
+        assert name in COMPOSITES or (root / "docs" / "rewards" / f"{name}.md").is_file(), name
