@@ -72,6 +72,8 @@ def _small(name: str, words: list[str]) -> list[str]:
     sizes = {key: value for key, value in SMALL_KEYS.get(name, {}).items() if key in keys}
     if "scenes" in {word.partition("=")[0] for word in words} and name != "view":
         sizes.pop("count", None)
+    if name == "post-train" and any(word.startswith("algorithm=") for word in words):
+        sizes.pop("algorithm.gradient_steps", None)  # of DDPO alone
     if name == "post-train" and any(word.startswith("prompt=") for word in words):
         sizes.pop("slots", None)  # prompts of real scenes ask for as many objects as those have
         sizes["logger.report_scenes"] = "0"  # the prior with text is untrained; its heaps take minutes to come apart
