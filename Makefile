@@ -1,5 +1,6 @@
 # make demo      steer the shipped prior and write runs/demo/report.html
 # make test      run the tests; JOBS=8 for more processes, SEED=1 for one order, ARGS="-m 'not slow'" for pytest
+# make test-docs  run the code of every page and notebook
 # make lint      check style, formatting and types
 # make docs      build the documentation into site/index.html
 # make check     run all of this as continuous integration does
@@ -14,7 +15,10 @@ SEED ?= $(shell date +%s)
 ENV := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 PIP := .venv/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test lint docs check install install-dev clean help
+PYTEST := $(ENV) .venv/bin/python -m pytest --randomly-seed=$(SEED) -n $(JOBS) --dist worksteal
+PAGES := tests/docs/test_pages.py tests/integration/test_notebooks.py
+
+.PHONY: demo test test-docs lint docs check install install-dev clean help
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -23,7 +27,10 @@ demo: install
 	.venv/bin/scene-envs demo output=runs/demo
 
 test: install-dev
-	$(ENV) .venv/bin/python -m pytest --randomly-seed=$(SEED) -n $(JOBS) --dist worksteal --doctest-modules scene_envs rewards agents configs tests $(ARGS)
+	$(PYTEST) --doctest-modules $(PAGES:%=--ignore=%) scene_envs rewards agents configs tests $(ARGS)
+
+test-docs: install-dev
+	$(PYTEST) $(PAGES) $(ARGS)
 
 lint: install-dev
 	.venv/bin/ruff check .

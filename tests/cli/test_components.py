@@ -92,9 +92,9 @@ def test_a_mask_and_a_planner(prior: str, tmp_path: Path) -> None:
 @pytest.mark.usefixtures("package")
 def test_help_lists_options_of_the_folder(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["post-train", "--help", *DIRECTORY]) == 0
-    assert "algorithm=ddpo_sf (or ddpo_is, signs):" in capsys.readouterr().out
+    assert "algorithm=ddpo_sf (or awm, ddpo_is, nft, reward_weighted, signs):" in capsys.readouterr().out
     assert main(["post-train", "algorithm=signs", "--help", *DIRECTORY]) == 0
     shown = capsys.readouterr().out
-    assert "algorithm=signs (or ddpo_is, ddpo_sf):" in shown
+    assert "algorithm=signs (or awm, ddpo_is, ddpo_sf, nft, reward_weighted):" in shown
     assert "algorithm.size=0.5" in shown
     assert "of every advantage." in shown

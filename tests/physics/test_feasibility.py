@@ -182,7 +182,7 @@ def test_jittered_scenes_become_ready() -> None:
 
 @pytest.mark.slow
 def test_what_is_not_ready_gets_more_rounds_and_the_rest_stays() -> None:
-    breakfast = get_grammar("breakfast_table_high_clutter").sample(np.random.default_rng(3), 8)
+    breakfast = get_grammar("breakfast_table_low_clutter").sample(np.random.default_rng(3), 6)
     batch = jittered(breakfast, 5, times=6.0)
     once, more = make_ready(batch, rounds=1), make_ready(batch)
     free = batch.is_free.sum(dim=-1)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from simple_scenes import SIDE, scene
+from tests.helpers.simple_scenes import SIDE, scene
 
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
