@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from tests.helpers.simple_scenes import SIDE, scene
 
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
 from scene_envs.physics.grasping import Gripper, _hand, reachable
 from scene_envs.physics.placement import flatten
 from scene_envs.scene import SceneBatch
+from tests.helpers.simple_scenes import SIDE, scene
 
 UP, FRONT = (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
 WIDE = Gripper(opening=SIDE + 0.02)
