@@ -8,7 +8,7 @@ run folder.
 COMMANDS = {
     "generate": "make a dataset of scenes from a grammar",
     "pretrain": "train a prior on a dataset",
-    "post-train": "steer a prior with a reward (DDPO-SF with regularisation on real scenes)",
+    "post-train": "steer a prior with a reward (reinforcement learning with regularisation on real scenes)",
     "doctor": "examine a post-training run before it starts",
     "sample": "draw scenes and pictures from a prior",
     "complete": "fill the empty slots of scenes, keeping their objects",
