@@ -155,15 +155,19 @@ class NFTSettings(ForwardProcessSettings):
     Attributes:
         beta: strength; smaller ones step further from the sampling policy.
         advantage_clip: advantage, in standard deviations, at which a sample is fully good or bad.
+        push_limit: a bad pose pushes only while the squared error of the sampling policy on it is at most this many
+            times that of the base prior; 0 for no limit.
     """
 
     name: str = "nft"
     beta: float = 0.5
     advantage_clip: float = 2.0
+    push_limit: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         positive(self, "beta", "advantage_clip")
+        at_least(self, 0, "push_limit")
 
 
 @dataclass
@@ -173,15 +177,18 @@ class AWMSettings(ForwardProcessSettings):
     Attributes:
         beta: strength of the pull to the sampling policy, above 1.
         advantage_clip: largest advantage, in standard deviations.
+        push_limit: as for ``nft``.
     """
 
     name: str = "awm"
     beta: float = 2.0
     advantage_clip: float = 2.0
+    push_limit: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         positive(self, "advantage_clip")
+        at_least(self, 0, "push_limit")
         if not self.beta > 1:
             raise InvalidInputError(f"beta={self.beta} must be above 1: below, a bad sample pushes without bound")
 

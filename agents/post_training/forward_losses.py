@@ -45,9 +45,13 @@ class ForwardProcessLoss(LossModule):
     Args:
         prior: what is trained.
         sampler: what made the scenes, such as a slower copy of ``prior``; its weights get no gradient.
+        base: what training began with; needed for ``push_limit``.
+        push_limit: a bad pose pushes only while the squared error of o_old on it is at most this many times that of
+            the base prior; 0 for no limit.
         generator: source of timesteps, noise and observed entries (CPU); None for torch's own.
 
-    Returns (``forward``): ``loss_objective`` (), and detached ``distance`` (), the root mean square of o - o_old.
+    Returns (``forward``): ``loss_objective`` (), and detached ``distance`` (), the root mean square of o - o_old,
+        and ``limited`` (), the share of bad poses that do not push any more.
     """
 
     @dataclass
@@ -62,20 +66,38 @@ class ForwardProcessLoss(LossModule):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    out_keys = ["loss_objective", "distance"]  # noqa: RUF012  (torchrl reads lists)
+    out_keys = ["loss_objective", "distance", "limited"]  # noqa: RUF012  (torchrl reads lists)
     prior: ScenePrior
     generator: Generator | None
 
-    def __init__(self, prior: ScenePrior, sampler: ScenePrior, *, generator: Generator | None = None) -> None:
+    def __init__(
+        self,
+        prior: ScenePrior,
+        sampler: ScenePrior,
+        *,
+        base: ScenePrior | None = None,
+        push_limit: float = 0.0,
+        generator: Generator | None = None,
+    ) -> None:
         super().__init__()
+        if push_limit < 0:
+            raise InvalidInputError(f"push_limit={push_limit} must not be negative; 0 is for no limit")
+        if push_limit and base is None:
+            raise InvalidInputError(f"push_limit={push_limit} compares with the base prior; give base=")
         self.prior = prior
         self.generator = generator
-        self._sampler = (sampler,)  # in a tuple: not a module of the loss, whose parameters are the prior's
+        self.push_limit = push_limit
+        self._others = (sampler, base)  # in a tuple: not modules of the loss, whose parameters are the prior's
 
     @property
     def sampler(self) -> ScenePrior:
         """What made the scenes."""
-        return self._sampler[0]
+        return self._others[0]
+
+    @property
+    def base(self) -> ScenePrior | None:
+        """What training began with."""
+        return self._others[1]
 
     @property
     def functional(self) -> bool:
@@ -127,23 +149,25 @@ class ForwardProcessLoss(LossModule):
         noised = self.prior.noised(scene, self.generator, None if timestep is None else timestep.reshape(-1))
         tokens, mask = flat.get(keys.text, None), flat.get(keys.text_mask, None)
         text = None if tokens is None or mask is None else (tokens.detach(), mask)
-        losses, distance = self._losses(noised, text, advantage, credit)
+        losses, distance, limited = self._losses(noised, text, advantage, credit)
         valid = flat.get(keys.valid, None)
         kept = torch.ones_like(losses, dtype=torch.bool) if valid is None else valid.reshape(-1)
         count = kept.sum().clamp(min=1)
         fields = {
             "loss_objective": torch.where(kept, losses, 0.0).sum() / count,
             "distance": (torch.where(kept, distance, 0.0).sum() / count).sqrt(),
+            "limited": limited,
         }
         return TensorDict(fields, [])
 
     def _losses(
         self, noised: NoisedScenes, text: Text | None, advantage: Tensor, credit: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """(B,) losses, and (B,) mean squares of o - o_old."""
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """(B,) losses, (B,) mean squares of o - o_old, and the share () of bad poses that do not push any more."""
         output = self.prior.output(noised, text)
         with torch.no_grad():
             old = self.sampler.output(noised, text)
+            advantage, limited = self._limited(noised, text, advantage, old.continuous)
         features, poses = output.continuous.shape[-1], self.prior.pose_width
         of_entries = advantage[..., None].expand(-1, output.continuous.shape[1], features)
         if features > poses:  # a continuous prior: categories are entries, too
@@ -158,7 +182,21 @@ class ForwardProcessLoss(LossModule):
             slots = self.category_loss(output.logits, old.logits, noised.category, credit)
             mean = (slots * noised.drawn).sum(dim=1) / noised.drawn.sum(dim=1).clamp(min=1.0)
             losses = losses + self.prior.config.category_weight * mean
-        return losses, distance
+        return losses, distance, limited
+
+    def _limited(
+        self, noised: NoisedScenes, text: Text | None, advantage: Tensor, old: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Advantages of poses, those of bad ones 0 beyond ``push_limit``, and the share () of the latter."""
+        if not self.push_limit or self.base is None:
+            return advantage, advantage.new_zeros(())
+        poses = self.prior.pose_width
+        weight = noised.weight[..., :poses]
+        first = self.base.output(noised, text).continuous
+        now, then = (((noised.target - said)[..., :poses].square() * weight).sum(dim=-1) for said in (old, first))
+        bad = (advantage < 0) & (weight.sum(dim=-1) > 0)
+        beyond = bad & (now > self.push_limit * then)
+        return torch.where(beyond, 0.0, advantage), beyond.sum() / bad.sum().clamp(min=1)
 
     def _advantage(self, flat: TensorDictBase, key: NestedKey, scene: Tensor) -> Tensor:
         """(B, 1) or (B, N); zeros where the key is missing."""
@@ -185,7 +223,7 @@ class NFTLoss(ForwardProcessLoss):
     have the same with cross-entropies of l_plus and l_minus, which are made of logits as o_plus and o_minus are.
 
     Args:
-        prior, sampler, generator: as in :class:`ForwardProcessLoss`.
+        prior, sampler, base, push_limit, generator: as in :class:`ForwardProcessLoss`.
         beta: strength; smaller ones step further from the sampling policy.
         clip: c, the advantage at which a sample is fully good or bad.
 
@@ -194,7 +232,7 @@ class NFTLoss(ForwardProcessLoss):
     >>> scenes = TensorDict({"scene": prior.encode(prior.sample(2, num_steps=3)), "advantage": torch.ones(2, 34)}, [2])
     >>> loss = NFTLoss(prior, prior)(scenes)
     >>> sorted(loss.keys()), float(loss["distance"])
-    (['distance', 'loss_objective'], 0.0)
+    (['distance', 'limited', 'loss_objective'], 0.0)
     >>> loss["loss_objective"].backward()
     """
 
@@ -205,9 +243,11 @@ class NFTLoss(ForwardProcessLoss):
         *,
         beta: float = 0.5,
         clip: float = 1.0,
+        base: ScenePrior | None = None,
+        push_limit: float = 0.0,
         generator: Generator | None = None,
     ) -> None:
-        super().__init__(prior, sampler, generator=generator)
+        super().__init__(prior, sampler, base=base, push_limit=push_limit, generator=generator)
         _positive(beta=beta, clip=clip)
         self.beta, self.clip = beta, clip
 
@@ -236,7 +276,7 @@ class AWMLoss(ForwardProcessLoss):
     that of :class:`NFTLoss` divided by the latter's beta.
 
     Args:
-        prior, sampler, generator: as in :class:`ForwardProcessLoss`.
+        prior, sampler, base, push_limit, generator: as in :class:`ForwardProcessLoss`.
         beta: strength of the pull, above 1.
         clip: c, the largest advantage.
     """
@@ -248,9 +288,11 @@ class AWMLoss(ForwardProcessLoss):
         *,
         beta: float = 2.0,
         clip: float = 1.0,
+        base: ScenePrior | None = None,
+        push_limit: float = 0.0,
         generator: Generator | None = None,
     ) -> None:
-        super().__init__(prior, sampler, generator=generator)
+        super().__init__(prior, sampler, base=base, push_limit=push_limit, generator=generator)
         _positive(clip=clip)
         if not beta > 1:
             raise InvalidInputError(f"beta={beta} must be above 1: below, a bad sample pushes without bound")

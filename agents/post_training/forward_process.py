@@ -32,15 +32,17 @@ class ForwardGradient:
         loss: value of the objective.
         norm: its gradient's norm.
         distance: root mean square of the trained denoiser's output minus that of the sampling policy's.
+        limited: share of bad poses that do not push any more.
     """
 
     loss: float
     norm: float
     distance: float
+    limited: float
 
     def figures(self) -> Mapping[str, float]:
         """Further columns of the log."""
-        return {"distance": self.distance}
+        return {"distance": self.distance, "limited": self.limited}
 
 
 class ForwardProcess(Algorithm[TensorDict]):
@@ -69,10 +71,12 @@ class ForwardProcess(Algorithm[TensorDict]):
     def make_loss(self) -> ForwardProcessLoss:
         """The loss that the settings name."""
         settings, pair = self.settings, (self.prior, self.sampler)
-        if isinstance(settings, NFTSettings):
-            return NFTLoss(*pair, beta=settings.beta, clip=settings.advantage_clip)
-        if isinstance(settings, AWMSettings):
-            return AWMLoss(*pair, beta=settings.beta, clip=settings.advantage_clip)
+        if isinstance(settings, NFTSettings | AWMSettings):
+            kind = NFTLoss if isinstance(settings, NFTSettings) else AWMLoss
+            base = deepcopy(self.sampler) if settings.push_limit else None
+            return kind(
+                *pair, beta=settings.beta, clip=settings.advantage_clip, base=base, push_limit=settings.push_limit
+            )
         assert isinstance(settings, RewardWeightedSettings)
         return RewardWeightedLoss(*pair, temperature=settings.temperature)
 
@@ -133,7 +137,7 @@ class ForwardProcess(Algorithm[TensorDict]):
         scenes = TensorDict(fields, [len(x0)])
         size = self.policy.chunk or len(x0)
         valid = max(1, int(rollout.valid.sum()))
-        total, distance = 0.0, 0.0
+        total, distance, limited = 0.0, 0.0, 0.0
         self.loss.generator = generator
         for _ in range(self.settings.draws):
             for start in range(0, len(x0), size):
@@ -144,7 +148,8 @@ class ForwardProcess(Algorithm[TensorDict]):
                 objective.backward()
                 total += float(objective.detach())
                 distance += share * float(result["distance"]) ** 2
-        return ForwardGradient(total, gradient_norm(self.prior.parameters()), distance**0.5)
+                limited += share * float(result["limited"])
+        return ForwardGradient(total, gradient_norm(self.prior.parameters()), distance**0.5, limited)
 
     def end_iteration(self) -> None:
         """Move the sampling policy towards the prior in training."""
