@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -30,14 +31,13 @@ _LEAN = 0.12
 simulator creeps in the next."""
 _STAYS: dict[str, Any] = {"max_displacement": 1e-3, "max_rotation": 1e-2}
 _HOLDS: dict[str, Any] = {"max_displacement": 2e-3, "max_rotation": 2e-2, "duration": 0.5}
-_TRIALS: tuple[dict[str, Any], ...] = (
-    {"duration": 0.1} | _STAYS,
-    {"duration": 0.5} | _STAYS,
-    *({"tilt": (x * _LEAN / math.sqrt(2), y * _LEAN / math.sqrt(2))} | _HOLDS for x in (-1, 1) for y in (-1, 1)),
-    {"duration": 2.0} | _STAYS,
-    {"duration": 2.0} | _STAYS,
+_LASTING: tuple[dict[str, Any], ...] = ({"duration": 2.0} | _STAYS, {"duration": 2.0} | _STAYS)
+_UPRIGHT: tuple[dict[str, Any], ...] = ({"duration": 0.1} | _STAYS, {"duration": 0.5} | _STAYS, *_LASTING)
+"""Times (s) and limits of motion (m, rad) by which a round is judged, one after the other."""
+_LEANING: tuple[dict[str, Any], ...] = tuple(
+    {"tilt": (x * _LEAN / math.sqrt(2), y * _LEAN / math.sqrt(2))} | _HOLDS for x in (-1, 1) for y in (-1, 1)
 )
-"""Times (s), limits of motion (m, rad) and directions of gravity by which it is judged, one after the other."""
+"""The same and directions of gravity, by which the best round is judged in the end."""
 _PATIENCE = 2
 """Rounds without more ready objects after which a scene is left as it is."""
 _UNMOVED = 1e-4
@@ -178,14 +178,15 @@ def make_ready(
     """Project, settle, then count the simulation-ready objects.
 
     A free object is ready when it is inside the workspace, overlaps nothing deeper than 0.1 mm, and stays within 1 mm
-    and 0.01 rad of where it is for 2 s of simulation, also without the objects that are not ready. For half a second
-    it has to stay within 2 mm and 0.02 rad when gravity leans by 0.12 rad, in each of four directions: a stack that
-    leans and only just holds is not ready. Objects whose rest has a closed form need no simulation. Scenes with objects
-    in the workspace that are not ready go through projection and settling again, with more solver iterations, up to
-    ``rounds`` times in all, until two in a row have made no more of them ready. The round with most ready objects is
-    kept, the earliest of equal ones. A heap, whose objects are so deep in each other that projection has to spread
-    them, is invalid. All rounds of a scene together do as much work as :func:`settle` may do; where it does not
-    suffice, the scene is as far as it got, what was not judged is not ready, and ``finished`` is False.
+    and 0.01 rad of where it is for 2 s of simulation, also without the objects that are not ready. In the end it has to
+    stay within 2 mm and 0.02 rad for half a second when gravity leans by 0.12 rad, in each of four directions: a stack
+    that leans and only just holds is not ready. Objects whose rest has a closed form need no simulation.
+
+    Scenes with objects in the workspace that are not ready go through projection and settling again, with more solver
+    iterations, up to ``rounds`` times in all, until two in a row have made no more of them ready. The round with most
+    ready objects is kept, the earliest of equal ones. A heap, whose objects are so deep in each other that projection
+    has to spread them, is invalid. All rounds of a scene together do as much work as :func:`settle` may do; where it
+    does not suffice, the scene is as far as it got, what was not judged is not ready, and ``finished`` is False.
 
     Args:
         batch: B scenes of N slots.
@@ -216,8 +217,13 @@ def make_ready(
         improved = scenes[better]
         tensor[improved], ready[improved] = last.batch.tensor[better], last.ready[better]
         counts[improved] = last.counts[better]
-    finished = best.valid & (units > 0)
-    return ReadyResult(SceneBatch(tensor, best.batch.scene_type), ready, counts, finished, best.valid)
+    final = SceneBatch(tensor, best.batch.scene_type)
+    holding = _strike(final, ready, _LEANING, units, pool)
+    fewer = (holding != ready).any(dim=-1).nonzero()[:, 0]
+    left = units[fewer]
+    holding[fewer] = _strike_until_still(final[fewer], holding[fewer], _LASTING, left, pool)
+    units[fewer] = left
+    return ReadyResult(final, holding, holding.sum(dim=-1), best.valid & (units > 0), best.valid)
 
 
 def _keep(batch: SceneBatch, kept: Tensor) -> SceneBatch:
@@ -245,24 +251,43 @@ def _make_ready_once(
 
 
 def _judge_ready(batch: SceneBatch, units: Tensor, pool: PhysicsPool | None) -> Tensor:
-    """(B, N) free objects that are simulation-ready (see :func:`make_ready`); takes work off ``units`` (B,), in place.
+    """(B, N) free objects that are ready while gravity is upright (see :func:`make_ready`).
 
-    What moves at once is struck first, then what moves later or without what was struck. Where the last judgement
-    still strikes something, everything that moved is struck with it.
+    Takes the work done off ``units`` (B,), in place.
     """
     ready = batch.is_free & batch.in_workspace & (units > 0)[:, None]
+    return _strike_until_still(batch, ready, _UPRIGHT, units, pool)
+
+
+def _strike(
+    batch: SceneBatch, ready: Tensor, trials: Sequence[dict[str, Any]], units: Tensor, pool: PhysicsPool | None
+) -> Tensor:
+    """``ready`` (B, N) without the objects that move in one of the trials, each without those struck before."""
+    ready = ready.clone()
     scenes = ready.any(dim=-1).nonzero()[:, 0]
-    for number, trial in enumerate(_TRIALS, start=1):
+    for trial in trials if len(scenes) else ():
+        ready[scenes] &= _judge(_keep(batch[scenes], ready[scenes]), scenes, trial, units, pool)[0]
+    return ready
+
+
+def _strike_until_still(
+    batch: SceneBatch, ready: Tensor, trials: Sequence[dict[str, Any]], units: Tensor, pool: PhysicsPool | None
+) -> Tensor:
+    """The same, where the last two trials are equal: the last is for scenes in which the one before struck something.
+
+    Where it strikes something again, everything that moved is struck with it.
+    """
+    ready = _strike(batch, ready, trials[:-2], units, pool)
+    scenes = ready.any(dim=-1).nonzero()[:, 0]
+    still = ready[scenes]
+    for trial in trials[-2:]:
         if not len(scenes):
             break
         feasible, displacement = _judge(_keep(batch[scenes], ready[scenes]), scenes, trial, units, pool)
         struck = (ready[scenes] & ~feasible).any(dim=-1)
         ready[scenes] &= feasible
-        still = displacement < _UNMOVED
-        if number == len(_TRIALS):
-            scenes, still = scenes[struck], still[struck]
-    if len(scenes):
-        ready[scenes] &= still
+        scenes, still = scenes[struck], (displacement < _UNMOVED)[struck]
+    ready[scenes] &= still
     return ready
 
 
