@@ -22,7 +22,8 @@ import torch
 from projection import HEAPS, heap
 from scipy.spatial.transform import Rotation
 
-from rewards import evaluate_reward, make_reward
+from rewards import Reward, RewardOutput, evaluate_reward, make_reward
+from rewards.verdicts import forget_verdicts
 from scene_envs.errors import SceneEnvsError
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import equilibrium, feasibility, make_ready, penetration, project, settle
@@ -37,6 +38,13 @@ REWARDS = {
     "prompt_match": make_reward("prompt_match", prompt="A scene with two cups on a table."),
     "clip": make_reward("clip", reward="feasible_objects", high=3.0),
     "product": make_reward("product", rewards=["object_count", "feasible_objects"]),
+    **{
+        name: make_reward(name)
+        for name in ("feasible_share", "clutter", "penetration", "stability", "reachability", "coverage", "diversity")
+    },
+    "category_count": make_reward("category_count", assets=["teacup"]),
+    "relation": make_reward("relation", prompt="A scene with two cups on a table."),
+    "realism": make_reward("realism"),
     "weighted_sum": make_reward("weighted_sum", rewards=["object_count", "feasible_objects"], weights=[1.0, 1.0]),
 }
 PHYSICS: dict[str, Function] = {
@@ -96,6 +104,12 @@ def seconds(function: Function, batch: SceneBatch) -> tuple[float, str]:
     return spent, "" if bool(torch.isfinite(answer).all()) else "!"
 
 
+def scored(reward: Reward, batch: SceneBatch) -> RewardOutput:
+    """The output of a reward that has seen none of the scenes."""
+    forget_verdicts()
+    return evaluate_reward(reward, batch)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("types", nargs="*", metavar="TYPE", help=f"of {', '.join(list_scene_types())}")
@@ -111,7 +125,7 @@ def main() -> None:
     for name in options.types or list_scene_types():
         env = gym.make("scene_envs:SceneEnvs/Search-v0", scene=name, objective="feasible_objects", num_steps=2)
         functions = PHYSICS | {
-            key: lambda batch, reward=reward: evaluate_reward(reward, batch) for key, reward in REWARDS.items()
+            key: lambda batch, reward=reward: scored(reward, batch) for key, reward in REWARDS.items()
         }
         functions["search"] = lambda batch, env=env: env.reset(seed=0, options={"scene": batch})
         clean = get_grammar(name).sample(np.random.default_rng(options.seed), 1)
