@@ -40,8 +40,9 @@ REWARDS = {
     "product": make_reward("product", rewards=["object_count", "feasible_objects"]),
     **{
         name: make_reward(name)
-        for name in ("feasible_share", "clutter", "penetration", "stability", "reachability", "coverage", "diversity")
+        for name in ("feasible_share", "clutter", "stability", "reachability", "coverage", "diversity")
     },
+    "penetration (reward)": make_reward("penetration"),
     "category_count": make_reward("category_count", assets=["teacup"]),
     "relation": make_reward("relation", prompt="A scene with two cups on a table."),
     "realism": make_reward("realism"),
