@@ -25,7 +25,8 @@ class Reachability:
 
     The gripper moves in a straight line from above or from the front, until some of the object is between its
     fingers (:func:`scene_envs.physics.grasping.reachable`). Whether the grasp would hold is not asked. Objects outside
-    the workspace are not reached; a scene without free objects scores 0.
+    the workspace are not reached; a scene without free objects scores 0. A heap of objects whose trials would take
+    long is invalid.
 
     Attributes:
         sides: ``"above"``, ``"front"`` (the side of the scene type's camera, level) or both; one of them is enough.
@@ -60,8 +61,8 @@ class Reachability:
         from scene_envs.physics.grasping import reachable
 
         approach = {"above": (0.0, 0.0, 1.0), "front": tuple(viewer_axes(batch.scene_type)[1].tolist())}
-        found = reachable(batch, [approach[side] for side in self.sides], self._gripper())
-        found = found & batch.is_free & batch.in_workspace
+        result = reachable(batch, [approach[side] for side in self.sides], self._gripper())
+        found = result.reached & batch.is_free & batch.in_workspace
         reached = found.any(dim=0)
         free, number = batch.is_free.sum(dim=-1).float(), reached.sum(dim=-1).float()
         terms = {f"from_{side}": found[index].sum(dim=-1).float() for index, side in enumerate(self.sides)}
@@ -69,6 +70,7 @@ class Reachability:
             value=number / free.clamp(min=1),
             per_object=reached.float(),
             terms={"free_objects": free, "reachable_objects": number, **terms},
+            valid=result.valid,
             object_flags={"reachable": reached},
         )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -32,8 +33,9 @@ simulator creeps in the next."""
 _STAYS: dict[str, Any] = {"max_displacement": 1e-3, "max_rotation": 1e-2}
 _HOLDS: dict[str, Any] = {"max_displacement": 2e-3, "max_rotation": 2e-2, "duration": 0.5}
 _LASTING: tuple[dict[str, Any], ...] = ({"duration": 2.0} | _STAYS, {"duration": 2.0} | _STAYS)
-_UPRIGHT: tuple[dict[str, Any], ...] = ({"duration": 0.1} | _STAYS, {"duration": 0.5} | _STAYS, *_LASTING)
-"""Times (s) and limits of motion (m, rad) by which a round is judged, one after the other."""
+"""Time (s) and limits of motion (m, rad) of what is ready: once, and again where something was struck."""
+_UPRIGHT: tuple[dict[str, Any], ...] = ({"duration": 0.1} | _STAYS, {"duration": 0.5} | _STAYS)
+"""The shorter trials by which every round is judged first: they find most of what moves, at less cost."""
 _LEANING: tuple[dict[str, Any], ...] = tuple(
     {"tilt": (x * _LEAN / math.sqrt(2), y * _LEAN / math.sqrt(2))} | _HOLDS for x in (-1, 1) for y in (-1, 1)
 )
@@ -201,6 +203,7 @@ def make_ready(
     units = stack(run_kernel("units", batch, {}, pool), batch, "units", torch.float64, shape=())
     best = last = _make_ready_once(batch, duration, ITERATIONS, units, pool)
     tensor, ready, counts = best.batch.tensor.clone(), best.ready.clone(), best.counts.clone()
+    lasting = best.lasting.clone()
     scenes = torch.arange(len(batch))  # that went through the last round
     without_gain = torch.zeros(len(batch), dtype=torch.int64)  # rounds in a row
     for _ in range(rounds - 1):
@@ -216,13 +219,13 @@ def make_ready(
         without_gain[scenes] = (without_gain[scenes] + 1) * ~better
         improved = scenes[better]
         tensor[improved], ready[improved] = last.batch.tensor[better], last.ready[better]
-        counts[improved] = last.counts[better]
+        counts[improved], lasting[improved] = last.counts[better], last.lasting[better]
     final = SceneBatch(tensor, best.batch.scene_type)
     holding = _strike(final, ready, _LEANING, units, pool)
-    fewer = (holding != ready).any(dim=-1).nonzero()[:, 0]
-    left = units[fewer]
-    holding[fewer] = _strike_until_still(final[fewer], holding[fewer], _LASTING, left, pool)
-    units[fewer] = left
+    due = (~lasting | (holding != ready).any(dim=-1)).nonzero()[:, 0]
+    left = units[due]
+    holding[due] = _strike_until_still(final[due], holding[due], left, pool)
+    units[due] = left
     return ReadyResult(final, holding, holding.sum(dim=-1), best.valid & (units > 0), best.valid)
 
 
@@ -232,9 +235,33 @@ def _keep(batch: SceneBatch, kept: Tensor) -> SceneBatch:
     return SceneBatch.from_parts(batch.translations, batch.rotations, categories, batch.scene_type)
 
 
+@dataclass(frozen=True, eq=False)
+class _Round:
+    """Scenes after one round of :func:`make_ready`.
+
+    Attributes:
+        batch: the settled scenes.
+        ready: (B, N) free objects that passed the trials of a round.
+        valid: (B,) whether projection and settling gave an answer.
+        finished: (B,) whether the work did not end early.
+        lasting: (B,) whether all that is ready stayed for the whole time.
+    """
+
+    batch: SceneBatch
+    ready: Tensor
+    valid: Tensor
+    finished: Tensor
+    lasting: Tensor
+
+    @property
+    def counts(self) -> Tensor:
+        """(B,) ready objects."""
+        return self.ready.sum(dim=-1)
+
+
 def _make_ready_once(
     batch: SceneBatch, duration: float, iterations: int, units: Tensor, pool: PhysicsPool | None
-) -> ReadyResult:
+) -> _Round:
     """One round of :func:`make_ready`; takes the work done off ``units`` (B,), in place."""
     projected = project(batch, pool=pool)
     rows = (projected.valid & ~projected.heap).nonzero()[:, 0]
@@ -243,20 +270,28 @@ def _make_ready_once(
     settled, settled_valid = poses_after(settling, projected.batch[rows])[0], valid_rows(settling)
     left = units[rows] - spent(settling)
     tensor, ready = projected.batch.tensor.clone(), torch.zeros_like(projected.batch.is_empty)
-    tensor[rows], ready[rows] = settled.tensor, _judge_ready(settled, left, pool) & settled_valid[:, None]
-    units[rows] = left
-    valid = torch.zeros(len(batch), dtype=torch.bool)
-    valid[rows] = settled_valid
-    return ReadyResult(SceneBatch(tensor, batch.scene_type), ready, ready.sum(dim=-1), valid & (units > 0), valid)
+    valid, lasting = torch.zeros(len(batch), dtype=torch.bool), torch.zeros(len(batch), dtype=torch.bool)
+    still, lasting[rows] = _judge_round(settled, left, pool)
+    tensor[rows], ready[rows] = settled.tensor, still & settled_valid[:, None]
+    units[rows], valid[rows] = left, settled_valid
+    return _Round(SceneBatch(tensor, batch.scene_type), ready, valid, valid & (units > 0), lasting)
 
 
-def _judge_ready(batch: SceneBatch, units: Tensor, pool: PhysicsPool | None) -> Tensor:
-    """(B, N) free objects that are ready while gravity is upright (see :func:`make_ready`).
+def _judge_round(batch: SceneBatch, units: Tensor, pool: PhysicsPool | None) -> tuple[Tensor, Tensor]:
+    """(B, N) free objects that stay in the trials of a round, and (B,) whether the longest found nothing that moves.
 
-    Takes the work done off ``units`` (B,), in place.
+    Only scenes of which everything in the workspace stays in the shorter trials go through the longest: the others go
+    through another round anyway. Takes the work done off ``units`` (B,), in place.
     """
-    ready = batch.is_free & batch.in_workspace & (units > 0)[:, None]
-    return _strike_until_still(batch, ready, _UPRIGHT, units, pool)
+    candidates = batch.is_free & batch.in_workspace
+    ready = _strike(batch, candidates & (units > 0)[:, None], _UPRIGHT, units, pool)
+    complete = ((ready == candidates).all(dim=-1) & (units > 0)).nonzero()[:, 0]
+    lasting = torch.zeros(len(batch), dtype=torch.bool)
+    left = units[complete]
+    stays = _strike(batch[complete], ready[complete], _LASTING[:1], left, pool)
+    lasting[complete] = (stays == ready[complete]).all(dim=-1)
+    ready[complete], units[complete] = stays, left
+    return ready, lasting
 
 
 def _strike(
@@ -270,17 +305,15 @@ def _strike(
     return ready
 
 
-def _strike_until_still(
-    batch: SceneBatch, ready: Tensor, trials: Sequence[dict[str, Any]], units: Tensor, pool: PhysicsPool | None
-) -> Tensor:
-    """The same, where the last two trials are equal: the last is for scenes in which the one before struck something.
+def _strike_until_still(batch: SceneBatch, ready: Tensor, units: Tensor, pool: PhysicsPool | None) -> Tensor:
+    """``ready`` (B, N) without the objects that move in the longest trial, repeated where it struck something.
 
     Where it strikes something again, everything that moved is struck with it.
     """
-    ready = _strike(batch, ready, trials[:-2], units, pool)
+    ready = ready.clone()
     scenes = ready.any(dim=-1).nonzero()[:, 0]
     still = ready[scenes]
-    for trial in trials[-2:]:
+    for trial in _LASTING:
         if not len(scenes):
             break
         feasible, displacement = _judge(_keep(batch[scenes], ready[scenes]), scenes, trial, units, pool)

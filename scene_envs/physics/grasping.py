@@ -14,6 +14,7 @@ from torch import Tensor
 from scene_envs.assets.base import Asset, AssetLibrary, ConvexPart
 from scene_envs.assets.shapes import box
 from scene_envs.errors import InvalidInputError
+from scene_envs.physics.budget import Budget
 from scene_envs.physics.collision import Collider
 from scene_envs.physics.geometry import library_geometry
 from scene_envs.physics.placement import Objects, flatten, object_boxes, part_pairs, place
@@ -30,6 +31,8 @@ TURNS = tuple(np.arange(4) * np.pi / 4)
 """Angles (rad) of the closing direction about the approach, counted from a level direction of the object."""
 PLACES = (0.5, 0.0, 1.0)
 """Where along the object's extent in the closing direction it is grasped: its middle, then its two edges."""
+PART_PAIRS = 50_000.0
+"""Pairs of convex parts that one scene may take, ten times what a crowded one takes: about 0.8 s."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,20 @@ class Gripper:
         return box((self.opening, self.finger_width, self.finger_length))
 
 
-def reachable(batch: SceneBatch, approaches: Sequence[Sequence[float]], gripper: Gripper | None = None) -> Tensor:
+@dataclass(frozen=True, eq=False)
+class ReachResult:
+    """Which objects a gripper comes to.
+
+    Attributes:
+        reached: (A, B, N) bool, for each approach; False for welded and empty slots.
+        valid: (B,) bool; False for heaps of objects that would take more work than a scene may.
+    """
+
+    reached: Tensor
+    valid: Tensor
+
+
+def reachable(batch: SceneBatch, approaches: Sequence[Sequence[float]], gripper: Gripper | None = None) -> ReachResult:
     """Objects to which an open gripper comes in a straight line without touching anything.
 
     For each approach the gripper is tried at the middle and at both edges of the object, with four closing directions
@@ -92,12 +108,10 @@ def reachable(batch: SceneBatch, approaches: Sequence[Sequence[float]], gripper:
         batch: B scenes of N slots.
         approaches: A directions in the world from the objects to where the gripper comes from, such as (0, 0, 1).
         gripper: its sizes; the default ones when None.
-
-    Returns:
-        (A, B, N) bool; False for welded and empty slots.
     """
     gripper = Gripper() if gripper is None else gripper
     found = torch.zeros(len(approaches), *batch.tensor.shape[:2], dtype=torch.bool)
+    valid = torch.ones(len(batch), dtype=torch.bool)
     categories = batch.categories.cpu().numpy()
     translations = batch.translations.double().cpu().numpy()
     rotations = batch.rotations.double().cpu().numpy()
@@ -107,10 +121,13 @@ def reachable(batch: SceneBatch, approaches: Sequence[Sequence[float]], gripper:
         rows = slice(row, row + 1)
         objects = flatten(hand.collider.library, translations[rows], rotations[rows], categories[rows], welded[rows])
         objects = objects[np.flatnonzero(categories[row, objects.slot] < batch.scene_type.num_assets)]
+        budget = Budget(PART_PAIRS)
         for index, approach in enumerate(approaches):
-            met = hand.reach(objects, np.asarray(approach, dtype=np.float64))
+            met = hand.reach(objects, np.asarray(approach, dtype=np.float64), budget)
             found[index, row, objects.slot[met]] = True
-    return found.to(batch.tensor.device)
+        valid[row] = not budget.is_spent
+    device = batch.tensor.device
+    return ReachResult((found & valid[:, None]).to(device), valid.to(device))
 
 
 @lru_cache(maxsize=16)
@@ -128,8 +145,11 @@ class _Hand:
         self.collider = Collider(library_geometry((*library.assets, *tools)))
         self.corners = [np.concatenate([part.vertices for part in asset.fine]) for asset in library]
 
-    def reach(self, objects: Objects, back: Array) -> Index:
-        """Rows of the free objects of one scene that the gripper reaches from the direction ``back`` (3,)."""
+    def reach(self, objects: Objects, back: Array, budget: Budget) -> Index:
+        """Rows of the free objects of one scene that the gripper reaches from the direction ``back`` (3,).
+
+        ``budget`` counts pairs of convex parts; when it is spent, what is returned means nothing.
+        """
         free = np.flatnonzero(~objects.fixed)
         if not len(free):
             return free
@@ -137,13 +157,14 @@ class _Hand:
         open_rows = free
         for place_along in PLACES:
             for reach in self.gripper.reaches:
+                if budget.is_spent:
+                    return free[:0]
                 tried = np.flatnonzero(np.isin(owner, open_rows))
                 across = low[tried, 0] + place_along * (high[tried, 0] - low[tried, 0])
                 deep = np.maximum(high[tried, 2] - reach, low[tried, 2])
                 tips = np.stack([across, 0.5 * (low[tried, 1] + high[tried, 1]), deep], axis=1)
-                good = self._succeed(
-                    objects, owner[tried], rotation[tried], np.einsum("gij,gj->gi", rotation[tried], tips)
-                )
+                tips = np.einsum("gij,gj->gi", rotation[tried], tips)
+                good = self._succeed(objects, owner[tried], rotation[tried], tips, budget)
                 open_rows = np.setdiff1d(open_rows, owner[tried[good]])
         return np.setdiff1d(free, open_rows)
 
@@ -163,16 +184,16 @@ class _Hand:
         owner = np.repeat(rows, len(TURNS))
         return owner, rotation.reshape(-1, 3, 3), low.reshape(-1, 3), high.reshape(-1, 3)
 
-    def _succeed(self, objects: Objects, owner: Index, rotation: Array, translation: Array) -> Index:
+    def _succeed(self, objects: Objects, owner: Index, rotation: Array, translation: Array, budget: Budget) -> Index:
         """Which of G poses have some of the object between the fingers, and the gripper overlapping nothing."""
         left = np.arange(len(owner))
         for tool, wanted in ((self.grasp, True), (self.body, False)):
             both = _concatenate(objects, tool, rotation[left], translation[left])
             first = len(objects) + np.arange(len(left))
-            left = left[self._overlap(both, first, owner[left]) == wanted]
-        return left[~self._is_blocked(objects, rotation[left], translation[left])]
+            left = left[self._overlap(both, first, owner[left], budget) == wanted]
+        return left[~self._is_blocked(objects, rotation[left], translation[left], budget)]
 
-    def _is_blocked(self, objects: Objects, rotation: Array, translation: Array) -> Mask:
+    def _is_blocked(self, objects: Objects, rotation: Array, translation: Array, budget: Budget) -> Mask:
         """(G,) whether the gripper overlaps anything."""
         both = _concatenate(objects, self.body, rotation, translation)
         count, total = len(objects), len(both)
@@ -180,20 +201,23 @@ class _Hand:
         near = ((low[count:, None] < high[None, :count]) & (low[None, :count] < high[count:, None])).all(axis=-1)
         first, second = np.nonzero(near)
         blocked = np.zeros(total - count, dtype=bool)
-        blocked[first[self._overlap(both, first + count, second)]] = True
+        blocked[first[self._overlap(both, first + count, second, budget)]] = True
         return blocked
 
-    def _overlap(self, objects: Objects, first: Index, second: Index) -> Mask:
+    def _overlap(self, objects: Objects, first: Index, second: Index, budget: Budget) -> Mask:
         """(P,) whether two objects overlap by more than :data:`TOUCHING`."""
         placed = place(self.collider.library, objects, "fine")
         pair, a, b = part_pairs(placed, first, second)
         near = ((placed.low[a] < placed.high[b]) & (placed.low[b] < placed.high[a])).all(axis=-1)
         pair, a, b = pair[near], a[near], b[near]
+        overlap = np.zeros(len(first), dtype=bool)
+        budget.spend(len(pair))
+        if budget.is_spent:
+            return overlap
         gap, _ = separations(self.collider.library, placed.parts, a, b)
         deep = gap < -TOUCHING
         pair, a, b = pair[deep], a[deep], b[deep]
         depth, _ = self.collider.depth(placed.parts, a, b)
-        overlap = np.zeros(len(first), dtype=bool)
         overlap[pair[depth > TOUCHING]] = True
         return overlap
 

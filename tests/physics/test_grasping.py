@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
+from scene_envs.physics.budget import Budget
 from scene_envs.physics.grasping import Gripper, _hand, reachable
 from scene_envs.physics.placement import flatten
 from scene_envs.scene import SceneBatch
@@ -21,7 +22,7 @@ WIDE = Gripper(opening=SIDE + 0.02)
 
 def reached(batch: SceneBatch, approach: tuple[float, float, float], gripper: Gripper = WIDE) -> list[bool]:
     """Verdicts on the free objects of one scene."""
-    return reachable(batch, [approach], gripper)[0, 0][batch.is_free[0]].tolist()
+    return reachable(batch, [approach], gripper).reached[0, 0][batch.is_free[0]].tolist()
 
 
 def test_a_box_is_grasped_when_it_fits_between_the_fingers() -> None:
@@ -29,7 +30,7 @@ def test_a_box_is_grasped_when_it_fits_between_the_fingers() -> None:
     assert reached(alone, UP) == [True]
     assert reached(alone, UP, Gripper(opening=SIDE - 0.01)) == [False]
     assert reached(alone, UP, Gripper(opening=SIDE + 1e-3)) == [True]
-    assert not bool(reachable(alone, [UP])[0, 0, 0])  # the floor is welded
+    assert not bool(reachable(alone, [UP]).reached[0, 0, 0])  # the floor is welded
 
 
 def test_neighbours_bar_the_fingers_only_where_there_is_no_room() -> None:
@@ -64,10 +65,25 @@ def test_rims_are_grasped_and_flat_things_down_to_the_floor() -> None:
 
 def test_verdicts_depend_neither_on_the_batch_nor_on_the_heading() -> None:
     batch = get_grammar("pantry_shelf").sample(np.random.default_rng(0), 2)
-    together = reachable(batch, [UP, FRONT])
-    alone = reachable(batch[1], [UP, FRONT])
+    together = reachable(batch, [UP, FRONT]).reached
+    alone = reachable(batch[1], [UP, FRONT]).reached
     assert torch.equal(together[:, 1:], alone)
     assert 0 < int(together.any(dim=0).sum()) < int(batch.is_free.sum())
+
+
+def test_a_heap_is_invalid_and_leaves_the_others_alone() -> None:
+    """Sixty objects of many parts at one point take many times the work of a crowded scene."""
+    clean = get_grammar("pantry_shelf").sample(np.random.default_rng(0), 1)
+    parts = torch.tensor([len(asset.fine) for asset in clean.scene_type.library.assets])
+    categories = torch.where(clean.is_welded, clean.categories, parts.argmax())
+    spread = torch.linspace(0.0, 0.05, clean.tensor.shape[1])[None, :, None]
+    translations = torch.where(clean.is_welded[..., None], clean.translations, torch.tensor([0.0, 0.0, 0.8]) + spread)
+    heap = SceneBatch.from_parts(translations, torch.eye(3).expand_as(clean.rotations), categories, clean.scene_type)
+    both = SceneBatch(torch.cat([heap.tensor, clean.tensor]), clean.scene_type)
+    result = reachable(both, [UP])
+    assert result.valid.tolist() == [False, True]
+    assert not bool(result.reached[:, 0].any())
+    assert torch.equal(result.reached[:, 1], reachable(clean, [UP]).reached[:, 0])
 
 
 def test_collisions_of_the_gripper_are_those_of_fcl() -> None:
@@ -79,7 +95,7 @@ def test_collisions_of_the_gripper_are_those_of_fcl() -> None:
     rng = np.random.default_rng(0)
     rotation = Rotation.random(150, random_state=0).as_matrix()
     translation = rng.uniform((-0.5, -0.5, 0.0), (0.5, 0.5, 0.25), (150, 3))
-    blocked = hand._is_blocked(objects, rotation, translation)
+    blocked = hand._is_blocked(objects, rotation, translation, Budget(float("inf")))
     assert 10 < int(blocked.sum()) < 140
 
     def shape(part: object) -> fcl.Convex:
