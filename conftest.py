@@ -18,7 +18,7 @@ collect_ignore_glob = ["tests/plugin_components/*"]
 def _registries() -> list[dict[str, Any]]:
     """Every registry that users add to by name, the built-in entries in place."""
     from agents.networks.registry import _ENTRIES as networks
-    from agents.planning.config import _PLANNERS as planners
+    from agents.planning.registry import _PLANNERS as planners
     from agents.post_training.algorithms import _ENTRIES as algorithms
     from rewards.registry import _registry as rewards
     from scene_envs.envs.masks import _MASKS

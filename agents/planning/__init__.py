@@ -1,23 +1,38 @@
-"""Inference-time search: trees, planners and search runs."""
+"""Inference-time search: planners, trees and search runs."""
 
 from typing import TYPE_CHECKING
 
 from scene_envs.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from agents.planning.config import PlannerSettings, SearchConfig, list_planners, register_planner
-    from agents.planning.planners import BestOfPlanner, PlanResult, Searchable, UCTPlanner
+    from agents.planning.beam import BeamPlanner
+    from agents.planning.best_of import BestOfPlanner
+    from agents.planning.config import SearchConfig
+    from agents.planning.greedy import GreedyPlanner
+    from agents.planning.journal import Journal
+    from agents.planning.ledger import Ledger, PlanResult, Searchable, SearchStoppedError
+    from agents.planning.mcts import MCTSPlanner
+    from agents.planning.registry import PlannerSettings, list_planners, register_planner
     from agents.planning.search_run import SearchOutcome, run_search
+    from agents.planning.session import Session
     from agents.planning.tree import Node, Tree
+    from agents.planning.uct import UCTPlanner
 
 __all__ = [
+    "BeamPlanner",
     "BestOfPlanner",
+    "GreedyPlanner",
+    "Journal",
+    "Ledger",
+    "MCTSPlanner",
     "Node",
     "PlanResult",
     "PlannerSettings",
     "SearchConfig",
     "SearchOutcome",
+    "SearchStoppedError",
     "Searchable",
+    "Session",
     "Tree",
     "UCTPlanner",
     "list_planners",
@@ -28,9 +43,17 @@ __all__ = [
 __getattr__ = lazy_names(
     __name__,
     {
-        "agents.planning.config": ("PlannerSettings", "SearchConfig", "list_planners", "register_planner"),
-        "agents.planning.planners": ("BestOfPlanner", "PlanResult", "Searchable", "UCTPlanner"),
+        "agents.planning.beam": ("BeamPlanner",),
+        "agents.planning.best_of": ("BestOfPlanner",),
+        "agents.planning.config": ("SearchConfig",),
+        "agents.planning.greedy": ("GreedyPlanner",),
+        "agents.planning.journal": ("Journal",),
+        "agents.planning.ledger": ("Ledger", "PlanResult", "SearchStoppedError", "Searchable"),
+        "agents.planning.mcts": ("MCTSPlanner",),
+        "agents.planning.registry": ("PlannerSettings", "list_planners", "register_planner"),
         "agents.planning.search_run": ("SearchOutcome", "run_search"),
+        "agents.planning.session": ("Session",),
         "agents.planning.tree": ("Node", "Tree"),
+        "agents.planning.uct": ("UCTPlanner",),
     },
 )

@@ -1,19 +1,22 @@
-"""Search run: a tree of inpaintings and best-of-N at equal NFE, with output files."""
+"""Search run: scenes found by a planner and best-of-N at equal NFE, with output files."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from agents.configuration.tree import config_text, plain_tree
+from agents.planning.best_of import BestOfPlanner
 from agents.planning.config import SearchConfig
-from agents.planning.planners import BestOfPlanner, PlanResult
+from agents.planning.journal import Journal
+from agents.planning.ledger import PlanResult
 from agents.planning.search_report import draw_curve, draw_scene
-from scene_envs.envs import SearchEnv
+from agents.planning.session import Lane, Session
+from scene_envs.envs import SearchEnv, SearchState
 from scene_envs.envs.resolvers import resolve_prior
 from scene_envs.errors import InvalidInputError, SceneEnvsError
 from scene_envs.files import finite, write_json, write_text
@@ -21,6 +24,9 @@ from scene_envs.scene import SceneBatch
 
 _PLAIN = (bool, int, float, str, list, dict, type(None))
 """What YAML takes."""
+
+_LIMITS = ("budget", "max_nfe", "max_seconds", "baseline", "workers")
+"""Keys of which the states of a search do not depend: they may change when a run goes on."""
 
 Progress = Callable[[str, int, int, float], None]
 """Called after every round with the planner's name, the expansions so far, the budget and the best Φ so far."""
@@ -31,15 +37,17 @@ class SearchOutcome:
     """Result of a search run.
 
     Attributes:
-        search: the tree search.
-        best_of: best of ``budget`` independent samples, the baseline at equal NFE.
-        first: the best of the first ``branching`` samples, a batch of one.
-        best: the best scene of the search, a batch of one.
+        search: the plan of the best search.
+        searches: the plans of all ``count`` searches.
+        best_of: best of as many independent samples, the baseline at equal NFE; None without one.
+        first: the best of the first ``branching`` samples of the best search, a batch of one.
+        best: the best scene of every search, a batch of ``count``; the best search first.
         metrics: what ``metrics.json`` holds.
     """
 
     search: PlanResult
-    best_of: PlanResult
+    searches: list[PlanResult]
+    best_of: PlanResult | None
     first: SceneBatch
     best: SceneBatch
     metrics: dict[str, Any]
@@ -54,18 +62,19 @@ def run_search(
     progress: Progress | None = None,
     **settings: Any,
 ) -> SearchOutcome:
-    """Search for a scene that scores high, starting from nothing but the prior.
+    """Search for scenes that score high, starting from nothing but the prior.
 
-    The root is the scene with fixed welded objects alone, so its children are fresh samples. From there UCT
+    The root is the scene with fixed welded objects alone, so its children are fresh samples. From there the planner
     regenerates what the objective blames (Pfaff et al. 2025, inference-time search). The same seed and settings give
-    the same tree.
+    the same scenes. An interrupt (Ctrl-C, SIGTERM) ends the search with the best so far, as does ``max_seconds``. With
+    an output folder, the same call goes on where an earlier one was killed or ended; a larger budget may be given.
 
     Args:
         prior: a prior, or the name or path of one.
         objective: any reward: name, mapping, function or object.
         config: the settings; or give its fields as keywords.
-        output: folder for ``curve.png``, ``before.png``, ``after.png``, ``best.safetensors``, ``metrics.json`` and
-            ``config.yaml``, in which functions and objects are left out; None writes nothing.
+        output: folder for ``curve.png``, ``before.png``, ``after.png``, ``best.safetensors``, ``metrics.json``, the
+            journals, and ``config.yaml``, in which functions and objects are left out; None writes nothing.
         progress: told of every round.
         **settings: fields of :class:`SearchConfig`.
 
@@ -75,116 +84,144 @@ def run_search(
     if config is not None and settings:
         raise InvalidInputError(f"give config= or single settings, not both (got {', '.join(sorted(settings))})")
     config = SearchConfig(**settings) if config is None else config
+    named = {"prior": prior, "objective": objective, **plain_tree(config)}
+    folder = None if output is None else Path(output)
+    run = _Run(resolve_prior(prior), objective, config, {k: v for k, v in named.items() if k not in _LIMITS}, folder)
     started = time.perf_counter()
-    env, search = _plan(
-        prior, objective, config, config.planner.make(config.branching), config.branching, "search", progress
-    )
+    planner, scenes = config.planner.make(config.branching), config.scenes
+    actions = max(scenes, config.branching) if config.planner.widens else config.branching
+    env, session, searches = run.plan(planner, actions, scenes, config.count, "search", progress)
     searched = time.perf_counter()
-    baseline = BestOfPlanner(parallel=max(16, config.branching))
-    # A root with as many actions as the budget: the same seeds by path, so the first scenes are the tree's.
-    _, best_of = _plan(env.problem.prior, objective, config, baseline, config.budget, "best of N", progress)
+    spent, best_of = sum(len(plan.values) for plan in searches), None
+    if config.baseline and spent and session.stopped != "interrupt":
+        # As many actions as scenes: the same seeds by path, so the first scenes are those of the first search.
+        _, _, (best_of,) = run.plan(BestOfPlanner(), spent, spent, 1, "best of N", progress)
     seconds = {"search": searched - started, "best_of": time.perf_counter() - searched}
-    if search.tree is None:  # a planner without a tree: its first scenes once more
-        first = _plan(env.problem.prior, objective, config, baseline, config.branching, "first", None)[1].best_state
-    else:
-        first = _best_first(search)
-    if first is None or search.best_path == ():
+    searches = sorted(searches, key=lambda plan: -plan.best_value if plan.best_path else math.inf)
+    best = searches[0]
+    if not best.best_path:
         raise SceneEnvsError(
-            f"the objective {objective!r} could not score any of the first {config.branching} samples of the prior; "
-            "the log above says why"
+            f"the search was interrupted before its first {config.branching} scenes were there; call it again"
+            if session.stopped and not spent
+            else f"the objective {objective!r} could not score any of the first {config.branching} samples of the "
+            "prior; the log above says why"
         )
+    first = _best_first(session.lanes, best.best_state.seed, config.branching)
     outcome = SearchOutcome(
-        search=search,
+        search=best,
+        searches=searches,
         best_of=best_of,
         first=env.scene(first),
-        best=env.scene(search.best_state),
-        metrics=_metrics(objective, env.problem.scale, config, search, best_of, first, seconds),
+        best=SceneBatch.concatenate([env.scene(plan.best_state) for plan in searches]),
+        metrics=_metrics(objective, env.problem.scale, config, searches, best_of, first, seconds, session.stopped),
     )
-    if output is not None:
-        _write(outcome, config, first, search.best_state, Path(output))
-        named = {"prior": prior, "objective": objective, **plain_tree(config)}
+    if folder is not None:
+        _write(outcome, config, first, folder)
         plain = {key: value for key, value in named.items() if isinstance(value, _PLAIN)}
-        write_text(Path(output) / "config.yaml", config_text(plain))
+        write_text(folder / "config.yaml", config_text(plain))
     return outcome
 
 
-def _plan(
-    prior: Any,
-    objective: Any,
-    config: SearchConfig,
-    planner: Any,
-    branching: int,
-    name: str,
-    progress: Progress | None,
-) -> tuple[SearchEnv, PlanResult]:
-    prior = resolve_prior(prior)
-    env = SearchEnv(
-        scene=prior.scene_type,
-        objective=objective,
-        branching=branching,
-        max_depth=config.max_depth,
-        num_steps=config.num_steps,
-        prior=prior,
-        slots=config.slots,
-        mask=config.mask,
-        objective_scale=config.objective_scale,
-        workers=config.workers,
-        prompt=config.prompt,
-        guidance=config.guidance,
-    )
-    try:
-        env.reset(seed=config.seed, options={"scene": SceneBatch.empty(prior.scene_type, 1, env.problem.slots)})
-        told = None if progress is None else lambda done, best: progress(name, done, config.budget, best)
-        return env, planner.plan(env, config.budget, told)
-    finally:
-        env.close()
+@dataclass(frozen=True)
+class _Run:
+    """What the searches of one run share."""
+
+    prior: Any
+    objective: Any
+    config: SearchConfig
+    named: dict[str, Any]
+    folder: Path | None
+
+    def plan(
+        self, planner: Any, actions: int, budget: int, count: int, name: str, progress: Progress | None
+    ) -> tuple[SearchEnv, Session, list[PlanResult]]:
+        """``count`` plans of ``budget`` scenes each, in an environment of ``actions`` per state."""
+        config = self.config
+        env = SearchEnv(
+            scene=self.prior.scene_type,
+            objective=self.objective,
+            branching=actions,
+            max_depth=config.max_depth,
+            num_steps=config.num_steps,
+            prior=self.prior,
+            slots=config.slots,
+            mask=config.mask,
+            objective_scale=config.objective_scale,
+            workers=config.workers,
+            prompt=config.prompt,
+            guidance=config.guidance,
+        )
+        journal = None
+        if self.folder is not None:
+            journal = Journal(self.folder / f"{name.replace(' ', '_')}.journal", self.named)
+        limit = config.max_seconds if name == "search" else None
+        session = Session(env, max_seconds=limit, journal=journal)
+        told = None if progress is None else lambda done, best: progress(name, done, count * budget, best)
+        try:
+            empty = SceneBatch.empty(self.prior.scene_type, 1, env.problem.slots)
+            roots = []
+            for search in range(count):
+                env.reset(seed=config.seed + search, options={"scene": empty})
+                roots.append(env.clone_state())
+            return env, session, session.run(planner, roots, budget, told)
+        finally:
+            env.close()
 
 
-def _best_first(search: PlanResult) -> Any:
-    """The best state among the children of the root, or None."""
-    assert search.tree is not None
-    children = [node for _, node in sorted(search.tree.root.children.items())]
-    return max(children, key=lambda node: node.value or 0.0).state if children else None
+def _best_first(lanes: Sequence[Lane], seed: int, branching: int) -> SearchState:
+    """The best of the first ``branching`` children of the root of ``seed``."""
+    states = next(lane.first for lane in lanes if lane.root.seed == seed)[:branching]
+    return max(states, key=lambda state: state.value if state.valid else -1.0)
 
 
 def _metrics(
     objective: Any,
     scale: float,
     config: SearchConfig,
-    search: PlanResult,
-    best_of: PlanResult,
-    first: Any,
+    searches: Sequence[PlanResult],
+    best_of: PlanResult | None,
+    first: SearchState,
     seconds: dict[str, float],
+    stopped: str,
 ) -> dict[str, Any]:
-    return {
+    search = searches[0]
+    metrics = {
         "objective": objective if isinstance(objective, str) else getattr(objective, "__name__", repr(objective)),
         "objective_scale": scale,
-        "nfe": len(search.values) * config.nfe_per_scene,
+        "saturated": search.best_state.objective > scale,
+        "planner": config.planner.name,
+        "stopped": stopped or None,
+        "nfe": sum(len(plan.values) for plan in searches) * config.nfe_per_scene,
         "first_samples": {"value": first.value, "objective": first.objective},
-        "search": {
-            "value": search.best_value,
-            "objective": search.best_state.objective,
-            "path": list(search.best_path),
-            "expansions": len(search.values),
-            "invalid": sum(map(math.isnan, search.values)),
-            "curve": finite(search.curve),
-        },
-        "best_of": {
-            "value": best_of.best_value,
-            "objective": best_of.best_state.objective,
-            "expansions": len(best_of.values),
-            "invalid": sum(map(math.isnan, best_of.values)),
-            "curve": finite(best_of.curve),
-        },
+        "search": _of_plan(search),
         "seconds": {name: round(value, 2) for name, value in seconds.items()},
+    }
+    if len(searches) > 1:
+        metrics["searches"] = [_of_plan(plan) for plan in searches]
+    if best_of is not None:
+        metrics["best_of"] = _of_plan(best_of)
+    return metrics
+
+
+def _of_plan(plan: PlanResult) -> dict[str, Any]:
+    return {
+        "value": plan.best_value,
+        "objective": plan.best_state.objective,
+        "path": list(plan.best_path),
+        "expansions": len(plan.values),
+        "invalid": sum(map(math.isnan, plan.values)),
+        "curve": finite(plan.curve),
     }
 
 
-def _write(outcome: SearchOutcome, config: SearchConfig, first: Any, best: Any, output: Path) -> None:
+def _write(outcome: SearchOutcome, config: SearchConfig, first: SearchState, output: Path) -> None:
     write_json(output / "metrics.json", outcome.metrics, indent=2)
     outcome.best.save(output / "best.safetensors")
+    curves = {config.planner.name: outcome.search.curve}
+    if outcome.best_of is not None:
+        curves["best of N"] = outcome.best_of.curve
     draw_curve(
-        {"tree search": outcome.search.curve, "best of N": outcome.best_of.curve},
+        curves,
         output / "curve.png",
         num_steps=config.nfe_per_scene,
         first=config.branching,
@@ -192,4 +229,4 @@ def _write(outcome: SearchOutcome, config: SearchConfig, first: Any, best: Any, 
         label=str(outcome.metrics["objective"]).replace("_", " "),
     )
     draw_scene(outcome.first, first, output / "before.png")
-    draw_scene(outcome.best, best, output / "after.png")
+    draw_scene(outcome.best[0], outcome.search.best_state, output / "after.png")

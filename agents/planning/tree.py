@@ -1,4 +1,4 @@
-"""Search tree: UCB1 selection, virtual visits for batched expansion, closed branches."""
+"""Search tree: UCB1 selection, progressive widening, virtual visits for batched expansion, closed branches."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def ucb1(mean: float, visits: int, parent_visits: int, exploration: float) -> fl
     return mean + exploration * math.sqrt(math.log(parent_visits) / visits)
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class Node:
     """One state of the search and what was learnt below it.
 
@@ -34,8 +34,11 @@ class Node:
         value: objective of this state, in [0, 1]; None for a root that was never evaluated.
         parent: the node this one was expanded from, None at the root.
         action: the action that led here, -1 at the root.
-        untried: legal actions not yet expanded, in the order they will be.
+        path: actions from the root to this node.
+        actions: its legal actions, in the order they are expanded.
+        tried: how many of them were expanded or are reserved.
         children: expanded actions and their nodes.
+        open_children: children below which something can be selected.
         visits: evaluations backed up through this node.
         total: sum of the values backed up.
         pending: virtual visits of expansions that are selected and not yet evaluated.
@@ -45,16 +48,19 @@ class Node:
     value: float | None = None
     parent: Node | None = field(default=None, repr=False)
     action: int = -1
-    untried: list[int] = field(default_factory=list)
+    path: tuple[int, ...] = ()
+    actions: Sequence[int] = ()
+    tried: int = 0
     children: dict[int, Node] = field(default_factory=dict, repr=False)
+    open_children: int = 0
     visits: int = 0
     total: float = 0.0
     pending: int = 0
 
     @property
-    def path(self) -> tuple[int, ...]:
-        """Actions from the root to this node."""
-        return () if self.parent is None else (*self.parent.path, self.action)
+    def untried(self) -> Sequence[int]:
+        """Legal actions not yet expanded nor reserved."""
+        return self.actions[self.tried :]
 
     @property
     def mean(self) -> float:
@@ -65,22 +71,27 @@ class Node:
     @property
     def is_open(self) -> bool:
         """True when some action at or below this node can be selected now."""
-        return bool(self.untried) or any(child.is_open for child in self.children.values())
+        return self.tried < len(self.actions) or self.open_children > 0
 
     def walk(self) -> Iterator[Node]:
         """This node and all below it, parents first, children by action."""
-        yield self
-        for action in sorted(self.children):
-            yield from self.children[action].walk()
+        left = [self]
+        while left:
+            node = left.pop()
+            yield node
+            left += [node.children[action] for action in sorted(node.children, reverse=True)]
 
 
 class Tree:
-    """A UCT tree over opaque states.
+    """A UCT tree over opaque states. The work of an expansion grows with the depth alone, not with the tree.
 
     Args:
         root: state the search starts from.
         actions: legal actions of the root.
         exploration: weight of the UCB1 bound.
+        children: children that a node gets before its children are searched; None for all its actions.
+        widening: progressive widening (Coulom 2007; Chaslot et al. 2008): a node of n visits may have n^widening
+            children where that is more than ``children``; 0 for never.
 
     >>> tree = Tree("root", [0, 1])
     >>> node, action = tree.select()
@@ -89,12 +100,20 @@ class Tree:
     (1, 0.25, (0,))
     """
 
-    def __init__(self, root: Any, actions: Sequence[int], exploration: float = math.sqrt(2.0)) -> None:
-        self.root = Node(root, untried=list(actions))
-        self.exploration = exploration
+    def __init__(
+        self,
+        root: Any,
+        actions: Sequence[int],
+        exploration: float = math.sqrt(2.0),
+        children: int | None = None,
+        widening: float = 0.0,
+    ) -> None:
+        self.root = Node(root, actions=actions)
+        self.exploration, self.children, self.widening = exploration, children, widening
+        self._best = self.root
 
     def select(self) -> tuple[Node, int] | None:
-        """The next expansion: descend by UCB1 to a node with an untried action and reserve that action.
+        """The next expansion: descend by UCB1 to a node that takes another child, and reserve its next action.
 
         Ties go to the lower action. Branches with nothing left to select are skipped. The expansion counts as a
         visit worth 0 along its path until :meth:`attach` or :meth:`release`, so that several can be selected before
@@ -106,22 +125,28 @@ class Tree:
         if not self.root.is_open:
             return None
         node = self.root
-        while not node.untried:
+        while not self._takes_another_child(node):
             node = self._best_child(node)
-        action = node.untried.pop(0)
+        action = node.actions[node.tried]
+        node.tried += 1
+        _close(node)
         _add_pending(node, 1)
         return node, action
 
     def attach(self, node: Node, action: int, state: Any, value: float, actions: Sequence[int]) -> Node:
         """Add the result of a selected expansion and back its value up to the root."""
-        child = Node(state, value, node, action, list(actions))
+        child = Node(state, value, node, action, (*node.path, action), actions)
         node.children[action] = child
+        if child.is_open:
+            _open(node)
         _add_pending(node, -1)
         current: Node | None = child
         while current is not None:
             current.visits += 1
             current.total += value
             current = current.parent
+        if self._best.value is None or _rank(child) < _rank(self._best):
+            self._best = child
         return child
 
     def release(self, node: Node, action: int) -> None:
@@ -134,15 +159,52 @@ class Tree:
 
     def best(self) -> Node:
         """The evaluated node with the highest value; the shallowest, then the first path, among equals."""
-        evaluated = [node for node in self.root.walk() if node.value is not None]
-        if not evaluated:
-            return self.root
-        return min(evaluated, key=lambda node: (-(node.value or 0.0), len(node.path), node.path))
+        return self._best
+
+    def _takes_another_child(self, node: Node) -> bool:
+        if node.tried >= len(node.actions):
+            return False
+        if self.children is None or node.open_children == 0:
+            return True
+        allowed = float(self.children)
+        if self.widening:
+            allowed = max(allowed, (node.visits + node.pending) ** self.widening)
+        return node.tried < allowed
 
     def _best_child(self, node: Node) -> Node:
         tries = max(1, node.visits + node.pending)
-        candidates = [child for _, child in sorted(node.children.items()) if child.is_open]
-        return max(candidates, key=lambda c: ucb1(c.mean, c.visits + c.pending, tries, self.exploration))
+        weight = self.exploration * math.sqrt(math.log(tries))
+        best, highest = None, -math.inf
+        for child in node.children.values():
+            if not child.is_open:
+                continue
+            visits = child.visits + child.pending
+            bound = child.mean + weight / math.sqrt(visits) if visits else math.inf
+            if best is None or bound > highest or (bound == highest and child.action < best.action):
+                best, highest = child, bound
+        assert best is not None
+        return best
+
+
+def _rank(node: Node) -> tuple[float, int, tuple[int, ...]]:
+    return -(node.value or 0.0), len(node.path), node.path
+
+
+def _close(node: Node) -> None:
+    """Tell the parents of a node that its last action went and that nothing is open below it."""
+    current: Node | None = node
+    while current is not None and not current.is_open and current.parent is not None:
+        current = current.parent
+        current.open_children -= 1
+
+
+def _open(node: Node) -> None:
+    """Count a new open child of ``node``, and ``node`` itself among its parent's where it was closed."""
+    current: Node | None = node
+    while current is not None:
+        was_open = current.is_open
+        current.open_children += 1
+        current = None if was_open else current.parent
 
 
 def _add_pending(node: Node | None, amount: int) -> None:

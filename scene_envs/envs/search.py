@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +19,10 @@ from scene_envs.envs.settings import SearchSettings, takes
 from scene_envs.envs.spaces import check_slots, prior_device, resolve_scene_and_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
+
+_LOGGER = logging.getLogger(__name__)
+_SAME = 1e-4
+"""Scenes are the same when their objects agree to this, m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +59,12 @@ class SearchState:
 
     def __hash__(self) -> int:
         return hash((self.seed, self.path))
+
+    @property
+    def fingerprint(self) -> bytes:
+        """Digest of the scene as a set of objects, to a tenth of a millimetre: equal for equal scenes."""
+        rows = torch.round(self.scene / _SAME).to(torch.int32).numpy()
+        return hashlib.blake2b(b"".join(sorted(row.tobytes() for row in rows)), digest_size=16).digest()
 
 
 @dataclass(frozen=True)
@@ -92,6 +104,9 @@ class SearchProblem:
     Args:
         **settings: fields of :class:`~scene_envs.envs.settings.SearchSettings`.
 
+    Raises:
+        InvalidInputError: no slot can be regenerated, as all belong to fixed objects.
+
     Attributes:
         evaluations: denoiser evaluations (NFE) spent so far, ``num_steps`` per generated scene and twice that many with
             guidance.
@@ -112,12 +127,18 @@ class SearchProblem:
         self.branching, self.max_depth, self.num_steps = chosen.branching, chosen.max_depth, chosen.num_steps
         self.prior.step_table(self.num_steps)  # says now, not later, that num_steps is more than the prior has
         free_slots = self.slots - len(self.scene_type.fixed)
+        if free_slots < 1:
+            raise InvalidInputError(
+                f"slots={self.slots}: all of them belong to fixed objects of {self.scene_type.name!r}, so that a "
+                "search has nothing to regenerate; give more"
+            )
         self.scale = float(free_slots) if chosen.objective_scale is None else chosen.objective_scale
         self.prompting = EnvPrompts(self.prior, chosen.prompt, chosen.guidance, self.slots)
         self.prompt = self.prompting.draw(np.random.default_rng(0)) if self.prompting.given else None
         self.mask_generator = resolve_mask(chosen.mask)
         self.scorer = RewardScorer(chosen.objective, chosen.workers)
         self.evaluations = 0
+        self._told_of_scale = False
 
     # -- states ---------------------------------------------------------------------------------
 
@@ -156,9 +177,21 @@ class SearchProblem:
         """The child of ``state`` under ``action``."""
         return self.expand_batch([(state, action)])[0]
 
-    def legal_actions(self, state: SearchState) -> list[int]:
-        """All inpaintings, or none at ``max_depth``."""
-        return [] if state.depth >= self.max_depth else list(range(self.branching))
+    def legal_actions(self, state: SearchState) -> Sequence[int]:
+        """All inpaintings; none at ``max_depth`` and where nothing is left to improve."""
+        return range(0 if state.depth >= self.max_depth or self.is_solved(state) else self.branching)
+
+    def is_solved(self, state: SearchState) -> bool:
+        """Whether nothing is left to improve: no slot is masked, or Φ is 1, the most there is."""
+        return state.value >= 1.0 or not bool(state.mask.any())
+
+    def without_masked(self, state: SearchState) -> SearchState:
+        """The same node with the objects that are still masked removed: what a search may return in the end."""
+        parts = torch.where(
+            state.mask[:, None], SceneBatch.empty(self.scene_type, 1, self.slots).tensor[0], state.scene
+        )
+        scene = SceneBatch(parts.unsqueeze(0), self.scene_type)
+        return self._score(scene, [(state.seed, state.path, state.value)])[0]
 
     def _check_legal(self, state: SearchState, action: int) -> None:
         if not isinstance(action, (int, np.integer)) or not 0 <= action < self.branching:
@@ -167,6 +200,8 @@ class SearchProblem:
             raise InvalidInputError(
                 f"the state at path {state.path} is at max_depth={self.max_depth}: it has no children"
             )
+        if self.is_solved(state):
+            raise InvalidInputError(f"nothing is left to improve in the state at path {state.path}: it has no children")
 
     # -- generation and scoring -----------------------------------------------------------------
 
@@ -176,9 +211,14 @@ class SearchProblem:
         changeable[: len(self.scene_type.fixed)] = False
         return changeable
 
+    @property
+    def nfe_per_scene(self) -> int:
+        """Denoiser evaluations per generated scene."""
+        return self.num_steps * (2 if self.prompting.guidance else 1)
+
     def _inpaint(self, batch: SceneBatch, masks: Tensor, noises: list[torch.Generator]) -> SceneBatch:
         guidance, reader = self.prompting.guidance, self.prompting.reader
-        self.evaluations += self.num_steps * len(batch) * (2 if guidance else 1)
+        self.evaluations += self.nfe_per_scene * len(batch)
         batch, masks = batch.to(self.device), masks.to(self.device)
         if reader is None or self.prompt is None:
             return self.prior.inpaint(batch, masks, num_steps=self.num_steps, generators=noises).to("cpu")
@@ -196,10 +236,20 @@ class SearchProblem:
         self, scene: SceneBatch, score: Score, seed: int, path: tuple[int, ...], parent_value: float
     ) -> SearchState:
         valid, objective = bool(score.valid[0]), float(score.value[0])
-        mask = self.mask_generator(scene, score, NodeRandomness.at(seed, path).mask)
+        changeable = self._changeable() & ~scene.is_welded[0]
+        if bool(scene.is_free.any()):
+            changeable &= self.mask_generator(scene, score, NodeRandomness.at(seed, path).mask)
+        if objective > self.scale and not self._told_of_scale:
+            self._told_of_scale = True
+            _LOGGER.warning(
+                "the objective is %.4g, more than objective_scale=%.4g: its value in the search ends at 1; raise "
+                "objective_scale to search further",
+                objective,
+                self.scale,
+            )
         return SearchState(
             scene=scene.tensor[0].clone(),
-            mask=mask & self._changeable() & ~scene.is_welded[0],
+            mask=changeable,
             depth=len(path),
             path=path,
             seed=seed,

@@ -36,7 +36,7 @@ class SearchEnv(gym.Env[Any, Any]):
 
     ## Action Space
 
-    `Discrete(branching)`: which inpainting. All are legal until `max_depth`.
+    `Discrete(branching)`: which inpainting. All are legal until the episode ends.
 
     ## Observation Space
 
@@ -68,7 +68,8 @@ class SearchEnv(gym.Env[Any, Any]):
 
     ## Episode End
 
-    `terminated` at depth `max_depth`. Never `truncated`.
+    `terminated` when nothing is left to improve: no slot is masked, or Φ is 1. `truncated` at depth `max_depth`, or
+    when `max_nfe` denoiser evaluations are spent since the reset.
 
     ## Arguments
 
@@ -89,6 +90,7 @@ class SearchEnv(gym.Env[Any, Any]):
     | `slots` | `None` | slots per scene; `None` is the scene type's number, more is allowed |
     | `mask` | `"culprits"` | mask generator: also `"infeasible"`, `"random"`, a registered name, a function |
     | `objective_scale` | `None` | objective value at which Φ = 1; `None` is the number of free slots |
+    | `max_nfe` | `None` | denoiser evaluations per episode; `None` is any number |
     | `workers` | `0` | processes for physics in the objective; 0 computes in this one |
     | `render_mode` | `None` | `"rgb_array"` renders the current scene |
     | `prompt` | `None` | what all scenes should hold, for priors that read prompts; the objective sees it too |
@@ -110,6 +112,7 @@ class SearchEnv(gym.Env[Any, Any]):
     def __init__(self, *, render_mode: str | None = None, **settings: Any) -> None:
         self.render_mode = check_render_mode(render_mode)
         self.problem = SearchProblem(**settings)
+        self.max_nfe: int | None = settings.get("max_nfe")
         slot_count = self.problem.slots
         self.observation_space = spaces.Dict(
             {
@@ -155,12 +158,23 @@ class SearchEnv(gym.Env[Any, Any]):
             ResetNeededError: the episode has ended or never began.
         """
         parent = self.state
-        if parent.depth >= self.problem.max_depth:
-            raise ResetNeededError(f"the episode ended at max_depth={self.problem.max_depth}; call reset() first")
+        if why := self._end(parent):
+            raise ResetNeededError(f"the episode ended, {why}; call reset() first")
         self._state = self.expand(parent, action)
         observation, info = self._observe(self._state)
-        terminated = self._state.depth >= self.problem.max_depth
-        return observation, self._state.value - parent.value, terminated, False, info
+        terminated = self.problem.is_solved(self._state)
+        truncated = not terminated and bool(self._end(self._state))
+        return observation, self._state.value - parent.value, terminated, truncated, info
+
+    def _end(self, state: SearchState) -> str:
+        """Why the episode ends at ``state``; empty where it goes on."""
+        if self.problem.is_solved(state):
+            return "with nothing left to improve"
+        if state.depth >= self.problem.max_depth:
+            return f"at max_depth={self.problem.max_depth}"
+        if self.max_nfe is not None and self.nfe + self.problem.nfe_per_scene > self.max_nfe:
+            return f"as max_nfe={self.max_nfe} denoiser evaluations are spent"
+        return ""
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """(H, W, 3) uint8 picture of the current scene, or None without a render mode."""
@@ -188,13 +202,13 @@ class SearchEnv(gym.Env[Any, Any]):
         self._state = self._check_state(state)
         self._remember([self._state])
 
-    def legal_actions(self, state: SearchState | None = None) -> list[int]:
-        """Actions of ``state`` (default: the current one); none at ``max_depth``."""
+    def legal_actions(self, state: SearchState | None = None) -> Sequence[int]:
+        """Actions of ``state`` (default: the current one); none at ``max_depth`` or with nothing left to improve."""
         return self.problem.legal_actions(self.state if state is None else state)
 
     def action_masks(self) -> np.ndarray:
         """(branching,) bool, the legal actions of the current state, as maskable agents ask for them."""
-        return np.isin(np.arange(self.problem.branching), self.legal_actions())
+        return np.isin(np.arange(self.problem.branching), list(self.legal_actions()))
 
     def expand(self, state: SearchState, action: int) -> SearchState:
         """The child of ``state`` under ``action``; the current state stays."""
@@ -215,6 +229,10 @@ class SearchEnv(gym.Env[Any, Any]):
         if self._best is None:
             raise ResetNeededError("the search has no state yet; call reset() first")
         return self._best
+
+    def without_masked(self, state: SearchState) -> SearchState:
+        """``state`` with the objects that are still masked removed; the current state stays."""
+        return self.problem.without_masked(state)
 
     def scene(self, state: SearchState | None = None) -> SceneBatch:
         """The scene of ``state`` (default: the current one), as a batch of one."""

@@ -93,6 +93,7 @@ class SearchSettings(EnvSettings):
         max_depth: actions per episode.
         mask: name of a mask generator, or a function; see :mod:`scene_envs.envs.masks`.
         objective_scale: objective at which Φ is 1; None means the number of free slots.
+        max_nfe: denoiser evaluations per episode; None for any number.
 
     Raises:
         InvalidInputError: a value is outside what is accepted.
@@ -103,10 +104,13 @@ class SearchSettings(EnvSettings):
     max_depth: int = 10
     mask: Any = "culprits"
     objective_scale: float | None = None
+    max_nfe: int | None = None
 
     def __post_init__(self) -> None:
         self._check_at_least_one("branching")
         self._check_at_least_one("max_depth")
+        if self.max_nfe is not None:
+            self._check_at_least_one("max_nfe")
         super().__post_init__()
         scale = self.objective_scale
         if scale is not None and not (np.isfinite(scale) and scale > 0):

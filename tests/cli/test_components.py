@@ -13,7 +13,7 @@ import yaml
 from agents import PostTrainConfig, PretrainConfig
 from agents.cli import main
 from agents.networks import registry as networks
-from agents.planning import config as planners
+from agents.planning import registry as planners
 from agents.post_training import algorithms
 from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior

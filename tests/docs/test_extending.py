@@ -13,7 +13,7 @@ import torch
 import yaml
 
 from agents.cli import main
-from agents.planning.config import planner_settings
+from agents.planning.registry import planner_settings
 from agents.post_training import DDPOSFLoss, DenoisingPolicy, compute_advantages
 from agents.post_training.algorithms import algorithm_settings, make_algorithm
 from agents.post_training.rollouts import collect

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from agents.planning.planners import BestOfPlanner, UCTPlanner
+from agents.planning import BestOfPlanner, UCTPlanner
 from agents.planning.tree import Node, Tree, ucb1
 from scene_envs.errors import InvalidInputError
 
@@ -177,7 +177,7 @@ def test_a_leaf_as_root_gives_no_plan() -> None:
     ("make", "message"),
     [
         (lambda: UCTPlanner(exploration=-1.0), "exploration must be a number >= 0, got -1.0"),
-        (lambda: UCTPlanner(parallel=0), "parallel must be at least 1, got 0"),
+        (lambda: UCTPlanner(parallel=0), "parallel must be a number >= 1, got 0"),
         (lambda: UCTPlanner().plan(ToyTree(scrambled), budget=0), "at least 1 expansion, got 0"),
     ],
 )

@@ -22,8 +22,8 @@ SETTINGS = {"budget": 24, "branching": 3, "num_steps": 4, "max_depth": 5, "seed"
 
 
 def central_objects(batch: SceneBatch, context: RewardContext) -> RewardOutput:
-    """Free objects within 30 cm of the middle; the others are to blame."""
-    central = batch.is_free & (batch.translations[..., :2].norm(dim=-1) < 0.3)
+    """Free objects within 10 cm of the middle; the others are to blame."""
+    central = batch.is_free & (batch.translations[..., :2].norm(dim=-1) < 0.1)
     return RewardOutput(central.sum(-1).float(), object_flags={"feasible": central})
 
 
@@ -90,7 +90,8 @@ def test_children_keep_what_is_not_masked_bit_for_bit(run: Run) -> None:
 
 def test_files_hold_what_was_found(run: Run) -> None:
     names = {path.name for path in run.output.iterdir()}
-    assert names == {"curve.png", "before.png", "after.png", "best.safetensors", "metrics.json", "config.yaml"}
+    pictures, journals = {"curve.png", "before.png", "after.png"}, {"search.journal", "best_of_N.journal"}
+    assert names == {*pictures, *journals, "best.safetensors", "metrics.json", "config.yaml"}
     assert torch.equal(SceneBatch.load(run.output / "best.safetensors").tensor, run.outcome.best.tensor)
     metrics = json.loads((run.output / "metrics.json").read_text())
     assert metrics["search"]["curve"][-1] == metrics["search"]["value"] == run.outcome.search.best_value

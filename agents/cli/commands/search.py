@@ -51,9 +51,17 @@ def run(settings: SearchKeys, run: Run) -> None:
 
         outcome = run_search(settings.prior, settings.objective, config=search, output=settings.output, progress=show)
     metrics = outcome.metrics
-    found, best_of, first = (metrics[key]["objective"] for key in ("search", "best_of", "first_samples"))
+    found, first = (metrics[key]["objective"] for key in ("search", "first_samples"))
+    best_of = "" if outcome.best_of is None else f"{metrics['best_of']['objective']:.4g} by as many samples, "
     run.say(
-        f"{metrics['objective']}: {found:.4g} by search, {best_of:.4g} by the best of {search.budget} samples, "
-        f"{first:.4g} by the best of the first {search.branching}"
+        f"{metrics['objective']}: {found:.4g} by {metrics['planner']} with {metrics['nfe']} denoiser evaluations, "
+        f"{best_of}{first:.4g} by the best of the first {search.branching}"
     )
+    if len(outcome.searches) > 1:
+        objectives = ", ".join(f"{plan.best_state.objective:.4g}" for plan in outcome.searches)
+        run.say(f"best scene of each search: {objectives}")
+    if metrics["stopped"] == "time":
+        run.say(f"ended after max_seconds={search.max_seconds:g}; the same command with more time goes on")
     run.say(f"written to {run.directory}")
+    if metrics["stopped"] == "interrupt":
+        raise KeyboardInterrupt

@@ -1,0 +1,57 @@
+"""Beam search: the best few states, inpainted side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from agents.planning.ledger import Candidate, Ledger, PlanResult, Progress, Searchable
+from agents.planning.registry import PlannerSettings, check_at_least, register_planner
+
+
+@register_planner("beam")
+@dataclass(frozen=True)
+class BeamPlanner(PlannerSettings):
+    """Beam search that keeps parents beside their children.
+
+    A round expands ``children`` inpaintings of each of the ``width`` best states. States that were expanded compete
+    with the new ones and are inpainted further while they stay among the best; of equal values the newer state is kept.
+    A scene is in the beam once.
+
+    Attributes:
+        width: states that are kept.
+        children: inpaintings per state and round; null takes ``branching``.
+    """
+
+    name: str = "beam"
+    widens = True
+    width: int = 3
+    children: int | None = None
+
+    def __post_init__(self) -> None:
+        check_at_least(self, 1, "width", "children")
+
+    def make(self, branching: int) -> BeamPlanner:
+        """The planner."""
+        return replace(self, children=branching if self.children is None else self.children)
+
+    def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
+        """Spend up to ``budget`` expansions below the current state."""
+        ledger, count = Ledger(problem, budget, progress), self.children or 1
+        beam: list[tuple[Candidate, Sequence[int]]] = [(ledger.root, ledger.actions(ledger.root))]
+        while ledger.left and beam:
+            children = ledger.expand([(state, action) for state, actions in beam for action in actions[:count]])
+            pool = [(child, ledger.actions(child)) for child in reversed(children) if child.valid]
+            pool += [(state, actions[count:]) for state, actions in beam if state.valid or not pool]
+            beam = self._best(pool)
+        return ledger.result()
+
+    def _best(self, pool: list[tuple[Candidate, Sequence[int]]]) -> list[tuple[Candidate, Sequence[int]]]:
+        """The best different states of ``pool`` that have actions left; the first among equals."""
+        kept: list[tuple[Candidate, Sequence[int]]] = []
+        seen = set()
+        for state, actions in sorted(pool, key=lambda entry: -entry[0].value if entry[0].valid else 0.0):
+            if actions and state.fingerprint not in seen and len(kept) < self.width:
+                seen.add(state.fingerprint)
+                kept.append((state, actions))
+        return kept

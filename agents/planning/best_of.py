@@ -1,0 +1,40 @@
+"""Best of N: independent samples of the root."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from agents.planning.ledger import Ledger, PlanResult, Progress, Searchable
+from agents.planning.registry import PlannerSettings, check_at_least, register_planner
+
+
+@register_planner("best_of")
+@dataclass(frozen=True)
+class BestOfPlanner(PlannerSettings):
+    """Best of N independent samples: expands the root alone, every action once, in order.
+
+    The baseline of a search at equal NFE. Give it a root with at least ``budget`` actions; when the problem seeds
+    children by their path, its first samples are those of any other planner.
+
+    Attributes:
+        parallel: scenes per batch of the denoiser.
+    """
+
+    name: str = "best_of"
+    widens = True
+    parallel: int = 16
+
+    def __post_init__(self) -> None:
+        check_at_least(self, 1, "parallel")
+
+    def make(self, branching: int) -> BestOfPlanner:
+        """The planner."""
+        return self
+
+    def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
+        """Spend up to ``budget`` expansions, or as many as the root has actions."""
+        ledger = Ledger(problem, budget, progress)
+        actions = ledger.actions(ledger.root)[:budget]
+        for start in range(0, len(actions), self.parallel):
+            ledger.expand([(ledger.root, action) for action in actions[start : start + self.parallel]])
+        return ledger.result()

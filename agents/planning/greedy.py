@@ -1,0 +1,51 @@
+"""Greedy repair: inpainting of the best state again and again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from agents.planning.ledger import Candidate, Ledger, PlanResult, Progress, Searchable
+from agents.planning.registry import PlannerSettings, check_at_least, register_planner
+
+
+@register_planner("greedy")
+@dataclass(frozen=True)
+class GreedyPlanner(PlannerSettings):
+    """Iterated repair of one state.
+
+    A round takes the next ``children`` inpaintings of the current state. The best of them becomes the current state
+    unless it scores less; one that scores the same is taken, since another mask may lead further. A state whose actions
+    are spent gives way to the best earlier one that has some.
+
+    Attributes:
+        children: inpaintings per round, one batch of the denoiser; null takes ``branching``.
+    """
+
+    name: str = "greedy"
+    widens = True
+    children: int | None = None
+
+    def __post_init__(self) -> None:
+        check_at_least(self, 1, "children")
+
+    def make(self, branching: int) -> GreedyPlanner:
+        """The planner."""
+        return replace(self, children=branching if self.children is None else self.children)
+
+    def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
+        """Spend up to ``budget`` expansions below the current state."""
+        ledger, count = Ledger(problem, budget, progress), self.children or 1
+        # The states on the way, the latest last, each with the actions that it has left.
+        trail: list[tuple[Candidate, Sequence[int]]] = [(ledger.root, ledger.actions(ledger.root))]
+        while ledger.left and trail:
+            state, actions = trail.pop()
+            if not actions:
+                continue
+            children = ledger.expand([(state, action) for action in actions[:count]])
+            trail.append((state, actions[count:]))
+            scored = [child for child in children if child.valid]
+            best = max(scored, key=lambda child: child.value, default=None)
+            if best is not None and (state is ledger.root or best.value >= state.value):
+                trail.append((best, ledger.actions(best)))
+        return ledger.result()

@@ -1,0 +1,110 @@
+"""Journal of a search: every state that was made, on the disk, for a run that goes on after it was killed."""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from scene_envs.envs import SearchState
+from scene_envs.errors import CorruptFileError, InvalidInputError
+
+_MAGIC = b"scene-envs search 1\n"
+_HEAD = struct.Struct("<II")
+"""Length and CRC-32 of a record."""
+
+
+class Journal:
+    """A file of records: the settings of the search, then the states of every round in the order they were made.
+
+    A record that was being written when the process was killed is dropped.
+
+    Args:
+        path: the file; made when it is not there.
+        settings: what the states depend on; plain values.
+
+    Raises:
+        InvalidInputError: the file was made with other settings.
+        CorruptFileError: the file is no journal, or is damaged before its end.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], settings: Mapping[str, Any]) -> None:
+        self.path = Path(path)
+        self._states: list[SearchState] = []
+        self._taken = 0
+        settings = {key: repr(value) for key, value in settings.items()}
+        if self.path.exists() and self.path.stat().st_size:
+            self._read(settings)
+        else:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._begin(settings)
+
+    def __len__(self) -> int:
+        """States that an earlier run left."""
+        return len(self._states)
+
+    def take(self, pairs: Sequence[tuple[SearchState, int]]) -> list[SearchState]:
+        """The states of the first of ``pairs`` that an earlier run made.
+
+        Raises:
+            InvalidInputError: it made others.
+        """
+        known = self._states[self._taken : self._taken + len(pairs)]
+        for (parent, action), state in zip(pairs, known, strict=False):
+            if (state.seed, state.path) != (parent.seed, (*parent.path, action)):
+                raise InvalidInputError(
+                    f"{self.path} holds another search: path {state.path} where this one asks for "
+                    f"{(*parent.path, action)}; give another output"
+                )
+        self._taken += len(known)
+        return known
+
+    def add(self, states: Sequence[SearchState]) -> None:
+        """Write the states of a round."""
+        self._append([{field.name: getattr(state, field.name) for field in fields(SearchState)} for state in states])
+
+    def _begin(self, settings: Mapping[str, str]) -> None:
+        self.path.write_bytes(_MAGIC)
+        self._append(settings)
+
+    def _append(self, content: Any) -> None:
+        buffer = io.BytesIO()
+        torch.save(content, buffer)
+        record = buffer.getvalue()
+        with self.path.open("ab") as file:
+            file.write(_HEAD.pack(len(record), zlib.crc32(record)) + record)
+            file.flush()
+
+    def _read(self, settings: Mapping[str, str]) -> None:
+        data, position, records = self.path.read_bytes(), len(_MAGIC), []
+        if not data.startswith(_MAGIC[: len(data)]):
+            raise CorruptFileError(f"{self.path} is no journal of a search; remove it, or give another output")
+        while position + _HEAD.size <= len(data):
+            length, checksum = _HEAD.unpack_from(data, position)
+            record = data[position + _HEAD.size : position + _HEAD.size + length]
+            if len(record) < length:
+                break
+            if zlib.crc32(record) != checksum:
+                raise CorruptFileError(f"{self.path} is damaged at byte {position}; remove it, or give another output")
+            records.append(torch.load(io.BytesIO(record), weights_only=True))
+            position += _HEAD.size + length
+        if not records:  # killed at its very beginning
+            self._begin(settings)
+            return
+        if position < len(data):  # killed while writing
+            with self.path.open("r+b") as file:
+                file.truncate(position)
+        for name in sorted({*settings, *records[0]}):
+            before, now = records[0].get(name), settings.get(name)
+            if before != now:
+                raise InvalidInputError(
+                    f"{self.path} is of a search with {name}={before}, not {now}; give another output, or that value"
+                )
+        self._states = [SearchState(**state) for states in records[1:] for state in states]

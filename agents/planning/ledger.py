@@ -1,0 +1,170 @@
+"""Ledger of a plan: what was expanded, what is left to spend, and the best state so far."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+from scene_envs.errors import InvalidInputError, SceneEnvsError
+
+if TYPE_CHECKING:
+    from agents.planning.tree import Tree
+
+Progress = Callable[[int, float], None]
+"""Called after every round with the expansions so far and the best value so far."""
+
+
+class SearchStoppedError(SceneEnvsError):
+    """A search environment expands nothing more: the time is over, or the user interrupted.
+
+    Planners built on a :class:`Ledger` end with what they have. Where another planner lets it through, the run that
+    started the planner keeps the best state it saw.
+    """
+
+
+class Searchable(Protocol):
+    """Protocol of the trees that a planner searches, such as ``scene_envs.envs.SearchEnv``.
+
+    States are immutable. A state with an attribute ``valid`` that is False could not be scored: it is counted and
+    left out of the plan. Two states with equal attributes ``fingerprint`` hold the same scene.
+    """
+
+    def clone_state(self) -> Any:
+        """The current state, the root of the plan."""
+        ...
+
+    def legal_actions(self, state: Any) -> Sequence[int]:
+        """Actions that can be expanded from ``state``; none at a leaf."""
+        ...
+
+    def expand_batch(self, pairs: Sequence[tuple[Any, int]]) -> Sequence[Any]:
+        """The child of every (state, action) pair."""
+        ...
+
+    def evaluate(self, state: Any) -> float:
+        """The objective of ``state``, in [0, 1]."""
+        ...
+
+
+@dataclass
+class PlanResult:
+    """Result of a planner.
+
+    Attributes:
+        best_state: the state with the highest objective.
+        best_value: its objective.
+        best_path: the actions that lead to it from the root.
+        values: objective of every expansion in the order they were made; NaN where it failed.
+        tree: the search tree, for planners that keep one.
+    """
+
+    best_state: Any
+    best_value: float
+    best_path: tuple[int, ...]
+    values: list[float]
+    tree: Tree | None = field(default=None, repr=False)
+
+    @property
+    def curve(self) -> list[float]:
+        """Best objective after each expansion; failed ones leave it as it was."""
+        best, curve = -math.inf, []
+        for value in self.values:
+            best = max(best, value) if math.isfinite(value) else best
+            curve.append(best)
+        return curve
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A state that was expanded.
+
+    Attributes:
+        state: the problem's own immutable state.
+        value: its objective, in [0, 1]; NaN where it could not be scored.
+        path: the actions that lead to it from the root.
+    """
+
+    state: Any
+    value: float
+    path: tuple[int, ...]
+
+    @property
+    def valid(self) -> bool:
+        """Whether it has a value."""
+        return math.isfinite(self.value)
+
+    @property
+    def fingerprint(self) -> Any:
+        """Equal for equal scenes; the path where the problem does not say."""
+        return getattr(self.state, "fingerprint", self.path)
+
+
+class Ledger:
+    """Spends a budget of expansions on a problem and keeps account: the planners' common part.
+
+    Nothing is left when the budget is spent, when a state of value 1 was found (the most there is), or when the problem
+    stops the search.
+
+    Args:
+        problem: what is searched.
+        budget: expansions.
+        progress: told after every round.
+
+    Raises:
+        InvalidInputError: the budget is below 1.
+    """
+
+    def __init__(self, problem: Searchable, budget: int, progress: Progress | None = None) -> None:
+        if budget < 1:
+            raise InvalidInputError(f"a plan needs a budget of at least 1 expansion, got {budget}")
+        self.problem, self.budget, self.progress = problem, budget, progress
+        self.root = Candidate(problem.clone_state(), math.nan, ())
+        self.values: list[float] = []
+        self.best = self.root
+        self._stopped = False
+
+    @property
+    def left(self) -> int:
+        """Expansions that may still be made."""
+        return 0 if self._stopped or self.best.value >= 1.0 else self.budget - len(self.values)
+
+    def actions(self, candidate: Candidate) -> Sequence[int]:
+        """Legal actions of a candidate."""
+        return self.problem.legal_actions(candidate.state)
+
+    def expand(self, pairs: Sequence[tuple[Candidate, int]]) -> list[Candidate]:
+        """The children of (candidate, action) pairs in one batch: of as many as are left, of none when stopped."""
+        pairs = pairs[: self.left]
+        if not pairs:
+            return []
+        try:
+            states = self.problem.expand_batch([(parent.state, action) for parent, action in pairs])
+        except SearchStoppedError:
+            self._stopped = True
+            return []
+        children = [
+            Candidate(state, state_value(self.problem, state), (*parent.path, action))
+            for (parent, action), state in zip(pairs, states, strict=True)
+        ]
+        for child in children:
+            self.values.append(child.value)
+            if child.valid and (not self.best.valid or _rank(child) < _rank(self.best)):
+                self.best = child
+        if self.progress is not None:
+            self.progress(len(self.values), self.best.value if self.best.valid else 0.0)
+        return children
+
+    def result(self, tree: Tree | None = None) -> PlanResult:
+        """The plan: the best state, the shallowest and then the first path among equals."""
+        return PlanResult(self.best.state, self.best.value, self.best.path, self.values, tree)
+
+
+def state_value(problem: Searchable, state: Any) -> float:
+    """The objective of ``state``, NaN when it could not be scored."""
+    return float(problem.evaluate(state)) if getattr(state, "valid", True) else math.nan
+
+
+def _rank(candidate: Candidate) -> tuple[float, int, tuple[int, ...]]:
+    return -candidate.value, len(candidate.path), candidate.path

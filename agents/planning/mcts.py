@@ -1,0 +1,119 @@
+"""MCTS as published: UCT with all children of a leaf at once and a random one of them as the rollout."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from agents.planning.ledger import Candidate, Ledger, PlanResult, Progress, Searchable, state_value
+from agents.planning.registry import PlannerSettings, check_at_least, register_planner
+from scene_envs.errors import unknown_name
+
+ROLLOUTS = ("random", "all")
+
+
+@dataclass(eq=False)
+class _Node:
+    candidate: Candidate
+    parent: _Node | None = None
+    children: list[_Node] = field(default_factory=list)
+    visits: int = 0
+    total: float = 0.0
+    closed: bool = False
+
+
+@register_planner("mcts")
+@dataclass(frozen=True)
+class MCTSPlanner(PlannerSettings):
+    """Monte Carlo tree search of Pfaff et al. (2025), inference-time search.
+
+    An iteration descends by ``mean + exploration * sqrt(2 ln(visits of the parent) / visits)``, children without a
+    visit first, to a leaf; makes all its ``children`` in one batch; and backs up the value of a random one of them, or
+    of all. The search stops at a state in which nothing is masked. The objects that are still masked in the best state
+    are removed from what is returned, where the problem has ``without_masked`` and the objective does not fall.
+
+    Attributes:
+        exploration: weight of the bound; the values are in [0, 1].
+        children: children of a leaf; null takes ``branching``.
+        rollout: ``random`` backs up one new child, ``all`` each of them.
+        seed: of the choice of the child, with the seed of the root.
+    """
+
+    name: str = "mcts"
+    widens = True
+    exploration: float = 1.0
+    children: int | None = None
+    rollout: str = "random"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_at_least(self, 0, "exploration", "seed")
+        check_at_least(self, 1, "children")
+        if self.rollout not in ROLLOUTS:
+            raise unknown_name("rollout", str(self.rollout), ROLLOUTS)
+
+    def make(self, branching: int) -> MCTSPlanner:
+        """The planner."""
+        return replace(self, children=branching if self.children is None else self.children)
+
+    def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
+        """Spend up to ``budget`` expansions below the problem's current state."""
+        ledger = Ledger(problem, budget, progress)
+        rng = np.random.default_rng([self.seed, getattr(ledger.root.state, "seed", 0)])
+        root = _Node(ledger.root)
+        while ledger.left and not root.closed:
+            leaf = self._select(root)
+            actions = ledger.actions(leaf.candidate)[: self.children or 1]
+            if not actions and _is_done(leaf.candidate.state):
+                break
+            made = ledger.expand([(leaf.candidate, action) for action in actions])
+            leaf.children = [_Node(child, leaf) for child in made if child.valid]
+            if not leaf.children:
+                _close(leaf)
+                continue
+            rolled = leaf.children if self.rollout == "all" else [leaf.children[rng.integers(len(leaf.children))]]
+            for node in rolled:
+                _back_up(node, node.candidate.value)
+        return _cleaned(problem, ledger.result())
+
+    def _select(self, node: _Node) -> _Node:
+        while node.children:
+            weight = self.exploration * math.sqrt(2.0 * math.log(max(1, node.visits)))
+            node = max(
+                (child for child in node.children if not child.closed),
+                key=lambda c: c.total / c.visits + weight / math.sqrt(c.visits) if c.visits else math.inf,
+            )
+        return node
+
+
+def _back_up(node: _Node | None, value: float) -> None:
+    while node is not None:
+        node.visits += 1
+        node.total += value
+        node = node.parent
+
+
+def _close(node: _Node) -> None:
+    """Leave out a leaf without children, and every node above it whose children are all closed."""
+    current: _Node | None = node
+    while current is not None and all(child.closed for child in current.children):
+        current.closed = True
+        current = current.parent
+
+
+def _is_done(state: object) -> bool:
+    """Whether nothing is masked in ``state``."""
+    mask = getattr(state, "mask", None)
+    return mask is not None and not bool(mask.any())
+
+
+def _cleaned(problem: Searchable, result: PlanResult) -> PlanResult:
+    """``result`` with the masked objects removed from its best state, unless that scores less."""
+    remove = getattr(problem, "without_masked", None)
+    if remove is None or not result.best_path:
+        return result
+    cleaned = remove(result.best_state)
+    value = state_value(problem, cleaned)
+    return replace(result, best_state=cleaned, best_value=value) if value >= result.best_value else result

@@ -1,0 +1,81 @@
+"""UCT: upper confidence bounds applied to trees of whole scenes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from agents.planning.ledger import Candidate, Ledger, PlanResult, Progress, Searchable
+from agents.planning.registry import PlannerSettings, check_at_least, register_planner
+from agents.planning.tree import Node, Tree
+
+
+@register_planner("uct")
+@dataclass(frozen=True)
+class UCTPlanner(PlannerSettings):
+    """Upper confidence bounds applied to trees (Kocsis & Szepesvári 2006), for states that score themselves.
+
+    Every state of the search MDP is a whole scene, so its objective is its value and there are no random rollouts:
+    one iteration selects by UCB1, expands one action, evaluates the child and backs its value up. A branch whose
+    actions are all spent is closed; the search ends early when the tree is. A child that holds the same scene as
+    another node, or that scores less than its parent by more than ``max_loss``, counts and is not searched below.
+
+    Attributes:
+        exploration: weight of the UCB1 bound. sqrt(2) is the textbook value for independent values over the whole of
+            [0, 1]; siblings of one scene differ by a few hundredths, hence the smaller default.
+        parallel: expansions selected before any is evaluated, by virtual loss: they become one batch of the
+            denoiser. Every value gives its own tree, the same one each time. null takes ``branching``.
+        children: children of a state before its children are searched; null takes ``branching``.
+        widening: exponent of progressive widening: a state of n visits may have n^widening children; 0 for never.
+        max_loss: how much less than its parent's a child's value may be; 1 prunes nothing but the same scenes.
+    """
+
+    name: str = "uct"
+    widens = True
+    exploration: float = 0.05
+    parallel: int | None = None
+    children: int | None = None
+    widening: float = 0.5
+    max_loss: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_at_least(self, 1, "parallel", "children")
+        check_at_least(self, 0, "exploration", "widening", "max_loss")
+
+    def make(self, branching: int) -> UCTPlanner:
+        """The planner."""
+        return replace(
+            self,
+            parallel=branching if self.parallel is None else self.parallel,
+            children=branching if self.children is None else self.children,
+        )
+
+    def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
+        """Spend up to ``budget`` expansions on the tree below the problem's current state."""
+        ledger = Ledger(problem, budget, progress)
+        tree = Tree(ledger.root.state, ledger.actions(ledger.root), self.exploration, self.children, self.widening)
+        seen = {ledger.root.fingerprint}
+        while ledger.left:
+            selected = _select_up_to(tree, min(self.parallel or 1, ledger.left))
+            if not selected:
+                break
+            parents = [Candidate(node.state, node.value or 0.0, node.path) for node, _ in selected]
+            children = ledger.expand([(parent, action) for parent, (_, action) in zip(parents, selected, strict=True)])
+            if not children:
+                for node, action in selected:
+                    tree.release(node, action)
+                break
+            for (node, action), child in zip(selected, children, strict=True):
+                if not child.valid:
+                    tree.release(node, action)
+                    continue
+                pruned = child.fingerprint in seen or child.value < (node.value or 0.0) - self.max_loss
+                seen.add(child.fingerprint)
+                tree.attach(node, action, child.state, child.value, () if pruned else ledger.actions(child))
+        return ledger.result(tree)
+
+
+def _select_up_to(tree: Tree, count: int) -> list[tuple[Node, int]]:
+    selected: list[tuple[Node, int]] = []
+    while len(selected) < count and (choice := tree.select()) is not None:
+        selected.append(choice)
+    return selected
