@@ -36,7 +36,8 @@ from rich.table import Table
 from agents.planning import SearchConfig, list_planners, run_search
 from agents.planning.registry import planner_settings
 from agents.planning.search_run import _Run  # the search alone, without loading and writing
-from scene_envs.envs.masks import CulpritsMask, resolve_mask
+from scene_envs.envs.mask_generators import CulpritsMask
+from scene_envs.envs.masks import resolve_mask
 from scene_envs.envs.resolvers import resolve_prior, resolve_reward
 from scene_envs.envs.scoring import RewardScorer
 from scene_envs.scene import SceneBatch

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         DenoisingTorchRLEnv,
         DenoisingVectorEnv,
         SearchEnv,
+        check_branchable,
         list_masks,
         register_mask,
     )
@@ -59,6 +60,7 @@ __all__ = [
     "SearchEnv",
     "UnknownNameError",
     "__version__",
+    "check_branchable",
     "describe",
     "feasibility",
     "generate",
@@ -93,6 +95,7 @@ __getattr__ = lazy_names(
             "DenoisingTorchRLEnv",
             "DenoisingVectorEnv",
             "SearchEnv",
+            "check_branchable",
             "list_masks",
             "register_mask",
         ],

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from scene_envs.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from scene_envs.envs.branchable import NotBranchableError, check_branchable
     from scene_envs.envs.denoising import DenoisingCore
     from scene_envs.envs.denoising_gymnasium import DenoisingEnv
     from scene_envs.envs.denoising_torchrl import DenoisingTorchRLEnv
@@ -27,6 +28,7 @@ __all__ = [
     "DenoisingTorchRLEnv",
     "DenoisingVectorEnv",
     "MaskGenerator",
+    "NotBranchableError",
     "ResetNeededError",
     "Score",
     "SearchEnv",
@@ -34,6 +36,7 @@ __all__ = [
     "SearchState",
     "StepResult",
     "Trajectories",
+    "check_branchable",
     "list_masks",
     "register_mask",
 ]
@@ -41,6 +44,7 @@ __all__ = [
 __getattr__ = lazy_names(
     __name__,
     {
+        "scene_envs.envs.branchable": ["NotBranchableError", "check_branchable"],
         "scene_envs.envs.denoising": ["DenoisingCore"],
         "scene_envs.envs.denoising_gymnasium": ["DenoisingEnv"],
         "scene_envs.envs.denoising_torchrl": ["DenoisingTorchRLEnv"],

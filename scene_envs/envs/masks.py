@@ -1,15 +1,15 @@
-"""Mask generators of the search: which slots of a scene the next inpaintings regenerate."""
+"""Registry of the masks of the search: which slots of a scene the next inpaintings regenerate."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
-import torch
 from torch import Tensor
 
+from scene_envs.envs import mask_generators as shipped
 from scene_envs.envs.scoring import Score
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.plugins import plugin_entry_points
@@ -25,12 +25,21 @@ the only source of randomness. Slots of welded objects are taken out afterwards.
 ENTRY_POINT_GROUP = "scene_envs.masks"
 """Packages offer mask generators under this group: an entry named after the mask, whose value is a MaskGenerator."""
 
-MAX_PENETRATION = 1e-3
-"""Object pairs that overlap deeper than this (m) count, as in feasibility."""
-
 Generator = TypeVar("Generator", bound=MaskGenerator)
 
-_MASKS: dict[str, MaskGenerator] = {}
+_MASKS: dict[str, MaskGenerator] = {
+    "culprits": shipped.CulpritsMask(),
+    "empty": shipped.EmptyMask(),
+    "given": shipped.GivenMask(),
+    "infeasible": shipped.infeasible_mask,
+    "infeasible_or_empty": shipped.infeasible_or_empty_mask,
+    "lowest_scoring": shipped.LowestScoringMask(),
+    "off_prompt": shipped.OffPromptMask(),
+    "penetrating": shipped.penetrating_mask,
+    "random": shipped.random_mask,
+    "region": shipped.RegionMask(),
+    "unstable": shipped.unstable_mask,
+}
 
 
 def register_mask(name: str) -> Callable[[Generator], Generator]:
@@ -63,11 +72,14 @@ def list_masks() -> list[str]:
 
 
 def resolve_mask(mask: Any) -> MaskGenerator:
-    """A mask generator from its name, or a function of that form.
+    """A mask generator from its name, a mapping of its name and settings, or a function of that form.
 
     Raises:
-        UnknownNameError: no mask generator has that name; the nearest known one is offered.
-        InvalidInputError: neither a name nor a function.
+        UnknownNameError: no mask generator has that name, or it has no such setting; the nearest known is offered.
+        InvalidInputError: none of these.
+
+    >>> resolve_mask({"name": "lowest_scoring", "count": 2})
+    LowestScoringMask(count=2)
     """
     if isinstance(mask, str):
         if mask in _MASKS:
@@ -76,122 +88,21 @@ def resolve_mask(mask: Any) -> MaskGenerator:
         if mask not in plugins:
             raise unknown_name("mask generator", mask, list_masks())
         return register_mask(mask)(plugins[mask].load())
+    if isinstance(mask, Mapping) and "name" in mask:
+        return _with_settings(resolve_mask(str(mask["name"])), {k: v for k, v in mask.items() if k != "name"}, mask)
     if callable(mask):
         return mask  # type: ignore[no-any-return]
     raise InvalidInputError(f"mask={mask!r}: give a name ({', '.join(list_masks())}) or a function")
 
 
-def bad_objects(scene: SceneBatch, score: Score) -> Tensor | None:
-    """(N,) bool: free objects that the objective blames, or None when it says nothing about single objects.
-
-    An object is blamed when the objective's flag ``feasible`` is False for it or, lacking that flag, when its
-    credit per object is not positive.
-    """
-    if "feasible" in score.object_flags:
-        return scene.is_free[0] & ~score.object_flags["feasible"][0]
-    if score.per_object is not None:
-        return scene.is_free[0] & (score.per_object[0] <= 0)
-    return None
-
-
-@register_mask("infeasible")
-def infeasible_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-    """The blamed objects and all empty slots; a random half when that is nothing, or when no object is blamed."""
-    bad = bad_objects(scene, score)
-    if bad is None:
-        return random_mask(scene, score, rng)
-    mask = bad | scene.is_empty[0]
-    return mask if bool(mask.any()) else random_mask(scene, score, rng)
-
-
-@register_mask("random")
-def random_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-    """A random half of the free objects (rounded up), and all empty slots."""
-    free = torch.nonzero(scene.is_free[0]).flatten().numpy()
-    chosen = rng.choice(free, size=(len(free) + 1) // 2, replace=False)
-    mask = scene.is_empty[0].clone()
-    mask[torch.from_numpy(chosen)] = True
-    return mask
-
-
-@dataclass(frozen=True)
-class CulpritsMask:
-    """The fewest objects whose replacement ends all overlaps, and a few empty slots.
-
-    An objective that counts feasible objects blames both objects of an overlapping pair; replacing one of them is
-    enough. Objects that overlap most others go first, until no kept pair overlaps. Blamed objects that overlap nothing
-    (they fall or slide) go too. Where that is fewer than ``at_least`` slots, random empty ones join, so that good
-    scenes can grow. An objective that says nothing about single objects gets ``at_least`` random slots.
-
-    Few slots at a time matter. While the noise is high the kept objects are hidden in it too, so the masked slots take
-    their usual share of objects whatever is already there: with all empty slots masked, inpainting by clamping crowds
-    the scene and spoils what was kept.
-
-    Args:
-        at_least: slots regenerated, when the scene has as many.
-
-    A scene without free objects is regenerated whole.
-    """
-
-    at_least: int = 4
-
-    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-        """(N,) bool, True where a slot is regenerated.
-
-        Args:
-            scene: a batch of one.
-            score: the objective's verdict on it.
-            rng: breaks ties and draws slots.
-        """
-        free, empty = scene.is_free[0], scene.is_empty[0]
-        if not bool(free.any()):
-            return empty.clone()
-        bad = bad_objects(scene, score)
-        mask = torch.zeros_like(empty)
-        if bad is None:
-            mask[self._draw(free | empty, self.at_least, rng)] = True
-            return mask
-        mask[_culprits(scene, bad, rng)] = True
-        for more in (empty, free):
-            mask[self._draw(more & ~mask, self.at_least - int(mask.sum()), rng)] = True
-        return mask
-
-    @staticmethod
-    def _draw(candidates: Tensor, count: int, rng: np.random.Generator) -> list[int]:
-        slots = torch.nonzero(candidates).flatten().tolist()
-        chosen: list[int] = rng.permutation(slots)[: max(0, count)].astype(int).tolist()
-        return chosen
-
-
-def _culprits(scene: SceneBatch, bad: Tensor, rng: np.random.Generator) -> list[int]:
-    """Slots of blamed objects (``bad``, (N,) bool), less those that are fine once others are gone."""
-    from scene_envs.physics import penetration  # with the physics libraries, which other masks spare
-
-    blamed = torch.nonzero(bad).flatten().tolist()
-    if not blamed:
-        return []
-    pairs = [pair.slots for pair in penetration(scene).pairs[0] if pair.depth > MAX_PENETRATION]
-    overlapping = {slot for pair in pairs for slot in pair}
-    welded = set(torch.nonzero(scene.is_welded[0]).flatten().tolist())
-    return cover(pairs, welded, rng) + [slot for slot in blamed if slot not in overlapping]
-
-
-def cover(pairs: Sequence[tuple[int, int]], fixed: Collection[int], rng: np.random.Generator) -> list[int]:
-    """Few slots, none of them ``fixed``, that touch every pair: greedy vertex cover, ties broken by ``rng``.
-
-    >>> cover([(1, 2), (2, 3), (2, 4)], (), np.random.default_rng(0))
-    [2]
-    >>> cover([(0, 1), (0, 2)], {0}, np.random.default_rng(0))
-    [1, 2]
-    """
-    chosen = {slot for pair in pairs for slot in pair if slot not in fixed and not set(pair).isdisjoint(fixed)}
-    left = [pair for pair in pairs if chosen.isdisjoint(pair)]
-    while left:
-        slots, counts = np.unique(left, return_counts=True)
-        slot = int(rng.choice(slots[counts == counts.max()]))
-        chosen.add(slot)
-        left = [pair for pair in left if slot not in pair]
-    return sorted(chosen)
-
-
-register_mask("culprits")(CulpritsMask())
+def _with_settings(generator: MaskGenerator, settings: Mapping[str, Any], mask: Mapping[str, Any]) -> MaskGenerator:
+    if not settings:
+        return generator
+    known: list[str] = [field.name for field in fields(generator)] if is_dataclass(generator) else []
+    for name in settings:
+        if name not in known:
+            raise unknown_name(f"setting of mask {mask['name']}", name, known)
+    try:
+        return replace(generator, **settings)  # type: ignore[type-var]
+    except TypeError as error:
+        raise InvalidInputError(f"mask={dict(mask)}: {error}") from None

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from scene_envs.envs.mask_generators import OffPromptMask
 from scene_envs.envs.masks import resolve_mask
 from scene_envs.envs.prompts import EnvPrompts
 from scene_envs.envs.scoring import RewardScorer, Score
@@ -136,6 +137,8 @@ class SearchProblem:
         self.prompting = EnvPrompts(self.prior, chosen.prompt, chosen.guidance, self.slots)
         self.prompt = self.prompting.draw(np.random.default_rng(0)) if self.prompting.given else None
         self.mask_generator = resolve_mask(chosen.mask)
+        if isinstance(self.mask_generator, OffPromptMask) and self.mask_generator.prompt is None:
+            self.mask_generator = OffPromptMask(self.prompt)
         self.scorer = RewardScorer(chosen.objective, chosen.workers)
         self.evaluations = 0
         self._told_of_scale = False

@@ -14,7 +14,20 @@ import torch
 from agents.planning.search_run import SearchConfig
 from rewards import RewardOutput
 from scene_envs.envs import masks, register_mask
-from scene_envs.envs.masks import CulpritsMask, MaskGenerator, cover, infeasible_mask, list_masks, resolve_mask
+from scene_envs.envs.mask_generators import (
+    CulpritsMask,
+    EmptyMask,
+    GivenMask,
+    LowestScoringMask,
+    OffPromptMask,
+    RegionMask,
+    cover,
+    infeasible_mask,
+    infeasible_or_empty_mask,
+    penetrating_mask,
+    unstable_mask,
+)
+from scene_envs.envs.masks import MaskGenerator, list_masks, resolve_mask
 from scene_envs.envs.scoring import RewardScorer, Score
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.scene import SceneBatch
@@ -47,7 +60,9 @@ def masked(scene: SceneBatch, mask: MaskGenerator, seed: int = 0) -> tuple[list[
 
 def test_one_object_in_the_way_of_two_is_the_only_one_replaced() -> None:
     scene = table_with(("teapot", 0, 0, 0), ("dinner_plate", 0.15, 0, 0), ("dinner_plate", -0.15, 0, 0))
-    assert masked(scene, infeasible_mask) == ([1, 2, 3], 30)
+    assert masked(scene, infeasible_mask) == masked(scene, penetrating_mask) == ([1, 2, 3], 0)
+    assert masked(scene, infeasible_or_empty_mask) == ([1, 2, 3], 30)
+    assert masked(scene, unstable_mask) == ([], 0)
     assert masked(scene, CulpritsMask(at_least=1)) == ([1], 0)
 
 
@@ -61,6 +76,8 @@ def test_of_two_that_overlap_one_is_replaced_and_chance_says_which() -> None:
 def test_objects_that_fall_or_sink_into_the_table_are_replaced() -> None:
     scene = table_with(("teacup", 0.2, 0, 0.05), ("teapot", -0.2, 0, -0.01), ("teacup", 0, 0.2, 0))
     assert masked(scene, CulpritsMask(at_least=2)) == ([1, 2], 0)
+    assert masked(scene, infeasible_mask) == ([1, 2], 0)
+    assert (masked(scene, unstable_mask), masked(scene, penetrating_mask)) == (([1], 0), ([2], 0))
     assert masked(scene, CulpritsMask(at_least=5)) == ([1, 2], 3)
 
 
@@ -99,12 +116,67 @@ def test_covers_touch_every_pair_and_spare_the_fixed() -> None:
         assert len(chosen) < 7 or not pairs or all(any(s in p for p in pairs) for s in chosen)
 
 
+def test_feasibility_is_asked_of_physics_where_the_objective_says_nothing_of_it() -> None:
+    scene = table_with(("teacup", 0.2, 0, 0.05), ("teapot", -0.2, 0, 0))
+    silent = RewardScorer("object_count")(scene)
+    assert infeasible_mask(scene, silent, np.random.default_rng(0)).nonzero().flatten().tolist() == [1]
+
+
+def test_one_simulation_serves_the_mask_and_the_objective(monkeypatch: pytest.MonkeyPatch) -> None:
+    from rewards.verdicts import forget_verdicts
+    from scene_envs import physics
+
+    calls: list[int] = []
+    judge = physics.feasibility
+    monkeypatch.setattr(
+        "scene_envs.physics.feasibility", lambda batch, **limits: calls.append(len(batch)) or judge(batch, **limits)
+    )
+    forget_verdicts()
+    scene = table_with(("teacup", 0.2, 0, 0.05))
+    score = RewardScorer("feasible_share")(scene)
+    infeasible_mask(scene, score, np.random.default_rng(0))
+    infeasible_mask(scene, RewardScorer("object_count")(scene), np.random.default_rng(0))
+    assert calls == [1]
+
+
+def test_masks_with_settings() -> None:
+    scene = table_with(("teacup", 0.2, 0, 0), ("teapot", -0.2, 0, 0), ("dinner_plate", 0, 0.3, 0))
+    assert masked(scene, EmptyMask()) == ([], 30)
+    assert masked(scene, EmptyMask(count=3)) == ([], 3)
+    assert masked(scene, RegionMask(low=(0, -1, -1), high=(1, 1, 1), empty=2)) == ([1, 3], 2)
+    assert masked(scene, resolve_mask({"name": "given", "slots": [2, 5]})) == ([2], 1)
+    score = Score(torch.zeros(1), torch.ones(1, dtype=torch.bool), per_object=torch.arange(34.0).flip(0)[None])
+    lowest = LowestScoringMask(count=2)(scene, score, np.random.default_rng(0))
+    assert lowest.nonzero().flatten().tolist() == [2, 3]
+    with pytest.raises(InvalidInputError, match="needs an objective with credit per object"):
+        LowestScoringMask()(scene, RewardScorer(lambda b, c: b.counts.float())(scene), np.random.default_rng(0))
+    with pytest.raises(InvalidInputError, match=r"slots=\[99\] must be some of 0\.\.33"):
+        masked(scene, GivenMask((99,)))
+    with pytest.raises(InvalidInputError, match="no corners"):
+        RegionMask(low=(0, 0), high=(1, 1, 1))
+    with pytest.raises(UnknownNameError, match="did you mean 'count'"):
+        resolve_mask({"name": "empty", "cuont": 3})
+
+
+def test_what_the_prompt_does_not_ask_for_is_off_prompt() -> None:
+    scene = table_with(("teacup", 0.2, 0, 0), ("teacup", -0.2, 0, 0), ("teacup", 0, 0.3, 0), ("teapot", 0, -0.3, 0))
+    two_cups = OffPromptMask("A scene with two cups.")
+    objects, empty = masked(scene, two_cups)
+    assert len(objects) == 1
+    assert objects[0] in (1, 2, 3)
+    assert empty == 0
+    assert masked(scene, OffPromptMask("A scene with five cups.")) == ([], 2)
+    assert masked(scene, OffPromptMask("A scene with three cups.")) == ([], 0)
+    with pytest.raises(InvalidInputError, match="no prompt"):
+        masked(scene, OffPromptMask())
+
+
 def test_names_are_resolved_and_unknown_ones_get_an_offer() -> None:
     assert resolve_mask("culprits") == CulpritsMask()
     assert resolve_mask("infeasible") is infeasible_mask
     with pytest.raises(UnknownNameError, match="did you mean 'culprits'"):
         resolve_mask("culprit")
-    with pytest.raises(InvalidInputError, match="culprits, infeasible, random"):
+    with pytest.raises(InvalidInputError, match="culprits, empty, given"):
         resolve_mask(3)
 
 

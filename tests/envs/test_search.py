@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import warnings
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -14,8 +15,6 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from agents.priors.testing import tiny_prior
 from rewards.base import RewardOutput
 from scene_envs.envs import ResetNeededError, SearchEnv
-from scene_envs.envs.masks import infeasible_mask, random_mask
-from scene_envs.envs.scoring import Score
 from scene_envs.envs.search import NodeRandomness
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.scene import SceneBatch
@@ -131,7 +130,7 @@ def test_only_masked_slots_change_and_welded_ones_never(prior, free_objects):
     assert not torch.equal(child.scene[root.mask], root.scene[root.mask])
     scene = env.scene(root)
     blamed = scene.is_free[0] & (torch.arange(34) % 2 == 1)
-    assert torch.equal(root.mask, blamed | scene.is_empty[0])
+    assert torch.equal(root.mask, blamed)
 
 
 def test_states_survive_pickling_and_restoring(env, prior, free_objects):
@@ -211,20 +210,57 @@ def test_randomness_of_nodes_is_theirs_alone():
     assert len(seeds) == 12
 
 
-def test_masks_fall_back_to_a_random_half():
-    everything = torch.zeros(1, 34, dtype=torch.long) + 1
-    everything[0, 0] = 0
-    full = SceneBatch.from_parts(torch.zeros(1, 34, 3), torch.eye(3).expand(1, 34, 3, 3), everything, "dimsum_table")
-    value, valid = torch.zeros(1), torch.ones(1, dtype=torch.bool)
-    all_good = Score(value, valid, object_flags={"feasible": full.is_free})
-    silent = Score(value, valid)
-    for score in (all_good, silent):
-        mask = infeasible_mask(full, score, np.random.default_rng(0))
-        assert int(mask.sum()) == 17  # half of 33, rounded up
-        assert not mask[0]
-        assert torch.equal(mask, random_mask(full, score, np.random.default_rng(0)))
-    by_credit = Score(value, valid, per_object=torch.arange(34)[None] - 3.0)
-    assert torch.nonzero(infeasible_mask(full, by_credit, np.random.default_rng(0))).flatten().tolist() == [1, 2, 3]
+def test_nothing_masked_ends_the_episode(prior, free_objects):
+    nothing = lambda scene, score, rng: torch.zeros(34, dtype=torch.bool)  # noqa: E731
+    env = SearchEnv(prior=prior, objective=free_objects, num_steps=1, mask=lambda s, r, rng: s.is_empty[0])
+    env.reset(seed=0)
+    env.problem.mask_generator = nothing
+    _, _, terminated, truncated, _ = env.step(0)
+    assert (terminated, truncated) == (True, False)
+    assert list(env.legal_actions()) == []
+    with pytest.raises(ResetNeededError, match="nothing left to improve"):
+        env.step(0)
+    with pytest.raises(InvalidInputError, match="nothing is left to improve"):
+        env.expand(env.state, 0)
+
+
+def test_the_largest_value_ends_the_episode_and_a_larger_objective_is_told(prior, caplog):
+    env = SearchEnv(prior=prior, objective=lambda b, c: RewardOutput(torch.full((len(b),), 50.0)), num_steps=1)
+    env.reset(seed=0)
+    assert (env.evaluate(), env.state.objective) == (1.0, 50.0)
+    assert list(env.legal_actions()) == []
+    assert "the objective is 50, more than objective_scale=33" in caplog.text
+
+
+def test_an_nfe_budget_truncates(prior, free_objects):
+    env = SearchEnv(prior=prior, objective=free_objects, num_steps=2, max_nfe=6)
+    env.reset(seed=0)
+    assert env.step(0)[2:4] == (False, False)
+    assert env.step(0)[2:4] == (False, True)
+    with pytest.raises(ResetNeededError, match="max_nfe=6"):
+        env.step(0)
+
+
+def test_without_masked_removes_what_is_still_masked(env):
+    env.reset(seed=0)
+    state = env.clone_state()
+    scene, cleaned = env.scene(state), env.scene(env.without_masked(state))
+    assert bool((state.mask & scene.is_free[0]).any())
+    assert torch.equal(cleaned.is_free[0], scene.is_free[0] & ~state.mask)
+    assert torch.equal(cleaned.tensor[0][~state.mask], scene.tensor[0][~state.mask])
+
+
+def test_fingerprints_are_of_the_set_of_objects(env):
+    env.reset(seed=0)
+    state = env.clone_state()
+    shuffled = replace(state, scene=state.scene[torch.randperm(34)], path=(1,))
+    moved = replace(state, scene=state.scene + torch.tensor(0.01))
+    assert state.fingerprint == shuffled.fingerprint != moved.fingerprint
+
+
+def test_slots_for_fixed_objects_alone_are_refused(prior, free_objects):
+    with pytest.raises(InvalidInputError, match="slots=1"):
+        SearchEnv(prior=prior, objective=free_objects, slots=1)
 
 
 def test_spec_goes_to_json_and_actions_are_checked(env, prior, free_objects, monkeypatch):

@@ -1,0 +1,282 @@
+"""Mask generators that ship: by blame of the objective, by physics, by prompt, by place."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from scene_envs.envs.resolvers import resolve_reward
+from scene_envs.envs.scoring import Score
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import SceneBatch
+
+MAX_PENETRATION = 1e-3
+"""Object pairs that overlap deeper than this (m) count, as in feasibility."""
+
+
+def bad_objects(scene: SceneBatch, score: Score) -> Tensor | None:
+    """(N,) bool: free objects that the objective blames, or None when it says nothing about single objects.
+
+    An object is blamed when the objective's flag ``feasible`` is False for it or, lacking that flag, when its
+    credit per object is not positive.
+    """
+    if "feasible" in score.object_flags:
+        return scene.is_free[0] & ~score.object_flags["feasible"][0]
+    if score.per_object is not None:
+        return scene.is_free[0] & (score.per_object[0] <= 0)
+    return None
+
+
+def infeasible_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+    """The free objects that physics calls infeasible, whatever the objective; none when all are feasible.
+
+    The verdict is the objective's flag ``feasible`` where it has one, and that of the reward ``feasible_objects``
+    otherwise, which simulates no scene twice.
+    """
+    flags = score.object_flags.get("feasible")
+    if flags is None:
+        flags = resolve_reward("feasible_objects")(scene).object_flags["feasible"]
+    return scene.is_free[0] & ~flags[0]
+
+
+def penetrating_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+    """The free objects that are more than 1 mm inside another object."""
+    mask = torch.zeros_like(scene.is_empty[0])
+    mask[sorted({slot for pair in _overlaps(scene) for slot in pair})] = True
+    return mask & scene.is_free[0]
+
+
+def unstable_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+    """The infeasible objects that overlap nothing: they fall, slide, or are outside the workspace."""
+    return infeasible_mask(scene, score, rng) & ~penetrating_mask(scene, score, rng)
+
+
+def infeasible_or_empty_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+    """The infeasible objects and all empty slots, as in Pfaff et al. (2025)."""
+    return infeasible_mask(scene, score, rng) | scene.is_empty[0]
+
+
+def random_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+    """A random half of the free objects (rounded up), and all empty slots."""
+    free = torch.nonzero(scene.is_free[0]).flatten().numpy()
+    chosen = rng.choice(free, size=(len(free) + 1) // 2, replace=False)
+    mask = scene.is_empty[0].clone()
+    mask[torch.from_numpy(chosen)] = True
+    return mask
+
+
+@dataclass(frozen=True)
+class EmptyMask:
+    """Empty slots, and no object.
+
+    Args:
+        count: how many, at random; None for all.
+    """
+
+    count: int | None = None
+
+    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+        """(N,) bool, True where a slot is regenerated."""
+        return _some(scene.is_empty[0], scene.tensor.shape[1] if self.count is None else self.count, rng)
+
+
+@dataclass(frozen=True)
+class LowestScoringMask:
+    """The free objects of the lowest credit, ties at random.
+
+    Args:
+        count: k, how many.
+
+    Raises:
+        InvalidInputError: the objective gives no credit per object.
+    """
+
+    count: int = 4
+
+    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+        """(N,) bool, True where a slot is regenerated."""
+        if score.per_object is None:
+            raise InvalidInputError(
+                "mask=lowest_scoring needs an objective with credit per object; choose another mask"
+            )
+        credit = score.per_object[0].double().masked_fill(~scene.is_free[0], torch.inf).cpu().numpy()
+        order = np.lexsort((rng.random(len(credit)), credit))[: self.count]
+        mask = torch.zeros_like(scene.is_empty[0])
+        mask[torch.from_numpy(order)] = True
+        return mask & scene.is_free[0]
+
+
+@dataclass(frozen=True)
+class RegionMask:
+    """The free objects whose frames are in a box of the workspace, and some empty slots.
+
+    Args:
+        low: smallest x, y, z, m.
+        high: largest x, y, z, m.
+        empty: empty slots that join, at random.
+    """
+
+    low: Sequence[float] = (-np.inf, -np.inf, -np.inf)
+    high: Sequence[float] = (np.inf, np.inf, np.inf)
+    empty: int = 4
+
+    def __post_init__(self) -> None:
+        if len(self.low) != 3 or len(self.high) != 3 or any(a > b for a, b in zip(self.low, self.high, strict=True)):
+            raise InvalidInputError(f"mask=region: low={self.low} and high={self.high} are no corners x, y, z of a box")
+
+    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+        """(N,) bool, True where a slot is regenerated."""
+        place = scene.translations[0]
+        inside = ((place >= torch.tensor(self.low)) & (place <= torch.tensor(self.high))).all(dim=-1)
+        return (inside & scene.is_free[0]) | _some(scene.is_empty[0], self.empty, rng)
+
+
+@dataclass(frozen=True)
+class GivenMask:
+    """Slots that the user names.
+
+    Args:
+        slots: their indices.
+    """
+
+    slots: Sequence[int] = ()
+
+    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+        """(N,) bool, True where a slot is regenerated."""
+        mask = torch.zeros_like(scene.is_empty[0])
+        outside = [slot for slot in self.slots if not 0 <= slot < len(mask)]
+        if outside or not self.slots:
+            raise InvalidInputError(f"mask=given: slots={list(self.slots)} must be some of 0..{len(mask) - 1}")
+        mask[list(self.slots)] = True
+        return mask
+
+
+@dataclass(frozen=True)
+class OffPromptMask:
+    """What a prompt speaks against, and empty slots for what it asks for.
+
+    These are the objects beyond the number it gives, both things of a relation that does not hold, and as many empty
+    slots as objects are missing.
+
+    Args:
+        prompt: the text; None takes the prompt of the search.
+    """
+
+    prompt: str | None = None
+
+    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+        """(N,) bool, True where a slot is regenerated; none when the scene is as the prompt says.
+
+        Raises:
+            InvalidInputError: there is no prompt, or it cannot be read.
+        """
+        from scene_envs.datasets import parse_prompt, scene_facts
+
+        if self.prompt is None:
+            raise InvalidInputError("mask=off_prompt has no prompt: give prompt= to the search, or to the mask")
+        claims = parse_prompt(self.prompt, scene.scene_type)
+        (facts,) = scene_facts(scene)
+        mask, missing, named = torch.zeros_like(scene.is_empty[0]), 0, set[int]()
+        for check in claims.check(facts):
+            free = [slot for slot in check.slots if bool(scene.is_free[0, slot])]
+            if hasattr(check.claim, "name"):
+                named.update(free)
+            if check.holds:
+                continue
+            relation = not hasattr(check.claim, "number")
+            surplus = len(free) if relation else check.found - check.expected
+            if surplus > 0:  # of the total, what has no name in the prompt goes first
+                order = sorted(rng.permutation(free).tolist(), key=lambda slot: slot in named)
+                mask[order[:surplus]] = True
+            missing += max(0, check.expected - check.found)
+        return mask | _some(scene.is_empty[0], missing, rng)
+
+
+@dataclass(frozen=True)
+class CulpritsMask:
+    """The fewest objects whose replacement ends all overlaps, and a few empty slots.
+
+    An objective that counts feasible objects blames both objects of an overlapping pair; replacing one of them is
+    enough. Objects that overlap most others go first, until no kept pair overlaps. Blamed objects that overlap nothing
+    (they fall or slide) go too. Where that is fewer than ``at_least`` slots, random empty ones join, so that good
+    scenes can grow. An objective that says nothing about single objects gets ``at_least`` random slots.
+
+    Few slots at a time matter. While the noise is high the kept objects are hidden in it too, so the masked slots take
+    their usual share of objects whatever is already there: with all empty slots masked, inpainting by clamping crowds
+    the scene and spoils what was kept.
+
+    Args:
+        at_least: slots regenerated, when the scene has as many.
+
+    A scene without free objects is regenerated whole.
+    """
+
+    at_least: int = 4
+
+    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+        """(N,) bool, True where a slot is regenerated.
+
+        Args:
+            scene: a batch of one.
+            score: the objective's verdict on it.
+            rng: breaks ties and draws slots.
+        """
+        free, empty = scene.is_free[0], scene.is_empty[0]
+        if not bool(free.any()):
+            return empty.clone()
+        bad = bad_objects(scene, score)
+        mask = torch.zeros_like(empty)
+        if bad is None:
+            return _some(free | empty, self.at_least, rng)
+        mask[_culprits(scene, bad, rng)] = True
+        for more in (empty, free):
+            mask |= _some(more & ~mask, self.at_least - int(mask.sum()), rng)
+        return mask
+
+
+def _culprits(scene: SceneBatch, bad: Tensor, rng: np.random.Generator) -> list[int]:
+    """Slots of blamed objects (``bad``, (N,) bool), less those that are fine once others are gone."""
+    blamed = torch.nonzero(bad).flatten().tolist()
+    if not blamed:
+        return []
+    pairs = _overlaps(scene)
+    overlapping = {slot for pair in pairs for slot in pair}
+    welded = set(torch.nonzero(scene.is_welded[0]).flatten().tolist())
+    return cover(pairs, welded, rng) + [slot for slot in blamed if slot not in overlapping]
+
+
+def cover(pairs: Sequence[tuple[int, int]], fixed: Collection[int], rng: np.random.Generator) -> list[int]:
+    """Few slots, none of them ``fixed``, that touch every pair: greedy vertex cover, ties broken by ``rng``.
+
+    >>> cover([(1, 2), (2, 3), (2, 4)], (), np.random.default_rng(0))
+    [2]
+    >>> cover([(0, 1), (0, 2)], {0}, np.random.default_rng(0))
+    [1, 2]
+    """
+    chosen = {slot for pair in pairs for slot in pair if slot not in fixed and not set(pair).isdisjoint(fixed)}
+    left = [pair for pair in pairs if chosen.isdisjoint(pair)]
+    while left:
+        slots, counts = np.unique(left, return_counts=True)
+        slot = int(rng.choice(slots[counts == counts.max()]))
+        chosen.add(slot)
+        left = [pair for pair in left if slot not in pair]
+    return sorted(chosen)
+
+
+def _overlaps(scene: SceneBatch) -> list[tuple[int, int]]:
+    """Pairs of slots that overlap deeper than feasibility allows."""
+    from scene_envs.physics import penetration  # with the physics libraries, which other masks spare
+
+    return [pair.slots for pair in penetration(scene).pairs[0] if pair.depth > MAX_PENETRATION]
+
+
+def _some(candidates: Tensor, count: int, rng: np.random.Generator) -> Tensor:
+    """(N,) bool: ``count`` of the candidates (N,) at random, or as many as there are."""
+    slots = torch.nonzero(candidates).flatten().tolist()
+    mask = torch.zeros_like(candidates)
+    mask[rng.permutation(slots)[: max(0, count)].astype(int).tolist()] = True
+    return mask
