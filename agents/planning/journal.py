@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import os
 import struct
@@ -39,7 +40,7 @@ class Journal:
         self.path = Path(path)
         self._states: list[SearchState] = []
         self._taken = 0
-        settings = {key: repr(value) for key, value in settings.items()}
+        settings = {key: _described(value) for key, value in settings.items()}
         if self.path.exists() and self.path.stat().st_size:
             self._read(settings)
         else:
@@ -108,3 +109,20 @@ class Journal:
                     f"{self.path} is of a search with {name}={before}, not {now}; give another output, or that value"
                 )
         self._states = [SearchState(**state) for states in records[1:] for state in states]
+
+
+def _described(value: Any) -> str:
+    """A setting as text that the next process gives too; a prior by its weights, other objects by their class alone."""
+    if isinstance(value, str | int | float | bool | None):
+        return repr(value)
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key}: {_described(value[key])}" for key in sorted(value)) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_described, value)) + "]"
+    if hasattr(value, "weights"):
+        digest = hashlib.blake2b(digest_size=8)
+        for name, tensor in sorted(value.weights().items()):
+            digest.update(name.encode() + tensor.detach().cpu().contiguous().numpy().tobytes())
+        return f"weights {digest.hexdigest()}"
+    kind = value if hasattr(value, "__qualname__") else type(value)
+    return f"{kind.__module__}.{kind.__qualname__}"

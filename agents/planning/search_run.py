@@ -86,7 +86,9 @@ def run_search(
     config = SearchConfig(**settings) if config is None else config
     named = {"prior": prior, "objective": objective, **plain_tree(config)}
     folder = None if output is None else Path(output)
-    run = _Run(resolve_prior(prior), objective, config, {k: v for k, v in named.items() if k not in _LIMITS}, folder)
+    loaded = resolve_prior(prior)
+    fixed = {key: value for key, value in named.items() if key not in _LIMITS} | {"prior": loaded}
+    run = _Run(loaded, objective, config, fixed, folder)
     started = time.perf_counter()
     planner, scenes = config.planner.make(config.branching), config.scenes
     actions = max(scenes, config.branching) if config.planner.widens else config.branching

@@ -105,9 +105,6 @@ class SearchProblem:
     Args:
         **settings: fields of :class:`~scene_envs.envs.settings.SearchSettings`.
 
-    Raises:
-        InvalidInputError: no slot can be regenerated, as all belong to fixed objects.
-
     Attributes:
         evaluations: denoiser evaluations (NFE) spent so far, ``num_steps`` per generated scene and twice that many with
             guidance.
@@ -128,11 +125,6 @@ class SearchProblem:
         self.branching, self.max_depth, self.num_steps = chosen.branching, chosen.max_depth, chosen.num_steps
         self.prior.step_table(self.num_steps)  # says now, not later, that num_steps is more than the prior has
         free_slots = self.slots - len(self.scene_type.fixed)
-        if free_slots < 1:
-            raise InvalidInputError(
-                f"slots={self.slots}: all of them belong to fixed objects of {self.scene_type.name!r}, so that a "
-                "search has nothing to regenerate; give more"
-            )
         self.scale = float(free_slots) if chosen.objective_scale is None else chosen.objective_scale
         self.prompting = EnvPrompts(self.prior, chosen.prompt, chosen.guidance, self.slots)
         self.prompt = self.prompting.draw(np.random.default_rng(0)) if self.prompting.given else None

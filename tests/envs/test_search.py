@@ -258,11 +258,6 @@ def test_fingerprints_are_of_the_set_of_objects(env):
     assert state.fingerprint == shuffled.fingerprint != moved.fingerprint
 
 
-def test_slots_for_fixed_objects_alone_are_refused(prior, free_objects):
-    with pytest.raises(InvalidInputError, match="slots=1"):
-        SearchEnv(prior=prior, objective=free_objects, slots=1)
-
-
 def test_spec_goes_to_json_and_actions_are_checked(env, prior, free_objects, monkeypatch):
     monkeypatch.setattr("scene_envs.envs.spaces.resolve_prior", lambda name: prior)
     made = gym.make(ID, objective="object_count", branching=2, num_steps=2)

@@ -1,0 +1,212 @@
+"""Sessions: limits, interrupts, resumption from a journal, searches in lock-step; with every planner."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from agents.planning import PlanResult, Session, list_planners, run_search
+from agents.priors.base import ScenePrior
+from agents.priors.testing import tiny_prior
+from rewards import RewardContext, RewardOutput
+from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError
+from scene_envs.scene import SceneBatch
+from tests.planning.test_planners import ToyTree, scrambled
+
+SETTINGS: dict[str, Any] = {"budget": 15, "branching": 3, "num_steps": 2, "seed": 3, "baseline": False, "slots": 12}
+PLANNERS = ("beam", "best_of", "greedy", "mcts", "uct")
+
+
+def near_middle(batch: SceneBatch, context: RewardContext) -> RewardOutput:
+    """Half of the free objects within 20 cm of the middle, so that Φ stays below 1; the others are to blame."""
+    central = batch.is_free & (batch.translations[..., :2].norm(dim=-1) < 0.2)
+    return RewardOutput(0.5 * central.sum(-1).float(), object_flags={"feasible": central})
+
+
+class Counting:
+    """``near_middle`` that counts scenes and acts at the third call."""
+
+    def __init__(self, act: Callable[[], None] = lambda: None) -> None:
+        self.scored, self.calls, self.act = 0, 0, act
+
+    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        self.calls += 1
+        if self.calls == 4:  # the root, two rounds, and then
+            self.act()
+        self.scored += len(batch)
+        return near_middle(batch, context)
+
+
+def interrupt() -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.fixture(autouse=True)
+def _without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("draw_curve", "draw_scene"):
+        monkeypatch.setattr(f"agents.planning.search_run.{name}", lambda *_, **__: None)
+
+
+@pytest.fixture(scope="module")
+def prior() -> ScenePrior:
+    return tiny_prior()
+
+
+def test_the_planners_are_those_that_ship() -> None:
+    assert set(PLANNERS) <= set(list_planners())
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_a_killed_run_goes_on_bit_for_bit(planner: str, prior: ScenePrior, tmp_path: Path) -> None:
+    settings = {**SETTINGS, "planner": {"name": planner}}
+    whole = run_search(prior, Counting(), output=tmp_path, **settings)
+    journal = tmp_path / "search.journal"
+    content = journal.read_bytes()
+    for share in (0.999, 0.5, 0.0001, 0):  # a kill while writing the last record, in the middle, the first, none
+        journal.write_bytes(content[: int(share * len(content))])
+        objective = Counting()
+        again = run_search(prior, objective, output=tmp_path, **settings)
+        assert again.search.values == whole.search.values
+        assert again.search.best_path == whole.search.best_path
+        assert torch.equal(again.best.tensor, whole.best.tensor)
+        assert journal.read_bytes() == content
+        assert objective.scored < 17 if share > 0.4 else objective.scored >= 15
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+@pytest.mark.parametrize("count", [1, 3])
+def test_an_interrupt_keeps_the_best_and_the_same_call_goes_on(
+    planner: str, count: int, prior: ScenePrior, tmp_path: Path
+) -> None:
+    rounds_of_three = {"best_of": {"parallel": 3}, "beam": {"width": 1}}.get(planner, {})
+    settings = {**SETTINGS, "planner": {"name": planner, **rounds_of_three}, "count": count, "budget": 12}
+    calls = Counting(interrupt) if count == 1 else Counting()
+    if count > 1:  # every search has a root of its own, scored before the rounds
+        calls.calls, calls.act = -(count - 1), interrupt
+    stopped = run_search(prior, calls, output=tmp_path, **settings)
+    assert stopped.metrics["stopped"] == "interrupt"
+    assert stopped.metrics["nfe"] == 2 * 6 * count
+    assert stopped.search.best_value == max(stopped.search.values)
+    assert (tmp_path / "best.safetensors").exists()
+    resumed = run_search(prior, Counting(), output=tmp_path, **settings)
+    straight = run_search(prior, near_middle, **settings)
+    assert resumed.search.values == straight.search.values
+    assert torch.equal(resumed.best.tensor, straight.best.tensor)
+
+
+def test_sigterm_is_an_interrupt(prior: ScenePrior) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    outcome = run_search(prior, Counting(lambda: os.kill(os.getpid(), signal.SIGTERM)), **SETTINGS)
+    assert outcome.metrics["stopped"] == "interrupt"
+    assert outcome.best_of is None
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_limits(planner: str, prior: ScenePrior) -> None:
+    settings = {**SETTINGS, "planner": {"name": planner}, "slots": None}
+    by_nfe = run_search(prior, near_middle, **settings, max_nfe=2 * 7 + 1)
+    assert len(by_nfe.search.values) <= 7
+    by_time = run_search(prior, near_middle, **settings, max_seconds=1e-9)
+    assert by_time.metrics["stopped"] == ("time" if planner != "best_of" else None)  # 15 scenes are its one round
+    assert by_time.search.values == by_nfe.search.values[: len(by_time.search.values)] or planner == "best_of"
+
+
+def test_searches_side_by_side_are_those_alone(prior: ScenePrior) -> None:
+    sizes: list[int] = []
+
+    def objective(batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        sizes.append(len(batch))
+        return near_middle(batch, context)
+
+    together = run_search(prior, objective, count=3, **SETTINGS)
+    assert len(together.best) == 3
+    assert sizes[:4] == [1, 1, 1, 9]
+    assert sizes.count(9) >= 3
+    values = [plan.best_value for plan in together.searches]
+    assert values == sorted(values, reverse=True)
+    alone = [run_search(prior, near_middle, **{**SETTINGS, "seed": seed}).search for seed in (3, 4, 5)]
+    assert sorted(plan.values for plan in alone) == sorted(plan.values for plan in together.searches)
+
+
+def test_a_larger_budget_goes_on(prior: ScenePrior, tmp_path: Path) -> None:
+    settings = {**SETTINGS, "planner": "greedy", "slots": None}
+    small = run_search(prior, Counting(), output=tmp_path, **{**settings, "budget": 10})
+    objective = Counting()
+    large = run_search(prior, objective, output=tmp_path, **settings)
+    assert large.search.values[:10] == small.search.values
+    assert objective.scored == 1 + 5  # the root, and what is new
+
+
+def test_another_search_in_the_folder_is_refused(prior: ScenePrior, tmp_path: Path) -> None:
+    run_search(prior, near_middle, output=tmp_path, **SETTINGS)
+    with pytest.raises(InvalidInputError, match="is of a search with seed=3, not 4; give another output"):
+        run_search(prior, near_middle, output=tmp_path, **{**SETTINGS, "seed": 4})
+    journal = tmp_path / "search.journal"
+    content = bytearray(journal.read_bytes())
+    content[len(content) // 2] ^= 1
+    journal.write_bytes(content)
+    with pytest.raises(CorruptFileError, match="is damaged at byte"):
+        run_search(prior, near_middle, output=tmp_path, **SETTINGS)
+    journal.write_text("a letter to a friend")
+    with pytest.raises(CorruptFileError, match="is no journal"):
+        run_search(prior, near_middle, output=tmp_path, **SETTINGS)
+    assert journal.read_text() == "a letter to a friend"
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"budget": 0}, "budget=0 scenes do not cover the 3 first samples"),
+        ({"max_nfe": 5}, "max_nfe=5 does not cover the 3 first samples .* raise it to 6"),
+        ({"max_seconds": 0}, "max_seconds=0 must be more than 0"),
+        ({"count": 0}, "count=0: give the number of scenes"),
+        ({"num_steps": 0}, "num_steps=0 must be"),
+        ({"slots": 1}, "slots=1: scenes of .* need at least 2 slots"),
+        ({"planner": "beem"}, "did you mean 'beam'"),
+        ({"planner": {"name": "beam", "width": 0}}, "planner beam: width must be a number >= 1, got 0"),
+        ({"planner": {"name": "mcts", "rollout": "some"}}, "unknown rollout 'some'"),
+        ({"mask": {"name": "empty", "cuont": 1}}, "did you mean 'count'"),
+    ],
+)
+def test_bad_settings_name_themselves(settings: dict[str, Any], message: str, prior: ScenePrior) -> None:
+    with pytest.raises(SceneEnvsError, match=message):
+        run_search(prior, near_middle, **{**SETTINGS, **settings})
+
+
+class Impatient:
+    """A planner of another package: it expands the root for ever and leaves the end to the session."""
+
+    def plan(self, problem: Any, budget: int, progress: Any = None) -> PlanResult:
+        for action in range(10_000):
+            problem.expand_batch([(problem.clone_state(), action)])
+        raise AssertionError("the session lets no plan go beyond its budget")
+
+
+class Failing:
+    """A planner with an error of its own."""
+
+    def plan(self, problem: Any, budget: int, progress: Any = None) -> PlanResult:
+        problem.expand_batch([(problem.clone_state(), 0)])
+        raise ZeroDivisionError("in the planner")
+
+
+def test_a_planner_that_never_ends_is_ended_at_its_budget() -> None:
+    results = Session(ToyTree(scrambled, branching=100)).run(Impatient(), [(), ()], budget=20)
+    for result in results:
+        assert result.values == [scrambled((action,)) for action in range(20)]
+        assert result.best_value == max(result.values) == scrambled(result.best_state)
+
+
+def test_an_error_of_one_plan_ends_all_and_is_raised() -> None:
+    with pytest.raises(ZeroDivisionError, match="in the planner"):
+        Session(ToyTree(scrambled)).run(Failing(), [(), ()], budget=20)
+    broken = ToyTree(lambda path: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        Session(broken).run(Impatient(), [(), ()], budget=20)
