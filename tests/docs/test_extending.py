@@ -103,7 +103,7 @@ class Digits:
 
 
 def test_the_planner_finds_the_best_leaf_of_a_tree_within_its_budget() -> None:
-    settings = planner_settings("beam")
+    settings = planner_settings("levels")
     result = settings(width=2).make(4).plan(Digits(), 100)
     assert result.best_path == (2, 2, 2)
     assert result.best_value == pytest.approx(0.222)
@@ -138,11 +138,11 @@ def test_the_loss_starts_as_the_policy_gradient_and_holds_the_policy_back() -> N
 
 def test_names_work_together_on_the_command_line(prior: str, tmp_path: Path) -> None:
     """The scene type and the network have tests of their own, in the folders of grammars and of networks."""
-    search = ["objective=tower", "objective_scale=0.5", "mask=outer", "planner=beam", "planner.width=1", "slots=6"]
+    search = ["objective=tower", "objective_scale=0.5", "mask=outer", "planner=levels", "planner.width=1", "slots=6"]
     small = ["budget=3", "branching=2", "num_steps=1", f"output={tmp_path / 'search'}"]
     assert main(["search", f"prior={prior}", *search, *small]) == 0
     settings = yaml.safe_load((tmp_path / "search" / "config.yaml").read_text())
-    assert settings["planner"] == {"name": "beam", "width": 1}
+    assert settings["planner"] == {"name": "levels", "width": 1}
     run = ["algorithm=proximal", "algorithm.penalty=0.5", "algorithm.gradient_steps=2", "reward=tower", "slots=6"]
     sizes = ["iterations=2", "batch_size=3", "num_steps=3", "regularisation.bank_size=8", "guard.scenes=2"]
     sizes += ["regularisation.batch_size=2", "logger.report_scenes=0", "logger.progress=none"]

@@ -1,4 +1,4 @@
-"""A planner: beam search, which expands the best few states of every depth."""
+"""A planner: the best few states of every depth, all their children."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ import numpy as np
 from agents.planning import PlannerSettings, PlanResult, register_planner
 
 
-@register_planner("beam")
+@register_planner("levels")
 @dataclass(frozen=True)
 class Beam(PlannerSettings):
     """Beam search.
@@ -16,7 +16,7 @@ class Beam(PlannerSettings):
         width: states that are kept of every depth.
     """
 
-    name: str = "beam"
+    name: str = "levels"
     width: int = 2
 
     def make(self, branching):
