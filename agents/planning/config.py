@@ -36,8 +36,8 @@ class SearchConfig:
         branching: inpaintings per state; the first ``branching`` scenes are fresh samples of the prior.
         max_depth: inpaintings in a row, the fresh sample included.
         num_steps: denoiser evaluations per scene.
-        mask: which objects to regenerate: ``culprits``, ``infeasible``, ``random``, another
-            registered one, or in Python a function.
+        mask: which objects to regenerate: a registered name, or a mapping of it and its settings; in Python a function
+            as well.
         slots: slots per scene; null takes the scene type's.
         objective_scale: objective at which Φ is 1; null takes the environment's.
         seed: of the tree; the baseline's first scenes are those of the tree.
@@ -66,7 +66,7 @@ class SearchConfig:
     prompt: str | None = None
     guidance: float = 0.0
     planner: PlannerSettings = nested(
-        UCTPlanner, folder="planner", option="uct", kinds=planner_settings, registered=list_planners
+        BeamPlanner, folder="planner", option="beam", kinds=planner_settings, registered=list_planners
     )
 
     @property

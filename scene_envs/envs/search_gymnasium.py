@@ -88,7 +88,7 @@ class SearchEnv(gym.Env[Any, Any]):
     | `num_steps` | `50` | denoising steps per inpainting |
     | `prior` | `None` | name, path or prior; `None` is the shipped prior of the scene type |
     | `slots` | `None` | slots per scene; `None` is the scene type's number, more is allowed |
-    | `mask` | `"culprits"` | [mask generator](../search.md#masks): a name, a mapping of it and its settings, a function |
+    | `mask` | `"culprits"` | [mask](../search.md#masks): a name, a mapping with its settings, or a function |
     | `objective_scale` | `None` | objective value at which Φ = 1; `None` is the number of free slots |
     | `max_nfe` | `None` | denoiser evaluations per episode; `None` is any number |
     | `workers` | `0` | processes for physics in the objective; 0 computes in this one |

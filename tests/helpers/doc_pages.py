@@ -49,11 +49,15 @@ SMALLER: dict[str, dict[str, str]] = {
     "docs/evaluation_learned.md": {"seeds=10": "seeds=1"},
     "docs/physics.md": {"workers=4": "workers=0"},
     "docs/planners/best_of.md": {"branching=8": "branching=2", "budget=8": "budget=2"},
+    "docs/planners/beam.md": {"budget=10": "budget=4"},
+    "docs/planners/greedy.md": {"children=3": "children=2", "budget=9": "budget=4"},
+    "docs/planners/mcts.md": {"branching=3": "branching=2", "children=3": "children=2", "budget=9": "budget=4"},
     "docs/planners/uct.md": {"branching=3": "branching=2", "budget=9": "budget=3"},
     "docs/search.md": {
         "budget=64, branching=4": "budget=2, branching=2, num_steps=20, slots=13",
         "branching=4)": "branching=2, num_steps=20, slots=13)",
         "budget=32": "budget=2",
+        "num_steps=2))": "num_steps=2, slots=8))",
     },
 }
 """Text of Python blocks, by page, and what a test puts in its place: the same calls with smaller numbers."""
@@ -102,7 +106,7 @@ SMALL_KEYS: dict[str, dict[str, str]] = {
         "regularisation.bank_size": "16",
         "guard.scenes": "4",
     },
-    "search": {"budget": "2", "num_steps": "20", "slots": "13", "branching": "2"},
+    "search": {"budget": "2", "count": "2", "num_steps": "20", "slots": "13", "branching": "2"},
     "evaluate": {"count": "2", "num_steps": "20", "training_scenes": "8", "prompt_count": "2", "workers": "0"},
     "export": {"count": "1", "num_steps": "20", "workers": "0"},
     "view": {"count": "2", "num_steps": "3", "first": "0", "open": "false"},

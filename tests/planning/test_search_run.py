@@ -18,7 +18,15 @@ from scene_envs.envs import SearchEnv
 from scene_envs.errors import InvalidInputError, SceneEnvsError
 from scene_envs.scene import SceneBatch
 
-SETTINGS = {"budget": 24, "branching": 3, "num_steps": 4, "max_depth": 5, "seed": 3, "mask": "infeasible"}
+SETTINGS = {
+    "budget": 24,
+    "branching": 3,
+    "num_steps": 4,
+    "max_depth": 5,
+    "seed": 3,
+    "mask": "infeasible",
+    "planner": "uct",
+}
 
 
 def central_objects(batch: SceneBatch, context: RewardContext) -> RewardOutput:

@@ -13,7 +13,7 @@ COMMANDS = {
     "sample": "draw scenes and pictures from a prior",
     "complete": "fill the empty slots of scenes, keeping their objects",
     "rearrange": "give the objects of scenes new poses",
-    "search": "search for one scene that scores high, at inference time",
+    "search": "search for scenes that score high, at inference time",
     "project": "make scenes simulation-ready: project out of penetration, then settle",
     "export": "write scenes for simulators and viewers: URDF, SDF, Drake, MJCF, USD, GLB, arrays",
     "view": "write a page that shows scenes in a browser: a dataset, samples, a prior or a grammar",

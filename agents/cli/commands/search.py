@@ -20,7 +20,7 @@ class SearchKeys(SearchConfig):
     Attributes:
         prior: a shipped name, or the folder of a prior or a run.
         objective: what the scene should score high on: any reward.
-        output: folder for best.safetensors, before.png, after.png and curve.png.
+        output: folder for best.safetensors, before.png, after.png and curve.png; the same command goes on there.
     """
 
     prior: str = "dimsum_table"
