@@ -10,7 +10,8 @@
 and range over the seeds. `--records` keeps the curve of each run as one line of JSON; runs that are in the file already
 are not repeated. The first scenes of all planners are the same for one seed.
 
-`crowding` masks the culprits of samples and some of their empty slots, inpaints once, and counts objects.
+`crowding` masks random slots of samples, or their culprits and some of their empty slots, inpaints once, and counts
+objects.
 
 `overhead` times 5,000 expansions on a problem that costs nothing, 1,000 at a time, and the share of a real search that
 is neither the denoiser, the objective nor the mask.
@@ -33,12 +34,12 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from agents.planning import SearchConfig, list_planners, run_search
+from agents.planning import list_planners, run_search
 from agents.planning.registry import planner_settings
-from agents.planning.search_run import _Run  # the search alone, without loading and writing
+from scene_envs.envs import SearchEnv
 from scene_envs.envs.mask_generators import CulpritsMask
 from scene_envs.envs.masks import resolve_mask
-from scene_envs.envs.resolvers import resolve_prior, resolve_reward
+from scene_envs.envs.resolvers import resolve_prior
 from scene_envs.envs.scoring import RewardScorer
 from scene_envs.scene import SceneBatch
 
@@ -75,6 +76,8 @@ def compare(options: argparse.Namespace) -> None:
                 baseline=False,
                 planner=planner_of(planner),
             )
+            if outcome.metrics["stopped"]:
+                return
             scale = outcome.metrics["objective_scale"]
             curve = [scale * value for value in outcome.search.curve]
             seconds = outcome.metrics["seconds"]["search"]
@@ -112,6 +115,12 @@ def crowding(options: argparse.Namespace) -> None:
     CONSOLE.print("free objects {:.1f}, feasible {:.1f}, culprits {:.1f}".format(*map(float, before)))
     gone = batch.is_free & ~fixed
     CONSOLE.print(f"without the culprits: {float(gone.sum(-1).float().mean()):.1f} objects")
+    shuffled = torch.zeros_like(everything)
+    for row, empties in zip(shuffled, batch.is_empty, strict=True):
+        row[1 + torch.randperm(len(row) - 1, generator=generators[0])[: int(empties.sum())]] = True
+    new = prior.inpaint(batch, shuffled, num_steps=options.num_steps, generators=generators)
+    counts = [float((scenes.is_free & shuffled).sum(-1).float().mean()) for scenes in (batch, new)]
+    CONSOLE.print("as many random slots as are empty: {:.1f} objects in them before, {:.1f} after".format(*counts))
     for slots in (0, 2, 4, 8, 99):
         mask = fixed.clone()
         for row, empties in zip(mask, batch.is_empty, strict=True):
@@ -181,18 +190,18 @@ def overhead(options: argparse.Namespace) -> None:
         table.add_row(name, *(f"{ms:.3f}" for ms in per), f"{size:.2f}")
     CONSOLE.print(table)
     prior = resolve_prior(options.prior)
-    inpaint, objective = Stopwatch(prior.inpaint), Stopwatch(resolve_reward(options.objective))
-    mask = Stopwatch(resolve_mask(options.mask))
+    inpaint, mask = Stopwatch(prior.inpaint), Stopwatch(resolve_mask(options.mask))
+    prior.inpaint = inpaint
     table = Table("planner", "s", "denoiser", "objective", "mask", "the rest")
     for name in options.planners:
-        prior.inpaint = inpaint
+        env = SearchEnv(prior=prior, objective=options.objective, mask=mask, branching=options.scenes, max_depth=1000)
+        objective = Stopwatch(env.problem.scorer)
+        env.problem.scorer = objective
+        env.reset(seed=options.seed, options={"scene": SceneBatch.empty(prior.scene_type, 1)})
+        planner = planner_settings(planner_of(name)["name"])(**planner_of(name)).make(options.branching)
         inpaint.seconds = objective.seconds = mask.seconds = 0.0
-        config = SearchConfig(
-            budget=options.scenes, branching=options.branching, mask=mask, planner=planner_of(name), baseline=False
-        )
-        run = _Run(prior, objective, config, {}, None)
         begun = time.perf_counter()
-        run.plan(config.planner.make(config.branching), options.scenes, options.scenes, 1, "search", None)
+        planner.plan(env, options.scenes)
         total = time.perf_counter() - begun
         parts = [inpaint.seconds, objective.seconds, mask.seconds]
         table.add_row(name, f"{total:.1f}", *(f"{part / total:.1%}" for part in [*parts, total - sum(parts)]))

@@ -66,7 +66,7 @@ class SearchConfig:
     prompt: str | None = None
     guidance: float = 0.0
     planner: PlannerSettings = nested(
-        BeamPlanner, folder="planner", option="beam", kinds=planner_settings, registered=list_planners
+        GreedyPlanner, folder="planner", option="greedy", kinds=planner_settings, registered=list_planners
     )
 
     @property

@@ -219,11 +219,11 @@ def test_an_interrupted_command_says_so_and_exits_with_130(
 ) -> None:
     folder, output = prior.save(tmp_path / "prior"), tmp_path / "run"
     register_reward("interrupting")(Counting(interrupt))
-    words = ["search", f"prior={folder}", "objective=interrupting", "budget=9", "branching=3", "planner.width=1"]
+    words = ["search", f"prior={folder}", "objective=interrupting", "budget=9", "branching=3"]
     words += ["num_steps=2", "slots=12", f"output={output}"]
     assert main(words) == 130
     shown = capsys.readouterr()
-    assert "by beam with 12 denoiser evaluations" in shown.out
+    assert "by greedy with 12 denoiser evaluations" in shown.out
     assert "the same command goes on" in shown.err
     register_reward("interrupting")(Counting())
     assert main([*words, "max_seconds=1000", "count=1"]) == 0
