@@ -19,6 +19,7 @@ def _registries() -> list[dict[str, Any]]:
     """Every registry that users add to by name, the built-in entries in place."""
     from agents.networks.registry import _ENTRIES as networks
     from agents.planning.registry import _PLANNERS as planners
+    from agents.planning.registry import _load_shipped as load_planners
     from agents.post_training.algorithms import _ENTRIES as algorithms
     from rewards.registry import _registry as rewards
     from scene_envs.envs.masks import _MASKS
@@ -28,6 +29,7 @@ def _registries() -> list[dict[str, Any]]:
     from scene_envs.scene_types.registry import _REGISTRY
 
     list_grammars()  # registers the built-in ones, which happens once per process
+    load_planners()
     return [_REGISTRY, GRAMMARS, _MASKS, _FORMATS, rewards, networks, planners, algorithms]
 
 

@@ -7,16 +7,9 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from agents.configuration.fields import composed, moved, named, nested
-from agents.planning.beam import BeamPlanner
-from agents.planning.best_of import BestOfPlanner
 from agents.planning.greedy import GreedyPlanner
-from agents.planning.mcts import MCTSPlanner
 from agents.planning.registry import PlannerSettings, list_planners, planner_settings
-from agents.planning.uct import UCTPlanner
 from scene_envs.errors import InvalidInputError
-
-SHIPPED = (BeamPlanner, BestOfPlanner, GreedyPlanner, MCTSPlanner, UCTPlanner)
-"""Planners of this package, registered by their import."""
 
 
 @composed

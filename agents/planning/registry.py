@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, ClassVar, TypeVar
 
 from scene_envs.errors import InvalidInputError, unknown_name
@@ -35,6 +36,8 @@ class PlannerSettings:
         raise NotImplementedError(f"{type(self).__name__} must define make(branching)")
 
 
+_SHIPPED = ("beam", "best_of", "greedy", "mcts", "uct")
+"""Modules of this package that register a planner each."""
 _PLANNERS: dict[str, type[PlannerSettings]] = {}
 Settings = TypeVar("Settings", bound=type[PlannerSettings])
 
@@ -57,6 +60,7 @@ def register_planner(name: str) -> Callable[[Settings], Settings]:
 
 def list_planners() -> list[str]:
     """Names of all planners, those of installed packages included, sorted."""
+    _load_shipped()
     load_plugins(ENTRY_POINT_GROUP)
     return sorted(_PLANNERS)
 
@@ -68,10 +72,18 @@ def planner_settings(name: str) -> type[PlannerSettings]:
         UnknownNameError: no planner has that name; the nearest known one is offered.
     """
     if name not in _PLANNERS:
+        _load_shipped()
+    if name not in _PLANNERS:
         load_plugins(ENTRY_POINT_GROUP)
     if name not in _PLANNERS:
         raise unknown_name("planner", str(name), list_planners())
     return _PLANNERS[name]
+
+
+def _load_shipped() -> None:
+    """Import the planners of this package, each of which imports this module."""
+    for name in _SHIPPED:
+        import_module(f"agents.planning.{name}")
 
 
 def check_at_least(planner: PlannerSettings, least: float, *names: str) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -62,6 +64,9 @@ def prior() -> ScenePrior:
 
 def test_the_planners_are_those_that_ship() -> None:
     assert set(PLANNERS) <= set(list_planners())
+    alone = "from agents.planning import list_planners; print(*list_planners())"  # before anything else is imported
+    shown = subprocess.run([sys.executable, "-c", alone], capture_output=True, text=True, check=True).stdout.split()
+    assert set(PLANNERS) <= set(shown)
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
@@ -130,7 +135,7 @@ def test_searches_side_by_side_are_those_alone(prior: ScenePrior) -> None:
     together = run_search(prior, objective, count=3, **SETTINGS)
     assert len(together.best) == 3
     assert sizes[:4] == [1, 1, 1, 9]
-    assert 27 in sizes
+    assert sizes.count(9) >= 3
     values = [plan.best_value for plan in together.searches]
     assert values == sorted(values, reverse=True)
     alone = [run_search(prior, near_middle, **{**SETTINGS, "seed": seed}).search for seed in (3, 4, 5)]
