@@ -271,6 +271,9 @@ class PostTrainer:
                 "first": rewards[0] if rewards else None,
                 "last": rewards[-1] if rewards else None,
                 "best": self.guard.best_reward,
+                "invalid_scenes": round(
+                    sum((1.0 - row["valid_fraction"]) * self.config.batch_size for row in self.history)
+                ),
             },
             "guard": self.guard.summary(),
         }
