@@ -6,6 +6,8 @@ traceback only under ``--traceback`` or ``SCENE_ENVS_TRACEBACK=1``.
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import os
 import sys
 import traceback
@@ -20,11 +22,14 @@ from agents.cli.commands import COMMANDS, RENAMED
 from agents.cli.keys import Sources, compose, format_rows, help_text
 from agents.cli.sweep import expand_sweeps
 from agents.configuration.tree import config_text
+from agents.utils.interrupts import Terminated, terminable
 from scene_envs import __version__
 from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError, UnknownNameError, unknown_name
 
-DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
+DONE, FAILED, WRONG_INPUT, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 
+_MOST_TEXT = 4000
+"""Characters of an error message."""
 _USAGE = """\
 usage: scene-envs COMMAND key=value ...
 
@@ -67,12 +72,19 @@ def _guarded(words: list[str], work: Callable[[list[str]], int]) -> int:
         show_traceback = True
         words.remove("--traceback")
     try:
-        return work(words)
+        with terminable():
+            return work(words)
+    except Terminated:
+        return _complain("terminated; where the output can be resumed, the same command goes on", TERMINATED)
     except KeyboardInterrupt:
         return _complain("interrupted; where the output can be resumed, the same command goes on", INTERRUPTED)
     except BrokenPipeError:  # the reader of our output has gone, as in `scene-envs rewards | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
+    except RecursionError as error:
+        if show_traceback:
+            traceback.print_exc()
+        return _complain(f"a value or a file is nested too deeply ({_cut(error)}); write it flatter", WRONG_INPUT)
     except Exception as error:
         if show_traceback:
             traceback.print_exc()
@@ -184,15 +196,32 @@ def _verdict(error: Exception) -> tuple[str, int]:
         return str(error), WRONG_INPUT
     if isinstance(error, SceneEnvsError):
         return str(error), FAILED
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f"the disk is full{_at(error)}; finished files are kept: make room and run again", FAILED
+    if isinstance(error, OSError) and error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return f"the operating system allows no access{_at(error)}; put that right, or give another output", FAILED
     if isinstance(error, OSError):
-        return f"the operating system refused: {error}", FAILED
+        return f"the operating system refused: {_cut(error)}", FAILED
+    if isinstance(error, MemoryError):
+        return f"not enough memory ({_cut(error)}); give smaller sizes, such as batch_size=", FAILED
     return (
-        f"something unexpected happened, {type(error).__name__}: {error}. "
+        f"something unexpected happened, {type(error).__name__}: {_cut(error)}. "
         "Run again with --traceback to see where, and please report it",
         FAILED,
     )
 
 
+def _at(error: OSError) -> str:
+    return f" at {error.filename!r}" if error.filename else ""
+
+
+def _cut(error: BaseException) -> str:
+    text = str(error)
+    return text if len(text) <= _MOST_TEXT else f"{text[:_MOST_TEXT]}..."
+
+
 def _complain(text: str, status: int) -> int:
-    print(f"scene-envs: {text}", file=sys.stderr)
+    text = text if len(text) <= _MOST_TEXT else f"{text[:_MOST_TEXT]}..."
+    with contextlib.suppress(OSError):  # stderr may be closed
+        print(f"scene-envs: {text}".encode(errors="backslashreplace").decode(), file=sys.stderr)
     return status

@@ -12,11 +12,11 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
-from scene_envs.files import replacing, write_json
+from scene_envs.files import write_json
+from scene_envs.tensor_files import read_tensors, write_tensors
 
 SHIPPED = Path(__file__).parent / "shipped"
 CONFIG_NAME = "config.json"
@@ -72,9 +72,7 @@ def to_precision(weights: Mapping[str, Tensor], precision: str) -> dict[str, Ten
 def write_prior(directory: str | os.PathLike[str], config: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Path:
     """Write a prior's configuration and weights, each file atomically."""
     directory = Path(directory)
-    with replacing(directory / WEIGHTS_NAME) as weights:
-        save_file({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, weights)
-        weights.chmod(0o644)
+    write_tensors(directory / WEIGHTS_NAME, tensors)
     write_config(directory, config)
     return directory
 
@@ -110,7 +108,7 @@ def read_prior(name: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, 
     """
     config = read_config(name)
     with _weights_of(name) as file:
-        tensors = load_file(file)
+        tensors, _ = read_tensors(file)
     return config, {key: value.float() if value.is_floating_point() else value for key, value in tensors.items()}
 
 
