@@ -48,6 +48,22 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
             partial.unlink(missing_ok=True)
 
 
+def is_file(path: Path) -> bool:
+    """Whether there is a file; False also for names that the system cannot have."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def exists(path: Path) -> bool:
+    """Whether there is anything; False also for names that the system cannot have."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
+
+
 def storage_error(path: str | os.PathLike[str], error: OSError) -> StorageError:
     """The error to raise when ``path`` could not be written."""
     full = error.errno in (errno.ENOSPC, errno.EDQUOT)

@@ -35,7 +35,7 @@ def write_tensors(
     path = Path(path)
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     kept = dict(metadata or {})
-    content = save(plain, {**kept, DIGEST: _digest(plain, kept)})
+    content = _in_order(save(plain, {**kept, DIGEST: _digest(plain, kept)}))
     with replacing(path) as partial, partial.open("wb") as file:
         file.write(content)
         file.flush()
@@ -83,6 +83,14 @@ def check_beside(path: Path) -> None:
     found = hashlib.sha256(path.read_bytes()).hexdigest()
     if found not in beside.read_text(encoding="utf-8", errors="replace").split():
         raise CorruptFileError(_changed(path))
+
+
+def _in_order(content: bytes) -> bytes:
+    """The same file with its header sorted: equal contents make equal bytes."""
+    size = int.from_bytes(content[:8], "little")
+    header = json.dumps(json.loads(content[8 : 8 + size]), sort_keys=True, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 8)
+    return len(header).to_bytes(8, "little") + header + content[8 + size :]
 
 
 def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:

@@ -207,8 +207,8 @@ def _parsed(command: str, key: str, value: str) -> Any:
         value = f"[{value}]"  # a,b is a list, where Hydra would see a sweep
     try:
         found = OverridesParser.create().parse_override(f"{key}={value}").value()
-    except HydraException:
-        raise InvalidInputError(f"{command}: a value cannot be read: {key}={value}") from None
+    except (HydraException, ValueError):
+        raise InvalidInputError(f"{command}: a value cannot be read: {key}={value[:200]}") from None
     return OmegaConf.to_container(OmegaConf.create({"value": found}))["value"]  # type: ignore[index, call-overload]
 
 

@@ -38,6 +38,7 @@ usage: scene-envs COMMAND key=value ...
 scene-envs COMMAND --help lists the keys of a command; --traceback shows where an error came from.
 --cfg job prints the keys and runs nothing; --config FILE starts the run of a config.yaml again;
 --config-dir FOLDER adds groups and experiments (+experiment=NAME); --multirun seed=0,1,2 makes a run of each.
+--allow-local lets reward=./my_rewards.py:clutter run that file.
 A command writes into output=FOLDER, by default runs/COMMAND-TIME.
 """
 
@@ -115,6 +116,7 @@ def _dispatch(words: list[str]) -> int:
 def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str]) -> int:
     words = list(words)
     config_dir, file = _option(words, "--config-dir"), _option(words, "--config")
+    allow_local = _flag(words, "--allow-local")
     shown, sweep, asked = _option(words, "--cfg", "-c"), _flag(words, "--multirun", "-m"), _flag(words, "-h", "--help")
     if shown not in ("", "job"):
         raise InvalidInputError(f"--cfg {shown}: only --cfg job is known, which prints the keys and runs nothing")
@@ -125,9 +127,42 @@ def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str
         print(f"{program}: {meaning}.\n\n{help_text(config, named, config_dir)}")
         return DONE
     if not sweep:
-        return _run(command, module, compose(command, module.config(), named, sources), bool(shown))
+        settings = compose(command, module.config(), named, sources)
+        _check(settings, allow_local, bool(shown))
+        return _run(command, module, settings, bool(shown))
     runs = [(compose(command, module.config(), variant, sources), label) for variant, label in expand_sweeps(named)]
+    for settings, _ in runs:
+        _check(settings, allow_local, bool(shown))
     return _run_all(command, module, runs, bool(shown))
+
+
+def _check(settings: Any, allow_local: bool, only_show: bool) -> None:
+    """Refuse what needs no more than a look; ask before a file of the user's is run."""
+    if only_show:
+        return
+    for key in ("reward", "objective"):
+        if "/" in (text := str(getattr(settings, key, ""))) or ".py:" in text:
+            _ask_for_files(key, getattr(settings, key), allow_local)
+    if isinstance(seed := getattr(settings, "seed", 0), int) and not 0 <= seed < 2**63:
+        raise InvalidInputError(f"seed={seed} must be from 0 to 2^63 - 1")
+    if isinstance(device := getattr(settings, "device", "cpu"), str) and device != "cpu":
+        from agents.utils.devices import check_device
+
+        check_device(device)
+
+
+def _ask_for_files(key: str, reward: Any, allow_local: bool) -> None:
+    from rewards.local_files import allow_local_rewards, allowed_files, local_files
+
+    for path in local_files(reward):
+        if path in allowed_files():
+            continue
+        if not allow_local and sys.stdin is not None and sys.stdin.isatty():
+            print(f"{key}= runs the file {path}. Run it? [y/N] ", end="", file=sys.stderr, flush=True)
+            allow_local = sys.stdin.readline().strip().lower() in ("y", "yes")
+        if not allow_local:
+            raise InvalidInputError(f"{key}= would run the file {str(path)!r}; add --allow-local if you trust it")
+        allow_local_rewards(path)
 
 
 def _run(command: str, module: ModuleType, settings: Any, only_show: bool) -> int:
@@ -202,7 +237,7 @@ def _verdict(error: Exception) -> tuple[str, int]:
         return f"the operating system allows no access{_at(error)}; put that right, or give another output", FAILED
     if isinstance(error, OSError):
         return f"the operating system refused: {_cut(error)}", FAILED
-    if isinstance(error, MemoryError):
+    if isinstance(error, MemoryError) or "can't allocate memory" in str(error) or "out of memory" in str(error):
         return f"not enough memory ({_cut(error)}); give smaller sizes, such as batch_size=", FAILED
     return (
         f"something unexpected happened, {type(error).__name__}: {_cut(error)}. "

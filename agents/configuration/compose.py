@@ -83,7 +83,11 @@ def compose_tree(
     try:
         with initialize_config_module("configs", version_base="1.3"):
             composed = compose(name, overrides=[*overrides, *values])
-        result = OmegaConf.to_container(composed, resolve=True)
+        result = OmegaConf.to_container(composed, resolve=False)  # ${…} in a text is text
+    except ValueError as error:
+        if isinstance(error, HydraException | OmegaConfBaseException):
+            raise InvalidInputError(f"{command}: {_reason(error)}") from error
+        raise InvalidInputError(f"{command}: a value cannot be read ({str(error)[:100]})") from None
     except (HydraException, OmegaConfBaseException) as error:
         if f"In 'recipe/{chosen.get('recipe')}'" in str(error):
             raise InvalidInputError(

@@ -191,12 +191,14 @@ def _scalar(hint: Any, value: Any, path: str) -> Any:
             _refuse(hint, value, path)
     if hint is str and isinstance(value, int | float) and not isinstance(value, bool):
         return str(value)
+    if hint is int and isinstance(value, int) and abs(value) >= 2**63:
+        raise InvalidInputError(f"{path} is a number of {len(str(abs(value)))} digits; whole numbers end at 2^63")
     right = isinstance(value, hint) and (hint is bool or not isinstance(value, bool))
     return value if right else _refuse(hint, value, path)
 
 
 def _refuse(hint: Any, value: Any, path: str) -> Any:
-    raise InvalidInputError(f"{path}={_typed(value)} is not {_wanted(hint)}")
+    raise InvalidInputError(f"{path}={_typed(value)[:300]} is not {_wanted(hint)}")
 
 
 def _wanted(hint: Any) -> str:

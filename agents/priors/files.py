@@ -15,12 +15,13 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
-from scene_envs.files import write_json
+from scene_envs.files import is_file, write_json
 from scene_envs.tensor_files import read_tensors, write_tensors
 
 SHIPPED = Path(__file__).parent / "shipped"
 CONFIG_NAME = "config.json"
 WEIGHTS_NAME = "model.safetensors"
+_MOST_NAME = 1000
 RESIDUAL = "residual."
 """What the names of measured tensors, which are no weights, start with."""
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
@@ -35,10 +36,14 @@ def list_priors() -> list[str]:
 def find_prior(name: str | os.PathLike[str]) -> Path:
     """The directory of a prior: a shipped name, a prior directory, or a run directory that holds ``prior/``."""
     path = Path(name)
+    if len(str(name)) > _MOST_NAME or "\0" in str(name):
+        raise InvalidInputError(
+            f"prior={str(name)[:60] + '...'!r} is neither a name nor a path ({len(str(name))} characters)"
+        )
     for candidate in (SHIPPED / str(name), path, path / "prior"):
-        if (candidate / CONFIG_NAME).is_file():
+        if is_file(candidate / CONFIG_NAME):
             return candidate
-    if path.exists() or os.sep in str(name):
+    if (len(str(name)) < _MOST_NAME // 4 and path.exists()) or os.sep in str(name):
         raise InvalidInputError(f"{str(name)!r} holds no prior: neither it nor its prior/ folder has a {CONFIG_NAME}")
     raise unknown_name("prior", str(name), list_priors())
 
@@ -87,8 +92,12 @@ def read_config(name: str | os.PathLike[str]) -> dict[str, Any]:
     file = find_prior(name) / CONFIG_NAME
     try:
         config: dict[str, Any] = json.loads(file.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CorruptFileError(f"{str(file)!r} is not valid JSON: {error}") from error
+    except (ValueError, RecursionError) as error:
+        raise CorruptFileError(
+            f"{str(file)!r} is not valid JSON: {type(error).__name__}: {str(error)[:200]}"
+        ) from error
+    if not isinstance(config, dict):
+        raise CorruptFileError(f"{str(file)!r} holds no mapping, so it is not the configuration of a prior")
     return config
 
 
