@@ -47,11 +47,17 @@ def serve(inbox: Connection, outbox: Connection, timeout: float) -> None:
         except MemoryError:
             reply = ("failed", ("RewardError", "the reward took more memory than reward_memory= allows"))
         except SceneEnvsError as error:
-            reply = ("failed", (type(error).__name__, str(error)))
+            hint = "; reward_memory= allows more" if _lacked_memory(error) else ""
+            reply = ("failed", (type(error).__name__, f"{error}{hint}"))
         except BaseException as error:
-            reply = ("failed", ("RewardError", f"the reward cannot be made: {describe_error(error)}"))
+            reply = ("failed", ("RewardError", f"the reward raised {describe_error(error)}"))
         signal.setitimer(signal.ITIMER_REAL, 0)
         outbox.send(reply)
+
+
+def _lacked_memory(error: BaseException) -> bool:
+    cause = error.__cause__
+    return isinstance(cause, MemoryError) or (isinstance(cause, RuntimeError) and "allocate memory" in str(cause))
 
 
 class _Answers:

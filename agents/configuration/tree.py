@@ -52,6 +52,8 @@ def field_values(kind: type, tree: Mapping[str, Any], path: str = "", command: s
 def convert(field: dataclasses.Field[Any], hint: Any, value: Any, path: str, command: str = "") -> Any:
     """``value`` as a field of type ``hint`` wants it."""
     if field.metadata.get("named"):
+        if isinstance(value, int | float):
+            raise InvalidInputError(f"{path}={_typed(value)[:60]} is neither a name nor a mapping with a name")
         alone = isinstance(value, Mapping) and set(value) == {"name"}
         return value["name"] if alone else _plain(value)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):

@@ -104,16 +104,23 @@ def read_notes(path: Path) -> dict[str, Any]:
     """The facts that :func:`write_shard` kept in the footer, and ``rows``; raises CorruptFileError."""
     file = open_parquet(path)
     footer = file.schema_arrow.metadata or {}
-    return {**json.loads(footer.get(_NOTES, b"{}")), "rows": file.metadata.num_rows}
+    try:
+        return {**json.loads(footer.get(_NOTES, b"{}")), "rows": file.metadata.num_rows}
+    except (ValueError, TypeError) as error:
+        raise CorruptFileError(
+            f"{str(path)!r} has a damaged footer; delete it and generate again to remake it"
+        ) from error
 
 
 def open_parquet(path: Path) -> pq.ParquetFile:
     """The parquet file at ``path``; raises InvalidInputError (none there) or CorruptFileError."""
     try:
-        return pq.ParquetFile(path, page_checksum_verification=True)
+        file = pq.ParquetFile(path, page_checksum_verification=True)
+        _ = file.schema_arrow.names, file.metadata.num_rows  # what is damaged there shows when it is read
+        return file
     except FileNotFoundError:
         raise InvalidInputError(f"no parquet file at {str(path)!r}") from None
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, ValueError) as error:
         raise CorruptFileError(
             f"{str(path)!r} is not a readable parquet file ({error}); delete it and generate again to remake it"
         ) from error

@@ -208,7 +208,7 @@ class BodyPool:
 
 def _import_bullet() -> Any:
     try:
-        with _silence():
+        with silence():
             import pybullet
     except ImportError as error:
         raise MissingDependencyError(
@@ -219,7 +219,7 @@ def _import_bullet() -> Any:
 
 
 @contextlib.contextmanager
-def _silence() -> Iterator[None]:
+def silence() -> Iterator[None]:
     """Keep the greeting that PyBullet prints on import out of the user's terminal."""
     sys.stdout.flush()
     sys.stderr.flush()

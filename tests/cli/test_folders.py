@@ -12,7 +12,6 @@ import yaml
 from agents.cli import main, parser
 from agents.priors.testing import tiny_prior
 from agents.utils.interrupts import Terminated, finishing_steps, terminable
-from scene_envs.errors import InvalidInputError
 from scene_envs.folders import claimed
 
 
@@ -189,16 +188,3 @@ def test_a_post_training_log_of_another_run_goes_before_the_first_iteration(tmp_
     with pytest.raises(KeyboardInterrupt):
         PostTrainer(small_config(tmp_path), prior=tiny_prior()).run()
     assert "7.5" not in (tmp_path / "log.csv").read_text()
-
-
-def test_pretraining_refuses_the_finished_run_of_other_keys(tmp_path):
-    from agents.pretraining.config import PretrainConfig
-    from agents.pretraining.trainer import pretrain
-
-    keys = {"data": "grammar", "iterations": 2, "batch_size": 4, "network": {"hidden": 16, "depth": 1, "heads": 2}}
-    pretrain(PretrainConfig(output=str(tmp_path), **keys))
-    before = (tmp_path / "prior" / "model.safetensors").read_bytes()
-    for other in ({"seed": 3}, {"optimizer": {"lr": 0.5}}):
-        with pytest.raises(InvalidInputError, match="started with (seed=0|optimizer.lr=)"):
-            pretrain(PretrainConfig(output=str(tmp_path), **{**keys, **other, "iterations": 3}))
-    assert (tmp_path / "prior" / "model.safetensors").read_bytes() == before
