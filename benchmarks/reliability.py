@@ -8,6 +8,7 @@ right to mount a tmpfs.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import hashlib
 import io
@@ -21,6 +22,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,7 +37,7 @@ POST = (
     "logger.checkpoint_every=1", "logger.report_scenes=0", "logger.progress=none",
 )  # fmt: skip
 PRETRAIN = (
-    "pretrain", "scene=dimsum_table", "data=grammar", "iterations=6", "batch_size=4", "network.hidden=16",
+    "pretrain", "data=DATA", "iterations=6", "batch_size=4", "network.hidden=16",
     "network.depth=1", "network.heads=2", "logger.checkpoint_every=1", "logger.evaluate_every=3", "logger.log_every=1",
 )  # fmt: skip
 GENERATE = ("generate", "count=40", "shard_size=10", "workers=0", "verify=false", "progress=false")
@@ -48,8 +50,8 @@ RESULTS = {
 NASTY = (
     "", "0", "-1", "1e999", "nan", "-inf", "null", "true", "9" * 30, "9" * 5000, "a", "a" * 300, "../" * 40, "/",
     "/proc", "[]", "[[[[[[[[1]]]]]]]]", "{}", "{name: }", "{a: {b: {c: 1}}}", "[1,2", "${oc.env:HOME}", "${x}",
-    "'", '"', "\\", "a=b", "1,2,3", "é\u202e😀", "\x00", "\n", "*", "~", "!!python/object:os.system", "1_000", "0x10", "1e3",
-    ".5", "None",
+    "'", '"', "\\", "a=b", "1,2,3", "é\u202e😀", "\x00", "\n", "*", "~", "!!python/object:os.system", "1_000", "0x10",
+    "1e3", ".5", "None",
 )  # fmt: skip
 """Values that no key expects, or that some treat in their own way."""
 
@@ -79,8 +81,18 @@ class Figures:
 
 
 def command(*words: str) -> list[str]:
-    """The process of a command."""
-    return [sys.executable, "-m", "agents.cli", *words]
+    """The process of a command; ``data=DATA`` stands for a small dataset."""
+    filled = [word if word != "data=DATA" else f"data={dataset()}" for word in words]
+    return [sys.executable, "-m", "agents.cli", *filled]
+
+
+@cache
+def dataset() -> str:
+    """A small dataset, made once."""
+    place = tempfile.TemporaryDirectory()
+    atexit.register(place.cleanup)
+    subprocess.run(command(*GENERATE, f"output={place.name}/data"), check=True, capture_output=True)
+    return f"{place.name}/data"
 
 
 def run_here(words: Sequence[str]) -> tuple[int, str]:
