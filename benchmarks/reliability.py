@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from agents.priors.base import ScenePrior
 
 POST = (
-    "post-train", "reward=object_count", "num_steps=2", "batch_size=4", "iterations=5", "algorithm.gradient_steps=1",
+    "post-train", "reward=object_count", "num_steps=6", "batch_size=4", "iterations=5", "algorithm.gradient_steps=1",
     "regularisation.batch_size=2", "regularisation.bank_size=12", "guard.scenes=4", "guard.every=2", "slots=6",
     "logger.checkpoint_every=1", "logger.report_scenes=0", "logger.progress=none",
 )  # fmt: skip
