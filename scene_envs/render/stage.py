@@ -45,7 +45,7 @@ class Frame:
 
 def load_pybullet() -> ModuleType:
     """The PyBullet module; raises MissingDependencyError where it is not installed."""
-    from scene_envs.physics.bodies import silence
+    from scene_envs.silence import silence
 
     try:
         with silence():
