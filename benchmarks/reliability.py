@@ -1,6 +1,6 @@
 """Reliability of commands and files: kills, fuzzed input, hostile rewards, full disks, two writers.
 
-``python -m benchmarks.reliability [kills=N] [lines=N] [files=N] [rewards=N] [full=N] [writers=N]`` tries each so many
+``python benchmarks/reliability.py [kills=N] [lines=N] [files=N] [rewards=N] [full=N] [writers=N]`` tries each so many
 times, one process at a time, and prints a table: how often it was tried, and in how many a finished state was lost, a
 result differed, or something wrong was not told. The last three should be 0. It needs no network; full disks need the
 right to mount a tmpfs.
