@@ -14,6 +14,8 @@ from rewards.diversity import Diversity
 from rewards.evaluation import evaluate_reward
 from rewards.feasible_objects import FeasibleObjects
 from rewards.feasible_share import FeasibleShare
+from rewards.isolation import IsolatedReward
+from rewards.local_files import allow_local_rewards
 from rewards.normalised import Normalised
 from rewards.object_count import ObjectCount
 from rewards.penetration import Penetration
@@ -42,6 +44,7 @@ __all__ = [
     "FeasibleObjects",
     "FeasibleShare",
     "Gate",
+    "IsolatedReward",
     "Normalised",
     "ObjectCount",
     "Penetration",
@@ -56,6 +59,7 @@ __all__ = [
     "RewardOutput",
     "Stability",
     "WeightedSum",
+    "allow_local_rewards",
     "allow_reward_targets",
     "check_reward",
     "depends_on_batch",

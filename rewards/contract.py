@@ -11,6 +11,7 @@ from torch import Generator, Tensor
 from rewards.base import RewardContext, RewardOutput, depends_on_batch
 from rewards.evaluation import evaluate_reward
 from rewards.registry import resolve_reward, reward_name
+from rewards.seeding import other_draw
 from rewards.verdicts import forget_verdicts
 from scene_envs.errors import RewardError
 from scene_envs.scene import SceneBatch
@@ -69,14 +70,17 @@ class _Subject:
         self.empty = SceneBatch.empty(scene_type, 2)
         self.random = random_scenes(scene_type, 4, self.generator)
         self._random_output: RewardOutput | None = None
+        self._calls = 0
 
     def score(self, batch: SceneBatch) -> RewardOutput:
+        self._calls += 1
         forget_verdicts()  # what is kept from an earlier call would prove nothing
         context = self.given_context
         if context is None:
             counts = batch.counts.tolist()
             context = RewardContext(prompts=tuple(f"A scene with {n} object{'s' * (n != 1)}." for n in counts))
-        return evaluate_reward(self.reward, batch, context, strict=True)
+        with other_draw(self._calls):  # a reward that draws shows it by another score
+            return evaluate_reward(self.reward, batch, context, strict=True)
 
     @property
     def random_output(self) -> RewardOutput:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import linecache
 import logging
 from collections.abc import Mapping
+from contextlib import nullcontext
+from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from rewards.base import RewardContext, RewardOutput
-from rewards.registry import as_output, resolve_reward, reward_name
+from rewards.registry import as_output, is_own, resolve_reward, reward_name
+from rewards.seeding import seeded_generators
 from scene_envs.errors import RewardError
 from scene_envs.protocols import SceneScorer
 from scene_envs.scene import SceneBatch
@@ -19,6 +24,8 @@ logger = logging.getLogger(__name__)
 
 _warned: set[tuple[int, str]] = set()
 _MOST_WARNINGS = 256
+_MOST_TEXT = 300
+"""Characters of a foreign error that a message repeats."""
 
 
 def evaluate_reward(
@@ -70,16 +77,52 @@ def reward_scorer(reward: Any) -> SceneScorer:
 def _evaluate(reward: Any, batch: SceneBatch, context: RewardContext) -> RewardOutput:
     name = reward_name(reward)
     version = batch.tensor._version
+    own = is_own(reward)
+    before = None if own else batch.tensor.clone()
     try:
-        with torch.no_grad():
+        with torch.no_grad(), nullcontext() if own else seeded_generators(context.seed, batch):
             output = as_output(reward(batch, context))
-    except RewardError:
+    except (RewardError, KeyboardInterrupt):
         raise
-    except Exception as error:
-        raise RewardError(f"reward {name!r} raised {type(error).__name__}: {error}") from error
-    if batch.tensor._version != version:
+    except SystemExit as error:
+        raise RewardError(
+            f"reward {name!r} called sys.exit({_text(error)}){_place(error.__traceback__)}; raise an error instead"
+        ) from error
+    except BaseException as error:
+        raise RewardError(f"reward {name!r} raised {describe_error(error)}{_place(error.__traceback__)}") from error
+    if batch.tensor._version != version or not (before is None or torch.equal(before, batch.tensor)):
         raise RewardError(f"reward {name!r} changed the scenes it was given; work on a clone of batch.tensor")
     return _checked(name, output, batch)
+
+
+def describe_error(error: BaseException) -> str:
+    """Type and text of an error of foreign code, of bounded length whatever its ``__str__`` does.
+
+    >>> describe_error(ValueError("no")), len(describe_error(ValueError("x" * 10**6))) < 400
+    ('ValueError: no', True)
+    """
+    text = _text(error)
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def _text(error: BaseException) -> str:
+    try:
+        text = str(error)
+    except BaseException:
+        return "(its text cannot be read)"
+    return text if len(text) <= _MOST_TEXT else f"{text[:_MOST_TEXT]}... ({len(text)} characters)"
+
+
+def _place(trace: TracebackType | None) -> str:
+    """``" (my_rewards.py, line 12)"``: the innermost line of foreign code, empty where there is none."""
+    found = ""
+    package = Path(__file__).parent
+    while trace is not None:
+        path, line = trace.tb_frame.f_code.co_filename, trace.tb_lineno
+        if Path(path).parent != package and linecache.getline(path, line) and "site-packages" not in path:
+            found = f" ({path}, line {line})"
+        trace = trace.tb_next
+    return found
 
 
 def _checked(name: str, output: Any, batch: SceneBatch) -> RewardOutput:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from rewards.base import Reward, RewardContext, RewardOutput
+from rewards.local_files import is_local, load_local
 from scene_envs.errors import InvalidInputError, RewardError, unknown_name
 from scene_envs.plugins import plugin_entry_points
 from scene_envs.scene import SceneBatch
@@ -190,6 +191,33 @@ def reward_name(reward: Any) -> str:
     return name if isinstance(name, str) and name else getattr(reward, "__qualname__", type(reward).__qualname__)
 
 
+def allowed_targets() -> list[str]:
+    """The packages that ``_target_`` may name, those of installed plug-ins aside."""
+    return list(_allowed_targets)
+
+
+def registered_module(name: str) -> str | None:
+    """The module of the reward registered under ``name`` in this process, None where there is none."""
+    return getattr(_registry.get(name), "__module__", None)
+
+
+def plugin_module(name: str) -> str | None:
+    """The module of the installed plug-in that offers ``name``, which is not imported; None where there is none."""
+    point = _plugins().get(name)
+    return None if point is None else point.module
+
+
+def is_own(reward: Any) -> bool:
+    """Whether the code of a reward object is of this package, that of its parts aside.
+
+    >>> is_own(resolve_reward("object_count")), is_own(print)
+    (True, False)
+    """
+    code = reward.function if isinstance(reward, FunctionReward) else reward
+    module = getattr(code, "__module__", None) or type(code).__module__
+    return _within(str(module), {"rewards"})
+
+
 # -- looking up --------------------------------------------------------------------------------------
 
 
@@ -200,6 +228,8 @@ def _plugins() -> dict[str, EntryPoint]:
 def _find(name: str) -> Callable[..., Any]:
     if name in _registry:
         return _registry[name]
+    if is_local(name):
+        return load_local(name)
     plugins = _plugins()
     if name not in plugins:
         raise unknown_name("reward", name, {*_registry, *plugins})
@@ -207,7 +237,14 @@ def _find(name: str) -> Callable[..., Any]:
     package = point.dist.name if point.dist is not None else point.module
     try:
         loaded = point.load()
-    except Exception as error:
+    except KeyboardInterrupt:
+        raise
+    except SystemExit as error:
+        raise RewardError(
+            f"reward {name!r} of the installed package {package!r} cannot be loaded from {point.value!r}: it calls "
+            f"sys.exit({str(error.code)[:80]}) when it is imported"
+        ) from error
+    except BaseException as error:
         raise RewardError(
             f"reward {name!r} of the installed package {package!r} cannot be loaded from {point.value!r}: "
             f"{type(error).__name__}: {error}"

@@ -41,6 +41,10 @@ class TrainingError(SceneEnvsError):
     """A training run cannot go on; what was done so far is on disk."""
 
 
+class StorageError(SceneEnvsError, OSError):
+    """A file could not be written: the disk is full, or the folder may not be written to."""
+
+
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
     """Build the error for an unknown ``kind`` called ``name``, offering the nearest known name.
 

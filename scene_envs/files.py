@@ -1,25 +1,30 @@
-"""Atomic file writes, and JSON without non-finite numbers."""
+"""Atomic file writes with errors that name the file, and JSON without non-finite numbers."""
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
+import secrets
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+
+from scene_envs.errors import StorageError
 
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A file to write beside ``path``, which takes the name ``path`` when the block ends without an error.
 
-    The folder is made if need be. What is written at first has a hidden name, ``.<name>.<process>.partial``, so that
-    processes never mix; it is removed when the block fails, and what was at ``path`` before is untouched.
+    The folder is made if need be. What is written at first has a hidden name of its own,
+    ``.<name>.<process>.<random>.partial``; it is removed when the block fails, and what was at ``path`` before is
+    untouched.
 
     Raises:
-        OSError: the operating system refused to write or to rename.
+        StorageError: the operating system refused to write or to rename; names the file and the remedy.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -29,14 +34,46 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     ['a.txt']
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial = path.with_name(f".{path.name[:200]}.{os.getpid()}.{secrets.token_hex(4)}.partial")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         yield partial
         os.replace(partial, path)
+    except StorageError:
+        raise
+    except OSError as error:
+        raise storage_error(path, error) from error
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is a file; False also for names that the system cannot have."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def exists(path: Path) -> bool:
+    """Whether there is anything; False also for names that the system cannot have."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
+
+
+def storage_error(path: str | os.PathLike[str], error: OSError) -> StorageError:
+    """The error to raise when ``path`` could not be written."""
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+    refused = error.errno in (errno.EACCES, errno.EPERM, errno.EROFS)
+    reason = "the disk is full" if full else error.strerror or str(error)
+    remedy = "make the folder writable, or give another output," if refused else "put that right"
+    remedy = "make room" if full else remedy
+    return StorageError(
+        f"cannot write {str(path)!r}: {reason}; finished files are kept; {remedy} and run again to resume"
+    )
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:

@@ -43,7 +43,9 @@ def load_plugins(group: str) -> None:
     for point in plugin_entry_points(group).values():
         try:
             point.load()
-        except Exception as error:
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # a module may also call sys.exit
             _LOGGER.warning(
                 "the plug-in %r (%s) could not be loaded: %s: %s", point.value, group, type(error).__name__, error
             )

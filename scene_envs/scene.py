@@ -9,12 +9,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from scene_envs.errors import CorruptFileError, InvalidInputError
-from scene_envs.files import replacing
+from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
 from scene_envs.normalizer import Normalizer
 from scene_envs.rotations import project_to_so3
 from scene_envs.scene_facts import AssetFacts
 from scene_envs.scene_types import SceneType, get_scene_type
+from scene_envs.tensor_files import read_tensors, write_tensors
 
 POSE_FEATURES = 12
 """Numbers of a pose: translation (3) and rotation matrix (9)."""
@@ -205,25 +205,19 @@ class SceneBatch(AssetFacts):
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write to one ``.safetensors`` file, atomically."""
-        from safetensors.torch import save_file
-
-        path = Path(path)
-        with replacing(path) as partial:
-            save_file({"scenes": self._tensor.cpu().contiguous()}, partial, {"scene_type": self.scene_type.name})
-        return path
+        return write_tensors(path, {"scenes": self._tensor}, {"scene_type": self.scene_type.name})
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SceneBatch:
         """Read a file written by :meth:`save`."""
-        from safetensors import SafetensorError, safe_open
-
         try:
-            with safe_open(path, "pt") as file:
-                metadata = file.metadata() or {}
-                return cls(file.get_tensor("scenes"), metadata["scene_type"])
+            tensors, metadata = read_tensors(path)
+            return cls(tensors["scenes"], metadata["scene_type"])
         except FileNotFoundError:
             raise InvalidInputError(f"no scene file at {str(path)!r}") from None
-        except (SafetensorError, KeyError) as error:
+        except KeyError as error:
+            if isinstance(error, UnknownNameError):
+                raise
             raise CorruptFileError(f"{str(path)!r} is not a scene file written by SceneBatch.save: {error}") from error
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
-from agents.configuration.compose import check_option, choice_word, compose_tree, group_options
+from agents.configuration.compose import check_option, choice_word, compose_tree, group_options, hidden, shown
 from agents.configuration.tree import build, check_not_moved, dotted_keys
 from agents.utils.docstrings import attribute_meanings
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
@@ -206,10 +206,10 @@ def _parsed(command: str, key: str, value: str) -> Any:
     if "," in value and value[:1] not in _OPENING:
         value = f"[{value}]"  # a,b is a list, where Hydra would see a sweep
     try:
-        found = OverridesParser.create().parse_override(f"{key}={value}").value()
-    except HydraException:
-        raise InvalidInputError(f"{command}: a value cannot be read: {key}={value}") from None
-    return OmegaConf.to_container(OmegaConf.create({"value": found}))["value"]  # type: ignore[index, call-overload]
+        found = OverridesParser.create().parse_override(hidden(f"{key}={value}")).value()
+    except (HydraException, ValueError):
+        raise InvalidInputError(f"{command}: a value cannot be read: {key}={value[:200]}") from None
+    return shown(OmegaConf.to_container(OmegaConf.create({"value": found}))["value"])  # type: ignore[index, call-overload]
 
 
 def _hint(config: type, key: str) -> Any:

@@ -6,6 +6,8 @@ traceback only under ``--traceback`` or ``SCENE_ENVS_TRACEBACK=1``.
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import os
 import sys
 import traceback
@@ -20,11 +22,14 @@ from agents.cli.commands import COMMANDS, RENAMED
 from agents.cli.keys import Sources, compose, format_rows, help_text
 from agents.cli.sweep import expand_sweeps
 from agents.configuration.tree import config_text
+from agents.utils.interrupts import Terminated, terminable
 from scene_envs import __version__
 from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError, UnknownNameError, unknown_name
 
-DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
+DONE, FAILED, WRONG_INPUT, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 
+_MOST_TEXT = 4000
+"""Characters of an error message."""
 _USAGE = """\
 usage: scene-envs COMMAND key=value ...
 
@@ -33,6 +38,7 @@ usage: scene-envs COMMAND key=value ...
 scene-envs COMMAND --help lists the keys of a command; --traceback shows where an error came from.
 --cfg job prints the keys and runs nothing; --config FILE starts the run of a config.yaml again;
 --config-dir FOLDER adds groups and experiments (+experiment=NAME); --multirun seed=0,1,2 makes a run of each.
+--allow-local lets reward=./my_rewards.py:clutter run that file.
 A command writes into output=FOLDER, by default runs/COMMAND-TIME.
 """
 
@@ -67,12 +73,19 @@ def _guarded(words: list[str], work: Callable[[list[str]], int]) -> int:
         show_traceback = True
         words.remove("--traceback")
     try:
-        return work(words)
+        with terminable():
+            return work(words)
+    except Terminated:
+        return _complain("terminated; where the output can be resumed, the same command goes on", TERMINATED)
     except KeyboardInterrupt:
         return _complain("interrupted; where the output can be resumed, the same command goes on", INTERRUPTED)
     except BrokenPipeError:  # the reader of our output has gone, as in `scene-envs rewards | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
+    except RecursionError as error:
+        if show_traceback:
+            traceback.print_exc()
+        return _complain(f"a value or a file is nested too deeply ({_cut(error)}); write it flatter", WRONG_INPUT)
     except Exception as error:
         if show_traceback:
             traceback.print_exc()
@@ -103,6 +116,7 @@ def _dispatch(words: list[str]) -> int:
 def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str]) -> int:
     words = list(words)
     config_dir, file = _option(words, "--config-dir"), _option(words, "--config")
+    allow_local = _flag(words, "--allow-local")
     shown, sweep, asked = _option(words, "--cfg", "-c"), _flag(words, "--multirun", "-m"), _flag(words, "-h", "--help")
     if shown not in ("", "job"):
         raise InvalidInputError(f"--cfg {shown}: only --cfg job is known, which prints the keys and runs nothing")
@@ -113,9 +127,42 @@ def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str
         print(f"{program}: {meaning}.\n\n{help_text(config, named, config_dir)}")
         return DONE
     if not sweep:
-        return _run(command, module, compose(command, module.config(), named, sources), bool(shown))
+        settings = compose(command, module.config(), named, sources)
+        _check(settings, allow_local, bool(shown))
+        return _run(command, module, settings, bool(shown))
     runs = [(compose(command, module.config(), variant, sources), label) for variant, label in expand_sweeps(named)]
+    for settings, _ in runs:
+        _check(settings, allow_local, bool(shown))
     return _run_all(command, module, runs, bool(shown))
+
+
+def _check(settings: Any, allow_local: bool, only_show: bool) -> None:
+    """Refuse what needs no more than a look; ask before a file of the user's is run."""
+    if only_show:
+        return
+    for key in ("reward", "objective"):
+        if "/" in (text := str(getattr(settings, key, ""))) or ".py:" in text:
+            _ask_for_files(key, getattr(settings, key), allow_local)
+    if isinstance(seed := getattr(settings, "seed", 0), int) and not 0 <= seed < 2**63:
+        raise InvalidInputError(f"seed={seed} must be from 0 to 2^63 - 1")
+    if isinstance(device := getattr(settings, "device", "cpu"), str) and device != "cpu":
+        from agents.utils.devices import check_device
+
+        check_device(device)
+
+
+def _ask_for_files(key: str, reward: Any, allow_local: bool) -> None:
+    from rewards.local_files import allow_local_rewards, allowed_files, local_files
+
+    for path in local_files(reward):
+        if path in allowed_files():
+            continue
+        if not allow_local and sys.stdin is not None and sys.stdin.isatty():
+            print(f"{key}= runs the file {path}. Run it? [y/N] ", end="", file=sys.stderr, flush=True)
+            allow_local = sys.stdin.readline().strip().lower() in ("y", "yes")
+        if not allow_local:
+            raise InvalidInputError(f"{key}= would run the file {str(path)!r}; add --allow-local if you trust it")
+        allow_local_rewards(path)
 
 
 def _run(command: str, module: ModuleType, settings: Any, only_show: bool) -> int:
@@ -184,15 +231,32 @@ def _verdict(error: Exception) -> tuple[str, int]:
         return str(error), WRONG_INPUT
     if isinstance(error, SceneEnvsError):
         return str(error), FAILED
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f"the disk is full{_at(error)}; finished files are kept: make room and run again", FAILED
+    if isinstance(error, OSError) and error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return f"the operating system allows no access{_at(error)}; put that right, or give another output", FAILED
     if isinstance(error, OSError):
-        return f"the operating system refused: {error}", FAILED
+        return f"the operating system refused: {_cut(error)}", FAILED
+    if isinstance(error, MemoryError) or "can't allocate memory" in str(error) or "out of memory" in str(error):
+        return f"not enough memory ({_cut(error)}); give smaller sizes, such as batch_size=", FAILED
     return (
-        f"something unexpected happened, {type(error).__name__}: {error}. "
+        f"something unexpected happened, {type(error).__name__}: {_cut(error)}. "
         "Run again with --traceback to see where, and please report it",
         FAILED,
     )
 
 
+def _at(error: OSError) -> str:
+    return f" at {error.filename!r}" if error.filename else ""
+
+
+def _cut(error: BaseException) -> str:
+    text = str(error)
+    return text if len(text) <= _MOST_TEXT else f"{text[:_MOST_TEXT]}..."
+
+
 def _complain(text: str, status: int) -> int:
-    print(f"scene-envs: {text}", file=sys.stderr)
+    text = text if len(text) <= _MOST_TEXT else f"{text[:_MOST_TEXT]}..."
+    with contextlib.suppress(OSError):  # stderr may be closed
+        print(f"scene-envs: {text}".encode(errors="backslashreplace").decode(), file=sys.stderr)
     return status

@@ -3,25 +3,58 @@
 from __future__ import annotations
 
 import logging
+import re
 import sys
 import time
 from collections.abc import Mapping
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from agents.configuration.tree import config_text
+from agents.configuration.tree import config_text, dotted
 from agents.utils.process_group import is_first_process
 from scene_envs.errors import InvalidInputError
-from scene_envs.files import write_json, write_text
+from scene_envs.files import storage_error, write_json, write_text
+from scene_envs.folders import claimed
 
 _PACKAGES = ("scene_envs", "rewards", "agents")
+_RESULTS = (
+    "metrics.json",
+    "checkpoint.pt",
+    "metadata.json",
+    "config.json",
+    "tree.json",
+    "best.safetensors",
+    "scenes.safetensors",
+    "ready.safetensors",
+    "viewer.html",
+)
+"""Files that a command must not write over, unless they are its own."""
+_RESUMES = {"generate": "metadata.json", "pretrain": "checkpoint.pt", "post-train": "checkpoint.pt"}
+"""Commands that go on with what a run from Python left, and the file that says so."""
+_OWN_RULE = ("generate", "pretrain", "post-train", "doctor", "demo", "evaluate")
+"""Commands that compare their keys with what is there themselves."""
+_MAY_DIFFER = (
+    "output",
+    "workers",
+    "device",
+    "pictures",
+    "open",
+    "progress",
+    "recipe",
+    "reward_timeout",
+    "reward_memory",
+)
+"""Keys that may change between a run and its repetition."""
 
 
 class Run:
     """Context in which a command works: its folder exists, and what the packages log goes to stderr and ``log.txt``.
 
-    ``config.yaml`` is written when the command starts, unless an earlier run left one, and again when it is done.
+    One process writes into a folder at a time. One that holds results of another command, or of the same with other
+    keys, is refused. ``config.yaml`` is written when the command starts, unless an earlier run left results, and again
+    when it is done. Files that a failure left empty are removed.
     Of the processes that ``torchrun`` starts, the first alone writes and speaks; the others log what fails.
 
     Args:
@@ -38,31 +71,92 @@ class Run:
         self.directory = Path(settings.output)
         self._is_first = is_first_process()
         self._handlers: list[logging.Handler] = []
+        self._before: set[Path] = set()
+        self._claim = ExitStack()
 
     def __enter__(self) -> Run:
+        self._claim = ExitStack()
+        if not self._is_first:
+            self._make_folder()
+            return self
+        self._claim.enter_context(claimed(self.directory, f"scene-envs {self.command}"))
+        try:
+            self._is_repeated = self._check_folder()
+            self._before = _empty_files(self.directory)
+            if not self._is_repeated:
+                self._write_config()
+            self._start_logging()
+            self.log(f"scene-envs {self.command}")
+        except BaseException as error:
+            self._claim.close()
+            if isinstance(error, OSError) and not isinstance(error, InvalidInputError):
+                raise storage_error(self.directory, error) from error
+            raise
+        return self
+
+    def _make_folder(self) -> None:
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
         except (FileExistsError, NotADirectoryError):
             raise InvalidInputError(f"output={str(self.directory)!r} is a file, not a folder; give another") from None
-        if not self._is_first:
-            return self
-        if not (self.directory / "config.yaml").exists():
-            self._write_config()
-        self._start_logging()
-        self.log(f"scene-envs {self.command}")
-        return self
+
+    def _check_folder(self) -> bool:
+        """Whether the folder holds results of this command; refuses those of another, or of other keys."""
+        found = [name for name in _RESULTS if (self.directory / name).exists()]
+        if not found:
+            return False
+        writer = _writer(self.directory)
+        if writer is None and _RESUMES.get(self.command) in found:
+            return True
+        if writer != self.command:
+            raise InvalidInputError(
+                f"output={str(self.directory)!r} holds {found[0]} of {_named(writer)}; give another output"
+            )
+        if self.command not in _OWN_RULE:
+            self._check_keys()
+        return True
+
+    def _check_keys(self) -> None:
+        import yaml
+
+        try:
+            before = yaml.safe_load((self.directory / "config.yaml").read_text(encoding="utf-8"))
+            now = yaml.safe_load(config_text(self.settings))
+        except (OSError, yaml.YAMLError, UnicodeDecodeError):
+            return
+        if not isinstance(before, dict):
+            return
+        was, is_now = dotted(before), dotted(now)
+        changed = [
+            f"{key} was {was[key]!r}, is {is_now[key]!r}"
+            for key in is_now
+            if key in was and was[key] != is_now[key] and key.partition(".")[0] not in _MAY_DIFFER
+        ]
+        if changed:
+            raise InvalidInputError(
+                f"output={str(self.directory)!r} was written with other keys ({'; '.join(changed)[:500]}); "
+                "give another output, or the same keys to write it again"
+            )
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if error is None:
-            self._write_config()
-        else:
-            self._append(f"failed: {error or kind}")
-        for handler in self._handlers:
-            handler.close()
-            for package in _PACKAGES:
-                logging.getLogger(package).removeHandler(handler)
+        try:
+            if error is None:
+                self._write_config()
+            elif self._is_first:
+                for path in _empty_files(self.directory) - self._before:
+                    with suppress(OSError):
+                        path.unlink()
+                with suppress(OSError):
+                    self._append(f"failed: {error or kind}")
+        finally:
+            for handler in self._handlers:
+                with suppress(OSError):
+                    handler.close()
+                for package in _PACKAGES:
+                    logging.getLogger(package).removeHandler(handler)
+            self._claim.close()
 
     def say(self, text: str) -> None:
         """Tell the user on stdout, and keep it in the log."""
@@ -99,6 +193,23 @@ class Run:
             logger.setLevel(logging.INFO)
             for handler in self._handlers:
                 logger.addHandler(handler)
+
+
+def _writer(folder: Path) -> str | None:
+    """The command whose log a folder holds, None where there is none."""
+    with suppress(OSError), (folder / "log.txt").open(encoding="utf-8", errors="replace") as file:
+        for line in file:
+            if found := re.match(r"[-0-9]+ [:0-9]+ scene-envs ([-a-z]+)$", line):
+                return found[1]
+    return None
+
+
+def _named(writer: str | None) -> str:
+    return "another program" if writer is None else f"scene-envs {writer}"
+
+
+def _empty_files(folder: Path) -> set[Path]:
+    return {path for path in folder.rglob("*") if path.is_file() and not path.stat().st_size and path.name != "log.txt"}
 
 
 def fresh_directory(command: str) -> str:

@@ -10,6 +10,9 @@ from typing import Any
 
 from scene_envs.errors import InvalidInputError, unknown_name
 
+_DOLLAR = "\ue0f0"
+"""Character of private use that stands for a dollar sign."""
+
 
 def group_options(folder: str, config_dir: str = "") -> list[str]:
     """Names of the YAML files of a group, those of the user's folder included, sorted."""
@@ -79,11 +82,15 @@ def compose_tree(
             raise InvalidInputError("recipe= and --config exclude each other: the file says everything already")
         overrides += [f"+{_group(folders[key], key)}={value}" for key, value in chosen.items()]
     name = f"{command.replace('-', '_')}_primary"
-    ConfigStore.instance().store(name=name, node={"defaults": defaults, **tree})
+    ConfigStore.instance().store(name=name, node={"defaults": defaults, **hidden(tree)})
     try:
         with initialize_config_module("configs", version_base="1.3"):
-            composed = compose(name, overrides=[*overrides, *values])
-        result = OmegaConf.to_container(composed, resolve=True)
+            composed = compose(name, overrides=[hidden(word) for word in (*overrides, *values)])
+        result = shown(OmegaConf.to_container(composed, resolve=False))
+    except ValueError as error:
+        if isinstance(error, HydraException | OmegaConfBaseException):
+            raise InvalidInputError(f"{command}: {_reason(error)}") from error
+        raise InvalidInputError(f"{command}: a value cannot be read ({str(error)[:100]})") from None
     except (HydraException, OmegaConfBaseException) as error:
         if f"In 'recipe/{chosen.get('recipe')}'" in str(error):
             raise InvalidInputError(
@@ -92,6 +99,28 @@ def compose_tree(
         raise InvalidInputError(f"{command}: {_reason(error)}") from error
     assert isinstance(result, dict)
     return {str(key): value for key, value in result.items()}
+
+
+def hidden(value: Any) -> Any:
+    """``value`` with ``${`` in its texts written so that OmegaConf sees no interpolation: text is text.
+
+    >>> shown(hidden({"text": "${oc.env:HOME}"}))
+    {'text': '${oc.env:HOME}'}
+    """
+    return _replaced(value, "${", _DOLLAR + "{")
+
+
+def shown(value: Any) -> Any:
+    """Inverse of :func:`hidden`."""
+    return _replaced(value, _DOLLAR + "{", "${")
+
+
+def _replaced(value: Any, old: str, new: str) -> Any:
+    if isinstance(value, str):
+        return value.replace(old, new)
+    if isinstance(value, Mapping):
+        return {_replaced(key, old, new): _replaced(item, old, new) for key, item in value.items()}
+    return [_replaced(item, old, new) for item in value] if isinstance(value, list | tuple) else value
 
 
 def check_option(folder: str, option: str, config_dir: str = "", others: Sequence[str] = ()) -> None:

@@ -52,6 +52,8 @@ def field_values(kind: type, tree: Mapping[str, Any], path: str = "", command: s
 def convert(field: dataclasses.Field[Any], hint: Any, value: Any, path: str, command: str = "") -> Any:
     """``value`` as a field of type ``hint`` wants it."""
     if field.metadata.get("named"):
+        if isinstance(value, int | float):
+            raise InvalidInputError(f"{path}={_typed(value)[:60]} is neither a name nor a mapping with a name")
         alone = isinstance(value, Mapping) and set(value) == {"name"}
         return value["name"] if alone else _plain(value)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
@@ -191,12 +193,14 @@ def _scalar(hint: Any, value: Any, path: str) -> Any:
             _refuse(hint, value, path)
     if hint is str and isinstance(value, int | float) and not isinstance(value, bool):
         return str(value)
+    if hint is int and isinstance(value, int) and abs(value) >= 2**63:
+        raise InvalidInputError(f"{path} is a number of {len(str(abs(value)))} digits; whole numbers end at 2^63")
     right = isinstance(value, hint) and (hint is bool or not isinstance(value, bool))
     return value if right else _refuse(hint, value, path)
 
 
 def _refuse(hint: Any, value: Any, path: str) -> Any:
-    raise InvalidInputError(f"{path}={_typed(value)} is not {_wanted(hint)}")
+    raise InvalidInputError(f"{path}={_typed(value)[:300]} is not {_wanted(hint)}")
 
 
 def _wanted(hint: Any) -> str:

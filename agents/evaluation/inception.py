@@ -15,6 +15,7 @@ from torch.nn import functional as F
 from agents.evaluation.frechet import feature_distance
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
 from scene_envs.scene import SceneBatch
+from scene_envs.tensor_files import read_tensors
 
 _SIDE = 299
 _FID_CLASSES = 1008
@@ -112,13 +113,13 @@ def _pool_like_tensorflow(network: nn.Module) -> None:
 def _read_state(path: Path) -> dict[str, Tensor]:
     try:
         if path.suffix == ".safetensors":
-            from safetensors.torch import load_file
-
-            state: Any = load_file(path)
+            state: Any = read_tensors(path)[0]
         else:
             state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        raise CorruptFileError(f"{str(path)!r} cannot be read as a state dict: {error}") from error
+    except CorruptFileError:
+        raise
+    except Exception as error:  # torch's own advice would be to run the code of the file
+        raise CorruptFileError(f"{str(path)!r} cannot be read as a state dict ({type(error).__name__})") from error
     if not isinstance(state, dict) or "fc.weight" not in state:
         raise CorruptFileError(f"{str(path)!r} is no state dict of an Inception-v3: it lacks 'fc.weight'")
     return state

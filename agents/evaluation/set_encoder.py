@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from agents.evaluation.scene_tokens import WAVE_FEATURES, SceneTokens, scene_tokens
 from agents.evaluation.set_network import SetNetwork, SetNetworkConfig
 from scene_envs.errors import CorruptFileError, InvalidInputError
-from scene_envs.files import replacing
 from scene_envs.scene import SceneBatch
+from scene_envs.tensor_files import read_tensors, write_tensors
 
 SHIPPED = Path(__file__).parent / "weights" / "set_encoder.safetensors"
 """The encoder that :func:`~agents.evaluation.frechet.frechet_scene_distance` uses."""
@@ -96,15 +96,10 @@ class SetEncoder(nn.Module):
             path: of the file.
             note: how the encoder was made, kept in the file.
         """
-        from safetensors.torch import save_file
-
-        path = Path(path)
         weights = {name: value.detach().contiguous() for name, value in self.state_dict().items()}
         weights = {name: value.half() if name.startswith("network.") else value for name, value in weights.items()}
         metadata = {"vocabulary": json.dumps(self.vocabulary), "config": json.dumps(asdict(self.config)), "note": note}
-        with replacing(path) as partial:
-            save_file(weights, partial, metadata)
-        return path
+        return write_tensors(path, weights, metadata)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str] | None = None) -> SetEncoder:
@@ -119,15 +114,12 @@ class SetEncoder(nn.Module):
 
 @cache
 def _load(path: str) -> SetEncoder:
-    from safetensors import SafetensorError, safe_open
-
     try:
-        with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {}
-            encoder = SetEncoder(json.loads(metadata["vocabulary"]), SetNetworkConfig(**json.loads(metadata["config"])))
-            encoder.load_state_dict({name: file.get_tensor(name).float() for name in file.keys()})  # noqa: SIM118
+        weights, metadata = read_tensors(path)
+        encoder = SetEncoder(json.loads(metadata["vocabulary"]), SetNetworkConfig(**json.loads(metadata["config"])))
+        encoder.load_state_dict({name: value.float() for name, value in weights.items()})
     except FileNotFoundError:
         raise InvalidInputError(f"no set encoder at {path!r}; train_set_encoder makes one") from None
-    except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise CorruptFileError(f"{path!r} is not a set encoder written by SetEncoder.save: {error}") from error
     return encoder.eval().requires_grad_(False)

@@ -165,6 +165,8 @@ def _page(
         "The held-out loss stayed within its limit" if over is None else f"Its limit was passed at iteration {over}"
     )
     verdict = f"{passed}; the prior kept is that of iteration {guard['best_iteration']}."
+    if lost := metrics["reward"].get("invalid_scenes"):
+        verdict += f" The reward could not score {lost} of the scenes; log.txt says why."
     sections = [
         Section("The curve", verdict, [Picture(curve, f"Mean {reward} of each batch, and the guard.")]),
         Section(

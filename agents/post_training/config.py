@@ -16,7 +16,7 @@ from agents.post_training.algorithms import AlgorithmSettings, DDPOSFSettings, a
 from scene_envs.envs.settings import PROMPT_SOURCES
 from scene_envs.errors import InvalidInputError
 
-RESUMABLE = ("recipe", "iterations", "output", "workers", "logger")
+RESUMABLE = ("recipe", "iterations", "output", "workers", "logger", "reward_timeout", "reward_memory")
 """Fields that may change between a run and its continuation."""
 
 
@@ -131,7 +131,10 @@ class PostTrainConfig:
         slots: slots per scene; null means as many as the prior was trained on.
         seed: of x_T, the chain's noise, the steps drawn and the real scenes.
         device: torch device.
-        workers: physics worker processes; 0 computes rewards in this process.
+        workers: physics worker processes; 0 computes physics in this process.
+        reward_timeout: seconds that a reward from outside this package, which runs in a process of its own, may take
+            for a batch; then its scenes are invalid.
+        reward_memory: GiB that such a reward may allocate.
         batch_size: scenes sampled per iteration.
         iterations: policy updates, that is batches of fresh scenes.
         recipe: a named set of the other keys: ``ours``, or ``demo`` for the demonstration; keys given beside it win.
@@ -165,6 +168,8 @@ class PostTrainConfig:
     seed: int = 0
     device: str = "cpu"
     workers: int = 0
+    reward_timeout: float = 60.0
+    reward_memory: float = 1.0
     batch_size: int = 48
     iterations: int = 60
     recipe: str = "ours"
@@ -179,6 +184,7 @@ class PostTrainConfig:
     def __post_init__(self) -> None:
         at_least(self, 1, "iterations", "num_steps")
         at_least(self, 2, "batch_size")
+        positive(self, "reward_timeout", "reward_memory")
         self.prompt = list(self.prompt) if isinstance(self.prompt, tuple) else self.prompt
         check_prompt(self.prompt, self.guidance)
         if self.optimizer.lr is None:

@@ -22,6 +22,7 @@ from agents.priors.base import ScenePrior
 from agents.priors.prompt_validation import no_text
 from agents.utils.checkpoints import check_tensors
 from agents.utils.weight_average import AveragedWeights, WeightAverage
+from rewards.isolation import close_reward, run_reward
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.errors import InvalidInputError
 
@@ -54,10 +55,17 @@ class Learner:
         )
         self.stds = self.policy.stds(self.slots).cpu()
         self.algorithm: Algorithm[Any] = make_algorithm(config.algorithm, self.policy, self.stds)
+        self.reward = run_reward(
+            config.reward,
+            seed=config.seed,
+            timeout=config.reward_timeout,
+            memory=config.reward_memory,
+            workers=config.workers,
+        )
         self.env = DenoisingTorchRLEnv(
             config.batch_size,
             scene=self.prior.scene_type,
-            reward=config.reward,
+            reward=self.reward,
             num_steps=config.num_steps,
             prior=self.prior,
             slots=self.slots,
@@ -78,8 +86,9 @@ class Learner:
             )
 
     def close(self) -> None:
-        """Stop physics workers, if any."""
+        """Stop the workers of physics and of the reward, if any."""
         self.env.close()
+        close_reward(self.reward)
 
     def deal_prompts(self, scenes: SceneBank) -> None:
         """Make the deck from which the prompts of batches come; nothing without prompts."""

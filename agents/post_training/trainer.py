@@ -28,9 +28,11 @@ from agents.post_training.scene_bank import SceneBank, real_scenes
 from agents.priors.base import ScenePrior
 from agents.priors.prompt_validation import check_object_count
 from agents.utils.checkpoints import save_checkpoint
+from agents.utils.interrupts import finishing_steps
 from agents.utils.loggers import make_logger
 from rewards import reward_name
 from scene_envs.errors import TrainingError
+from scene_envs.folders import claimed
 from scene_envs.scene import SceneBatch
 
 
@@ -75,11 +77,12 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> P
     >>> len(result.history), result.history[0]["log_ratio"]
     (2, 0.0)
     """
-    trainer = PostTrainer(config, prior=prior)
-    try:
-        return trainer.run()
-    finally:
-        trainer.close()
+    with claimed(config.directory, "post_train"):
+        trainer = PostTrainer(config, prior=prior)
+        try:
+            return trainer.run()
+        finally:
+            trainer.close()
 
 
 class PostTrainer:
@@ -124,7 +127,11 @@ class PostTrainer:
             self._save_prior()  # until something better: the base
         title = f"post-train {self.prior.scene_type.name}"
         started = time.perf_counter() - self.seconds
-        with run_progress(title, config.iterations, config.logger.progress, self.iteration) as report:
+        write_log(self.directory, self.history)  # that of an earlier run, or rows beyond the checkpoint, go
+        with (
+            run_progress(title, config.iterations, config.logger.progress, self.iteration) as report,
+            finishing_steps() as end,
+        ):
             while self.iteration < config.iterations and not self._stopped:
                 rollout, row = self.step()
                 self.seconds = time.perf_counter() - started
@@ -132,11 +139,12 @@ class PostTrainer:
                 last = self.iteration == config.iterations
                 if self.iteration % config.guard.every == 0 or last:
                     self._check(rollout)
-                if self.iteration % config.logger.checkpoint_every == 0 or last or self._stopped:
+                if self.iteration % config.logger.checkpoint_every == 0 or last or self._stopped or end.pending:
                     self.save()
                 write_log(self.directory, self.history)
                 self.logger.log(self.history[-1], self.iteration)
                 report(self.iteration, row["reward"], self.guard.ratio)
+                end()
         return self._finish()
 
     def prepare(self, *, reuse_scenes: bool = False) -> None:
@@ -271,6 +279,9 @@ class PostTrainer:
                 "first": rewards[0] if rewards else None,
                 "last": rewards[-1] if rewards else None,
                 "best": self.guard.best_reward,
+                "invalid_scenes": round(
+                    sum((1.0 - row["valid_fraction"]) * self.config.batch_size for row in self.history)
+                ),
             },
             "guard": self.guard.summary(),
         }

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import csv
+import io
 import logging
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from agents.utils.loggers import RunLogger
+from scene_envs.files import write_text
 
 logger = logging.getLogger(__name__)
 
@@ -25,6 +29,23 @@ class TrainingLog:
         self.directory = directory
         self._also = RunLogger() if also is None else also
 
+    def begin(self, step: int) -> None:
+        """Keep the rows of this run up to ``step``, each once; those of another run, and beyond a checkpoint, go."""
+        path = self.directory / "log.csv"
+        if not path.exists():
+            return
+        with path.open(newline="", encoding="utf-8", errors="replace") as file:
+            rows = list(csv.DictReader(file))
+        kept = {int(row["step"]): row for row in rows if _is_whole(row) and int(row["step"]) <= step}
+        if not kept:
+            path.unlink()
+            return
+        text = io.StringIO()
+        writer = csv.DictWriter(text, FIELDS, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(kept[number] for number in sorted(kept))
+        write_text(path, text.getvalue())
+
     def close(self) -> None:
         """Close the other logger."""
         self._also.close()
@@ -42,3 +63,8 @@ class TrainingLog:
                 writer.writeheader()
             writer.writerow(row)
         self._also.log({key: value for key, value in row.items() if key != "step"}, step)
+
+
+def _is_whole(row: Mapping[str, Any]) -> bool:
+    """Whether a row of the file has all its numbers; the last of a killed run may not."""
+    return str(row.get("step") or "").isdigit() and all(row.get(name) is not None for name in FIELDS)

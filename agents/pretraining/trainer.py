@@ -6,6 +6,7 @@ import logging
 import math
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -23,15 +24,19 @@ from agents.pretraining.setup import prepare
 from agents.pretraining.text_warmup import warm_up_text
 from agents.priors.base import ScenePrior
 from agents.utils.checkpoints import check_tensors, load_checkpoint, save_checkpoint
+from agents.utils.interrupts import Ending, finishing_steps
 from agents.utils.loggers import make_logger
-from agents.utils.process_group import ProcessGroup
+from agents.utils.process_group import ProcessGroup, is_first_process
 from agents.utils.seeds import derived_generator
 from agents.utils.weight_average import AveragedWeights, WeightAverage
 from scene_envs.errors import InvalidInputError, MissingDependencyError, TrainingError
 from scene_envs.files import write_json, write_text
+from scene_envs.folders import claimed
 
 logger = logging.getLogger(__name__)
 
+_MAY_DIFFER = ("iterations", "output", "logger", "device", "recipe")
+"""Keys that may change between a run and its continuation."""
 _PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 
@@ -106,6 +111,8 @@ class Pretrainer:
             self._warm_up_text()
         if self.config.optimizer.compile:
             self.prior.denoiser.network.compile()
+        if self.processes.is_first:
+            self.log.begin(self.step)
         for row in self._steps():
             if self.processes.is_first:
                 self.log.write(row, self.config.iterations)
@@ -125,8 +132,13 @@ class Pretrainer:
             self.average = WeightAverage(self.network, self.config.optimizer.ema)
 
     def _steps(self) -> Iterator[dict[str, float]]:
-        config, started = self.config, time.perf_counter() - self.seconds
+        started = time.perf_counter() - self.seconds
         running: list[float] = []
+        with finishing_steps() as end:
+            yield from self._stepping(started, running, end)
+
+    def _stepping(self, started: float, running: list[float], end: Ending) -> Iterator[dict[str, float]]:
+        config = self.config
         while self.step < config.iterations:
             loss, norm = self._update()
             running.append(loss)
@@ -143,8 +155,9 @@ class Pretrainer:
                 yield row
             if config.logger.pictures_every and self.step % config.logger.pictures_every == 0:
                 self._draw_samples()
-            if self.step % config.logger.checkpoint_every == 0 or last:
+            if self.step % config.logger.checkpoint_every == 0 or last or end.pending:
                 self._save()
+            end()
 
     def _update(self) -> tuple[float, float]:
         config = self.config
@@ -239,8 +252,12 @@ class Pretrainer:
     def _load(self) -> None:
         state = load_checkpoint(self.checkpoint_path)
         before = self._started_with(state)
-        if not before:
-            check_tensors(self.network, state["network"], self.checkpoint_path)
+        if before:
+            raise InvalidInputError(
+                f"{str(self.directory)!r} holds a run that was started with {before}; give the same keys again to "
+                "resume it, or another output"
+            )
+        check_tensors(self.network, state["network"], self.checkpoint_path)
         try:
             self.network.load_state_dict({**state["network"], **state["average"]})  # gives weights their present names
             average = WeightAverage(self.network, self.config.optimizer.ema)
@@ -248,8 +265,8 @@ class Pretrainer:
             self.optimizer.load_state_dict(state["optimizer"])
         except (RuntimeError, ValueError, KeyError) as error:
             raise InvalidInputError(
-                f"the run in {str(self.directory)!r} cannot go on: it was started with "
-                f"{before or 'another network or optimiser'}; give the same keys again, or another output"
+                f"the run in {str(self.directory)!r} cannot go on: it was started with another network or optimiser; "
+                "give the same keys again, or another output"
             ) from error
         self.average = average
         self.average.updates = state["average_updates"]
@@ -261,8 +278,11 @@ class Pretrainer:
     def _started_with(self, state: dict[str, Any]) -> str:
         """The keys of the run in a checkpoint that are not those of this one; empty when all are the same."""
         before, now = dotted(state["config"]), dotted(asdict(self.config))
-        now |= {"iterations": before["iterations"], "output": before["output"]}  # may differ
-        keys = [f"{key}={value}" for key, value in before.items() if value != now.get(key, value)]
+        keys = [
+            f"{key}={value}"
+            for key, value in before.items()
+            if key.partition(".")[0] not in _MAY_DIFFER and value != now.get(key, value)
+        ]
         return ", ".join(keys)
 
     def save_prior(self) -> ScenePrior:
@@ -292,6 +312,11 @@ def pretrain(config: PretrainConfig) -> dict[str, Any]:
     Returns:
         The numbers of ``metrics.json``, which is written beside the prior and ``config.yaml``.
     """
+    with claimed(config.directory, "pretrain") if is_first_process() else nullcontext():
+        return _pretrain(config)
+
+
+def _pretrain(config: PretrainConfig) -> dict[str, Any]:
     prior, data, heldout = prepare(config)
     trainer = Pretrainer(config, data, heldout, prior)
     trained = trainer.run()

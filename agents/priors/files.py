@@ -12,15 +12,16 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
-from scene_envs.files import replacing, write_json
+from scene_envs.files import is_file, write_json
+from scene_envs.tensor_files import read_tensors, write_tensors
 
 SHIPPED = Path(__file__).parent / "shipped"
 CONFIG_NAME = "config.json"
 WEIGHTS_NAME = "model.safetensors"
+_MOST_NAME = 1000
 RESIDUAL = "residual."
 """What the names of measured tensors, which are no weights, start with."""
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
@@ -35,10 +36,14 @@ def list_priors() -> list[str]:
 def find_prior(name: str | os.PathLike[str]) -> Path:
     """The directory of a prior: a shipped name, a prior directory, or a run directory that holds ``prior/``."""
     path = Path(name)
+    if len(str(name)) > _MOST_NAME or "\0" in str(name):
+        raise InvalidInputError(
+            f"prior={str(name)[:60] + '...'!r} is neither a name nor a path ({len(str(name))} characters)"
+        )
     for candidate in (SHIPPED / str(name), path, path / "prior"):
-        if (candidate / CONFIG_NAME).is_file():
+        if is_file(candidate / CONFIG_NAME):
             return candidate
-    if path.exists() or os.sep in str(name):
+    if (len(str(name)) < _MOST_NAME // 4 and path.exists()) or os.sep in str(name):
         raise InvalidInputError(f"{str(name)!r} holds no prior: neither it nor its prior/ folder has a {CONFIG_NAME}")
     raise unknown_name("prior", str(name), list_priors())
 
@@ -72,9 +77,7 @@ def to_precision(weights: Mapping[str, Tensor], precision: str) -> dict[str, Ten
 def write_prior(directory: str | os.PathLike[str], config: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Path:
     """Write a prior's configuration and weights, each file atomically."""
     directory = Path(directory)
-    with replacing(directory / WEIGHTS_NAME) as weights:
-        save_file({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, weights)
-        weights.chmod(0o644)
+    write_tensors(directory / WEIGHTS_NAME, tensors)
     write_config(directory, config)
     return directory
 
@@ -89,8 +92,12 @@ def read_config(name: str | os.PathLike[str]) -> dict[str, Any]:
     file = find_prior(name) / CONFIG_NAME
     try:
         config: dict[str, Any] = json.loads(file.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CorruptFileError(f"{str(file)!r} is not valid JSON: {error}") from error
+    except (ValueError, RecursionError) as error:
+        raise CorruptFileError(
+            f"{str(file)!r} is not valid JSON: {type(error).__name__}: {str(error)[:200]}"
+        ) from error
+    if not isinstance(config, dict):
+        raise CorruptFileError(f"{str(file)!r} holds no mapping, so it is not the configuration of a prior")
     return config
 
 
@@ -110,7 +117,7 @@ def read_prior(name: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, 
     """
     config = read_config(name)
     with _weights_of(name) as file:
-        tensors = load_file(file)
+        tensors, _ = read_tensors(file)
     return config, {key: value.float() if value.is_floating_point() else value for key, value in tensors.items()}
 
 

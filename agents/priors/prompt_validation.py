@@ -35,6 +35,9 @@ def check_prompts(
     if prompt is None:
         check_guidance(prompt, guidance)
         return None
+    texts = [prompt] if isinstance(prompt, str) else prompt
+    if not isinstance(texts, Sequence) or not all(isinstance(text, str) for text in texts):
+        raise InvalidInputError(f"prompt={str(prompt)[:80]!r} must be a text, a list of texts, or null")
     prompts = [prompt] * count if isinstance(prompt, str) else list(prompt)
     if len(prompts) != count:
         raise InvalidInputError(f"{len(prompts)} prompts for {count} scenes; give one text, or one per scene")

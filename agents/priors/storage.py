@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
 from agents.diffusion import Preconditioning, ResidualVariance
-from agents.priors.files import read_prior, to_precision, write_prior
+from agents.priors.files import find_prior, read_prior, to_precision, write_prior
 from scene_envs.errors import CorruptFileError, UnknownNameError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene_types import SceneType, get_scene_type, register_scene_type
 
+logger = logging.getLogger(__name__)
+
+ASSET_FOLDERS = "SCENE_ENVS_ASSET_FOLDERS"
+"""Environment variable with the folders of assets that priors from elsewhere may read."""
+_LIMITS = {"slots": 10_000, "num_timesteps": 1_000_000, "seed": 2**63}
 _LEVELS, _RESIDUAL = "residual.timesteps", "residual.variance"
 
 
@@ -54,11 +60,12 @@ def read_stored(name: str | os.PathLike[str]) -> StoredPrior:
     """
     state, tensors = read_prior(name)
     with explained(name):
+        check_sizes(state["prior"], sum(tensor.numel() for tensor in tensors.values()), name)
         return StoredPrior(
             preconditioning=Preconditioning.from_state(state["preconditioning"]),
             normalizer=Normalizer.from_state(state["normalizer_state"]),
             residual=ResidualVariance(tensors.pop(_LEVELS), tensors.pop(_RESIDUAL)) if _LEVELS in tensors else None,
-            scene_type=_known_scene_type(state),
+            scene_type=_known_scene_type(state, find_prior(name)),
             process=state.get("process", "continuous"),
             fields=state["prior"],
             card=state.get("card") or {},
@@ -93,11 +100,70 @@ def write_stored(directory: str | os.PathLike[str], stored: StoredPrior, precisi
     return write_prior(directory, state, tensors)
 
 
-def _known_scene_type(state: dict[str, Any]) -> SceneType:
-    """The scene type that a prior was saved with, which is registered unless one of that name is known."""
+def _known_scene_type(state: dict[str, Any], directory: Path) -> SceneType:
+    """The scene type that a prior was saved with, which is registered unless one of that name is known.
+
+    Of its folders of assets, those in the prior's own are read, and those that the user named in ``ASSET_FOLDERS``.
+    """
     try:
         return get_scene_type(state["prior"]["scene_type"])
     except UnknownNameError:
         if "scene_type" not in state:
             raise
-        return register_scene_type(SceneType.from_dict(state["scene_type"]))
+        found = SceneType.from_dict(state["scene_type"])
+        allowed = [directory.resolve(), *_named_folders()]
+        kept = tuple(folder for folder in found.asset_folders if _within(Path(folder).resolve(), allowed))
+        left = [folder for folder in found.asset_folders if folder not in kept]
+        if left:
+            logger.warning(
+                "the prior %r names folders of assets outside its own, which are not read: %s; to read them, name "
+                "them in the environment variable %s, separated by %r",
+                str(directory),
+                ", ".join(left)[:500],
+                ASSET_FOLDERS,
+                os.pathsep,
+            )
+        return register_scene_type(replace(found, asset_folders=kept))
+
+
+def _named_folders() -> list[Path]:
+    return [Path(name).expanduser().resolve() for name in os.environ.get(ASSET_FOLDERS, "").split(os.pathsep) if name]
+
+
+def _within(folder: Path, parents: list[Path]) -> bool:
+    return any(folder == parent or parent in folder.parents for parent in parents)
+
+
+def check_sizes(fields: Any, weights: int, name: str | os.PathLike[str]) -> None:
+    """Refuse a configuration that asks for a network larger than the weights in its file, before anything is built.
+
+    Args:
+        fields: the configuration, nested.
+        weights: how many numbers the file holds.
+        name: of the prior, for the message.
+
+    Raises:
+        CorruptFileError: a size is out of proportion.
+    """
+    sizes = list(_sizes(fields, ""))
+    room = 64 * (weights + 100_000)
+    wide = max([size for key, size in sizes if key not in _LIMITS], default=1)
+    deep = max([size for key, size in sizes if key == "depth"], default=1)
+    for key, size in sizes:
+        most = _LIMITS.get(key, int((room / (deep if size == wide and key != "depth" else 1)) ** 0.5))
+        if abs(size) > most:
+            raise CorruptFileError(
+                f"the configuration of the prior {str(name)!r} asks for {key}={size}, beyond what its file of "
+                f"{weights} weights can have ({most})"
+            )
+
+
+def _sizes(fields: Any, key: str) -> Iterator[tuple[str, int]]:
+    if isinstance(fields, dict):
+        for name, value in fields.items():
+            yield from _sizes(value, str(name))
+    elif isinstance(fields, list):
+        for value in fields:
+            yield from _sizes(value, key)
+    elif isinstance(fields, int) and not isinstance(fields, bool):
+        yield key, fields

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import os
-import pickle
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,6 +14,10 @@ from torch import Tensor, nn
 from scene_envs.errors import CorruptFileError, InvalidInputError, TrainingError
 from scene_envs.files import replacing
 
+_MARK = b"scene-envs sha256 "
+_TRAILER = len(_MARK) + 64
+"""The last bytes of a checkpoint: the mark, and the digest of all bytes before it in hexadecimal."""
+
 
 def save_checkpoint(path: str | os.PathLike[str], state: dict[str, Any]) -> None:
     """Write ``state`` (tensors, numbers, strings, containers) to ``path``, replacing it atomically.
@@ -21,8 +26,13 @@ def save_checkpoint(path: str | os.PathLike[str], state: dict[str, Any]) -> None
         TrainingError: the disk refused; the previous checkpoint is untouched.
     """
     try:
-        with replacing(path) as partial, partial.open("wb") as file:
+        with replacing(path) as partial, partial.open("w+b") as file:
             torch.save(state, file)
+            file.seek(0)
+            digest = hashlib.sha256()
+            while block := file.read(1 << 20):
+                digest.update(block)
+            file.write(_MARK + digest.hexdigest().encode())
             file.flush()
             os.fsync(file.fileno())
     except (OSError, RuntimeError) as error:
@@ -36,16 +46,25 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read a checkpoint, weights only: no code in the file is run.
 
     Raises:
-        CorruptFileError: truncated, or not a checkpoint.
+        CorruptFileError: truncated, damaged, or not a checkpoint.
     """
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        with open(path, "rb") as file:
+            content = file.read()
     except FileNotFoundError:
         raise InvalidInputError(f"no checkpoint at {str(path)!r}") from None
-    except (RuntimeError, EOFError, pickle.UnpicklingError, ValueError, KeyError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    if content[-_TRAILER:].startswith(_MARK):
+        content, written = content[:-_TRAILER], content[-64:].decode(errors="replace")
+        if hashlib.sha256(content).hexdigest() != written:
+            raise CorruptFileError(
+                f"{str(path)!r} is damaged: its contents are not what was written (checksum); delete it to start the "
+                "run anew"
+            )
+    try:
+        state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    except Exception as error:  # a damaged file fails in any way; torch's own advice would be to run its code
         raise CorruptFileError(
-            f"{str(path)!r} is truncated or not a checkpoint ({reason}); delete it to start the run anew"
+            f"{str(path)!r} is truncated or not a checkpoint ({type(error).__name__}); delete it to start the run anew"
         ) from error
     if not isinstance(state, dict):
         raise CorruptFileError(f"{str(path)!r} holds a {type(state).__name__}, not a checkpoint")

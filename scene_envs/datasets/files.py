@@ -129,7 +129,7 @@ def read_block(block: Block, features: int) -> Rows:
         parquet = store.open_parquet(block.file)
         present = _columns(parquet.schema_arrow.names, str(block.file))
         table = _within_group(parquet.iter_batches(BLOCK, row_groups=[block.group], columns=present), block)
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, ValueError) as error:
         raise CorruptFileError(
             f"cannot read rows {block.start} to {block.start + block.rows - 1} of {str(block.file)!r}: {error}; "
             "delete the file and generate again to remake it"
@@ -149,12 +149,13 @@ def to_rows(table: pa.Table, features: int, place: str, start: int = 0) -> Rows:
     _columns(table.column_names, place)
     try:
         scenes = _to_array(_one_array(table[store.SCENES]), features, start)
+        prompt_sets = _prompt_sets(table)
     except (pa.ArrowException, ValueError) as error:
         raise CorruptFileError(
             f"cannot read scenes of {features} features per slot from {place!r}: {error}; "
             "delete the file and generate again to remake it"
         ) from error
-    return Rows(scenes, _prompt_sets(table), place, start)
+    return Rows(scenes, prompt_sets, place, start)
 
 
 # -- files --------------------------------------------------------------------------------------------

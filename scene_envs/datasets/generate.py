@@ -17,6 +17,7 @@ from scene_envs.datasets.ray_workers import run_ray
 from scene_envs.datasets.shards import Job, shard_journal
 from scene_envs.datasets.workers import Work, run_processes, write_shard_of
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
+from scene_envs.files import storage_error
 from scene_envs.grammars import Grammar, get_grammar
 from scene_envs.grammars.catalogue import grammar_factory
 from scene_envs.normalizer import Normalizer
@@ -154,7 +155,7 @@ def _prepare(folder: Path, grammar: Grammar, settings: dict[str, Any]) -> Normal
     except (FileExistsError, NotADirectoryError):
         raise InvalidInputError(f"output {str(folder)!r} is a file, not a folder; give another") from None
     except OSError as error:
-        raise store.storage_error(folder, error) from error
+        raise storage_error(folder, error) from error
     normalizer = fixed_normalizer(grammar)
     store.write_json(path, store.make_metadata(scene_type, normalizer, **settings))
     return normalizer

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from scene_envs.datasets.store import storage_error
+from scene_envs.files import storage_error
 
 
 class Journal:

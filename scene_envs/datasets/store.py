@@ -7,7 +7,6 @@ column ``language_annotations`` holds all prompts of a scene.
 
 from __future__ import annotations
 
-import errno
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError
+from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.files import replacing
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene_types import SceneType
@@ -32,10 +31,6 @@ _NOTES = b"scene_envs"
 _MODEL_PATH = "scene_envs/assets/{name}"
 _ROW_GROUP = 500
 """Scenes per row group: what a streaming reader has to hold at least."""
-
-
-class StorageError(SceneEnvsError, OSError):
-    """A file could not be written: the disk is full, or the folder may not be written to."""
 
 
 def shard_name(index: int) -> str:
@@ -101,7 +96,7 @@ def encode_shard(
         columns[PROMPT_SETS] = pa.array([list(prompts) for prompts in prompt_sets], pa.list_(pa.string()))
     table = pa.table(columns).replace_schema_metadata({_NOTES: json.dumps(notes, sort_keys=True).encode()})
     sink = pa.BufferOutputStream()
-    pq.write_table(table, sink, compression="zstd", row_group_size=_ROW_GROUP)
+    pq.write_table(table, sink, compression="zstd", row_group_size=_ROW_GROUP, write_page_checksum=True)
     return bytes(sink.getvalue().to_pybytes())
 
 
@@ -109,16 +104,23 @@ def read_notes(path: Path) -> dict[str, Any]:
     """The facts that :func:`write_shard` kept in the footer, and ``rows``; raises CorruptFileError."""
     file = open_parquet(path)
     footer = file.schema_arrow.metadata or {}
-    return {**json.loads(footer.get(_NOTES, b"{}")), "rows": file.metadata.num_rows}
+    try:
+        return {**json.loads(footer.get(_NOTES, b"{}")), "rows": file.metadata.num_rows}
+    except (ValueError, TypeError) as error:
+        raise CorruptFileError(
+            f"{str(path)!r} has a damaged footer; delete it and generate again to remake it"
+        ) from error
 
 
 def open_parquet(path: Path) -> pq.ParquetFile:
     """The parquet file at ``path``; raises InvalidInputError (none there) or CorruptFileError."""
     try:
-        return pq.ParquetFile(path)
+        file = pq.ParquetFile(path, page_checksum_verification=True)
+        _ = file.schema_arrow.names, file.metadata.num_rows  # what is damaged there shows when it is read
+        return file
     except FileNotFoundError:
         raise InvalidInputError(f"no parquet file at {str(path)!r}") from None
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, ValueError) as error:
         raise CorruptFileError(
             f"{str(path)!r} is not a readable parquet file ({error}); delete it and generate again to remake it"
         ) from error
@@ -130,21 +132,8 @@ def remove_partial(folder: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def storage_error(path: Path, error: OSError) -> StorageError:
-    """Error to raise when ``path`` could not be written."""
-    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-    reason = "the disk is full" if full else error.strerror or str(error)
-    remedy = "make room" if full else "put that right"
-    return StorageError(
-        f"cannot write {str(path)!r}: {reason}; finished files are kept; {remedy} and run again to resume"
-    )
-
-
 @contextmanager
 def _replacing(path: Path) -> Iterator[Path]:
     """A place to write ``path`` at before it takes its name; one per process, so that two never mix."""
-    try:
-        with replacing(path) as partial:
-            yield partial
-    except OSError as error:
-        raise storage_error(path, error) from error
+    with replacing(path) as partial:
+        yield partial

@@ -127,6 +127,8 @@ def resolve_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
     """
     if formats == "all":
         return tuple(f.name for f in _FORMATS.values() if not f.requires or find_spec(f.requires) is not None)
+    if not isinstance(formats, Sequence) or not all(isinstance(name, str) for name in formats):
+        raise InvalidInputError(f"formats={formats!r} is no list of names; known: {', '.join(list_formats())}")
     names = (formats,) if isinstance(formats, str) else tuple(dict.fromkeys(formats))
     if not names:
         raise InvalidInputError(f"formats is empty; give at least one of {', '.join(list_formats())}")

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-import os
-import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +15,7 @@ from scipy.spatial import ConvexHull
 from scene_envs.errors import MissingDependencyError, PhysicsError
 from scene_envs.physics.constants import FRICTION
 from scene_envs.physics.geometry import LevelGeometry, LibraryGeometry, inset_hull
+from scene_envs.silence import silence
 
 Array = NDArray[np.float64]
 BodyKey = tuple[int, str]
@@ -208,7 +206,7 @@ class BodyPool:
 
 def _import_bullet() -> Any:
     try:
-        with _silence():
+        with silence():
             import pybullet
     except ImportError as error:
         raise MissingDependencyError(
@@ -216,23 +214,6 @@ def _import_bullet() -> Any:
             "install it there with: pip install pybullet"
         ) from error
     return pybullet
-
-
-@contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Keep the greeting that PyBullet prints on import out of the user's terminal."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    with open(os.devnull, "w") as sink:
-        kept = os.dup(1), os.dup(2)
-        try:
-            os.dup2(sink.fileno(), 1)
-            os.dup2(sink.fileno(), 2)
-            yield
-        finally:
-            for copy, descriptor in zip(kept, (1, 2), strict=True):
-                os.dup2(copy, descriptor)
-                os.close(copy)
 
 
 def _wavefront(hulls: list[Array]) -> str:

@@ -45,8 +45,11 @@ class Frame:
 
 def load_pybullet() -> ModuleType:
     """The PyBullet module; raises MissingDependencyError where it is not installed."""
+    from scene_envs.silence import silence
+
     try:
-        import pybullet
+        with silence():
+            import pybullet
     except ImportError as error:
         raise MissingDependencyError(
             "pictures need PyBullet, which is not installed; install it with `pip install pybullet` "

@@ -199,3 +199,43 @@ def test_tracebacks_are_shown_only_when_asked_for(error, echo, tmp_path, capsys,
 def test_a_docstring_over_two_lines_is_one_sentence():
     assert describe_fields(EchoConfig)[-1].meaning == "a name or a mapping."
     assert "goes on over two lines." in {key.name: key.meaning for key in describe_fields(EchoConfig)}["text"]
+
+
+def test_wrong_keys_are_told_before_anything_heavy_is_loaded():
+    lines = [
+        ["post-train", "iterations=a"],
+        ["sample", "count=x"],
+        ["search", "budgte=3"],
+        ["pretrain", "optimizer.lr=-1"],
+    ]
+    code = (
+        "import sys; from agents.cli import main\n"
+        f"print([main(line) for line in {lines}], {{'torch', 'matplotlib', 'pybullet'}} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[2, 2, 2, 2] set()"
+
+
+@pytest.mark.parametrize("text", ["${oc.env:HOME}", "a ${b} \\${c}", "${", "$HOME"])
+def test_text_that_looks_like_an_interpolation_is_text(text, echo, tmp_path):
+    assert main(["demo", f"text={text}", f"output={tmp_path}"]) == 0
+    assert echo.seen[0].text == text
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["sample", "count=" + "9" * 5000], "cannot be read"),
+        (["sample", "seed=" + "9" * 30], "whole numbers end at 2^63"),
+        (["sample", "seed=-1"], "seed=-1 must be from 0"),
+        (["sample", "device=banana"], "device='banana' is not a torch device of this machine"),
+        (["view", "scene=1e999"], "is neither a name nor a mapping"),
+        (["project", "scenes=" + "a" * 300], "no scene file, run or dataset is there"),
+        (["sample", "reward=./mine.py:few"], "add --allow-local if you trust it"),
+    ],
+)
+def test_values_that_no_key_expects_are_refused_in_a_few_words(words, message, capsys, tmp_path):
+    assert main([*words, f"output={tmp_path}"]) == 2
+    err = capsys.readouterr().err
+    assert message in err
+    assert len(err) < 1000

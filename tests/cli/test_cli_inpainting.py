@@ -135,5 +135,5 @@ def test_an_imported_prior_without_geometry_is_sampled_without_physics(
     assert len(SceneBatch.load(output / "scenes.safetensors")) == 2
     assert not (output / "gallery.png").exists()
     assert "reward" not in json.loads((output / "metrics.json").read_text())
-    assert main([*words, "project=true"]) == 2
+    assert main([*words[:-1], f"output={tmp_path / 'ready'}", "project=true"]) == 2
     assert "have none here" in capsys.readouterr().err

@@ -100,6 +100,8 @@ def test_a_run_does_not_go_on_with_keys_that_do_not_fit_it(config: PretrainConfi
     for other, was in (
         ({"optimizer.name": "adamw"}, "optimizer.name=muon"),
         ({"network.hidden": 32}, "network.hidden=16"),
+        ({"seed": 7}, "seed="),
+        ({"optimizer.lr": 0.5}, "optimizer.lr="),
     ):
         with pytest.raises(InvalidInputError, match=f"started with {was}"):
             make_run(changed(config, {"iterations": 8, **other}), raw).run()

@@ -18,11 +18,13 @@ class CheckRewardConfig:
         reward: its name, or a mapping such as '{name: clip, reward: object_count, high: 20}'.
         scene: the scene type to try it on.
         seed: of the scenes it is tried on.
+        reward_timeout: seconds that a reward from outside this package, which runs in a process of its own, may take.
     """
 
     reward: Any = named("object_count", "reward")
     scene: Any = named("dimsum_table", "scene")
     seed: int = 0
+    reward_timeout: float = 60.0
 
 
 def config() -> type[CheckRewardConfig]:
@@ -33,7 +35,12 @@ def config() -> type[CheckRewardConfig]:
 def run(settings: CheckRewardConfig) -> None:
     """Print what was checked; raises RewardError with every broken clause."""
     from rewards import check_reward, reward_name
+    from rewards.isolation import close_reward, run_reward
 
-    for clause in check_reward(settings.reward, settings.scene, seed=settings.seed):
-        print(f"ok  {clause}")
+    reward = run_reward(settings.reward, timeout=settings.reward_timeout)
+    try:
+        for clause in check_reward(reward, settings.scene, seed=settings.seed):
+            print(f"ok  {clause}")
+    finally:
+        close_reward(reward)
     print(f"reward {reward_name(settings.reward)!r} keeps its contract")

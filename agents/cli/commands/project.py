@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from agents.cli.commands.scenes import draw_scenes, make_ready
+from agents.cli.commands.scenes import draw_scenes, load_scenes, make_ready
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
@@ -16,13 +17,15 @@ class ProjectConfig:
     """Scenes made simulation-ready.
 
     Attributes:
-        scenes: a scene file, such as the scenes.safetensors that sample writes.
+        scenes: a scene file, the folder of a sample or search run, or a dataset.
+        count: how many of the scenes, from the first; null for all.
         pictures: how many scenes the galleries show; 0 draws none.
         workers: physics worker processes; 0 computes in this one.
         output: folder for ready.safetensors, before.png and ready.png.
     """
 
     scenes: str = ""
+    count: int | None = None
     pictures: int = 12
     workers: int = 2
     output: str = ""
@@ -37,11 +40,10 @@ def run(settings: ProjectConfig, run: Run) -> None:
     """Project, settle, count what is ready."""
     from scene_envs.errors import InvalidInputError
     from scene_envs.physics import PhysicsPool
-    from scene_envs.scene import SceneBatch
 
     if not settings.scenes:
-        raise InvalidInputError("project: name a scene file, as in scenes=runs/mine/scenes.safetensors")
-    batch = SceneBatch.load(settings.scenes)
+        raise InvalidInputError("project: name a scene file, run or dataset, as in scenes=runs/mine")
+    batch = load_scenes(Path(settings.scenes), settings.count)
     with PhysicsPool(workers=settings.workers) as pool:
         draw_scenes(batch, settings.pictures, run, "before.png")
         run.write_metrics({"scenes": len(batch), "ready": make_ready(batch, settings.pictures, pool, run)})

@@ -29,6 +29,7 @@ class SampleConfig:
         slots: slots per scene, more than trained is allowed; null means as trained.
         seed: of the noise.
         reward: scores the samples, for metrics.json; null for none.
+        reward_timeout: seconds that a reward from outside this package, which runs in a process of its own, may take.
         project: also make the samples simulation-ready (project out of penetration, then settle).
         export: formats to write the scenes in, as drake or [drake, mjcf], the simulation-ready ones with
             project=true; null for none. See scene-envs export.
@@ -49,6 +50,7 @@ class SampleConfig:
     slots: int | None = None
     seed: int = 0
     reward: Any = named("feasible_objects", "reward")
+    reward_timeout: float = 60.0
     project: bool = False
     export: Any = None
     pictures: int = 12
@@ -66,13 +68,17 @@ def config() -> type[SampleConfig]:
 def run(settings: SampleConfig, run: Run) -> None:
     """Draw, score, save and picture the scenes."""
     from agents.priors.base import ScenePrior
-    from rewards import resolve_reward
+    from rewards.isolation import close_reward, run_reward
     from scene_envs.export.formats import resolve_formats
     from scene_envs.physics import PhysicsPool
     from scene_envs.scene import SceneBatch
 
     formats = None if settings.export is None else resolve_formats(settings.export)
-    reward = None if settings.reward is None else resolve_reward(settings.reward)
+    reward = None
+    if settings.reward is not None:
+        reward = run_reward(
+            settings.reward, seed=settings.seed, timeout=settings.reward_timeout, workers=settings.workers
+        )
     prior = ScenePrior.load(settings.prior).to(settings.device)
     if not prior.scene_type.has_geometry:
         settings = _without_geometry(settings, prior.scene_type, run)
@@ -100,6 +106,7 @@ def run(settings: SampleConfig, run: Run) -> None:
     with PhysicsPool(workers=settings.workers) as pool:
         if reward is not None:
             metrics["reward"] = reward_figures(reward, batch, pool, run)
+            close_reward(reward)
         draw_scenes(batch, settings.pictures, run, "gallery.png")
         if settings.project:
             metrics["ready"] = make_ready(batch, settings.pictures, pool, run)

@@ -20,11 +20,16 @@ class SearchKeys(SearchConfig):
     Attributes:
         prior: a shipped name, or the folder of a prior or a run.
         objective: what the scene should score high on: any reward.
+        reward_timeout: seconds that an objective from outside this package, which runs in a process of its own, may
+            take for a batch; then its scenes are invalid.
+        reward_memory: GiB that such an objective may allocate.
         output: folder for best.safetensors, before.png, after.png and curve.png; the same command goes on there.
     """
 
     prior: str = "dimsum_table"
     objective: Any = named("feasible_objects", "reward")
+    reward_timeout: float = 60.0
+    reward_memory: float = 1.0
     output: str = ""
 
 
@@ -39,8 +44,13 @@ def run(settings: SearchKeys, run: Run) -> None:
     from rich.progress import Progress
 
     from agents.planning import run_search
+    from rewards.isolation import close_reward, is_foreign, run_reward
 
     search = SearchConfig(**{field.name: getattr(settings, field.name) for field in fields(SearchConfig)})
+    limits = {"timeout": settings.reward_timeout, "memory": settings.reward_memory}
+    objective = settings.objective
+    if is_foreign(objective):
+        objective = run_reward(objective, seed=settings.seed, workers=settings.workers, **limits)
     with Progress(console=Console(stderr=True)) as bar:
         tasks: dict[str, Any] = {}
 
@@ -49,7 +59,10 @@ def run(settings: SearchKeys, run: Run) -> None:
                 tasks[planner] = bar.add_task(planner, total=budget)
             bar.update(tasks[planner], completed=done, description=f"{planner}, best {best:.3f}")
 
-        outcome = run_search(settings.prior, settings.objective, config=search, output=settings.output, progress=show)
+        try:
+            outcome = run_search(settings.prior, objective, config=search, output=settings.output, progress=show)
+        finally:
+            close_reward(objective)
     metrics = outcome.metrics
     found, first = (metrics[key]["objective"] for key in ("search", "first_samples"))
     best_of = "" if outcome.best_of is None else f"{metrics['best_of']['objective']:.4g} by as many samples, "

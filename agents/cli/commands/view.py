@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.cli.commands.scenes import SCENE_FILES
+from agents.cli.commands.scenes import find_scenes
 from agents.configuration.fields import named
 
 if TYPE_CHECKING:
@@ -112,9 +112,8 @@ def _read(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str]:
 
     path = Path(settings.scenes)
     chosen = slice(settings.first, settings.first + settings.count)
-    held = next((path / name for name in SCENE_FILES if (path / name).is_file()), None)
-    if held is not None or path.suffix == ".safetensors":
-        path = held or path
+    path = find_scenes(path)
+    if path.suffix == ".safetensors":
         batch = SceneBatch.load(path)
         total, captions = len(batch), None
         batch = batch[chosen]

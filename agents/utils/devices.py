@@ -1,0 +1,28 @@
+"""Torch devices by name."""
+
+from __future__ import annotations
+
+import torch
+
+from scene_envs.errors import InvalidInputError
+
+
+def check_device(name: str) -> None:
+    """Refuse a device that torch does not know or that is not here.
+
+    Raises:
+        InvalidInputError: says which would work.
+
+    >>> check_device("cpu")
+    """
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device)
+    except Exception:  # each backend has errors of its own
+        here = ["cpu"]
+        here += [f"cuda:{index}" for index in range(torch.cuda.device_count())]
+        raise InvalidInputError(
+            f"device={str(name)[:60]!r} is not a torch device of this machine; here: {', '.join(here)}"
+        ) from None
+    if device.type == "meta":
+        raise InvalidInputError("device='meta' holds no numbers; give cpu or cuda")

@@ -1,0 +1,88 @@
+"""Signals that end a command: SIGTERM as an exception, and both held back while a step is finished."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+logger = logging.getLogger(__name__)
+
+_GRACE = 15
+"""Seconds that a step may take to end before the signal ends it."""
+
+
+class Terminated(KeyboardInterrupt):
+    """The process was asked to end by SIGTERM; handled like Ctrl-C."""
+
+
+@contextmanager
+def terminable() -> Iterator[None]:
+    """Context in which SIGTERM raises :class:`Terminated`; in other threads than the first nothing is changed."""
+    with _handling({signal.SIGTERM: _raise}):
+        yield
+
+
+@contextmanager
+def finishing_steps() -> Iterator[Ending]:
+    """Context in which SIGINT and SIGTERM wait for the end of a step, at most 15 s; a second one does not wait.
+
+    Yields what is to be called after each step, once the state is saved if a signal is ``pending``.
+    """
+    end = Ending()
+    with _handling({signal.SIGINT: end.note, signal.SIGTERM: end.note, signal.SIGALRM: end.late}):
+        try:
+            yield end
+        finally:
+            if end.pending:
+                signal.alarm(0)
+
+
+class Ending:
+    """A signal that waits for the end of a step; called after it, raises what waits."""
+
+    def __init__(self) -> None:
+        self.number = 0
+
+    @property
+    def pending(self) -> bool:
+        """Whether a signal waits."""
+        return self.number != 0
+
+    def note(self, number: int, frame: FrameType | None) -> None:
+        """Remember the first signal, raise the second."""
+        if self.number:
+            _raise(number, frame)
+        self.number = number
+        signal.alarm(_GRACE)
+        logger.info("finishing this step and saving; the same signal again ends at once")
+
+    def late(self, number: int, frame: FrameType | None) -> None:
+        """The step took too long."""
+        _raise(self.number, frame)
+
+    def __call__(self) -> None:
+        """Raise what waits."""
+        if self.number:
+            _raise(self.number, None)
+
+
+def _raise(number: int, frame: FrameType | None) -> None:
+    raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
+
+
+@contextmanager
+def _handling(handlers: dict[signal.Signals, Any]) -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)

@@ -1,0 +1,298 @@
+"""Rewards in processes of their own, which can be ended: what a reward does there harms no run."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import weakref
+from collections.abc import Mapping
+from dataclasses import replace
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+import torch
+
+from rewards.base import RewardContext, RewardOutput
+from rewards.local_files import allowed_files, is_local, names_in
+from rewards.registry import allowed_targets, is_own, plugin_module, registered_module, resolve_reward, reward_name
+from rewards.seeding import current_draw
+from scene_envs.errors import InvalidInputError, RewardError, SceneEnvsError, UnknownNameError
+from scene_envs.scene import SceneBatch
+
+_START_UP = 120.0
+"""Seconds that an empty worker may take to start."""
+_ERRORS: dict[str, type[SceneEnvsError]] = {
+    kind.__name__: kind for kind in (InvalidInputError, UnknownNameError, RewardError)
+}
+
+
+class IsolatedReward:
+    """A reward that runs in a worker process.
+
+    Scores are those of the same reward in this process, bit for bit. A call that takes too long, ends its process,
+    crashes or fills its memory raises a :class:`~scene_envs.errors.RewardError`, so that its scenes are invalid; the
+    next call gets a new process.
+
+    Args:
+        reward: a registered name, ``PATH.py:NAME`` or a mapping; objects cannot be sent.
+        timeout: seconds that a call may take, and that making the reward may take.
+        memory: GiB that it may allocate beyond what an empty worker needs (on Linux; elsewhere unlimited).
+        seed: of the run, for rewards that draw random numbers.
+        workers: physics workers of a reward that asks for ``context.pool``; 0 computes in its process.
+
+    Raises:
+        InvalidInputError: the reward or a limit is none.
+        RewardError: the reward cannot be made, or not in time.
+
+    >>> with IsolatedReward("object_count", timeout=60.0) as reward:
+    ...     reward(SceneBatch.empty("dimsum_table", 2), RewardContext()).value
+    tensor([1., 1.])
+    """
+
+    def __init__(
+        self, reward: Any, *, timeout: float = 60.0, memory: float = 1.0, seed: int = 0, workers: int = 0
+    ) -> None:
+        if not isinstance(reward, str | Mapping):
+            raise InvalidInputError(f"only a reward given by name or as a mapping can be isolated, got {reward!r}")
+        check_limits(timeout, memory)
+        self.name = self.__name__ = reward_name(reward)
+        self.depends_on_batch = False
+        self.seed = seed
+        self.timeout, self.memory, self.workers = timeout, memory, workers
+        self._reward = reward
+        self._worker: _Worker | None = None
+        self._lock = threading.Lock()
+        self._started()
+
+    def __enter__(self) -> IsolatedReward:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"IsolatedReward({self._reward!r})"
+
+    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        """Score in the worker; the batch may be on any device."""
+        scenes = batch.tensor.detach().cpu().contiguous().numpy()
+        seed = self.seed if context.seed == 0 else context.seed
+        message = ("score", replace(batch.scene_type), scenes, (context.prompts, seed, current_draw()))
+        with self._lock:
+            body = self._started().ask(message, self.timeout)
+        return _unpacked(body, batch.tensor.device)
+
+    def close(self) -> None:
+        """End the worker; the next call starts another."""
+        if self._worker is not None:
+            self._worker.stop()
+            self._worker = None
+
+    def _started(self) -> _Worker:
+        if self._worker is None or not self._worker.alive:
+            self._worker = _Worker(self.name, self.timeout, self.memory)
+            try:
+                message = ("make", self._reward, allowed_targets(), allowed_files(), self.workers)
+                self.depends_on_batch = bool(self._worker.ask(message, self.timeout))
+            except BaseException:
+                self.close()
+                raise
+        return self._worker
+
+
+class SeededReward:
+    """A reward of this process that is told the seed of its run.
+
+    Args:
+        reward: a name, mapping, function, class or reward.
+        seed: of the run.
+    """
+
+    def __init__(self, reward: Any, seed: int) -> None:
+        self.reward = resolve_reward(reward)
+        self.name = reward_name(self.reward)
+        self.depends_on_batch = bool(getattr(self.reward, "depends_on_batch", False))
+        self.seed = seed
+
+    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        """Score with the run's seed in the context."""
+        from rewards.evaluation import evaluate_reward
+
+        return evaluate_reward(self.reward, batch, replace(context, seed=self.seed), strict=True)
+
+
+def run_reward(reward: Any, *, seed: int = 0, timeout: float = 60.0, memory: float = 1.0, workers: int = 0) -> Any:
+    """A reward as runs use it: this package's own in this process, others in one that can be ended.
+
+    Functions and objects, which exist in this process alone, stay in it.
+
+    Args:
+        reward: whatever names a reward.
+        seed: of the run.
+        timeout: as for :class:`IsolatedReward`, like the arguments that follow.
+        memory: GiB.
+        workers: physics workers.
+
+    >>> run_reward("object_count")
+    ObjectCount()
+    """
+    check_limits(timeout, memory)
+    if is_foreign(reward):
+        return IsolatedReward(reward, timeout=timeout, memory=memory, seed=seed, workers=workers)
+    resolved = resolve_reward(reward)
+    return resolved if isinstance(reward, str) and is_own(resolved) else SeededReward(resolved, seed)
+
+
+def close_reward(reward: Any) -> None:
+    """End the worker of a reward, if it has one."""
+    if isinstance(reward, IsolatedReward):
+        reward.close()
+
+
+def is_foreign(reward: Any) -> bool:
+    """Whether a name or mapping needs code from outside this package that another process can load, too.
+
+    >>> is_foreign("object_count"), is_foreign({"name": "clip", "reward": "./mine.py:clutter", "high": 1.0})
+    (False, True)
+    """
+    if isinstance(reward, Mapping) and "_target_" in reward and not str(reward["_target_"]).startswith("rewards."):
+        return True
+    if not isinstance(reward, str):
+        return any(is_foreign(name) for name in _parts(reward))
+    if is_local(reward):
+        return True
+    module = registered_module(reward) or plugin_module(reward)
+    if module is None or module == "__main__" or module.split(".")[0] in ("rewards", "scene_envs"):
+        return False
+    return plugin_module(reward) is not None  # registered by a module that was imported here alone: only here
+
+
+def check_limits(timeout: float, memory: float) -> None:
+    """Refuse limits that are not positive numbers."""
+    for name, value in (("reward_timeout", timeout), ("reward_memory", memory)):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < float("inf"):
+            raise InvalidInputError(f"{name}={value!r} must be a positive number")
+
+
+def _parts(reward: Any) -> list[Any]:
+    if isinstance(reward, Mapping):
+        return [*names_in([reward.get("name", "")]), *(v for k, v in reward.items() if k != "name")]
+    return list(reward) if isinstance(reward, list | tuple) else []
+
+
+class _Worker:
+    """One process, the two pipes to it, and the watch over its time."""
+
+    def __init__(self, name: str, timeout: float, memory: float) -> None:
+        self.name, self.memory = name, memory
+        self.alive = True
+        child_reads, parent_writes = os.pipe()
+        parent_reads, child_writes = os.pipe()
+        path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
+        limits = [str(timeout), str(int(memory * 2**30)), str(torch.get_num_threads())]
+        try:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "rewards.worker", str(child_reads), str(child_writes), *limits],
+                pass_fds=(child_reads, child_writes),
+                env=os.environ | {"PYTHONPATH": path, "PYTHONHASHSEED": "0"},
+                stdin=subprocess.DEVNULL,
+                stdout=2,  # what a reward prints is no output of ours
+                start_new_session=True,
+            )
+        finally:
+            os.close(child_reads)
+            os.close(child_writes)
+        self.outbox = Connection(parent_writes, readable=False)
+        self.inbox = Connection(parent_reads, writable=False)
+        self._end = weakref.finalize(self, _end, self.process, self.outbox, self.inbox)
+        self._receive("started", _START_UP)
+
+    def ask(self, message: Any, timeout: float) -> Any:
+        """The answer to a message; a worker that gives none within ``timeout`` seconds is ended."""
+        return self._receive(message, timeout)
+
+    def stop(self) -> None:
+        """End the process and all that it started, and close the pipes."""
+        self.alive = False
+        self._end()
+
+    def _receive(self, message: Any, timeout: float) -> Any:
+        late = threading.Event()
+
+        def end() -> None:  # a process that hangs neither reads nor writes: only its end unblocks this one
+            late.set()
+            _kill(self.process)
+
+        clock = threading.Timer(timeout, end)
+        clock.daemon = True
+        clock.start()
+        try:
+            if message != "started":
+                self.outbox.send(message)
+            kind, body = self.inbox.recv()
+        except (EOFError, OSError, pickle.UnpicklingError):
+            self.stop()
+            raise RewardError(f"reward {self.name!r} {self._how_it_ended(late.is_set(), timeout)}") from None
+        except BaseException:
+            self.stop()
+            raise
+        finally:
+            clock.cancel()
+        if kind == "done":
+            return body
+        error, text = body
+        raise _ERRORS.get(error, RewardError)(text)
+
+    def _how_it_ended(self, late: bool, timeout: float) -> str:
+        status = self.process.returncode
+        if late or status == -signal.SIGALRM:
+            return f"took longer than reward_timeout={timeout:g} s; its process was ended"
+        if status is not None and status < 0:
+            with contextlib.suppress(ValueError):
+                return f"crashed its process ({signal.Signals(-status).name})"
+        return f"ended its process (exit status {status}) instead of returning scores"
+
+
+def _end(process: subprocess.Popen[bytes], outbox: Connection, inbox: Connection) -> None:
+    for pipe in (outbox, inbox):
+        with contextlib.suppress(OSError):
+            pipe.close()
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(0.2)  # one that ended by itself is told from one that was ended
+    _kill(process)
+    process.wait()
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, signal.SIGKILL)
+
+
+def packed(output: RewardOutput) -> dict[str, Any]:
+    """An output as arrays, to be sent."""
+    return {
+        "value": output.value.cpu().numpy(),
+        "per_object": None if output.per_object is None else output.per_object.cpu().numpy(),
+        "terms": {name: term.cpu().numpy() for name, term in output.terms.items()},
+        "valid": output.is_valid.cpu().numpy(),
+        "object_flags": {name: flag.cpu().numpy() for name, flag in output.object_flags.items()},
+    }
+
+
+def _unpacked(body: Mapping[str, Any], device: torch.device) -> RewardOutput:
+    def tensor(array: Any) -> torch.Tensor:
+        return torch.from_numpy(np.array(array)).to(device)
+
+    return RewardOutput(
+        tensor(body["value"]),
+        None if body["per_object"] is None else tensor(body["per_object"]),
+        {name: tensor(term) for name, term in body["terms"].items()},
+        tensor(body["valid"]),
+        {name: tensor(flag) for name, flag in body["object_flags"].items()},
+    )

@@ -1,0 +1,58 @@
+"""Seeds of the global random generators while a reward runs."""
+
+from __future__ import annotations
+
+import hashlib
+import random
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+
+from scene_envs.scene import SceneBatch
+
+_local = threading.local()
+
+
+@contextmanager
+def seeded_generators(seed: int, batch: SceneBatch) -> Iterator[None]:
+    """Context in which the generators of torch (CPU), NumPy and Python start from a seed of their own.
+
+    The seed hangs on ``seed`` and on the scenes alone: the same scenes meet the same numbers in every call, in every
+    process, and after a run is resumed. The generators go on afterwards as if nothing had been drawn.
+
+    Args:
+        seed: of the run.
+        batch: the scenes that are scored.
+    """
+    states = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
+    digest = hashlib.blake2b(batch.tensor.detach().cpu().contiguous().numpy().tobytes(), digest_size=8)
+    digest.update(f"{seed} {current_draw()}".encode())
+    number = int.from_bytes(digest.digest(), "little")
+    torch.default_generator.manual_seed(number >> 1)
+    np.random.seed(number % 2**32)  # noqa: NPY002
+    random.seed(number)
+    try:
+        yield
+    finally:
+        torch.set_rng_state(states[0])
+        np.random.set_state(states[1])  # noqa: NPY002
+        random.setstate(states[2])
+
+
+@contextmanager
+def other_draw(number: int) -> Iterator[None]:
+    """Context in which rewards meet other random numbers than usual, a stream for each ``number`` but 0."""
+    before = current_draw()
+    _local.draw = number
+    try:
+        yield
+    finally:
+        _local.draw = before
+
+
+def current_draw() -> int:
+    """The stream of random numbers that this thread's rewards meet."""
+    return int(getattr(_local, "draw", 0))

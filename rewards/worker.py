@@ -1,0 +1,118 @@
+"""A worker process of one reward: ``python -m rewards.worker READ_FD WRITE_FD TIMEOUT MEMORY THREADS``.
+
+It is told which reward to make, then scores one batch per message. It ends when its pipe closes, even while the reward
+works.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import sys
+import threading
+from multiprocessing.connection import Connection
+from typing import Any
+
+import torch
+
+from rewards.base import RewardContext, depends_on_batch
+from rewards.evaluation import describe_error, evaluate_reward
+from rewards.isolation import packed
+from rewards.local_files import allow_local_rewards
+from rewards.registry import allow_reward_targets, resolve_reward
+from rewards.seeding import other_draw
+from scene_envs.errors import SceneEnvsError
+from scene_envs.physics import PhysicsPool
+from scene_envs.scene import SceneBatch
+from scene_envs.scene_types import get_scene_type, register_scene_type
+
+_GRACE = 5
+"""Seconds after which a call that its parent did not end ends the process by itself."""
+
+
+def serve(inbox: Connection, outbox: Connection, timeout: float) -> None:
+    """Answer messages until the other end closes."""
+    answer = _Answers()
+    outbox.send(("done", None))
+    while True:
+        try:
+            kind, *body = inbox.recv()
+        except EOFError:
+            return
+        signal.setitimer(signal.ITIMER_REAL, timeout + _GRACE)  # the default action ends even what holds the GIL
+        try:
+            reply: tuple[str, Any] = ("done", getattr(answer, kind)(*body))
+        except MemoryError:
+            reply = ("failed", ("RewardError", "the reward took more memory than reward_memory= allows"))
+        except SceneEnvsError as error:
+            hint = "; reward_memory= allows more" if _lacked_memory(error) else ""
+            reply = ("failed", (type(error).__name__, f"{error}{hint}"))
+        except BaseException as error:
+            reply = ("failed", ("RewardError", f"the reward raised {describe_error(error)}"))
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        outbox.send(reply)
+
+
+def _lacked_memory(error: BaseException) -> bool:
+    cause = error.__cause__
+    return isinstance(cause, MemoryError) or (isinstance(cause, RuntimeError) and "allocate memory" in str(cause))
+
+
+class _Answers:
+    """What the parent may ask."""
+
+    def __init__(self) -> None:
+        self.reward: Any = None
+        self.pool: PhysicsPool | None = None
+
+    def make(self, reward: Any, targets: list[str], files: list[Any], workers: int) -> bool:
+        """Make the reward; whether it depends on the batch."""
+        for target in targets:
+            allow_reward_targets(target)
+        for file in files:
+            allow_local_rewards(file)
+        self.reward = resolve_reward(reward)
+        self.pool = PhysicsPool(workers=workers) if workers else None
+        return depends_on_batch(self.reward)
+
+    def score(self, scene_type: Any, scenes: Any, facts: tuple[Any, int, int]) -> dict[str, Any]:
+        """Score one batch."""
+        prompts, seed, draw = facts
+        try:
+            known = get_scene_type(scene_type.name)
+        except SceneEnvsError:
+            known = register_scene_type(scene_type)
+        batch = SceneBatch(torch.from_numpy(scenes), known if known == scene_type else scene_type)
+        with other_draw(draw):
+            context = RewardContext(prompts=prompts, pool=self.pool, seed=seed)
+            return packed(evaluate_reward(self.reward, batch, context, strict=True))
+
+
+def _watch(inbox: int) -> None:
+    """End the process, and those that it started, when the other end of the pipe closes."""
+    poll = select.poll()
+    poll.register(inbox, 0)  # hang-ups alone
+    poll.poll()
+    os.killpg(os.getpgid(0), signal.SIGKILL)
+
+
+def _limit(memory: int) -> None:
+    """Allow ``memory`` bytes beyond what the process has now, and write no core files."""
+    with contextlib.suppress(ImportError, OSError, ValueError):
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        with open("/proc/self/status") as file:
+            now = next(int(line.split()[1]) for line in file if line.startswith("VmData")) * 1024
+        resource.setrlimit(resource.RLIMIT_DATA, (now + memory, now + memory))
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when to stop
+    read, write = int(sys.argv[1]), int(sys.argv[2])
+    torch.set_num_threads(int(sys.argv[5]))  # sums of floats depend on it
+    threading.Thread(target=_watch, args=(read,), daemon=True).start()
+    _limit(int(sys.argv[4]))
+    serve(Connection(read, writable=False), Connection(write, readable=False), float(sys.argv[3]))

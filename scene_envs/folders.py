@@ -1,0 +1,117 @@
+"""Locks of folders: one writer at a time, and what killed writers left half-written is swept."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import re
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from scene_envs.errors import InvalidInputError, StorageError
+from scene_envs.files import storage_error
+
+LOCK = ".writer.lock"
+_PARTIAL = re.compile(r"\..*?\.(?P<process>\d+)(\.\w+)?\.partial")
+_held: set[Path] = set()
+_guard = threading.Lock()
+
+
+@contextmanager
+def claimed(folder: str | os.PathLike[str], owner: str) -> Iterator[Path]:
+    """Context in which this process alone writes into ``folder``, which is made if need be.
+
+    The claim ends with the process, however it ends, and may be repeated by the same process. Files that a killed
+    process left half-written in the folder are removed.
+
+    Args:
+        folder: where to write.
+        owner: what writes, for the message to others.
+
+    Raises:
+        InvalidInputError: another process writes there (it is named), or ``folder`` is a file.
+        StorageError: the folder cannot be made or written to.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as parent, claimed(Path(parent) / "run", "a test") as folder:
+    ...     [path.name for path in folder.iterdir()]
+    ['.writer.lock']
+    """
+    folder = Path(folder)
+    key = Path(os.path.realpath(folder))
+    with _guard:
+        again = key in _held
+        _held.add(key)
+    if again:
+        yield folder
+        return
+    lock = -1
+    try:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = _lock(folder / LOCK, owner)
+            sweep(folder)
+        except (FileExistsError, NotADirectoryError):
+            raise InvalidInputError(f"output={str(folder)!r} is a file, not a folder; give another") from None
+        except StorageError:
+            raise
+        except OSError as error:
+            raise storage_error(folder, error) from error
+        yield folder
+    finally:
+        with _guard:
+            _held.discard(key)
+        if lock >= 0:
+            with contextlib.suppress(OSError):
+                (folder / LOCK).unlink(missing_ok=True)
+            os.close(lock)
+
+
+def sweep(folder: Path) -> None:
+    """Remove what ended processes left half-written in ``folder`` and below."""
+    for path in folder.rglob(".*.partial"):
+        found = _PARTIAL.fullmatch(path.name)
+        if found is None or int(found["process"]) == os.getpid() or not _is_alive(int(found["process"])):
+            with contextlib.suppress(OSError):
+                path.unlink()
+
+
+def _lock(path: Path, owner: str) -> int:
+    """The descriptor of the locked file; the system lets go of the lock when the process ends."""
+    import fcntl
+
+    while True:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            told = os.pread(descriptor, 500, 0).decode(errors="replace").strip()
+            os.close(descriptor)
+            if error.errno in (errno.EAGAIN, errno.EACCES):
+                raise InvalidInputError(
+                    f"{str(path.parent)!r} is being written by {told or 'another process'}; wait until it is done, "
+                    "or give another output"
+                ) from None
+            raise
+        with contextlib.suppress(FileNotFoundError):
+            if os.fstat(descriptor).st_ino == os.stat(path).st_ino:  # nobody removed it meanwhile
+                text = f"{owner}, process {os.getpid()} on {socket.gethostname()}, since {time.strftime('%F %T')}"
+                os.truncate(descriptor, 0)
+                os.pwrite(descriptor, text.encode(), 0)
+                return descriptor
+        os.close(descriptor)
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True

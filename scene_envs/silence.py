@@ -1,0 +1,25 @@
+"""Silence of the greetings that libraries print when they are imported."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+
+
+@contextlib.contextmanager
+def silence() -> Iterator[None]:
+    """Keep the greeting that PyBullet prints on import out of the user's terminal."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    with open(os.devnull, "w") as sink:
+        kept = os.dup(1), os.dup(2)
+        try:
+            os.dup2(sink.fileno(), 1)
+            os.dup2(sink.fileno(), 2)
+            yield
+        finally:
+            for copy, descriptor in zip(kept, (1, 2), strict=True):
+                os.dup2(copy, descriptor)
+                os.close(copy)

@@ -1,0 +1,112 @@
+"""Safetensors files with a digest of their contents, verified when they are read."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from torch import Tensor
+
+from scene_envs.errors import CorruptFileError
+from scene_envs.files import replacing
+
+DIGEST = "sha256"
+"""Key of the digest in a file's metadata; also the suffix of a file beside that holds the digest of all bytes."""
+
+
+def write_tensors(
+    path: str | os.PathLike[str], tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None
+) -> Path:
+    """Write tensors to one file, whole or not at all.
+
+    Args:
+        path: where to.
+        tensors: by name, on any device.
+        metadata: texts that are kept beside them.
+
+    Raises:
+        StorageError: the file cannot be written; nothing is left of it.
+    """
+    from safetensors.torch import save
+
+    path = Path(path)
+    plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    kept = dict(metadata or {})
+    content = _in_order(save(plain, {**kept, DIGEST: _digest(plain, kept)}))
+    with replacing(path) as partial, partial.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    path.with_name(f"{path.name}.{DIGEST}").unlink(missing_ok=True)  # of what was there before
+    return path
+
+
+def read_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors and metadata of a file, on the CPU; one without a digest, as earlier versions wrote, is read as it is.
+
+    Raises:
+        FileNotFoundError: there is none.
+        CorruptFileError: it is truncated, no safetensors file, or not what was written.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    path = Path(path)
+    check_beside(path)
+    try:
+        with safe_open(path, "pt") as file:
+            metadata = dict(file.metadata() or {})
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except FileNotFoundError:
+        raise
+    except (SafetensorError, OSError, ValueError, RuntimeError, MemoryError) as error:
+        raise CorruptFileError(
+            f"{str(path)!r} is truncated or not a safetensors file ({_short(error)}); copy it again or make it anew"
+        ) from error
+    digest = metadata.pop(DIGEST, None)
+    if digest is not None and digest != _digest(tensors, metadata):
+        raise CorruptFileError(_changed(path))
+    return tensors, metadata
+
+
+def check_beside(path: Path) -> None:
+    """Verify a file against the digest in the file ``<name>.sha256`` beside it, if there is one.
+
+    Raises:
+        CorruptFileError: they do not agree.
+    """
+    beside = path.with_name(f"{path.name}.{DIGEST}")
+    if not beside.is_file() or not path.is_file():
+        return
+    found = hashlib.sha256(path.read_bytes()).hexdigest()
+    if found not in beside.read_text(encoding="utf-8", errors="replace").split():
+        raise CorruptFileError(_changed(path))
+
+
+def _in_order(content: bytes) -> bytes:
+    """The same file with its header sorted: equal contents make equal bytes."""
+    size = int.from_bytes(content[:8], "little")
+    header = json.dumps(json.loads(content[8 : 8 + size]), sort_keys=True, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 8)
+    return len(header).to_bytes(8, "little") + header + content[8 + size :]
+
+
+def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
+    import torch
+
+    digest = hashlib.new(DIGEST, json.dumps(sorted(metadata.items())).encode())
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+        digest.update(tensor.contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
+def _changed(path: Path) -> str:
+    return f"{str(path)!r} is damaged: its contents are not what was written (checksum); copy it again or make it anew"
+
+
+def _short(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:200]

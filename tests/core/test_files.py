@@ -1,0 +1,184 @@
+"""Files are whole or absent, name themselves when they are damaged, and folders have one writer."""
+
+import errno
+import multiprocessing
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from agents.priors import ScenePrior
+from agents.priors.testing import tiny_prior
+from agents.utils.checkpoints import load_checkpoint, save_checkpoint
+from scene_envs import SceneBatch
+from scene_envs.datasets.store import read_notes
+from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError, StorageError
+from scene_envs.files import replacing, write_text
+from scene_envs.folders import LOCK, claimed, sweep
+from scene_envs.tensor_files import read_tensors, write_tensors
+
+
+def flipped(path: Path, bit: int) -> None:
+    content = bytearray(path.read_bytes())
+    content[bit // 8] ^= 1 << bit % 8
+    path.write_bytes(content)
+
+
+def make_scenes(folder: Path) -> Path:
+    return SceneBatch.empty("dimsum_table", 3).save(folder / "scenes.safetensors")
+
+
+def make_checkpoint(folder: Path) -> Path:
+    path = folder / "checkpoint.pt"
+    save_checkpoint(path, {"weights": torch.arange(500.0), "step": 3})
+    return path
+
+
+READERS = {
+    "scenes": (make_scenes, lambda path: SceneBatch.load(path).tensor),
+    "checkpoint": (make_checkpoint, lambda path: load_checkpoint(path)["weights"]),
+}
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_a_flipped_bit_is_found_or_changes_nothing(kind, tmp_path):
+    make, read = READERS[kind]
+    path = make(tmp_path)
+    whole, expected = path.read_bytes(), read(path)
+    generator = torch.Generator().manual_seed(0)
+    for bit in torch.randint(8 * len(whole), (150,), generator=generator).tolist():
+        path.write_bytes(whole)
+        flipped(path, bit)
+        try:
+            found = read(path)
+        except CorruptFileError as error:
+            assert str(path) in str(error)  # noqa: PT017
+            assert "weights_only" not in str(error)  # noqa: PT017
+        else:
+            assert torch.equal(found, expected)
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_a_truncated_file_names_itself_whatever_its_length(kind, tmp_path):
+    make, read = READERS[kind]
+    path = make(tmp_path)
+    whole, expected = path.read_bytes(), read(path)
+    for length in sorted({0, 1, 7, 8, 9, 100, *range(0, len(whole), len(whole) // 40), len(whole) - 1}):
+        path.write_bytes(whole[:length])
+        try:
+            found = read(path)
+        except CorruptFileError as error:
+            assert str(path) in str(error)  # noqa: PT017
+        else:
+            assert torch.equal(found, expected)  # only the checksum was cut off
+
+
+def test_damaged_weights_of_a_prior_are_refused(tmp_path):
+    prior = tiny_prior()
+    prior.save(tmp_path)
+    weights = tmp_path / "model.safetensors"
+    flipped(weights, 8 * (weights.stat().st_size - 40))
+    with pytest.raises(CorruptFileError, match="checksum"):
+        ScenePrior.load(tmp_path)
+
+
+def test_files_of_earlier_versions_have_no_checksum_and_load(tmp_path):
+    from safetensors.torch import save_file
+
+    save_file({"a": torch.ones(3)}, tmp_path / "old.safetensors")
+    assert torch.equal(read_tensors(tmp_path / "old.safetensors")[0]["a"], torch.ones(3))
+    torch.save({"step": 1}, tmp_path / "old.pt")
+    assert load_checkpoint(tmp_path / "old.pt") == {"step": 1}
+
+
+def test_a_checksum_beside_a_file_is_verified_and_goes_with_the_file(tmp_path):
+    from safetensors.torch import save_file
+
+    path = tmp_path / "model.safetensors"
+    save_file({"a": torch.ones(3)}, path)
+    beside = tmp_path / "model.safetensors.sha256"
+    beside.write_text("0" * 64 + "  model.safetensors\n")
+    with pytest.raises(CorruptFileError, match="checksum"):
+        read_tensors(path)
+    write_tensors(path, {"a": torch.zeros(3)}, {"note": "x"})
+    assert not beside.exists()
+    assert read_tensors(path)[1] == {"note": "x"}
+
+
+def test_every_shipped_prior_has_a_checksum():
+    from agents.priors.files import SHIPPED
+
+    for weights in SHIPPED.glob("*/model.safetensors"):
+        assert weights.with_name("model.safetensors.sha256").is_file() or b"sha256" in weights.read_bytes()[:100_000]
+
+
+def test_a_flipped_bit_in_the_pages_of_a_shard_is_found(tmp_path):
+    from scene_envs.datasets import SceneDataset, generate
+
+    generate("dimsum_table", 4, tmp_path, workers=0, verify=False, progress=False)
+    (shard,) = tmp_path.glob("*.parquet")
+    assert read_notes(shard)["rows"] == 4
+    whole, expected = shard.read_bytes(), SceneDataset.load(tmp_path).batch().tensor
+    silent = 0
+    for bit in range(8 * 64, 8 * len(whole) // 2, 997):
+        shard.write_bytes(whole)
+        flipped(shard, bit)
+        try:
+            silent += not torch.equal(SceneDataset.load(tmp_path).batch().tensor, expected)
+        except SceneEnvsError as error:
+            assert shard.name in str(error)  # noqa: PT017
+    assert silent == 0
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES, errno.EROFS])
+def test_a_write_that_is_refused_names_file_and_remedy_and_leaves_nothing(code, tmp_path):
+    def refused():
+        with replacing(tmp_path / "a.txt") as partial:
+            partial.touch()
+            raise OSError(code, os.strerror(code))
+
+    with pytest.raises(StorageError, match=r"a\.txt.*(make room|another output)"):
+        refused()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_second_writer_is_told_who_the_first_is(tmp_path):
+    code = (
+        "import sys; from scene_envs.folders import claimed\n"
+        f"with claimed({str(tmp_path)!r}, 'the first'): print('held', flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as first:
+        assert first.stdout.readline() == b"held\n"
+        with pytest.raises(InvalidInputError, match=rf"written by the first, process {first.pid} on .*another output"):
+            claimed(tmp_path, "the second").__enter__()
+        first.kill()
+        first.wait()
+        assert (tmp_path / LOCK).exists()  # left by the killed process
+        with claimed(tmp_path, "the second"), claimed(tmp_path, "the same process"):
+            pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_killed_writers_left_is_swept_and_what_others_write_is_not(tmp_path):
+    dead = multiprocessing.get_context("spawn").Process()
+    dead.start()
+    dead.join()
+    (tmp_path / "prior").mkdir()
+    gone = [tmp_path / f".a.{dead.pid}.partial", tmp_path / "prior" / f".b.json.{dead.pid}.0a1b.partial"]
+    kept = tmp_path / f".c.{os.getppid()}.0a1b.partial"
+    for path in (*gone, kept):
+        path.touch()
+    sweep(tmp_path)
+    assert kept.exists()
+    assert not any(path.exists() for path in gone)
+
+
+def test_two_writers_of_one_file_never_share_a_partial_file(tmp_path):
+    with replacing(tmp_path / "a") as one, replacing(tmp_path / "a") as two:
+        assert one != two
+        write_text(one, "1")
+        write_text(two, "2")
+    assert (tmp_path / "a").read_text() in ("1", "2")

@@ -1,0 +1,65 @@
+"""Rewards that harm the process they run in, as a user's file."""
+
+import ctypes
+import os
+import random
+import sys
+import time
+
+import numpy as np
+import torch
+
+
+class Unspeakable(Exception):
+    """An error whose text cannot be read."""
+
+    def __str__(self):
+        raise RuntimeError("no text")
+
+
+def honest(batch):
+    return batch.translations[..., 2].sum(dim=-1) / 3.0 + batch.counts.sqrt()
+
+
+def noisy(batch):
+    numpy_part = torch.from_numpy(np.random.rand(len(batch))).float()  # noqa: NPY002
+    return torch.rand(len(batch)) + numpy_part + random.random()
+
+
+def leaves(batch):
+    sys.exit(0)
+
+
+def quits(batch):
+    os._exit(0)
+
+
+def hangs(batch):
+    time.sleep(1e6)
+
+
+def holds_the_interpreter(batch):
+    ctypes.PyDLL(None).sleep(100000)  # in C, with the interpreter's lock
+
+
+def segfaults(batch):
+    ctypes.string_at(0)
+
+
+def fills_memory(batch):
+    kept = []
+    while True:
+        kept.append(torch.ones(32 * 2**20))
+
+
+def talks(batch):
+    raise ValueError("x" * 2**20)
+
+
+def mumbles(batch):
+    raise Unspeakable
+
+
+def rewrites(batch):
+    batch.tensor.numpy()[0, 0, 0] += 1.0
+    return batch.counts

@@ -1,0 +1,167 @@
+"""A reward that exits, hangs, crashes, fills memory or talks without end costs its scenes and nothing else."""
+
+import random
+import re
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from rewards import (
+    IsolatedReward,
+    RewardContext,
+    allow_local_rewards,
+    check_reward,
+    evaluate_reward,
+    register_reward,
+    resolve_reward,
+)
+from rewards.isolation import SeededReward, is_foreign, run_reward
+from scene_envs.errors import InvalidInputError, RewardError
+from tests.helpers import hostile_rewards as hostile
+
+FILE = Path(hostile.__file__)
+
+
+@pytest.mark.parametrize(
+    ("reward", "message"),
+    [
+        (hostile.leaves, r"'leaves' called sys.exit\(0\).*hostile_rewards.py, line \d+"),
+        (hostile.talks, r"'talks' raised ValueError: x+\.\.\. \(1048576 characters\).*hostile_rewards.py, line \d+"),
+        (hostile.mumbles, r"'mumbles' raised Unspeakable: \(its text cannot be read\)"),
+        (hostile.rewrites, r"'rewrites' changed the scenes"),
+    ],
+)
+def test_a_hostile_reward_in_this_process_is_invalid_in_one_short_sentence(reward, message, cups):
+    with pytest.raises(RewardError, match=message) as caught:
+        evaluate_reward(resolve_reward(reward), cups, strict=True)
+    assert len(str(caught.value)) < 700
+    assert str(caught.value).count(reward.__name__) == 1
+    assert evaluate_reward(resolve_reward(reward), cups).valid.tolist() == [False, False]
+
+
+def test_ctrl_c_is_not_taken_for_a_failure(cups):
+    def interrupted(batch, context):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate_reward(interrupted, cups)
+
+
+def test_check_reward_sees_what_is_written_through_numpy():
+    with pytest.raises(RewardError, match="changed the scenes"):
+        check_reward(hostile.rewrites)
+
+
+def test_global_generators_are_seeded_from_the_run_and_left_as_they_were(cups):
+    def scores(seed):
+        return evaluate_reward(SeededReward(hostile.noisy, seed), cups).value
+
+    before = torch.get_rng_state(), np.random.get_state()[1], random.getstate()  # noqa: NPY002
+    first = scores(3)
+    after = torch.get_rng_state(), np.random.get_state()[1], random.getstate()  # noqa: NPY002
+    assert torch.equal(before[0], after[0])
+    assert (before[1] == after[1]).all()
+    assert before[2] == after[2]
+    assert torch.equal(first, scores(3))
+    assert not torch.equal(first, scores(4))
+
+
+def test_a_part_of_a_composite_is_named_once(cups):
+    composite = resolve_reward(
+        {"name": "weighted_sum", "rewards": [{"name": "clip", "reward": hostile.talks, "low": 0}]}
+    )
+    with pytest.raises(RewardError) as caught:
+        evaluate_reward(composite, cups, strict=True)
+    assert str(caught.value).count("'talks'") == 1
+
+
+def test_rewards_of_this_package_and_objects_stay_in_this_process():
+    assert not is_foreign("object_count")
+    assert not is_foreign({"name": "weighted_sum", "rewards": ["object_count", {"name": "clutter"}]})
+    assert is_foreign({"name": "gate", "reward": "object_count", "condition": "mine.py:good", "threshold": 1.0})
+    assert is_foreign({"_target_": "my_package.Mine"})
+    assert run_reward("object_count") == resolve_reward("object_count")
+
+    @register_reward("only_in_this_process")
+    def mine(batch):
+        return batch.counts
+
+    assert not is_foreign("only_in_this_process")
+
+
+@pytest.mark.usefixtures("plugin")
+def test_an_installed_reward_is_run_elsewhere():
+    assert is_foreign("open_space")
+    assert is_foreign({"name": "clip", "reward": "open_space", "high": 1.0})
+
+
+def test_a_file_runs_only_where_it_was_allowed(tmp_path, cups):
+    path = tmp_path / "mine.py"
+    path.write_text("def few(batch):\n    return -batch.counts\n")
+    with pytest.raises(InvalidInputError, match="--allow-local"):
+        resolve_reward(f"{path}:few")
+    allow_local_rewards(path)
+    assert evaluate_reward(resolve_reward(f"{path}:few"), cups).value.tolist() == (-cups.counts).tolist()
+    with pytest.raises(InvalidInputError, match="no function or class 'many'"):
+        resolve_reward(f"{path}:many")
+
+
+@pytest.mark.parametrize("limits", [{"timeout": 0}, {"timeout": "a"}, {"memory": float("nan")}, {"memory": -1}])
+def test_limits_are_positive_numbers(limits):
+    with pytest.raises(InvalidInputError, match="positive number"):
+        run_reward("object_count", **limits)
+
+
+@pytest.mark.slow
+def test_scores_of_a_worker_are_those_of_this_process_bit_for_bit(cups):
+    allow_local_rewards(FILE)
+    context = RewardContext(prompts=("a", "b"))
+    for name in ("honest", "noisy"):
+        with IsolatedReward(f"{FILE}:{name}", timeout=60, seed=5) as reward:
+            here = evaluate_reward(SeededReward(getattr(hostile, name), 5), cups, context)
+            there = [evaluate_reward(reward, cups, context) for _ in range(2)]
+        assert torch.equal(here.value, there[0].value)
+        assert torch.equal(here.value, there[1].value)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("leaves", "called sys.exit"),
+        ("quits", r"ended its process \(exit status 0\)"),
+        ("hangs", "took longer than reward_timeout=4 s"),
+        ("holds_the_interpreter", "took longer than reward_timeout=4 s"),
+        ("segfaults", r"crashed its process \(SIGSEGV\)"),
+        ("fills_memory", "memory"),
+        ("talks", "1048576 characters"),
+        ("rewrites", "changed the scenes"),
+    ],
+)
+def test_a_hostile_reward_costs_its_scenes_and_nothing_else(name, message, cups):
+    allow_local_rewards(FILE)
+    before = cups.tensor.clone()
+    with IsolatedReward(f"{FILE}:{name}", timeout=4, memory=0.5) as reward:
+        started = time.monotonic()
+        output = evaluate_reward(reward, cups)
+        assert time.monotonic() - started < 15  # the limit, and the end of the process
+    assert output.valid.tolist() == [False, False]
+    assert re.search(message, output.problem)
+    assert torch.equal(before, cups.tensor)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [("import sys; sys.exit(0)", "SystemExit"), ("import os; os._exit(0)", "ended its process"),
+     ("import time; time.sleep(1e6)", "took longer than reward_timeout=4 s")],
+)  # fmt: skip
+def test_a_file_that_exits_or_hangs_when_it_is_imported_is_one_sentence(line, message, tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text(f"{line}\ndef few(batch):\n    return -batch.counts\n")
+    allow_local_rewards(path)
+    with pytest.raises(RewardError, match=message):
+        IsolatedReward(f"{path}:few", timeout=4)
