@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal, Protocol
@@ -133,7 +134,7 @@ class FluxModule(nn.Module):
 
 
 @dataclass(frozen=True)
-class ModuleConfig:
+class ModuleConfig(ABC):
     """What configures a module; subclasses are frozen dataclasses whose fields go into files as they are.
 
     Attributes:
@@ -166,6 +167,6 @@ class ModuleConfig:
         """Leading text tokens that are for this module alone."""
         return 0
 
+    @abstractmethod
     def build(self, core: FluxSizes) -> FluxModule:
         """The module with fresh weights, for a network of this configuration."""
-        raise NotImplementedError
