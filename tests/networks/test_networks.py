@@ -309,6 +309,7 @@ def test_files_without_a_kind_hold_flux_networks() -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("process", PROCESSES)
 @pytest.mark.parametrize("name", NETWORKS)
 def test_sizes_with_equal_parameters(name: str, process: str) -> None:

@@ -15,7 +15,6 @@ from torch import Tensor
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import PhysicsPool, feasibility, make_ready, project, settle
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types.built_in import BUILT_IN
 
 pytestmark = pytest.mark.slow
 
@@ -66,7 +65,7 @@ def pool() -> Iterator[PhysicsPool]:
         yield pool
 
 
-@pytest.mark.parametrize("name", [scene_type.name for scene_type in BUILT_IN])
+@pytest.mark.parametrize("name", ["dimsum_table", "pantry_shelf", "restaurant_low_clutter"])
 def test_no_history_changes_a_result(name: str, pool: PhysicsPool) -> None:
     """Each function of each scene alone, after others in a random order, and in workers with histories of their own."""
     batch = crowded(name)

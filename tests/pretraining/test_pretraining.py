@@ -57,6 +57,7 @@ class Killed(Exception):
     """Stands for a killed process."""
 
 
+@pytest.mark.slow
 def test_a_killed_run_resumes_bit_for_bit(config: PretrainConfig, raw: torch.Tensor, tmp_path: Path) -> None:
     whole = make_run(replace(config, output=str(tmp_path / "whole")), raw)
     whole.run()
@@ -105,6 +106,7 @@ def test_a_run_does_not_go_on_with_keys_that_do_not_fit_it(config: PretrainConfi
             make_run(changed(config, {"iterations": 8, **other}), raw).run()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("process", ["continuous", "mixed"])
 def test_a_run_that_an_earlier_version_began_is_refused_in_plain_words(
     config: PretrainConfig, raw: torch.Tensor, process: str
@@ -121,6 +123,7 @@ def test_a_run_that_an_earlier_version_began_is_refused_in_plain_words(
         make_run(replace(config, iterations=8), raw).run()
 
 
+@pytest.mark.slow
 def test_a_checkpoint_that_holds_no_base_rates_resumes_bit_for_bit(
     config: PretrainConfig, raw: torch.Tensor, tmp_path: Path
 ) -> None:
@@ -161,6 +164,7 @@ def test_what_an_older_prior_takes_as_constant_may_not_vary_where_it_is_trained_
         build_prior(further, turned, Normalizer.fit(turned))
 
 
+@pytest.mark.slow
 def test_a_truncated_checkpoint_is_named(config: PretrainConfig, raw: torch.Tensor) -> None:
     run = make_run(config, raw)
     run.run()
@@ -225,6 +229,7 @@ def test_a_batch_that_cannot_be_parted_is_refused(config: PretrainConfig, raw: t
         make_run(changed(config, {"optimizer.precision": "bfloat"}), raw)
 
 
+@pytest.mark.slow
 def test_autocast_is_of_the_network_only(config: PretrainConfig, raw: torch.Tensor) -> None:
     run = make_run(changed(config, {"optimizer.precision": "bfloat16"}), raw)
     x = run.prior.initial(2, 34)
@@ -233,6 +238,7 @@ def test_autocast_is_of_the_network_only(config: PretrainConfig, raw: torch.Tens
     assert run.run().denoiser.precision == torch.float32
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_grammar_scenes")
 def test_a_grammar_without_end_trains_a_prior_that_reads_prompts(tmp_path: Path) -> None:
     config = PretrainConfig(
@@ -275,6 +281,7 @@ def test_two_processes_take_the_steps_of_one_with_twice_the_parts(tmp_path: Path
     assert float(two[-1]["heldout"]) == pytest.approx(float(one[-1]["heldout"]), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_one_prior_is_trained_on_several_scene_types(tmp_path: Path) -> None:
     for scene in ("dimsum_table", "pantry_shelf"):
         generate(scene, 12, tmp_path / scene, workers=0, verify=False, progress=False)

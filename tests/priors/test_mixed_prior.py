@@ -45,6 +45,7 @@ def test_scenes_survive_encoding_and_known_entries_are_clamped(prior: MixedPrior
     assert (state_of(start[:, 1:, 12:]) == MASK).float().mean() > 0.99
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_steps", [1, 7, 150])
 def test_chains_of_any_length_end_in_scenes_without_mask_tokens(prior: MixedPrior, num_steps: int) -> None:
     table = prior.step_table(num_steps)
