@@ -184,11 +184,11 @@ class MixedBaseline(_Baseline):
         text_mask: Tensor | None = None,
         position: Tensor | None = None,
         noise_level: Tensor | None = None,
-        given: Tensor | None = None,
+        observed: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Predict; arguments and results as in :meth:`agents.networks.mixed_flux.MixedFlux.forward`."""
         tokens = self.pose_in(self._with_octaves(pose, position, noise_level)) + self.category_in(states)
-        if self.given_in is not None and given is not None:
-            tokens = tokens + self.given_in(given)
+        if self.given_in is not None and observed is not None:
+            tokens = tokens + self.given_in(observed)
         tokens = self._tokens(tokens, time * self.time_scale, text, text_mask)
         return self.pose_out(tokens), self.logits_out(tokens)

@@ -63,7 +63,7 @@ class MixedDiffuSceneConfig(_Size):
     Attributes:
         categories: K = C + 1, assets and *empty*; the mask token is one more.
         time_scale: what timesteps are multiplied by before they are embedded.
-        flags: 1 to tell the network which poses and categories are given (inpainting), 0 as published.
+        flags: 1 to tell the network which poses and categories are observed (inpainting), 0 as published.
     """
 
     categories: int

@@ -63,7 +63,7 @@ class Scene:
 
     Attributes:
         states: (B, N) int64 categories in 0..K, K being the mask token.
-        given: (B, N) int64, 1 where the pose is given, plus 2 where the category is; None for nowhere.
+        observed: (B, N) int64, 1 where the pose is observed, plus 2 where the category is; None for nowhere.
         slot_mask: (B, N) bool, False for filling; None where there is none.
         summary: (B, W) mean of the text tokens; None without text.
         own_text: leading text tokens (B, T, W) that modules took, by their names.
@@ -80,7 +80,7 @@ class Scene:
     """
 
     states: Tensor
-    given: Tensor | None = None
+    observed: Tensor | None = None
     slot_mask: Tensor | None = None
     summary: Tensor | None = None
     own_text: dict[str, Tensor] = field(default_factory=dict)

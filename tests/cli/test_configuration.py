@@ -100,6 +100,8 @@ def test_old_keys_name_the_new_ones(command: str) -> None:
     ("make", "message"),
     [
         (lambda: PretrainConfig(hidden=3), "another name now: network.hidden"),
+        (lambda: PretrainConfig(loss={"given_share": 0.1}), "another name now: loss.observed_share"),
+        (lambda: PretrainConfig(network={"modules": {"given_flags": False}}), "now: network.modules.observed_flags"),
         (lambda: PretrainConfig(network={"hiden": 3}), "did you mean 'network.hidden'"),
         (lambda: PretrainConfig(network={"hidden": "wide"}), "network.hidden=wide is not a whole number"),
         (lambda: PretrainConfig(optimizer="sgd"), "sgd"),

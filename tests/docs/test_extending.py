@@ -192,14 +192,15 @@ def test_an_experiment_with_the_algorithm_and_the_reward_runs_twice_alike(
     assert first["reward"] == second["reward"]
 
 
-def test_the_network_has_its_keys_on_the_command_line_and_in_python(folder: str) -> None:
+def test_the_network_has_its_keys_on_the_command_line_and_in_python(folder: str, tmp_path: Path) -> None:
     """The scene type and the network have tests of their own, in the folders of grammars and of networks."""
     words = ["network=deep_sets", "network.depth=2"]
     composed = compose("pretrain", PretrainConfig, words, Sources(config_dir=folder))
     assert (composed.network.name, composed.network.hidden, composed.network.depth) == ("deep_sets", 16, 2)
     assert PretrainConfig(network="deep_sets").network.name == "deep_sets"  # without its YAML
     assert PostTrainConfig(algorithm="proximal").algorithm.penalty == 1.0  # type: ignore[attr-defined]
-    assert main(["pretrain", "network=deep_sets", "process=continuous", "--config-dir", folder]) == 2
+    output = ["--config-dir", folder, f"output={tmp_path}"]
+    assert main(["pretrain", "network=deep_sets", "process=continuous", *output]) == 2
 
 
 def test_help_lists_options_of_the_folder(folder: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -67,8 +67,8 @@ def _prior(process: str, prediction: str) -> ScenePrior:
     """A prior with the linear schedule whose network is a formula."""
     base = tiny_prior(process=process)
     config = getattr(base, "mixed", base.config)
-    # no entry is given: the formula does not know of any
-    extra = {"given_share": 0.0} if process == "mixed" else {}
+    # no entry is observed: the formula does not know of any
+    extra = {"observed_share": 0.0} if process == "mixed" else {}
     config = replace(config, schedule="linear", prediction=prediction, **extra)
     prior: ScenePrior = type(base)(config, base.normalizer, base.preconditioning)  # type: ignore[call-arg]
     network = (_Mixed if process == "mixed" else _Continuous)(prediction)

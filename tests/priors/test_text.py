@@ -61,10 +61,10 @@ def test_prompts_of_many_lengths_are_read_as_one_by_one() -> None:
 def test_padding_changes_nothing_in_the_network(prior: MixedPrior) -> None:
     x, t = prior.initial(1, 34, torch.Generator().manual_seed(0)), torch.tensor([500])
     tokens, mask = prior.encode_prompts(PROMPTS[:1])
-    alone = prior.denoiser(x, t, prior.seen(x), (tokens, mask))
+    alone = prior.denoiser(x, t, prior.observed_entries(x), (tokens, mask))
     padding = torch.full((1, 5, tokens.shape[-1]), 7.0)
     padded = torch.cat([tokens, padding], dim=1), torch.cat([mask, torch.zeros(1, 5, dtype=torch.bool)], dim=1)
-    for first, second in zip(alone, prior.denoiser(x, t, prior.seen(x), padded), strict=True):
+    for first, second in zip(alone, prior.denoiser(x, t, prior.observed_entries(x), padded), strict=True):
         torch.testing.assert_close(first, second, atol=1e-5, rtol=1e-4)
 
 
@@ -80,8 +80,8 @@ def test_the_prompt_and_the_order_of_its_words_matter(prior: MixedPrior) -> None
 def test_guidance_follows_its_formula(prior: MixedPrior) -> None:
     x, table, w = prior.initial(2, 34, torch.Generator().manual_seed(0)), prior.step_table(4), 1.5
     text, t = prior.encode_prompts(PROMPTS), torch.tensor([1000, 1000])
-    pose, logits = prior.denoiser(x, t, prior.seen(x), text)
-    free_pose, free_logits = prior.denoiser(x, t, prior.seen(x), prior.encode_prompts(["", ""]))
+    pose, logits = prior.denoiser(x, t, prior.observed_entries(x), text)
+    free_pose, free_logits = prior.denoiser(x, t, prior.observed_entries(x), prior.encode_prompts(["", ""]))
     guided = prior.transition(x, 0, table, text=text, guidance=w)
     mean, _ = prior.process.posterior(x[..., :12], (1 + w) * pose - w * free_pose, 1000, int(table.previous[0]))
     known = prior.known(34)[:, :12]
