@@ -290,8 +290,9 @@ class MixedPrior(TrainableMixedPrior):
 
     @torch.no_grad()
     def run_chain(
-        self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None, observed: Observed | None = None,
-        text: Text | None = None, guidance: float = 0.0, resample: int = 1, eta: float = 1.0,
+        self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None,
+        observed: Observed | None = None, text: Text | None = None, guidance: float = 0.0, resample: int = 1,
+        eta: float = 1.0,
     ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D) from x_T, with observed entries kept.
 

@@ -54,7 +54,7 @@ class TrainableMixedPrior(PromptReader, ScenePrior):
         self, x0: Tensor, generator: Generator | None = None, reduction: str = "mean", t: Tensor | None = None,
         text: Text | None = None,
     ) -> Tensor:  # fmt: skip
-        """Mean square of the pose output plus ``category_weight`` times the category loss, on entries that are not observed.
+        """Mean square of the pose output plus ``category_weight`` times the category loss, on unobserved entries.
 
         Args:
             x0: (B, N, D) scenes as :meth:`encode` gives them.
