@@ -18,7 +18,8 @@ from agents.pretraining.config import PretrainConfig
 from agents.pretraining.data import SceneTable
 from agents.pretraining.initial_prior import build_prior
 from agents.pretraining.setup import prepare
-from agents.pretraining.trainer import Pretrainer, learning_rate_at, part_generator
+from agents.pretraining.trainer import Pretrainer, learning_rate_at
+from agents.utils.seeds import derived_generator
 from agents.utils.weight_average import WeightAverage
 from scene_envs.datasets import generate
 from scene_envs.errors import CorruptFileError, InvalidInputError, TrainingError, UnknownNameError
@@ -214,7 +215,7 @@ def test_parts_one_after_the_other_add_up_to_their_batch(
 ) -> None:
     """The gradient of a step is the mean over its parts, each with noise of its own."""
     run = make_run(changed(config, {"process.name": process, "optimizer.accumulate": 2, "optimizer.clip": 1e9}), raw)
-    losses = [run._part_loss(4, part_generator(0, 0, part)) for part in range(2)]
+    losses = [run._part_loss(4, derived_generator(0, 0, part)) for part in range(2)]
     expected = torch.autograd.grad(sum(losses) / 2, list(run.network.parameters()), allow_unused=True)  # type: ignore[arg-type]
     norm = torch.stack([g.norm() for g in expected if g is not None]).norm()
     value, found = run._update()
