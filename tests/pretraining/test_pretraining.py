@@ -82,6 +82,7 @@ def test_a_killed_run_resumes_bit_for_bit(config: PretrainConfig, raw: torch.Ten
         assert torch.equal(tensor, resumed.average.tensors[name]), name
 
 
+@pytest.mark.slow
 def test_nan_stops_the_run_and_keeps_the_last_checkpoint(config: PretrainConfig, raw: torch.Tensor) -> None:
     run = make_run(config, raw)
     update = run._update
@@ -97,6 +98,7 @@ def test_nan_stops_the_run_and_keeps_the_last_checkpoint(config: PretrainConfig,
     assert make_run(config, raw).run().card["trained_steps"] == 6
 
 
+@pytest.mark.slow
 def test_a_run_does_not_go_on_with_keys_that_do_not_fit_it(config: PretrainConfig, raw: torch.Tensor) -> None:
     make_run(config, raw).run()
     for other, was in (
@@ -153,6 +155,7 @@ def test_a_checkpoint_that_holds_no_base_rates_resumes_bit_for_bit(
         assert torch.equal(tensor, resumed.network.state_dict()[name]), name
 
 
+@pytest.mark.slow
 def test_what_an_older_prior_takes_as_constant_may_not_vary_where_it_is_trained_further(
     config: PretrainConfig, raw: torch.Tensor
 ) -> None:
