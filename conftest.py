@@ -11,9 +11,6 @@ for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # parallel tests do not fight for cores
 os.environ.setdefault("MPLBACKEND", "Agg")
 
-collect_ignore_glob = ["tests/plugin_components/*"]
-"""A package of its own, which registers what it brings when it is imported."""
-
 
 def _registries() -> list[dict[str, Any]]:
     """Every registry that users add to by name, the built-in entries in place."""

@@ -301,21 +301,27 @@ def main() -> None:
     torch.set_num_threads(1)
     console = Console()
     if options.heaps:
-        headers = ("scene type", "assets", *HEAPS, "free of overlap", "left mm")
-        table = Table(*headers, title="heaps: slowest scene of each kind, ms")
+        table = Table(
+            *("scene type", "assets", *HEAPS, "free of overlap", "left mm"),
+            title="heaps: slowest scene of each kind, ms",
+        )
         for name in options.types:
             measure_heaps(name, options.count, options.seed, table)
         console.print(table)
         return
     if options.count:
-        columns = ("scene type", "jitter", "objects", "free of overlap", "median ms", "90 % ms", "moved mm", "outside")
-        table = Table(*columns, title="each type")
+        table = Table(
+            *("scene type", "jitter", "objects", "free of overlap", "median ms", "90 % ms", "moved mm", "outside"),
+            title="each type",
+        )
         for name in options.types:
             measure_type(name, options.count, options.seed, table)
         console.print(table)
     if options.small:
-        headers = ("scene type", "scenes", "mean", "10 %", "median", "90 %", "largest", "we solve", "SLSQP alone")
-        table = Table(*headers, title="way of projection / way of SLSQP, 2 to 8 objects, jitter 2 cm")
+        table = Table(
+            *("scene type", "scenes", "mean", "10 %", "median", "90 %", "largest", "we solve", "SLSQP alone"),
+            title="way of projection / way of SLSQP, 2 to 8 objects, jitter 2 cm",
+        )
         for name in options.types:
             measure_small(name, options.small, options.starts, options.seed, table)
         console.print(table)

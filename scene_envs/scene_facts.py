@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ _CHUNK = 32
 """Scenes whose supports are found together."""
 
 
-class AssetFacts:
+class AssetFacts(ABC):
     """The part of :class:`~scene_envs.scene.SceneBatch` that knows the assets themselves.
 
     All tensors are on the device of the scenes, and 0 or False in empty slots unless they say otherwise. The asset
@@ -27,19 +28,19 @@ class AssetFacts:
     scene_type: SceneType
 
     @property
+    @abstractmethod
     def translations(self) -> Tensor:
         """(B, N, 3) m, world frame."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def rotations(self) -> Tensor:
         """(B, N, 3, 3), asset frame to world frame."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def categories(self) -> Tensor:
         """(B, N) int64."""
-        raise NotImplementedError
 
     @property
     def masses(self) -> Tensor:

@@ -1,4 +1,8 @@
-"""Sweeps of ``--multirun``: one list of words for every combination of values."""
+"""Sweeps of ``--multirun``: one list of words for every combination of values.
+
+Hydra's parser reads the values; its sweeper and launcher are not used, because they run only inside ``hydra.main`` and
+name their folders by their own rules.
+"""
 
 from __future__ import annotations
 

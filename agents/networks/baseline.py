@@ -50,6 +50,21 @@ class BaselineConfig:
         return "log_noise" if self.frequencies else "timestep"
 
 
+@dataclass(frozen=True, kw_only=True)
+class MixedBaselineConfig(BaselineConfig):
+    """What the sizes of all baselines of mixed scenes have in common.
+
+    Attributes:
+        categories: K = C + 1, assets and *empty*; the mask token is one more.
+        time_scale: what timesteps are multiplied by before they are embedded.
+        flags: 1 to tell the network which poses and categories are observed (inpainting), 0 as published.
+    """
+
+    categories: int
+    time_scale: float = 1.0
+    flags: int = 1
+
+
 class Attention(nn.Module):
     """Multi-head attention of tokens (B, N, H) to ``source`` (B, M, H), which may be the same tokens.
 
@@ -160,19 +175,17 @@ class ContinuousBaseline(_Baseline):
 class MixedBaseline(_Baseline):
     """Poses (B, N, 12) and category states (B, N) to a pose output (B, N, 12) and logits (B, N, K), zero at first."""
 
-    def __init__(
-        self, config: BaselineConfig, categories: int, time_scale: float, flags: int, trunk: nn.Module
-    ) -> None:
+    def __init__(self, config: MixedBaselineConfig, trunk: nn.Module) -> None:
         super().__init__(config, trunk)
         hidden = config.hidden
-        self.time_scale = time_scale
+        self.time_scale = config.time_scale
         self.pose_in = mlp(POSE_FEATURES + 6 * config.frequencies, hidden, hidden)
-        self.category_in = nn.Embedding(categories + 1, hidden)
-        self.given_in = nn.Embedding(4, hidden) if flags else None
+        self.category_in = nn.Embedding(config.categories + 1, hidden)
+        self.given_in = nn.Embedding(4, hidden) if config.flags else None
         if self.given_in is not None:
             nn.init.zeros_(self.given_in.weight)
         self.pose_out = head(hidden, POSE_FEATURES)
-        self.logits_out = head(hidden, categories)
+        self.logits_out = head(hidden, config.categories)
 
     def forward(
         self,
@@ -184,11 +197,11 @@ class MixedBaseline(_Baseline):
         text_mask: Tensor | None = None,
         position: Tensor | None = None,
         noise_level: Tensor | None = None,
-        given: Tensor | None = None,
+        observed: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Predict; arguments and results as in :meth:`agents.networks.mixed_flux.MixedFlux.forward`."""
         tokens = self.pose_in(self._with_octaves(pose, position, noise_level)) + self.category_in(states)
-        if self.given_in is not None and given is not None:
-            tokens = tokens + self.given_in(given)
+        if self.given_in is not None and observed is not None:
+            tokens = tokens + self.given_in(observed)
         tokens = self._tokens(tokens, time * self.time_scale, text, text_mask)
         return self.pose_out(tokens), self.logits_out(tokens)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from agents.networks.baseline import Attention, BaselineConfig, ContinuousBaseline, MixedBaseline
+from agents.networks.baseline import Attention, BaselineConfig, ContinuousBaseline, MixedBaseline, MixedBaselineConfig
 from scene_envs.errors import InvalidInputError
 
 
@@ -57,18 +57,8 @@ class DiffuSceneConfig(_Size):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MixedDiffuSceneConfig(_Size):
-    """Size of a :class:`MixedDiffuScene`; what is not listed is as in :class:`DiffuSceneConfig`.
-
-    Attributes:
-        categories: K = C + 1, assets and *empty*; the mask token is one more.
-        time_scale: what timesteps are multiplied by before they are embedded.
-        flags: 1 to tell the network which poses and categories are given (inpainting), 0 as published.
-    """
-
-    categories: int
-    time_scale: float = 1.0
-    flags: int = 1
+class MixedDiffuSceneConfig(_Size, MixedBaselineConfig):
+    """Size of a :class:`MixedDiffuScene`: that of :class:`DiffuSceneConfig`, and :class:`MixedBaselineConfig`."""
 
 
 class _Residual(nn.Module):
@@ -186,5 +176,5 @@ class MixedDiffuScene(MixedBaseline):
     """
 
     def __init__(self, config: MixedDiffuSceneConfig) -> None:
-        super().__init__(config, config.categories, config.time_scale, config.flags, _UNet(config))
+        super().__init__(config, _UNet(config))
         self.config = config

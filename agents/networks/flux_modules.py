@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal, Protocol
@@ -62,7 +63,7 @@ class Scene:
 
     Attributes:
         states: (B, N) int64 categories in 0..K, K being the mask token.
-        given: (B, N) int64, 1 where the pose is given, plus 2 where the category is; None for nowhere.
+        observed: (B, N) int64, 1 where the pose is observed, plus 2 where the category is; None for nowhere.
         slot_mask: (B, N) bool, False for filling; None where there is none.
         summary: (B, W) mean of the text tokens; None without text.
         own_text: leading text tokens (B, T, W) that modules took, by their names.
@@ -79,7 +80,7 @@ class Scene:
     """
 
     states: Tensor
-    given: Tensor | None = None
+    observed: Tensor | None = None
     slot_mask: Tensor | None = None
     summary: Tensor | None = None
     own_text: dict[str, Tensor] = field(default_factory=dict)
@@ -133,7 +134,7 @@ class FluxModule(nn.Module):
 
 
 @dataclass(frozen=True)
-class ModuleConfig:
+class ModuleConfig(ABC):
     """What configures a module; subclasses are frozen dataclasses whose fields go into files as they are.
 
     Attributes:
@@ -166,6 +167,6 @@ class ModuleConfig:
         """Leading text tokens that are for this module alone."""
         return 0
 
+    @abstractmethod
     def build(self, core: FluxSizes) -> FluxModule:
         """The module with fresh weights, for a network of this configuration."""
-        raise NotImplementedError

@@ -14,7 +14,14 @@ from dataclasses import dataclass
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from agents.networks.baseline import Attention, BaselineConfig, ContinuousBaseline, MixedBaseline, mlp
+from agents.networks.baseline import (
+    Attention,
+    BaselineConfig,
+    ContinuousBaseline,
+    MixedBaseline,
+    MixedBaselineConfig,
+    mlp,
+)
 from scene_envs.errors import InvalidInputError
 
 
@@ -47,18 +54,8 @@ class MiDiffusionConfig(_Size):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MixedMiDiffusionConfig(_Size):
-    """Size of a :class:`MixedMiDiffusion`; what is not listed is as in :class:`MiDiffusionConfig`.
-
-    Attributes:
-        categories: K = C + 1, assets and *empty*; the mask token is one more.
-        time_scale: what timesteps are multiplied by before they are embedded.
-        flags: 1 to tell the network which poses and categories are given (inpainting), 0 as published.
-    """
-
-    categories: int
-    time_scale: float = 1.0
-    flags: int = 1
+class MixedMiDiffusionConfig(_Size, MixedBaselineConfig):
+    """Size of a :class:`MixedMiDiffusion`: that of :class:`MiDiffusionConfig`, and :class:`MixedBaselineConfig`."""
 
 
 class _AdaptiveNorm(nn.Module):
@@ -138,5 +135,5 @@ class MixedMiDiffusion(MixedBaseline):
     """
 
     def __init__(self, config: MixedMiDiffusionConfig) -> None:
-        super().__init__(config, config.categories, config.time_scale, config.flags, _Transformer(config))
+        super().__init__(config, _Transformer(config))
         self.config = config

@@ -27,11 +27,11 @@ _CERTAIN = 30.0
 
 
 @dataclass(frozen=True)
-class Given:
-    """Entries of scenes that are given exactly: the network sees them without noise, chains keep them.
+class Observed:
+    """Entries of scenes that are observed exactly: the network sees them without noise, chains keep them.
 
     Attributes:
-        x: (B, N, D) scenes; only given entries are read.
+        x: (B, N, D) scenes; only observed entries are read.
         pose: (B, N) bool.
         category: (B, N) bool.
     """
@@ -53,7 +53,7 @@ class Given:
         )
 
     def write(self, x: Tensor) -> Tensor:
-        """``x`` (B, N, D) with the given entries in place."""
+        """``x`` (B, N, D) with the observed entries in place."""
         return torch.where(self.entries(), self.x, x)
 
 
@@ -104,14 +104,14 @@ class MixedDenoiser(nn.Module):
         return self._mean[t[:, None], states], self._std[t[:, None], states]
 
     def output(
-        self, x_t: Tensor, t: Tensor, given: Given | None = None, text: tuple[Tensor, Tensor] | None = None
+        self, x_t: Tensor, t: Tensor, observed: Observed | None = None, text: tuple[Tensor, Tensor] | None = None
     ) -> tuple[Tensor, Tensor]:
         """The raw pose output, in the units of ``poses.target``, and logits.
 
         Args:
-            x_t: (B, N, 12 + K), given entries in place.
+            x_t: (B, N, 12 + K), observed entries in place.
             t: (B,) timesteps.
-            given: which entries carry no noise.
+            observed: which entries carry no noise.
             text: (B, L, W) tokens and (B, L) their mask.
         """
         pose, states = x_t[..., :POSE_FEATURES], state_of(x_t[..., POSE_FEATURES:])
@@ -120,13 +120,13 @@ class MixedDenoiser(nn.Module):
         level = ratio[:, None].expand(pose.shape[:2])
         scaled = self.poses.network_input(pose, t)
         position = pose / alpha
-        if given is not None:
-            exact = given.pose[..., None]
+        if observed is not None:
+            exact = observed.pose[..., None]
             scaled = torch.where(exact, self.poses.network_input(pose, torch.zeros_like(t)), scaled)
             position = torch.where(exact, pose, position)
-            level = torch.where(given.pose, torch.zeros_like(level), level)
+            level = torch.where(observed.pose, torch.zeros_like(level), level)
         time = 250.0 * ratio.log() if self.reads_log_noise else (t - 1).to(pose.dtype)
-        inputs = [scaled, states, position, level, *([] if given is None else [given.flags()])]
+        inputs = [scaled, states, position, level, *([] if observed is None else [observed.flags()])]
         if self.drops_empty:
             output, logits = self._on_present(inputs, time, text)
             return output, torch.where((states < self.categories.categories)[..., None], self._certain(states), logits)
@@ -135,7 +135,7 @@ class MixedDenoiser(nn.Module):
     def _run(
         self, inputs: Sequence[Tensor], time: Tensor, text: Text | None, slot_mask: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """The network on scaled poses, states, positions, noise levels and, where there are any, given flags."""
+        """The network on scaled poses, states, positions, noise levels and, where there are any, observed flags."""
         scaled, states, position, level, *flags = inputs
         tokens, mask = (None, None) if text is None else text
         extra = {} if slot_mask is None else {"slot_mask": slot_mask}
@@ -148,7 +148,7 @@ class MixedDenoiser(nn.Module):
                 text_mask=mask,
                 position=position,
                 noise_level=level,
-                given=flags[0] if flags else None,
+                observed=flags[0] if flags else None,
                 **extra,
             )
         return output.to(scaled.dtype), logits.to(scaled.dtype)
@@ -170,9 +170,9 @@ class MixedDenoiser(nn.Module):
         return _CERTAIN * (F.one_hot(states.clamp(max=count - 1), count).float() - 1.0)
 
     def forward(
-        self, x_t: Tensor, t: Tensor, given: Given | None = None, text: tuple[Tensor, Tensor] | None = None
+        self, x_t: Tensor, t: Tensor, observed: Observed | None = None, text: tuple[Tensor, Tensor] | None = None
     ) -> tuple[Tensor, Tensor]:
         """The clean pose (B, N, 12), normalised, and the logits of the clean category (B, N, K)."""
-        output, logits = self.output(x_t, t, given, text)
+        output, logits = self.output(x_t, t, observed, text)
         moments = self.moments(state_of(x_t[..., POSE_FEATURES:]), t)
         return self.poses.x0_from_output(x_t[..., :POSE_FEATURES], t, output, moments), logits

@@ -88,7 +88,7 @@ class MixedFlux(nn.Module):
         text_mask: Tensor | None = None,
         position: Tensor | None = None,
         noise_level: Tensor | None = None,
-        given: Tensor | None = None,
+        observed: Tensor | None = None,
         slot_mask: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Predict.
@@ -102,13 +102,13 @@ class MixedFlux(nn.Module):
             position: (B, N, 12) poses in signal units, for modules that read geometry; translations alone, (B, N, 3),
                 will do where none reads rotations.
             noise_level: (B, N) noise-to-signal ratio of ``position``.
-            given: (B, N) int64, 1 where the pose is given, plus 2 where the category is; None for nowhere.
+            observed: (B, N) int64, 1 where the pose is observed, plus 2 where the category is; None for nowhere.
             slot_mask: (B, N) bool, False for filling that nothing may attend to; None where there is none.
 
         Returns:
             pose output (B, N, 12) and logits (B, N, K) of the clean category.
         """
-        scene = Scene(states, given, slot_mask)
+        scene = Scene(states, observed, slot_mask)
         text, text_mask = self._take_text(scene, text, text_mask)
         self._read_geometry(scene, position, noise_level)
         embedded = timestep_embedding(time * self.config.time_scale, _TIME_WIDTH).to(pose.dtype)

@@ -11,7 +11,7 @@ from agents.networks.count_conditioning import CountConditioningConfig
 from agents.networks.count_embedding import CountEmbeddingConfig
 from agents.networks.flux_modules import ModuleConfig
 from agents.networks.fourier_features import FourierFeaturesConfig
-from agents.networks.given_flags import GivenFlagsConfig
+from agents.networks.observed_flags import ObservedFlagsConfig
 from agents.networks.pooled_text import PooledTextConfig
 from agents.networks.relations import RelationsConfig
 from agents.networks.rotation_features import RotationFeaturesConfig
@@ -24,7 +24,7 @@ TIME_INPUTS = ("timestep", "log_noise")
 MODULES: dict[str, type[ModuleConfig]] = {
     kind.name: kind
     for kind in (
-        GivenFlagsConfig,
+        ObservedFlagsConfig,
         PooledTextConfig,
         CountEmbeddingConfig,
         CountConditioningConfig,

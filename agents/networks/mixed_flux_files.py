@@ -11,8 +11,12 @@ FLAT_FIELDS = (
 )
 """Fields that configured what are modules now."""
 
+_MODULES = {"given_flags": "observed_flags"}
+"""Modules that have another name now."""
+
 _PREFIXES = {
-    "given_in.": "given_flags.embedding.",
+    "given_in.": "observed_flags.embedding.",
+    "given_flags.": "observed_flags.",
     "pooled_in.": "pooled_text.linear.",
     "tally.": "count_embedding.",
     "requests.": "count_conditioning.",
@@ -37,16 +41,19 @@ def current_fields(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Fields of a configuration with ``modules``, from those of a file that may list none.
 
     >>> current_fields({"categories": 8, "frequencies": 0, "flags": 1})
-    {'categories': 8, 'modules': [{'name': 'given_flags'}], 'time_input': 'timestep'}
+    {'categories': 8, 'modules': [{'name': 'observed_flags'}], 'time_input': 'timestep'}
+    >>> current_fields({"categories": 8, "modules": [{"name": "given_flags"}]})
+    {'categories': 8, 'modules': [{'name': 'observed_flags'}]}
     """
     if "modules" in fields:
-        return dict(fields)
+        modules = [{**module, "name": _MODULES.get(module["name"], module["name"])} for module in fields["modules"]]
+        return {**fields, "modules": modules}
     old = {"frequencies": 8, "flags": 1, "attention": "plain", "relation_blur": "largest", **fields}
     conditioning = old.get("count_conditioning", old.get("requests", 0))
     text = old.get("text_width", 0)
     relative = old["attention"] == "relative"
     listed: list[tuple[Any, dict[str, Any]]] = [
-        (old["flags"], {"name": "given_flags"}),
+        (old["flags"], {"name": "observed_flags"}),
         (text and old.get("pooled_text"), {"name": "pooled_text"}),
         (old.get("count_embedding", old.get("tally")), {"name": "count_embedding"}),
         (

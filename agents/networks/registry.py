@@ -12,11 +12,11 @@ from agents.networks.diffuscene import DiffuScene, DiffuSceneConfig, MixedDiffuS
 from agents.networks.flux import FluxConfig, FluxDenoiser
 from agents.networks.flux_modules import ModuleConfig
 from agents.networks.fourier_features import FourierFeaturesConfig
-from agents.networks.given_flags import GivenFlagsConfig
 from agents.networks.midiffusion import MiDiffusion, MiDiffusionConfig, MixedMiDiffusion, MixedMiDiffusionConfig
 from agents.networks.mixed_flux import MixedFlux
 from agents.networks.mixed_flux_config import MODULES, MixedFluxConfig, make_module, module_states
 from agents.networks.mixed_flux_files import current_fields
+from agents.networks.observed_flags import ObservedFlagsConfig
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.plugins import load_plugins
 
@@ -259,9 +259,9 @@ def _continuous_flux(keys: Mapping[str, Any]) -> dict[str, Any]:
 def _mixed_flux(keys: Mapping[str, Any]) -> dict[str, Any]:
     """Fields of the Flux core, and its modules in the order of ``MODULES``."""
     core = ("categories", "hidden", "heads", "text_width", "text_reach", "pose_head", "time_scale", "unit", "rotations")
-    given = keys["modules"] if keys["modules"] is not None else [GivenFlagsConfig()]
+    chosen = keys["modules"] if keys["modules"] is not None else [ObservedFlagsConfig()]
     octaves = keys["frequencies"]
-    modules = [make_module(entry) for entry in given] + ([FourierFeaturesConfig(octaves)] if octaves else [])
+    modules = [make_module(entry) for entry in chosen] + ([FourierFeaturesConfig(octaves)] if octaves else [])
     order = list(MODULES)
     return {
         **{name: keys[name] for name in core},

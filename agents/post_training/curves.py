@@ -23,6 +23,7 @@ def draw_curve(
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     iteration = np.array([row["iteration"] for row in history])
     reward = np.array([row["reward"] for row in history], dtype=float)
@@ -32,8 +33,9 @@ def draw_curve(
     FigureCanvasAgg(figure)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.4, 1.0))
     upper.fill_between(iteration, reward - spread, reward + spread, color=REWARD_COLOR, alpha=0.12, linewidth=0)
-    upper.plot(iteration, reward, color=REWARD_COLOR, alpha=0.35, linewidth=1)
-    upper.plot(iteration, smooth(reward), color=REWARD_COLOR, linewidth=2.2)
+    upper.plot(iteration, reward, color=REWARD_COLOR, alpha=0.35, linewidth=1, label="a batch ± std")
+    upper.plot(iteration, smooth(reward), color=REWARD_COLOR, linewidth=2.2, label="smoothed")
+    upper.legend(frameon=False, fontsize=8)
     upper.set_ylabel(reward_name)
     if checks:
         lower.plot([0, *(x for x, _ in checks)], [1.0, *(y for _, y in checks)], "o-", color=GUARD_COLOR, markersize=4)
@@ -43,6 +45,7 @@ def draw_curve(
                    transform=lower.get_yaxis_transform())  # fmt: skip
     lower.set_ylabel("held-out loss\nover base")
     lower.set_xlabel("iteration")
+    lower.xaxis.set_major_locator(MaxNLocator(integer=True))
     for axes in (upper, lower):
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="y", color="#e8ebee", linewidth=0.8)

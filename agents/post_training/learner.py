@@ -150,7 +150,7 @@ class Learner:
         config = self.config.optimizer
         row = self.accumulate(rollout, advantage, scenes, index)
         row["gradient_norm"] = float(nn.utils.clip_grad_norm_(self.parameters, config.clip))
-        if not all(is_finite(row[name]) for name in ("gradient_norm", "policy_loss", "pretraining_loss")):
+        if not all(math.isfinite(row[name]) for name in ("gradient_norm", "policy_loss", "pretraining_loss")):
             self.optimizer.zero_grad(set_to_none=True)
             raise NonFiniteGradient(row)
         row["learning_rate"] = self.lr * min(1.0, (index + 1) / max(1, config.warmup))
@@ -192,8 +192,3 @@ class Learner:
 
     def _generator(self, stream: str, index: int) -> Generator:
         return Generator().manual_seed(stream_seed(self.config.seed, stream, index))
-
-
-def is_finite(value: float) -> bool:
-    """Neither NaN nor infinite."""
-    return math.isfinite(value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ import torch
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.curves import draw_curve
 from agents.post_training.guard import Guard, realism
-from agents.post_training.learner import Learner, NonFiniteGradient, is_finite
+from agents.post_training.learner import Learner, NonFiniteGradient
 from agents.post_training.progress import run_progress
 from agents.post_training.prompts import PROMPTS_NAME, PromptSets, prompts_beside, save_prompts
 from agents.post_training.rollouts import Rollout, stream_seed
@@ -209,7 +210,7 @@ class PostTrainer:
 
     def _check(self, rollout: Rollout) -> None:
         since = self.guard.readings[-1].iteration if self.guard.readings else 0
-        recent = [row["reward"] for row in self.history[since:] if is_finite(row["reward"])]
+        recent = [row["reward"] for row in self.history[since:] if math.isfinite(row["reward"])]
         reward = sum(recent) / len(recent) if recent else float("nan")
         with self.learner.averaged() as prior:
             reading = self.guard.check(prior, self.iteration, reward, realism(rollout.batch))
@@ -271,7 +272,7 @@ class PostTrainer:
         _writing(f"the prior {str(path)!r}", lambda: self.prior.save(path))
 
     def _finish(self) -> PostTrainResult:
-        rewards = [row["reward"] for row in self.history if is_finite(row["reward"])]
+        rewards = [row["reward"] for row in self.history if math.isfinite(row["reward"])]
         metrics = {
             "iterations": self.iteration,
             "seconds": round(self.seconds, 1),

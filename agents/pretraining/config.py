@@ -17,7 +17,7 @@ class ModuleSettings:
     """What is added to the core of the mixed flux network; other networks do not read it.
 
     Attributes:
-        given_flags: the network is told which poses and categories are observed, for inpainting.
+        observed_flags: the network is told which poses and categories are observed, for inpainting.
         pooled_text: the mean of the text tokens also modulates every block.
         count_embedding: the network is told how many slots it sees of each category, and how many are masked.
         relations: slots see where others stand, blurred along x, y and z by the noise of the ``axis`` itself, or of the
@@ -28,7 +28,9 @@ class ModuleSettings:
             the noise; only with relations.
     """
 
-    given_flags: bool = True
+    RENAMED: ClassVar[Mapping[str, str]] = {"given_flags": "network.modules.observed_flags"}
+
+    observed_flags: bool = True
     pooled_text: bool = True
     count_embedding: bool = True
     relations: str = "axis"
@@ -131,9 +133,11 @@ class LossSettings:
         translation_weight: weight of x, y, z in the loss, rotations having 1.
         category: of a mixed prior, ``cross_entropy`` of the clean category, or ``bound``, the paper's.
         category_weight: weight of the loss of the categories beside that of the poses.
-        given_share: share of a mixed prior's training scenes in which some poses or categories are given, for
+        observed_share: share of a mixed prior's training scenes in which some poses or categories are observed, for
             inpainting.
     """
+
+    RENAMED: ClassVar[Mapping[str, str]] = {"given_share": "loss.observed_share"}
 
     noise_mean: float = -1.8
     noise_std: float = 2.1
@@ -142,7 +146,7 @@ class LossSettings:
     translation_weight: float = 3.0
     category: str = "cross_entropy"
     category_weight: float = 2.0
-    given_share: float = 0.3
+    observed_share: float = 0.3
 
 
 @dataclass
@@ -278,7 +282,7 @@ class PretrainConfig:
         **moved("process", "prediction", "schedule", "noise_floor", "noise_ceiling", "moments", "rotation", "kernel"),
         **moved("process", "empty_slots", "unmasking", "denoised_clip"),
         **moved("loss", "noise_mean", "noise_std", "timesteps", "translation_weight", "category_weight"),
-        **moved("loss", "given_share", loss_weighting="weighting", category_loss="category"),
+        **moved("loss", given_share="observed_share", loss_weighting="weighting", category_loss="category"),
         **moved("text", text_encoder="encoder", text_width="width", text_depth="depth", text_latents="latents"),
         **moved("text", text_window="window", text_learning_rate="lr_share", text_warmup="warmup"),
         **moved("text", text_numbers="numbers", prompt_dropout="dropout"),

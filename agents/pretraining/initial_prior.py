@@ -16,7 +16,7 @@ from agents.networks.contacts import ContactsConfig
 from agents.networks.count_conditioning import CountConditioningConfig
 from agents.networks.count_embedding import CountEmbeddingConfig
 from agents.networks.flux_modules import ModuleConfig
-from agents.networks.given_flags import GivenFlagsConfig
+from agents.networks.observed_flags import ObservedFlagsConfig
 from agents.networks.pooled_text import PooledTextConfig
 from agents.networks.registry import NetworkConfig, network_config
 from agents.networks.relations import RelationsConfig
@@ -135,7 +135,7 @@ def _mixed(config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts:
         kernel=process.kernel,
         category_loss=config.loss.category,
         category_weight=config.loss.category_weight,
-        given_share=config.loss.given_share,
+        observed_share=config.loss.observed_share,
         text=text,
         empty_slots=process.empty_slots,
         unmasking=process.unmasking,
@@ -200,7 +200,7 @@ def _modules(config: PretrainConfig, slots: int, text_width: int) -> list[Module
     chosen = config.network.modules
     relations = chosen.relations != "none"
     offered: list[tuple[bool, Callable[[], ModuleConfig]]] = [
-        (chosen.given_flags, GivenFlagsConfig),
+        (chosen.observed_flags, ObservedFlagsConfig),
         (chosen.pooled_text and text_width > 0, PooledTextConfig),
         (chosen.count_embedding, CountEmbeddingConfig),
         (_conditions_counts(config), lambda: CountConditioningConfig(slots, _kinds(config.scene))),

@@ -163,7 +163,9 @@ class Pretrainer:
         config = self.config
         total = torch.zeros((), device=config.device)
         for part in range(config.optimizer.accumulate):
-            generator = part_generator(config.seed, self.step, self.processes.rank * config.optimizer.accumulate + part)
+            generator = derived_generator(
+                config.seed, self.step, self.processes.rank * config.optimizer.accumulate + part
+            )
             loss = self._part_loss(config.batch_size // self.parts, generator) / self.parts
             loss.backward()  # type: ignore[no-untyped-call]
             total += loss.detach()
@@ -299,11 +301,6 @@ class Pretrainer:
                 self.prior.save(self.directory / "prior")
         self.processes.wait()
         return ScenePrior.load(self.directory)
-
-
-def part_generator(seed: int, step: int, part: int) -> Generator:
-    """The generator of one part of one step of a run."""
-    return derived_generator(seed, step, part)
 
 
 def pretrain(config: PretrainConfig) -> dict[str, Any]:

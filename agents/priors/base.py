@@ -20,7 +20,7 @@ from agents.diffusion import (
     StepTable,
 )
 from agents.networks.count_conditioning import CountConditioning
-from agents.networks.mixed_denoiser import Given
+from agents.networks.mixed_denoiser import Observed
 from agents.networks.text import Text
 from agents.priors.forward import DenoiserOutput, NoisedScenes
 from agents.priors.inpainting import Inpainting
@@ -337,7 +337,7 @@ class ScenePrior(Inpainting, nn.Module, ABC):
 
     @abstractmethod
     def noised(
-        self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None, observed: Given | None = None
+        self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None, observed: Observed | None = None
     ) -> NoisedScenes:
         """A draw of the forward process for scenes ``x0`` (B, N, D), as the pretraining loss takes it.
 

@@ -108,7 +108,7 @@ def import_checkpoint(
         category_loss="bound",
         category_weight=1.0,
         text=bert_of(config.text_width, text_encoder, file),
-        given_share=0.0,
+        observed_share=0.0,
         clip=1.0,
     )
     moments = Preconditioning(torch.zeros(POSE_FEATURES), torch.ones(POSE_FEATURES))

@@ -73,7 +73,7 @@ class MixedPriorConfig:
         category_loss: ``"cross_entropy"`` of the clean category, or ``"bound"``, the paper's variational bound.
         category_weight: weight of the category loss beside the pose loss.
         auxiliary: weight of the cross-entropy in the bound.
-        given_share: share of training scenes in which some poses or categories are observed, for inpainting.
+        observed_share: share of training scenes in which some poses or categories are observed, for inpainting.
         text: kind and size of the text encoder; None for a prior that reads no prompts.
         noise_floor: lowest noise-to-signal ratio of the ``"karras"`` schedule, in normalised units.
         noise_ceiling: highest.
@@ -100,7 +100,7 @@ class MixedPriorConfig:
     category_loss: str = "cross_entropy"
     category_weight: float = 0.3
     auxiliary: float = 5e-4
-    given_share: float = 0.3
+    observed_share: float = 0.3
     text: AnyTextConfig | None = None
     noise_floor: float = 0.002
     noise_ceiling: float = 80.0
@@ -113,4 +113,8 @@ class MixedPriorConfig:
 
 def current_names(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Fields of a prior's configuration with the names of today, from those of a file of an earlier version."""
-    return {key: current_prediction(value) if key == "prediction" else value for key, value in fields.items()}
+    renamed = {"given_share": "observed_share"}
+    return {
+        renamed.get(key, key): current_prediction(value) if key == "prediction" else value
+        for key, value in fields.items()
+    }

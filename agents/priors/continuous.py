@@ -14,7 +14,7 @@ from agents.diffusion.gaussian import timestep_weights
 from agents.diffusion.schedules import make_schedule
 from agents.diffusion.weighting import check_weighting, loss_weights, timestep_distribution
 from agents.networks.denoiser import Denoiser
-from agents.networks.mixed_denoiser import Given
+from agents.networks.mixed_denoiser import Observed
 from agents.networks.registry import build_network, config_from_state, config_state
 from agents.networks.text import Text
 from agents.priors.base import ScenePrior
@@ -222,7 +222,7 @@ class ContinuousPrior(ScenePrior):
         return per_scene.mean() if reduction == "mean" else per_scene
 
     def noised(
-        self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None, observed: Given | None = None
+        self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None, observed: Observed | None = None
     ) -> NoisedScenes:
         """Noised scenes, their targets and weights; see :meth:`ScenePrior.noised`."""
         if observed is not None:

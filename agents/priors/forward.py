@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from agents.networks.mixed_denoiser import Given
+from agents.networks.mixed_denoiser import Observed
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class NoisedScenes:
     scale: Tensor
     category: Tensor
     drawn: Tensor | None = None
-    observed: Given | None = None
+    observed: Observed | None = None
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
@@ -15,7 +15,7 @@ from scene_envs.scene import CATEGORY, POSE, SceneBatch
 from scene_envs.scene_types import SceneType
 
 
-class Inpainting:
+class Inpainting(ABC):
     """The part of a prior that regenerates some of a scene and keeps the rest: inpainting, completion, rearrangement.
 
     A mixed prior sees what is kept without noise. A continuous prior sees it with the noise of every level (Lugmayr et
@@ -30,9 +30,9 @@ class Inpainting:
         return False
 
     @property
+    @abstractmethod
     def device(self) -> torch.device:
         """Device of the weights."""
-        raise NotImplementedError
 
     @abstractmethod
     def step_table(self, num_steps: int) -> StepTable:

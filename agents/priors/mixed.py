@@ -28,7 +28,7 @@ from agents.diffusion.reverse_steps import state_of
 from agents.diffusion.schedules import make_schedule
 from agents.diffusion.unmasking import UNMASKINGS
 from agents.diffusion.weighting import check_weighting
-from agents.networks.mixed_denoiser import Given, MixedDenoiser
+from agents.networks.mixed_denoiser import MixedDenoiser, Observed
 from agents.networks.registry import build_network, config_from_state, config_state
 from agents.networks.text import Text
 from agents.networks.text_encoders import text_config_from_state, text_encoder
@@ -137,16 +137,16 @@ class MixedPrior(TrainableMixedPrior):
 
     # -- what the network is told ---------------------------------------------------------------
 
-    def seen(self, x: Tensor, given: Given | None = None) -> Given | None:
-        """Observed entries of scenes ``x`` (B, N, D) for the network: ``given``, or else the fixed objects.
+    def observed_entries(self, x: Tensor, observed: Observed | None = None) -> Observed | None:
+        """Observed entries of scenes ``x`` (B, N, D) for the network: ``observed``, or else the fixed objects.
 
         A prior trained with observed entries has always been told of its fixed objects; one trained without is not.
         """
-        if given is not None or self.mixed.given_share <= 0:
-            return given
+        if observed is not None or self.mixed.observed_share <= 0:
+            return observed
         fixed = torch.zeros(x.shape[:2], dtype=torch.bool, device=x.device)
         fixed[:, : len(self.scene_type.fixed)] = True
-        return Given(x, fixed, fixed)
+        return Observed(x, fixed, fixed)
 
     # -- scenes and states ----------------------------------------------------------------------
 
@@ -213,7 +213,7 @@ class MixedPrior(TrainableMixedPrior):
         step: int,
         table: StepTableLike,
         *,
-        given: Given | None = None,
+        observed: Observed | None = None,
         text: Text | None = None,
         guidance: float = 0.0,
         free: Text | None = None,
@@ -227,7 +227,7 @@ class MixedPrior(TrainableMixedPrior):
             x_t: scenes at ``table.timesteps[step]``.
             step: index in the table.
             table: the chain.
-            given: entries that carry no noise; None for the fixed objects alone.
+            observed: entries that carry no noise; None for the fixed objects alone.
             text: tokens (B, L, W) and their mask (B, L); None for no prompt.
             guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional, on poses and logits.
             free: what stands for no prompt, as :meth:`unconditional` gives it; encoded anew when None.
@@ -236,12 +236,12 @@ class MixedPrior(TrainableMixedPrior):
         t, previous = int(table.timesteps[step]), int(table.previous[step])
         self.process.check_stride(t, previous)
         levels = torch.full((x_t.shape[0],), t, device=x_t.device)
-        given = self.seen(x_t, given)
+        observed = self.observed_entries(x_t, observed)
         if free is None and (text is None or guidance):
             free = self.unconditional(x_t.shape[0])
-        pose, logits = self.denoiser(x_t, levels, given, free if text is None else text)
+        pose, logits = self.denoiser(x_t, levels, observed, free if text is None else text)
         if text is not None and guidance:
-            free_pose, free_logits = self.denoiser(x_t, levels, given, free)
+            free_pose, free_logits = self.denoiser(x_t, levels, observed, free)
             pose = (1 + guidance) * pose - guidance * free_pose
             logits = (1 + guidance) * logits.log_softmax(-1) - guidance * free_logits.log_softmax(-1)
         if self.mixed.clip:
@@ -282,16 +282,17 @@ class MixedPrior(TrainableMixedPrior):
     ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; the rest is seen as it is."""
         text = None if prompts is None else self.encode_prompts(prompts)
-        given = Given(self.encode(batch), ~mask[..., 0], ~mask[..., 1])
-        noise = draw_noise(given.x, generators)
+        observed = Observed(self.encode(batch), ~mask[..., 0], ~mask[..., 1])
+        noise = draw_noise(observed.x, generators)
         probs = self.categories.prior().to(noise).expand(*noise.shape[:2], -1)
         start = self.clamp(self._with_states(noise[..., :POSE_FEATURES], probs, noise))
-        return self.run_chain(start, table, generators, given, text, guidance, resample)
+        return self.run_chain(start, table, generators, observed, text, guidance, resample)
 
     @torch.no_grad()
     def run_chain(
-        self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None, given: Given | None = None,
-        text: Text | None = None, guidance: float = 0.0, resample: int = 1, eta: float = 1.0,
+        self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None,
+        observed: Observed | None = None, text: Text | None = None, guidance: float = 0.0, resample: int = 1,
+        eta: float = 1.0,
     ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D) from x_T, with observed entries kept.
 
@@ -299,21 +300,23 @@ class MixedPrior(TrainableMixedPrior):
             x: x_T (B, N, D).
             table: the chain.
             noises: one generator for all scenes, or one per scene; None for torch's own.
-            given: entries that carry no noise.
+            observed: entries that carry no noise.
             text, guidance, eta: as in :meth:`transition`.
             resample: how often each step is taken, going back in between.
         """
         free = self.unconditional(len(x)) if text is None or guidance else None
-        x = x if given is None else given.write(x)
+        x = x if observed is None else observed.write(x)
         for step in range(len(table)):
             level, after = int(table.timesteps[step]), int(table.previous[step])
             for again in range(resample if after > 0 else 1):
                 if again:
                     x = self._renoise(x, after, level, draw_noise(x, noises))
-                    x = x if given is None else given.write(x)
-                reverse = self.transition(x, step, table, given=given, text=text, guidance=guidance, free=free, eta=eta)
+                    x = x if observed is None else observed.write(x)
+                reverse = self.transition(
+                    x, step, table, observed=observed, text=text, guidance=guidance, free=free, eta=eta
+                )
                 x = reverse.from_noise(draw_noise(x, noises))
-                x = x if given is None else given.write(x)
+                x = x if observed is None else observed.write(x)
         return x
 
     def _renoise(self, x_s: Tensor, s: int, t: int, noise: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from agents.diffusion import CategoricalProcess, ResidualVariance, StepTable
 from agents.diffusion.reverse_steps import state_of
 from agents.diffusion.weighting import loss_weights
-from agents.networks.mixed_denoiser import Given, MixedDenoiser
+from agents.networks.mixed_denoiser import MixedDenoiser, Observed
 from agents.networks.text import Text
 from agents.priors.base import ScenePrior
 from agents.priors.config import MixedPriorConfig
@@ -43,7 +43,7 @@ class TrainableMixedPrior(PromptReader, ScenePrior):
         """K = C + 1."""
 
     @abstractmethod
-    def seen(self, x: Tensor, given: Given | None = None) -> Given | None:
+    def observed_entries(self, x: Tensor, observed: Observed | None = None) -> Observed | None:
         """Observed entries of scenes ``x`` (B, N, D) for the network."""
 
     @abstractmethod
@@ -54,7 +54,7 @@ class TrainableMixedPrior(PromptReader, ScenePrior):
         self, x0: Tensor, generator: Generator | None = None, reduction: str = "mean", t: Tensor | None = None,
         text: Text | None = None,
     ) -> Tensor:  # fmt: skip
-        """Mean square of the pose output plus ``category_weight`` times the category loss, on entries not given.
+        """Mean square of the pose output plus ``category_weight`` times the category loss, on unobserved entries.
 
         Args:
             x0: (B, N, D) scenes as :meth:`encode` gives them.
@@ -91,15 +91,15 @@ class TrainableMixedPrior(PromptReader, ScenePrior):
         return loss
 
     def noised(
-        self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None, observed: Given | None = None
+        self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None, observed: Observed | None = None
     ) -> NoisedScenes:
         """Noised scenes, their targets and weights; see :meth:`ScenePrior.noised`."""
         config, device = self.mixed, x0.device
         if t is None:
             t = self.draw_timesteps(x0.shape[0], generator).to(device)
         noise = torch.randn(x0.shape, generator=generator).to(device)
-        if observed is None and config.given_share > 0:
-            observed = self.draw_given(x0, generator)
+        if observed is None and config.observed_share > 0:
+            observed = self.draw_observed(x0, generator)
         x_t = self.add_noise(x0, t, noise)
         x_t = x_t if observed is None else observed.write(x_t)
         pose0, category = x0[..., :POSE_FEATURES], x0[..., POSE_FEATURES:].argmax(dim=-1)
@@ -124,18 +124,18 @@ class TrainableMixedPrior(PromptReader, ScenePrior):
         text = self.unconditional(len(noised.t)) if text is None else text
         return DenoiserOutput(*self.denoiser.output(noised.x_t, noised.t, noised.observed, text))
 
-    def draw_given(self, x0: Tensor, generator: Generator | None) -> Given:
+    def draw_observed(self, x0: Tensor, generator: Generator | None) -> Observed:
         """Random observed entries: slots (completion), all categories (rearrangement), or any attribute of any slot."""
         batch, slots = x0.shape[:2]
         kind, share = torch.rand(2, batch, 1, generator=generator)
-        kind = kind / max(self.mixed.given_share, 1e-9)  # above 1: nothing is given
+        kind = kind / max(self.mixed.observed_share, 1e-9)  # above 1: nothing is observed
         picks = torch.rand(2, batch, slots, generator=generator) < share
         whole, rearrange, free = kind < 0.5, (kind >= 0.5) & (kind < 0.75), (kind >= 0.75) & (kind < 1.0)
         pose = (whole & picks[0]) | (rearrange & picks[0] & (share < 0.5)) | (free & picks[0])
         category = (whole & picks[0]) | rearrange.expand(-1, slots) | (free & picks[1])
         fixed = torch.zeros(slots, dtype=torch.bool)
         fixed[: len(self.scene_type.fixed)] = True
-        return Given(x0, (pose | fixed).to(x0.device), (category | fixed).to(x0.device))
+        return Observed(x0, (pose | fixed).to(x0.device), (category | fixed).to(x0.device))
 
     @torch.no_grad()
     def fit_residual(self, x0: Tensor, levels: int = 40, seed: int = 0) -> ResidualVariance:
@@ -149,7 +149,7 @@ class TrainableMixedPrior(PromptReader, ScenePrior):
             noise = torch.randn(x0.shape, generator=generator).to(x0.device)
             level = t.to(x0.device).expand(len(x0))
             poses = [
-                self.denoiser(part, level[: len(part)], self.seen(part), self.unconditional(len(part)))[0]
+                self.denoiser(part, level[: len(part)], self.observed_entries(part), self.unconditional(len(part)))[0]
                 for part in self.add_noise(x0, level, noise).split(_AT_ONCE)
             ]
             error = (torch.cat(poses) - x0[..., :POSE_FEATURES]).square() * present[..., None]

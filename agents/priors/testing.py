@@ -8,7 +8,7 @@ from torch import nn
 from agents.diffusion import Preconditioning
 from agents.networks import FluxConfig, MixedFluxConfig, TextConfig
 from agents.networks.fourier_features import FourierFeaturesConfig
-from agents.networks.given_flags import GivenFlagsConfig
+from agents.networks.observed_flags import ObservedFlagsConfig
 from agents.priors.base import ScenePrior
 from agents.priors.config import PROCESSES, MixedPriorConfig, PriorConfig
 from agents.priors.continuous import ContinuousPrior
@@ -70,7 +70,7 @@ def _mixed(scene_type: SceneType, slots: int, text: bool) -> ScenePrior:
         pose_head=16,
         text_width=0 if reader is None else reader.width,
         time_input="log_noise",
-        modules=(GivenFlagsConfig(), FourierFeaturesConfig()),
+        modules=(ObservedFlagsConfig(), FourierFeaturesConfig()),
     )
     config = MixedPriorConfig(scene_type.name, slots, network, text=reader)
     moments = Preconditioning(torch.zeros(POSE_FEATURES), torch.full((POSE_FEATURES,), 0.5))

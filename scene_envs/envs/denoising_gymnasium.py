@@ -34,8 +34,8 @@ class DenoisingEnv(gym.Env[Any, np.ndarray]):
 
     ## Description
 
-    A scene starts as Gaussian noise and becomes clean in `num_steps` steps; then a reward scores it, once. An
-    agent that acts well makes scenes that the reward likes. This is the Markov decision process of DDPO (Black et
+    A scene starts as Gaussian noise and becomes clean in `num_steps` steps; then a reward scores it, once. The
+    agent's goal is a scene with a high reward. This is the Markov decision process of DDPO (Black et
     al. 2024, Section 4.2) on scenes of objects with full SE(3) poses: the state is `(x_t, t)`, the action is
     `x_{t-1}`, and the transition is the identity. The reverse process itself belongs to the agent, except in
     `action_mode="noise"`, where the prior takes the reverse step and the agent chooses the noise of that step.
@@ -82,7 +82,7 @@ class DenoisingEnv(gym.Env[Any, np.ndarray]):
 
     x_T: standard normal noise from `self.np_random`, known entries set; and a prompt, drawn from it too if `prompt`
     leaves a choice. The same seed gives the same x_T and the same prompt. In `noise` mode the prior follows the
-    prompt; in `next_sample` mode the agent does what it likes with it. Rewards see it in their context.
+    prompt; in `next_sample` mode the agent may use or ignore it. Rewards get it in their context.
 
     ## Episode End
 
@@ -114,7 +114,7 @@ class DenoisingEnv(gym.Env[Any, np.ndarray]):
 
     `gym.make_vec("scene_envs:SceneEnvs/Denoising-v0", num_envs=128, ...)` builds one batched environment
     (`DenoisingVectorEnv`): tensors inside, NumPy arrays outside. `autoreset_mode` is `"SameStep"` by default;
-    `"NextStep"` and `"Disabled"` (with `options={"reset_mask": ...}`) are there too. Environment i of a vector
+    `"NextStep"` and `"Disabled"` (with `options={"reset_mask": ...}`) are available. Environment i of a vector
     environment seeded with s plays the episodes of a single environment seeded with s + i.
     `scene_envs.envs.DenoisingTorchRLEnv` is the torchrl adapter; it agrees bit for bit.
 

@@ -152,6 +152,7 @@ def test_parts_are_convex_closed_thick_and_few_cornered(library, name):
         assert len(part.vertices) <= 72
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_fine_parts_touch_and_do_not_overlap(library, name):
     fcl = pytest.importorskip("fcl")
@@ -278,6 +279,7 @@ def test_each_asset_stands_still(kitchen):
     assert float(equilibrium(batch, duration=0.5).displacement[:, 1:3].max()) <= 1e-4
 
 
+@pytest.mark.slow
 def test_each_asset_falls_back_upright(kitchen):
     cos, sin = math.cos(0.05), math.sin(0.05)
     tilted = [[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]]
@@ -307,6 +309,7 @@ def test_things_stand_on_plates_and_in_bowls(kitchen):
     assert float(result.displacement.max()) <= 3e-4
 
 
+@pytest.mark.slow
 def test_projection_leaves_things_on_plates_and_in_bowls(kitchen):
     rng = np.random.default_rng(0)
     layouts = []

@@ -89,6 +89,7 @@ def test_links_are_merged_as_rigid_bodies_are(tmp_path: Path) -> None:
     assert colors == [[102, 102, 128], [204, 128, 51]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "text"), [("hammer.urdf", HAMMER.format(joint="fixed")), ("hammer.sdf", HAMMER_SDF)])
 def test_drake_merges_them_alike(tmp_path: Path, name: str, text: str) -> None:
     pytest.importorskip("pydrake")

@@ -67,6 +67,7 @@ def test_a_concave_mesh_keeps_its_hollow(tmp_path: Path) -> None:
     assert asset.inertia == pytest.approx(exact.moment_inertia, abs=0.05 * exact.moment_inertia.max())
 
 
+@pytest.mark.slow
 def test_a_decomposition_is_computed_once_and_kept(
     tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -40,6 +40,7 @@ def test_help_loads_nothing_heavy():
     assert done.stderr.strip() == "set()"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -127,6 +128,7 @@ def echo(monkeypatch):
     return command
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("word", "name", "value"),
     [

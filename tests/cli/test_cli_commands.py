@@ -88,6 +88,7 @@ def test_the_doctor_prints_its_screen_and_keeps_the_numbers(prior, tmp_path, cap
     assert "log-ratio at the start" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_search_writes_its_pictures_and_curve(prior, tmp_path, capsys):
     words = ["objective=object_count", "budget=4", "branching=2", "num_steps=2", "slots=6"]
     assert main(["search", f"prior={prior}", *words, f"output={tmp_path}"]) == 0

@@ -38,6 +38,7 @@ def test_complete_adds_and_keeps(files: tuple[Path, Path], tmp_path: Path) -> No
     assert json.loads((tmp_path / "metrics.json").read_text())["added"] >= 0
 
 
+@pytest.mark.slow
 def test_rearrange_moves_and_keeps_what_there_is(files: tuple[Path, Path], tmp_path: Path) -> None:
     scenes, prior = files
     words = ["rearrange", f"scenes={scenes}", f"prior={prior}", "num_steps=3", "pictures=2", f"output={tmp_path}"]
@@ -64,6 +65,7 @@ def test_prompts_reach_the_prior(files: tuple[Path, Path], reader: Path, tmp_pat
     assert torch.equal(SceneBatch.load(tmp_path / "scenes.safetensors").tensor, expected.tensor)
 
 
+@pytest.mark.slow
 def test_search_and_post_training_take_prompts(reader: Path, tmp_path: Path) -> None:
     pytest.importorskip("pybullet")
     words = ["search", f"prior={reader}", "objective=prompt_match", "prompt=A scene with two cups.", "guidance=1"]

@@ -1,16 +1,42 @@
-"""Importing the package registers environments and loads nothing heavy."""
+"""What an import loads: environments are registered, and nothing heavy comes with them."""
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 
+import pytest
 
-def test_import_is_light_and_registers() -> None:
-    code = (
-        "import sys, gymnasium, scene_envs; "
-        "assert 'SceneEnvs/Denoising-v0' in gymnasium.registry and 'SceneEnvs/Search-v0' in gymnasium.registry; "
-        "heavy = {'torch', 'pybullet', 'fcl', 'trimesh', 'torchrl', 'rewards', 'agents'} & set(sys.modules); "
-        "assert not heavy, heavy"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
+HEAVY = ("pybullet", "fcl", "trimesh", "torchrl", "rewards", "agents")
+STEPS = {
+    "the package": ("import scene_envs", ("torch", *HEAVY)),
+    "a class": ("from scene_envs import SceneBatch, get_scene_type", HEAVY),
+    "an environment": ("import scene_envs.envs.denoising", ("rewards", "agents")),
+    "gym.make": ("gymnasium.make('SceneEnvs/Denoising-v0', reward='object_count', num_steps=1).reset(seed=0)", ()),
+    "text encoders": ("import agents.networks.text_encoders", ("transformers",)),
+}
+"""What one process does, one after another, and the modules that it has not loaded then."""
+
+
+@pytest.fixture(scope="module")
+def loaded() -> dict[str, list[str]]:
+    """Names of all modules after each step of a fresh process."""
+    code = ["import json, sys, gymnasium", "found = {}"]
+    for name, (statement, _) in STEPS.items():
+        code += [statement, f"found[{name!r}] = list(sys.modules)"]
+    code += ["found['registered'] = list(gymnasium.registry)", "print(json.dumps(found))"]
+    done = subprocess.run([sys.executable, "-c", "\n".join(code)], capture_output=True, text=True, check=True)
+    answer: dict[str, list[str]] = json.loads(done.stdout.splitlines()[-1])
+    return answer
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("step", STEPS)
+def test_what_is_not_needed_is_not_loaded(loaded: dict[str, list[str]], step: str) -> None:
+    assert {*STEPS[step][1]} & {*loaded[step]} == set()
+
+
+@pytest.mark.slow
+def test_environments_are_registered(loaded: dict[str, list[str]]) -> None:
+    assert {"SceneEnvs/Denoising-v0", "SceneEnvs/Search-v0"} <= {*loaded["registered"]}

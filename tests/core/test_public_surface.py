@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import ast
 import inspect
-import subprocess
-import sys
 from importlib import import_module
 from pathlib import Path
 
@@ -37,15 +35,6 @@ def test_lazy_names_are_typed(package: str) -> None:
     assert set(typed) == set(import_module(package).__all__) - {"__version__"}
     for name, module in typed.items():
         assert getattr(import_module(module or ""), name) is getattr(import_module(package), name)
-
-
-def test_a_name_loads_what_it_needs_and_no_more() -> None:
-    code = (
-        "import sys; from scene_envs import SceneBatch, get_scene_type; "
-        "heavy = {'pybullet', 'fcl', 'trimesh', 'torchrl', 'rewards', 'agents'} & set(sys.modules); "
-        "assert not heavy, heavy"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:

@@ -81,6 +81,7 @@ def test_scenes_of_a_stream_are_those_of_the_dataset(folder: Path) -> None:
     assert torch.equal(taken.normalizer.scale, whole.normalizer.scale)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("taken", [0, 7, 20, 100, 133])
 def test_a_stream_goes_on_exactly_from_its_state(folder: Path, taken: int) -> None:
     stream = SceneStream(folder, window=20, seed=4)
@@ -197,6 +198,7 @@ def test_a_mixture_is_seeded_and_goes_on_exactly_from_its_state(folder: Path, to
     assert [next(resumed).prompts for _ in range(13)] == then
 
 
+@pytest.mark.slow
 def test_a_part_of_a_mixture_keeps_to_it(folder: Path) -> None:
     fractions = (0.5, 0.5)
     seen = [

@@ -224,6 +224,7 @@ def test_tables_of_a_room_are_places() -> None:
     ) == [True, True, False, True, True, False, True, True, True, True]
 
 
+@pytest.mark.slow
 def test_facts_survive_the_noise_of_a_prior() -> None:
     """3 mm and 1 degree: at least 97 % of objects keep what holds them, and tables and tiers within 99 %."""
     for name, count in (("dimsum_table", 12), ("breakfast_table_low_clutter", 30), ("pantry_shelf", 6)):

@@ -57,6 +57,7 @@ def test_all_prompts_parse_back_and_hold(name: str) -> None:
             assert facts.score(scene) == 1.0
 
 
+@pytest.mark.slow
 @types
 def test_a_second_opinion_agrees(name: str) -> None:
     batch = scenes(name)
@@ -68,6 +69,7 @@ def test_a_second_opinion_agrees(name: str) -> None:
                 assert oracle.is_true(claim), (index, prompt, claim)
 
 
+@pytest.mark.slow
 @types
 def test_prompts_become_false_when_the_scene_changes(name: str) -> None:
     """An object less and every number is wrong; two things exchanged and their relation is."""

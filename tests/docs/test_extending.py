@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,7 +13,9 @@ import pytest
 import torch
 import yaml
 
+from agents import PostTrainConfig, PretrainConfig
 from agents.cli import main
+from agents.cli.keys import Sources, compose
 from agents.planning.registry import planner_settings
 from agents.post_training import DDPOSFLoss, DenoisingPolicy, compute_advantages
 from agents.post_training.algorithms import algorithm_settings, make_algorithm
@@ -136,15 +139,75 @@ def test_the_loss_starts_as_the_policy_gradient_and_holds_the_policy_back() -> N
     assert float(ours(transitions)["loss_objective"].detach()) == pytest.approx(expected_loss, rel=1e-4)
 
 
-def test_names_work_together_on_the_command_line(prior: str, tmp_path: Path) -> None:
-    """The scene type and the network have tests of their own, in the folders of grammars and of networks."""
-    search = ["objective=tower", "objective_scale=0.5", "mask=outer", "planner=levels", "planner.width=1", "slots=6"]
-    small = ["budget=3", "branching=2", "num_steps=1", f"output={tmp_path / 'search'}"]
-    assert main(["search", f"prior={prior}", *search, *small]) == 0
-    settings = yaml.safe_load((tmp_path / "search" / "config.yaml").read_text())
+OPTIONS = {
+    "algorithm/proximal": "name: proximal\npenalty: 0.5\n",
+    "reward/tower": "name: tower\nscale: 2.0\n",
+    "network/deep_sets": "name: deep_sets\nhidden: 16\ndepth: 3\n",
+    "mask/outer": "name: outer\n",
+    "planner/levels": "name: levels\nwidth: 1\n",
+    "experiment/short": """# @package _global_
+defaults:
+  - override /algorithm: proximal
+  - override /reward: tower
+iterations: 2
+batch_size: 3
+num_steps: 3
+regularisation: {batch_size: 2, bank_size: 8}
+guard: {scenes: 2}
+logger: {progress: none, report_scenes: 0}
+""",
+}
+"""A folder of values for the names of the package, as a user's ``--config-dir``."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> str:
+    configs = tmp_path_factory.mktemp("configs")
+    for name, text in OPTIONS.items():
+        (configs / name).parent.mkdir(exist_ok=True)
+        (configs / f"{name}.yaml").write_text(text, encoding="utf-8")
+    return str(configs)
+
+
+def test_search_takes_the_reward_the_mask_and_the_planner_by_name(prior: str, folder: str, tmp_path: Path) -> None:
+    words = ["objective=tower", "objective_scale=0.5", "mask=outer", "planner=levels", "slots=6"]
+    small = ["budget=3", "branching=2", "num_steps=1", f"output={tmp_path}", "--config-dir", folder]
+    assert main(["search", f"prior={prior}", *words, *small]) == 0
+    settings = yaml.safe_load((tmp_path / "config.yaml").read_text())
     assert settings["planner"] == {"name": "levels", "width": 1}
-    run = ["algorithm=proximal", "algorithm.penalty=0.5", "algorithm.gradient_steps=2", "reward=tower", "slots=6"]
-    sizes = ["iterations=2", "batch_size=3", "num_steps=3", "regularisation.bank_size=8", "guard.scenes=2"]
-    sizes += ["regularisation.batch_size=2", "logger.report_scenes=0", "logger.progress=none"]
-    assert main(["post-train", f"prior={prior}", *run, *sizes, f"output={tmp_path / 'run'}"]) == 0
-    assert "name: proximal" in (tmp_path / "run" / "config.yaml").read_text()
+    assert settings["mask"] == "outer"
+
+
+def test_an_experiment_with_the_algorithm_and_the_reward_runs_twice_alike(
+    prior: str, folder: str, tmp_path: Path
+) -> None:
+    """The ``config.yaml`` of the run starts it again, without the folder that its values came from."""
+    words = ["post-train", "+experiment=short", f"prior={prior}", "slots=6", f"output={tmp_path / 'run'}"]
+    assert main([*words, "algorithm.gradient_steps=2", "--config-dir", folder]) == 0
+    config = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
+    assert {**config["algorithm"], "name": "proximal", "penalty": 0.5, "gradient_steps": 2} == config["algorithm"]
+    assert config["reward"] == {"name": "tower", "scale": 2.0}
+    assert main(["post-train", "--config", str(tmp_path / "run" / "config.yaml"), f"output={tmp_path / 'again'}"]) == 0
+    first, second = (json.loads((tmp_path / name / "metrics.json").read_text()) for name in ("run", "again"))
+    assert first["reward"] == second["reward"]
+
+
+def test_the_network_has_its_keys_on_the_command_line_and_in_python(folder: str, tmp_path: Path) -> None:
+    """The scene type and the network have tests of their own, in the folders of grammars and of networks."""
+    words = ["network=deep_sets", "network.depth=2"]
+    composed = compose("pretrain", PretrainConfig, words, Sources(config_dir=folder))
+    assert (composed.network.name, composed.network.hidden, composed.network.depth) == ("deep_sets", 16, 2)
+    assert PretrainConfig(network="deep_sets").network.name == "deep_sets"  # without its YAML
+    assert PostTrainConfig(algorithm="proximal").algorithm.penalty == 1.0  # type: ignore[attr-defined]
+    output = ["--config-dir", folder, f"output={tmp_path}"]
+    assert main(["pretrain", "network=deep_sets", "process=continuous", *output]) == 2
+
+
+def test_help_lists_options_of_the_folder(folder: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["post-train", "--help", "--config-dir", folder]) == 0
+    assert re.search(r"algorithm=ddpo_sf \(or .*\bproximal\b.*\):", capsys.readouterr().out)
+    assert main(["post-train", "algorithm=proximal", "--help", "--config-dir", folder]) == 0
+    shown = capsys.readouterr().out
+    assert re.search(r"algorithm=proximal \(or .*\bddpo_sf\b.*\):", shown)
+    assert "algorithm.penalty=0.5" in shown
+    assert "coefficient of the squared log-ratio" in shown

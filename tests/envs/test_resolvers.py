@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from importlib.metadata import EntryPoints
 from pathlib import Path
 
@@ -15,18 +13,6 @@ from scene_envs.envs import resolvers
 from scene_envs.errors import MissingDependencyError, UnknownNameError
 
 ID = "scene_envs:SceneEnvs/Denoising-v0"
-
-
-@pytest.mark.slow
-def test_gym_make_needs_no_other_import() -> None:
-    code = (
-        "import sys, gymnasium as gym; "
-        "import scene_envs.envs.denoising; "
-        "upper = {'rewards', 'agents'} & set(sys.modules); "
-        "assert not upper, upper; "
-        f"gym.make('{ID}', reward='object_count', num_steps=1).reset(seed=0)"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_unknown_names_offer_the_nearest() -> None:

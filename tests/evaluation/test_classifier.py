@@ -39,12 +39,14 @@ def two_cups(distance: float) -> SceneBatch:
     return SceneBatch.from_parts(translations, rotations, categories, batch.scene_type)
 
 
+@pytest.mark.slow
 def test_real_against_real_is_chance(scenes: SceneBatch) -> None:
     accuracy = classifier_accuracy(scenes[:160], scenes[160:], seeds=2, config=QUICK)
     assert accuracy.mean == pytest.approx(0.5, abs=0.13)  # 112 held-out scenes a seed: 5 % standard error
     assert len(accuracy.per_seed) == 2
 
 
+@pytest.mark.slow
 def test_scenes_five_millimetres_too_high_are_found_out(scenes: SceneBatch) -> None:
     accuracy = classifier_accuracy(scenes[:160], lifted(scenes[160:], 5e-3), seeds=1, config=QUICK)
     assert accuracy.mean > 0.9

@@ -90,6 +90,7 @@ def test_held_out_scenes_may_be_a_folder_of_their_own(scenes: SceneBatch, tmp_pa
     assert len(real.training) == 20
 
 
+@pytest.mark.slow
 def test_a_union_takes_as_many_scenes_of_each_of_its_types(scenes: SceneBatch, tmp_path: Path) -> None:
     shelves = grammar_scenes("pantry_shelf", 12, seed=6)
     union = union_scene_type(["dimsum_table", "pantry_shelf"])

@@ -25,6 +25,7 @@ def metrics(folder) -> dict:
     return json.loads((folder / "metrics.json").read_text())
 
 
+@pytest.mark.slow
 def test_a_scene_file_in_some_formats(tmp_path, capsys):
     scenes = all_scenes().save(tmp_path / "scenes.safetensors")
     out = tmp_path / "out"
@@ -80,6 +81,7 @@ def test_sample_exports_what_it_made_ready(prior, tmp_path):
     assert metrics(tmp_path)["export"]["formats"] == ["npz", "drake"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "message"),
     [

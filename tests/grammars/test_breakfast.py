@@ -91,6 +91,7 @@ def test_slices_of_toast_are_stacked_on_one_axis() -> None:
     assert stacks >= 5  # about an eighth of 200 plates
 
 
+@pytest.mark.slow
 def test_fruit_stands_in_the_middle_of_a_bowl_and_bread_leans_in_it() -> None:
     scenes = drawn(shared_bowls(0.01, 2), 40)
     for bowl, scene in every(scenes, "bowl"):
@@ -100,6 +101,7 @@ def test_fruit_stands_in_the_middle_of_a_bowl_and_bread_leans_in_it() -> None:
             assert food.at[2] == pytest.approx(0.006, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_utensils_stand_in_the_crock_with_their_heads_up() -> None:
     scenes = drawn(crock(1.0), 7)
     numbers = []

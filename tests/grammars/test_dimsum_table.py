@@ -16,7 +16,7 @@ NAMES = np.array([*SCENE_TYPE.assets, ""])
 
 @pytest.fixture(scope="module")
 def scenes() -> NDArray[np.float32]:
-    return get_grammar("dimsum_table").sample_array(np.random.default_rng(1), 1500)
+    return get_grammar("dimsum_table").sample_array(np.random.default_rng(1), 600)
 
 
 def _present(scene: NDArray[np.float32]) -> tuple[NDArray[np.str_], NDArray[np.float32], NDArray[np.float32]]:

@@ -40,9 +40,9 @@ def tea_house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(scope="module")
 def folder(tea_house: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset of ten scenes, made by two spawned processes that find the package by themselves."""
+    """A dataset of ten scenes, made by a spawned process that finds the package by itself."""
     output = tmp_path_factory.mktemp("data") / NAME
-    report = generate(NAME, 10, output, seed=3, workers=2, shard_size=5, progress=False)
+    report = generate(NAME, 10, output, seed=3, workers=1, shard_size=5, progress=False)
     assert report.scenes == 10
     return output
 

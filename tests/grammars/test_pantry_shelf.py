@@ -14,6 +14,8 @@ from scene_envs.grammars.shelf import TIER_HEIGHTS
 from scene_envs.scene_types import get_scene_type
 from tests.helpers.drawn_scenes import Thing, apart, check_physics, check_slots, contents_of, counts, every, things_of
 
+pytestmark = pytest.mark.slow
+
 NAME = "pantry_shelf"
 SCENE_TYPE = get_scene_type(NAME)
 RADIUS = {asset.name: float(np.abs(asset.bounds[:, :2]).max()) for asset in SCENE_TYPE.library}

@@ -161,6 +161,7 @@ def test_the_number_of_tables_keeps_its_weights_whatever_the_condition_rejects()
     assert np.mean([len(towers) == 1 for towers in draws]) == pytest.approx(0.5, abs=0.1)
 
 
+@pytest.mark.slow
 def test_counts_follow_the_published_statistics(kind: str) -> None:
     """4 standard errors of the mean of 1,500 structures are 2.6 % (high) and 4.5 % (low) of the published mean."""
     mean, low, high = PAPER[kind]

@@ -22,10 +22,7 @@ SMALLER: dict[str, dict[str, str]] = {
         'iterations=40, output="runs/clutter"': (
             'iterations=1, batch_size=2, num_steps=3, **SMALL, output="runs/short"'
         ),
-        'PostTrainConfig(output="runs/clutter")': (
-            'PostTrainConfig(output="runs/compared", iterations=1, batch_size=2, num_steps=3, **SMALL), '
-            "scenes=1, num_steps=20"
-        ),
+        "post_train_and_compare(config)": "post_train_and_compare(config, scenes=1, num_steps=20)",
     },
     "docs/datasets.md": {
         "10_000,": "12,",

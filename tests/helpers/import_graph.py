@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -44,6 +45,7 @@ def imported_names(tree: ast.AST) -> Iterator[str]:
                 yield str(node.args[0].value)
 
 
+@cache
 def import_graph() -> dict[str, set[str]]:
     """Which modules of the three packages each module imports."""
     graph = {}
@@ -51,6 +53,3 @@ def import_graph() -> dict[str, set[str]]:
         found = {resolved(target) for target in imported_names(ast.parse(file.read_text(encoding="utf-8")))}
         graph[name] = {target for target in found if target is not None and target != name}
     return graph
-
-
-GRAPH = import_graph()

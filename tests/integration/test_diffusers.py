@@ -67,8 +67,8 @@ def _prior(process: str, prediction: str) -> ScenePrior:
     """A prior with the linear schedule whose network is a formula."""
     base = tiny_prior(process=process)
     config = getattr(base, "mixed", base.config)
-    # no entry is given: the formula does not know of any
-    extra = {"given_share": 0.0} if process == "mixed" else {}
+    # no entry is observed: the formula does not know of any
+    extra = {"observed_share": 0.0} if process == "mixed" else {}
     config = replace(config, schedule="linear", prediction=prediction, **extra)
     prior: ScenePrior = type(base)(config, base.normalizer, base.preconditioning)  # type: ignore[call-arg]
     network = (_Mixed if process == "mixed" else _Continuous)(prediction)
@@ -175,6 +175,7 @@ def test_steps_have_the_mean_and_variance_of_ddpm(
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("eta", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("prediction", PREDICTIONS)
 @pytest.mark.parametrize("process", PROCESSES)
@@ -200,6 +201,7 @@ def test_steps_have_the_mean_and_variance_of_ddim(process: str, prediction: str,
             assert eta > 0 or bool((std == 0).all())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_steps", STEPS)
 @pytest.mark.parametrize("process", PROCESSES)
 def test_whole_chains_end_where_those_of_ddpm_end(
@@ -219,6 +221,7 @@ def test_whole_chains_end_where_those_of_ddpm_end(
     assert 0.1 < float(theirs[:, free].std()) < 1.0  # of the data's order, neither collapsed nor diverged
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_steps", STEPS)
 @pytest.mark.parametrize("process", PROCESSES)
 def test_whole_chains_without_noise_end_where_those_of_ddim_end(process: str, num_steps: int) -> None:

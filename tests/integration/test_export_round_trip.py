@@ -105,6 +105,7 @@ def drake_poses(plant, context, scene):
 DRAKE = pytest.mark.parametrize("name", ["scene.dmd.yaml", "world.sdf"])
 
 
+@pytest.mark.slow
 @DRAKE
 @SCENES
 def test_drake_has_the_same_poses_and_masses(folder, scenes, index, name):
@@ -122,6 +123,7 @@ def test_drake_has_the_same_poses_and_masses(folder, scenes, index, name):
         np.testing.assert_allclose(center.CopyToFullMatrix3(), thing.asset.inertia, atol=1e-12)
 
 
+@pytest.mark.slow
 @DRAKE
 @JUDGED
 def test_drake_finds_the_same_overlaps(folder, batch, index, name):
@@ -161,6 +163,7 @@ def test_drake_rubs_as_we_do_and_has_contact_patches(folder, name):
         assert properties.HasProperty("hydroelastic", "compliance_type")
 
 
+@pytest.mark.slow
 @DRAKE
 def test_drake_leaves_a_laid_table_still(folder, scenes, name):
     plant, _, diagram, context = drake_scene(folder, 0, name)

@@ -20,6 +20,8 @@ from scene_envs.render import render
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import Camera, FixedObject, SceneType, register_scene_type
 
+pytestmark = pytest.mark.slow
+
 bullet = pytest.importorskip("pybullet")
 pybullet_data = pytest.importorskip("pybullet_data")
 DATA = Path(pybullet_data.getDataPath())

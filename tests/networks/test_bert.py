@@ -176,10 +176,3 @@ def test_configurations_survive_a_file(encoder: BertEncoder) -> None:
         assert isinstance(text_encoder(config), kind)
     assert text_config_from_state(None) is None
     assert text_config("vocabulary", ["a cup"]).width == TextConfig(()).width
-
-
-def test_importing_the_encoder_loads_no_transformers() -> None:
-    import subprocess
-
-    code = "import sys, agents.networks.text_encoders; print('transformers' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "False"

@@ -14,8 +14,8 @@ from agents import PretrainConfig
 from agents.diffusion.gaussian import check_prediction
 from agents.networks import MixedFlux, MixedFluxConfig, build_network, network_config
 from agents.networks.contacts import ContactsConfig
-from agents.networks.given_flags import GivenFlagsConfig
 from agents.networks.mixed_flux_files import current_fields, current_name
+from agents.networks.observed_flags import ObservedFlagsConfig
 from agents.networks.registry import config_from_state, config_state
 from agents.networks.relations import RelationsConfig
 from agents.priors.base import ScenePrior
@@ -25,7 +25,7 @@ from scene_envs.errors import InvalidInputError, UnknownNameError
 SIZES: dict[str, Any] = {"features": 20, "categories": 8, "hidden": 16, "depth": 2, "heads": 2}
 ALL: dict[str, Any] = {
     "modules": [
-        {"name": "given_flags"},
+        {"name": "observed_flags"},
         {"name": "pooled_text"},
         {"name": "count_embedding"},
         {"name": "count_conditioning", "largest": 9},
@@ -99,7 +99,7 @@ def test_wrong_lists_of_modules_are_named() -> None:
     with pytest.raises(InvalidInputError, match="'contacts' needs relations before it"):
         MixedFluxConfig(8, modules=(ContactsConfig(), RelationsConfig()))
     with pytest.raises(InvalidInputError, match="listed twice"):
-        MixedFluxConfig(8, modules=(GivenFlagsConfig(), GivenFlagsConfig()))
+        MixedFluxConfig(8, modules=(ObservedFlagsConfig(), ObservedFlagsConfig()))
     with pytest.raises(InvalidInputError, match="'pooled_text' needs a network with text"):
         MixedFluxConfig(8, modules=({"name": "pooled_text"},))  # type: ignore[arg-type]
     with pytest.raises(UnknownNameError, match="did you mean 'contacts'"):
@@ -107,7 +107,7 @@ def test_wrong_lists_of_modules_are_named() -> None:
     with pytest.raises(InvalidInputError, match=r"'relations' has no fields \['blurr'\]"):
         MixedFluxConfig(8, modules=({"name": "relations", "blurr": "axis"},))  # type: ignore[arg-type]
     with pytest.raises(UnknownNameError, match="contacts"):
-        MixedFluxConfig(8, modules=(GivenFlagsConfig(),)).without("contacts")
+        MixedFluxConfig(8, modules=(ObservedFlagsConfig(),)).without("contacts")
 
 
 def test_an_earlier_name_of_a_prediction_says_the_present_one() -> None:

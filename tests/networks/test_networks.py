@@ -31,7 +31,7 @@ from agents.networks import (
 from agents.networks.count_conditioning import CountConditioning, still_to_come
 from agents.networks.count_embedding import count_states
 from agents.networks.fourier_features import FourierFeaturesConfig
-from agents.networks.given_flags import GivenFlagsConfig
+from agents.networks.observed_flags import ObservedFlagsConfig
 from agents.networks.registry import config_from_state, config_state
 from agents.networks.relations import RelationsConfig
 from scene_envs.errors import InvalidInputError, UnknownNameError
@@ -42,7 +42,7 @@ EQUIVARIANT = ("flux", "midiffusion")
 BASELINES = ("midiffusion", "diffuscene")
 
 
-SEEN = [{"name": name} for name in ("given_flags", "count_embedding", "relations", "rotation_features", "contacts")]
+SEEN = [{"name": name} for name in ("observed_flags", "count_embedding", "relations", "rotation_features", "contacts")]
 READ: list[dict[str, Any]] = [{"name": "pooled_text"}, {"name": "count_conditioning", "largest": 9}]
 
 
@@ -94,7 +94,7 @@ def inputs(process: str, slots: int, text: bool = True, batch: int = 2) -> dict[
             "time": torch.tensor([3.0, 700.0]).double()[:batch],
             "position": normal(batch, slots, 12),
             "noise_level": torch.rand((batch, slots), generator=generator).double(),
-            "given": torch.randint(4, (batch, slots), generator=generator),
+            "observed": torch.randint(4, (batch, slots), generator=generator),
         }
     return {**arguments, **(words if text else {})}
 
@@ -116,7 +116,9 @@ def run(network: nn.Module, process: str, arguments: dict[str, Any]) -> Tensor:
 
 def turned(arguments: dict[str, Any], order: Tensor, process: str) -> dict[str, Any]:
     """The same scenes with slots in another order."""
-    of_slots = ("x", "position") if process == "continuous" else ("pose", "states", "position", "noise_level", "given")
+    of_slots = (
+        ("x", "position") if process == "continuous" else ("pose", "states", "position", "noise_level", "observed")
+    )
     return {key: value[:, order] if key in of_slots else value for key, value in arguments.items()}
 
 
@@ -253,10 +255,10 @@ def test_known_numbers_become_shares_of_the_masked_slots() -> None:
 def test_flags_and_time_are_read(name: str) -> None:
     network, arguments = make(name, "mixed"), inputs("mixed", 6)
     said = run(network, "mixed", arguments)
-    for key, value in {"given": 3 - arguments["given"], "time": arguments["time"] + 40}.items():
+    for key, value in {"observed": 3 - arguments["observed"], "time": arguments["time"] + 40}.items():
         assert (run(network, "mixed", {**arguments, key: value}) - said).abs().max() > 1e-3
     blind = make(name, "mixed", flags=0)
-    assert (run(blind, "mixed", arguments) == run(blind, "mixed", {**arguments, "given": None})).all()
+    assert (run(blind, "mixed", arguments) == run(blind, "mixed", {**arguments, "observed": None})).all()
 
 
 @pytest.mark.parametrize("name", BASELINES)
@@ -305,10 +307,11 @@ def test_files_give_the_same_network_back(name: str, process: str) -> None:
 def test_files_without_a_kind_hold_flux_networks() -> None:
     assert config_from_state({"features": 20}, "continuous") == FluxConfig(20)
     assert config_from_state({"categories": 8, "unit": [1.0, 2.0, 3.0]}, "mixed") == MixedFluxConfig(
-        8, unit=(1.0, 2.0, 3.0), time_input="log_noise", modules=(GivenFlagsConfig(), FourierFeaturesConfig())
+        8, unit=(1.0, 2.0, 3.0), time_input="log_noise", modules=(ObservedFlagsConfig(), FourierFeaturesConfig())
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("process", PROCESSES)
 @pytest.mark.parametrize("name", NETWORKS)
 def test_sizes_with_equal_parameters(name: str, process: str) -> None:

@@ -48,6 +48,7 @@ def turns(count: int, seed: int = 0) -> Tensor:
     return torch.from_numpy(Rotation.random(count, random_state=seed).as_matrix())[None]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", [0.01, 0.1, 0.5])
 def test_features_of_a_position_are_the_mean_of_those_of_noisy_ones(level: float) -> None:
     """E sin(w (x + s n)) = sin(w x) exp(-w^2 s^2 / 2): a wave that noise blurs is as faint as it is unknown."""

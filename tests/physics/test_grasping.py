@@ -63,6 +63,7 @@ def test_rims_are_grasped_and_flat_things_down_to_the_floor() -> None:
     assert reached(post.with_poses(post.translations, rotations), UP, Gripper()) == [True]
 
 
+@pytest.mark.slow
 def test_verdicts_depend_neither_on_the_batch_nor_on_the_heading() -> None:
     batch = get_grammar("pantry_shelf").sample(np.random.default_rng(0), 2)
     together = reachable(batch, [UP, FRONT]).reached

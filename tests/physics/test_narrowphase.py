@@ -44,7 +44,7 @@ def depth_of(
 @pytest.fixture(scope="module")
 def pairs() -> tuple[list[Array], PlacedParts, list[str]]:
     """Pairs of library parts, polytopes and slivers in every kind of contact."""
-    return sample(3300, seed=5)
+    return sample(1500, seed=5)
 
 
 @pytest.fixture(scope="module")
@@ -137,6 +137,7 @@ def test_every_kind_of_contact_agrees_with_the_minkowski_difference(
     np.testing.assert_allclose(np.maximum(depths[0], 0.0), np.maximum(expected, 0.0), atol=1e-11, rtol=0)
 
 
+@pytest.mark.slow
 def test_moving_along_the_direction_by_the_depth_separates(
     pairs: tuple[list[Array], PlacedParts, list[str]], depths: tuple[Array, Array]
 ) -> None:
@@ -150,6 +151,7 @@ def test_moving_along_the_direction_by_the_depth_separates(
         assert gap == pytest.approx(-depth[row], abs=1e-12)
 
 
+@pytest.mark.slow
 def test_the_two_parts_are_exchanged(
     pairs: tuple[list[Array], PlacedParts, list[str]], depths: tuple[Array, Array]
 ) -> None:
@@ -159,6 +161,7 @@ def test_the_two_parts_are_exchanged(
     np.testing.assert_allclose(np.maximum(exchanged, 0.0), np.maximum(depths[0], 0.0), atol=1e-12, rtol=0)
 
 
+@pytest.mark.slow
 def test_both_parts_move_together(
     pairs: tuple[list[Array], PlacedParts, list[str]], depths: tuple[Array, Array]
 ) -> None:
@@ -169,6 +172,7 @@ def test_both_parts_move_together(
     np.testing.assert_allclose(np.maximum(depth, 0.0), np.maximum(depths[0], 0.0), atol=1e-12, rtol=0)
 
 
+@pytest.mark.slow
 def test_a_pair_does_not_depend_on_the_others(
     pairs: tuple[list[Array], PlacedParts, list[str]], depths: tuple[Array, Array]
 ) -> None:
@@ -204,6 +208,7 @@ def test_no_pairs_and_poses_that_are_none() -> None:
     assert [part.shape for part in solver(placed, nothing, nothing)] == [(0,), (0, 3)]
 
 
+@pytest.mark.slow
 def test_parts_with_thousands_of_edges_fit_into_memory() -> None:
     """Two spheres of 1,200 corners each: their edges make 13 million pairs."""
     rng = np.random.default_rng(2)
@@ -242,6 +247,7 @@ for line in sys.stdin:
 """
 
 
+@pytest.mark.slow
 def test_generic_pairs_agree_with_fcl(
     pairs: tuple[list[Array], PlacedParts, list[str]], depths: tuple[Array, Array]
 ) -> None:

@@ -53,6 +53,7 @@ def test_none_one_and_two_workers_agree_bit_for_bit(
     assert len(pool.process_ids) == 2
 
 
+@pytest.mark.slow
 def test_every_function_runs_in_workers(batch: SceneBatch, pool: PhysicsPool) -> None:
     few = batch[:3]
     assert torch.equal(settle(few, duration=0.25, pool=pool).batch.tensor, settle(few, duration=0.25).batch.tensor)
@@ -129,6 +130,7 @@ def test_wrong_arguments_and_a_closed_pool_are_refused(batch: SceneBatch) -> Non
         feasibility(batch[:1], pool=pool)
 
 
+@pytest.mark.slow
 def test_closing_ends_the_processes() -> None:
     pool = PhysicsPool(workers=1)
     feasibility(scene(("cube", 0.0, 0.0, 0.0)), pool=pool)

@@ -15,16 +15,15 @@ from torch import Tensor
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import PhysicsPool, feasibility, make_ready, project, settle
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types.built_in import BUILT_IN
 
 pytestmark = pytest.mark.slow
 
-NOISE = (0.004, 0.015, 0.03)
+NOISE = (0.004, 0.03)
 """m along every axis; one scene each."""
 
 
 def crowded(name: str, seed: int = 5) -> SceneBatch:
-    """Three scenes with as many objects as three draws of six have, thrown about by 4, 15 and 30 mm."""
+    """Two scenes with as many objects as the fullest of six draws have, thrown about by 4 and 30 mm."""
     drawn = get_grammar(name).sample(np.random.default_rng(seed), 6)
     clean = drawn[drawn.counts.argsort(descending=True)[: len(NOISE)]]
     scale = torch.tensor(NOISE)[:, None, None]
@@ -66,7 +65,7 @@ def pool() -> Iterator[PhysicsPool]:
         yield pool
 
 
-@pytest.mark.parametrize("name", [scene_type.name for scene_type in BUILT_IN])
+@pytest.mark.parametrize("name", ["dimsum_table", "pantry_shelf", "restaurant_low_clutter"])
 def test_no_history_changes_a_result(name: str, pool: PhysicsPool) -> None:
     """Each function of each scene alone, after others in a random order, and in workers with histories of their own."""
     batch = crowded(name)

@@ -35,6 +35,7 @@ def forward_config(
     return PostTrainConfig(output=str(output), **(keys | changes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize("process", ["mixed", "continuous"])
 def test_stopped_and_resumed_run_equals_the_uninterrupted_one(tmp_path: Path, algorithm: str, process: str) -> None:
@@ -51,6 +52,7 @@ def test_stopped_and_resumed_run_equals_the_uninterrupted_one(tmp_path: Path, al
     assert [row["reward"] for row in parts.history] == [row["reward"] for row in whole.history]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["nft", "awm"])
 @pytest.mark.parametrize("process", ["mixed", "continuous"])
 def test_more_objects_after_training_on_their_number(tmp_path: Path, algorithm: str, process: str) -> None:

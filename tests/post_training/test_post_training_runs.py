@@ -150,6 +150,7 @@ def test_other_settings_do_not_continue_a_run(tmp_path: Path) -> None:
         post_train(small_config(tmp_path, learning_rate=0.5), prior=tiny_prior())
 
 
+@pytest.mark.slow
 def test_truncated_checkpoint_is_named(tmp_path: Path) -> None:
     post_train(small_config(tmp_path, iterations=2), prior=tiny_prior())
     path = tmp_path / "checkpoint.pt"

@@ -129,6 +129,7 @@ def test_the_text_encoder_stays_as_it_is(tmp_path: Path, prompt: str | None) -> 
     assert all(p.requires_grad for p in prior.parameters())  # the base prior is left as it was
 
 
+@pytest.mark.slow
 def test_stopped_and_resumed_run_equals_the_uninterrupted_one(tmp_path: Path) -> None:
     changes = {"prompt": "data", "scenes_per_prompt": 2, "reward": count_objects}
     post_train(small_config(tmp_path / "whole", **changes), prior=reader())
@@ -146,6 +147,7 @@ def test_prompts_of_real_scenes_that_do_not_fit_are_refused_at_the_start(tmp_pat
     trainer.close()
 
 
+@pytest.mark.slow
 def test_real_scenes_bring_their_own_prompts(tmp_path: Path) -> None:
     generate("dimsum_table", 24, tmp_path / "data", seed=0, workers=0)
     dataset = SceneDataset.load(tmp_path / "data")
@@ -169,6 +171,7 @@ def test_real_scenes_bring_their_own_prompts(tmp_path: Path) -> None:
     trainer.close()
 
 
+@pytest.mark.slow
 def test_prompts_of_a_run_that_never_saved_are_not_taken_for_those_of_other_scenes(tmp_path: Path) -> None:
     generate("dimsum_table", 24, tmp_path / "data", seed=0, workers=0)
     trainer = PostTrainer(

@@ -18,7 +18,8 @@ from agents.pretraining.config import PretrainConfig
 from agents.pretraining.data import SceneTable
 from agents.pretraining.initial_prior import build_prior
 from agents.pretraining.setup import prepare
-from agents.pretraining.trainer import Pretrainer, learning_rate_at, part_generator
+from agents.pretraining.trainer import Pretrainer, learning_rate_at
+from agents.utils.seeds import derived_generator
 from agents.utils.weight_average import WeightAverage
 from scene_envs.datasets import generate
 from scene_envs.errors import CorruptFileError, InvalidInputError, TrainingError, UnknownNameError
@@ -57,6 +58,7 @@ class Killed(Exception):
     """Stands for a killed process."""
 
 
+@pytest.mark.slow
 def test_a_killed_run_resumes_bit_for_bit(config: PretrainConfig, raw: torch.Tensor, tmp_path: Path) -> None:
     whole = make_run(replace(config, output=str(tmp_path / "whole")), raw)
     whole.run()
@@ -80,6 +82,7 @@ def test_a_killed_run_resumes_bit_for_bit(config: PretrainConfig, raw: torch.Ten
         assert torch.equal(tensor, resumed.average.tensors[name]), name
 
 
+@pytest.mark.slow
 def test_nan_stops_the_run_and_keeps_the_last_checkpoint(config: PretrainConfig, raw: torch.Tensor) -> None:
     run = make_run(config, raw)
     update = run._update
@@ -95,6 +98,7 @@ def test_nan_stops_the_run_and_keeps_the_last_checkpoint(config: PretrainConfig,
     assert make_run(config, raw).run().card["trained_steps"] == 6
 
 
+@pytest.mark.slow
 def test_a_run_does_not_go_on_with_keys_that_do_not_fit_it(config: PretrainConfig, raw: torch.Tensor) -> None:
     make_run(config, raw).run()
     for other, was in (
@@ -107,6 +111,7 @@ def test_a_run_does_not_go_on_with_keys_that_do_not_fit_it(config: PretrainConfi
             make_run(changed(config, {"iterations": 8, **other}), raw).run()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("process", ["continuous", "mixed"])
 def test_a_run_that_an_earlier_version_began_is_refused_in_plain_words(
     config: PretrainConfig, raw: torch.Tensor, process: str
@@ -123,6 +128,7 @@ def test_a_run_that_an_earlier_version_began_is_refused_in_plain_words(
         make_run(replace(config, iterations=8), raw).run()
 
 
+@pytest.mark.slow
 def test_a_checkpoint_that_holds_no_base_rates_resumes_bit_for_bit(
     config: PretrainConfig, raw: torch.Tensor, tmp_path: Path
 ) -> None:
@@ -151,6 +157,7 @@ def test_a_checkpoint_that_holds_no_base_rates_resumes_bit_for_bit(
         assert torch.equal(tensor, resumed.network.state_dict()[name]), name
 
 
+@pytest.mark.slow
 def test_what_an_older_prior_takes_as_constant_may_not_vary_where_it_is_trained_further(
     config: PretrainConfig, raw: torch.Tensor
 ) -> None:
@@ -163,6 +170,7 @@ def test_what_an_older_prior_takes_as_constant_may_not_vary_where_it_is_trained_
         build_prior(further, turned, Normalizer.fit(turned))
 
 
+@pytest.mark.slow
 def test_a_truncated_checkpoint_is_named(config: PretrainConfig, raw: torch.Tensor) -> None:
     run = make_run(config, raw)
     run.run()
@@ -212,7 +220,7 @@ def test_parts_one_after_the_other_add_up_to_their_batch(
 ) -> None:
     """The gradient of a step is the mean over its parts, each with noise of its own."""
     run = make_run(changed(config, {"process.name": process, "optimizer.accumulate": 2, "optimizer.clip": 1e9}), raw)
-    losses = [run._part_loss(4, part_generator(0, 0, part)) for part in range(2)]
+    losses = [run._part_loss(4, derived_generator(0, 0, part)) for part in range(2)]
     expected = torch.autograd.grad(sum(losses) / 2, list(run.network.parameters()), allow_unused=True)  # type: ignore[arg-type]
     norm = torch.stack([g.norm() for g in expected if g is not None]).norm()
     value, found = run._update()
@@ -227,6 +235,7 @@ def test_a_batch_that_cannot_be_parted_is_refused(config: PretrainConfig, raw: t
         make_run(changed(config, {"optimizer.precision": "bfloat"}), raw)
 
 
+@pytest.mark.slow
 def test_autocast_is_of_the_network_only(config: PretrainConfig, raw: torch.Tensor) -> None:
     run = make_run(changed(config, {"optimizer.precision": "bfloat16"}), raw)
     x = run.prior.initial(2, 34)
@@ -235,6 +244,7 @@ def test_autocast_is_of_the_network_only(config: PretrainConfig, raw: torch.Tens
     assert run.run().denoiser.precision == torch.float32
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_grammar_scenes")
 def test_a_grammar_without_end_trains_a_prior_that_reads_prompts(tmp_path: Path) -> None:
     config = PretrainConfig(
@@ -277,6 +287,7 @@ def test_two_processes_take_the_steps_of_one_with_twice_the_parts(tmp_path: Path
     assert float(two[-1]["heldout"]) == pytest.approx(float(one[-1]["heldout"]), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_one_prior_is_trained_on_several_scene_types(tmp_path: Path) -> None:
     for scene in ("dimsum_table", "pantry_shelf"):
         generate(scene, 12, tmp_path / scene, workers=0, verify=False, progress=False)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -16,17 +18,17 @@ from scene_envs.datasets.prompts import describe_all
 from scene_envs.grammars import get_grammar
 from scene_envs.normalizer import Normalizer
 
-SCENES = get_grammar("living_room_shelf").sample(np.random.default_rng(0), 512)
-PROMPTS = describe_all(SCENES, np.random.default_rng(0))
 
-
-def fresh(**keys: object) -> tuple[MixedPrior, SceneTable]:
+def fresh(count: int = 24, **keys: object) -> tuple[MixedPrior, SceneTable]:
+    """A prior without training, and ``count`` scenes with prompts."""
+    scenes = get_grammar("living_room_shelf").sample(np.random.default_rng(0), count)
+    prompts = describe_all(scenes, np.random.default_rng(0))
     text = {"encoder": "vocabulary", "width": 48, "depth": 1, "latents": 2}
     small = PretrainConfig(scene="living_room_shelf", text=text, network={"hidden": 32, "depth": 2, "heads": 2})
     config = changed_config(small, keys)
-    prior = build_prior(config, SCENES.tensor, Normalizer.fit(SCENES.tensor), PROMPTS)
+    prior = build_prior(config, scenes.tensor, Normalizer.fit(scenes.tensor), prompts)
     assert isinstance(prior, MixedPrior)
-    return prior, SceneTable(prior.encode(SCENES), PROMPTS)
+    return prior, SceneTable(prior.encode(scenes), prompts)
 
 
 def read_numbers(prior: MixedPrior, prompt: str) -> torch.Tensor:
@@ -38,7 +40,7 @@ def read_numbers(prior: MixedPrior, prompt: str) -> torch.Tensor:
 
 @pytest.mark.slow
 def test_numbers_of_objects_are_read_from_prompts() -> None:
-    prior, data = fresh()
+    prior, data = fresh(count=160)
     assert warm_up_text(prior, data, 250, 48, seed=0) is not None
     assert [int(read_numbers(prior, f"A scene with {n} objects.")[-1]) for n in (4, 6, 8)] == [4, 6, 8]
     kinds = list(dict.fromkeys(asset.display_name for asset in prior.scene_type.library))
@@ -57,10 +59,11 @@ def test_assets_of_one_name_are_one_kind_to_a_prompt() -> None:
 
 
 def test_the_same_seed_learns_the_same_and_nothing_else_changes() -> None:
-    priors = [fresh()[0] for _ in range(2)]
+    prior, data = fresh()
+    priors = [prior, copy.deepcopy(prior)]
     before = {name: value.clone() for name, value in priors[0].denoiser.state_dict().items()}
     for prior in priors:
-        warm_up_text(prior, SceneTable(prior.encode(SCENES), PROMPTS), 3, 16, seed=5)
+        warm_up_text(prior, data, 3, 16, seed=5)
     states = [prior.denoiser.state_dict() for prior in priors]
     changed = {name for name in before if not torch.equal(states[0][name], before[name])}
     assert all(torch.equal(states[0][name], states[1][name]) for name in before)

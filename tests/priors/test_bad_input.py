@@ -206,6 +206,7 @@ def test_a_dataset_without_prompts_cannot_train_a_prior_that_reads_them(
 # -- steps ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_steps", [0, -3, 1001])
 def test_steps_outside_the_range(
     num_steps: int, prior: ScenePrior, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

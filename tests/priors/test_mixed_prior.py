@@ -10,7 +10,7 @@ import torch
 
 from agents.diffusion import MixedStep
 from agents.diffusion.reverse_steps import state_of
-from agents.networks.mixed_denoiser import Given
+from agents.networks.mixed_denoiser import Observed
 from agents.post_training import DDPOSFLoss, DenoisingPolicy
 from agents.post_training.rollouts import collect
 from agents.priors.base import ScenePrior
@@ -45,6 +45,7 @@ def test_scenes_survive_encoding_and_known_entries_are_clamped(prior: MixedPrior
     assert (state_of(start[:, 1:, 12:]) == MASK).float().mean() > 0.99
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_steps", [1, 7, 150])
 def test_chains_of_any_length_end_in_scenes_without_mask_tokens(prior: MixedPrior, num_steps: int) -> None:
     table = prior.step_table(num_steps)
@@ -101,13 +102,13 @@ def test_kept_entries_come_back_bit_identical(prior: MixedPrior, scenes: SceneBa
 
 def test_given_entries_carry_no_noise_into_the_network(prior: MixedPrior, scenes: SceneBatch) -> None:
     x0 = prior.encode(scenes)
-    given = Given(x0, torch.rand(6, 34) < 0.5, torch.rand(6, 34) < 0.5)
+    observed = Observed(x0, torch.rand(6, 34) < 0.5, torch.rand(6, 34) < 0.5)
     seen = [
-        given.write(prior.add_noise(x0, torch.full((6,), 700), torch.randn(x0.shape)))[given.entries()]
+        observed.write(prior.add_noise(x0, torch.full((6,), 700), torch.randn(x0.shape)))[observed.entries()]
         for _ in range(2)
     ]
     assert (seen[0] == seen[1]).all()
-    assert (seen[0] == x0[given.entries()]).all()
+    assert (seen[0] == x0[observed.entries()]).all()
 
 
 def test_fixed_objects_look_alike_in_training_and_in_chains(
@@ -119,7 +120,7 @@ def test_fixed_objects_look_alike_in_training_and_in_chains(
 
     def watched(self: torch.nn.Module, pose: torch.Tensor, *args: torch.Tensor, **more: torch.Tensor) -> object:
         seen.append({"pose": pose[0, 0], "position": more["position"][0, 0], "level": more["noise_level"][0, 0],
-                     "given": more["given"][0, 0]})  # fmt: skip
+                     "observed": more["observed"][0, 0]})  # fmt: skip
         return forward(self, pose, *args, **more)
 
     monkeypatch.setattr(kind, "forward", watched)
@@ -130,7 +131,7 @@ def test_fixed_objects_look_alike_in_training_and_in_chains(
     for other in seen[1:]:
         for name, value in seen[0].items():
             torch.testing.assert_close(other[name], value, atol=1e-6, rtol=0)
-    assert int(seen[0]["given"]) == 3
+    assert int(seen[0]["observed"]) == 3
     assert float(seen[0]["level"]) == 0.0
 
 
@@ -207,7 +208,7 @@ def test_the_probability_of_a_chain_of_states_is_that_of_bayes(prior: MixedPrior
     x = prior.initial(1, 34, torch.Generator().manual_seed(0))
     table = prior.step_table(2)  # T -> 1 -> 0
     step = prior.transition(x, 0, table)
-    _, logits = prior.denoiser(x, torch.tensor([1000]), prior.seen(x))
+    _, logits = prior.denoiser(x, torch.tensor([1000]), prior.observed_entries(x))
     logits[..., prior.scene_type.assets.index("cafe_table")] = -torch.inf
     data, keep = logits.softmax(dim=-1)[0, 1:], float(prior.categories.schedule.keep[1])
     mask, rest = float(prior.categories.schedule.mask[1]), 0.0

@@ -88,7 +88,7 @@ def test_without_guidance_only_the_conditional_answer_counts(prior: MixedPrior) 
     """w = 0 is the prompt alone, and w = -1 would be no prompt at all."""
     x, table = prior.initial(2, 34, torch.Generator().manual_seed(0)), prior.step_table(4)
     text = prior.encode_prompts(PROMPTS)
-    pose, _ = prior.denoiser(x, torch.tensor([1000, 1000]), prior.seen(x), text)
+    pose, _ = prior.denoiser(x, torch.tensor([1000, 1000]), prior.observed_entries(x), text)
     plain, away, free = (
         prior.transition(x, 0, table, text=words, guidance=w) for words, w in ((text, 0.0), (text, -1.0), (None, 0.0))
     )

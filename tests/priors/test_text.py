@@ -61,10 +61,10 @@ def test_prompts_of_many_lengths_are_read_as_one_by_one() -> None:
 def test_padding_changes_nothing_in_the_network(prior: MixedPrior) -> None:
     x, t = prior.initial(1, 34, torch.Generator().manual_seed(0)), torch.tensor([500])
     tokens, mask = prior.encode_prompts(PROMPTS[:1])
-    alone = prior.denoiser(x, t, prior.seen(x), (tokens, mask))
+    alone = prior.denoiser(x, t, prior.observed_entries(x), (tokens, mask))
     padding = torch.full((1, 5, tokens.shape[-1]), 7.0)
     padded = torch.cat([tokens, padding], dim=1), torch.cat([mask, torch.zeros(1, 5, dtype=torch.bool)], dim=1)
-    for first, second in zip(alone, prior.denoiser(x, t, prior.seen(x), padded), strict=True):
+    for first, second in zip(alone, prior.denoiser(x, t, prior.observed_entries(x), padded), strict=True):
         torch.testing.assert_close(first, second, atol=1e-5, rtol=1e-4)
 
 
@@ -80,8 +80,8 @@ def test_the_prompt_and_the_order_of_its_words_matter(prior: MixedPrior) -> None
 def test_guidance_follows_its_formula(prior: MixedPrior) -> None:
     x, table, w = prior.initial(2, 34, torch.Generator().manual_seed(0)), prior.step_table(4), 1.5
     text, t = prior.encode_prompts(PROMPTS), torch.tensor([1000, 1000])
-    pose, logits = prior.denoiser(x, t, prior.seen(x), text)
-    free_pose, free_logits = prior.denoiser(x, t, prior.seen(x), prior.encode_prompts(["", ""]))
+    pose, logits = prior.denoiser(x, t, prior.observed_entries(x), text)
+    free_pose, free_logits = prior.denoiser(x, t, prior.observed_entries(x), prior.encode_prompts(["", ""]))
     guided = prior.transition(x, 0, table, text=text, guidance=w)
     mean, _ = prior.process.posterior(x[..., :12], (1 + w) * pose - w * free_pose, 1000, int(table.previous[0]))
     known = prior.known(34)[:, :12]
@@ -145,11 +145,11 @@ def test_training_further_lists_the_words_that_the_prior_lacks(
 @pytest.mark.slow
 def test_a_short_training_teaches_what_prompts_say() -> None:
     """Of two kinds of scenes, told apart by prompts alone, the right prompt explains one better than the wrong one."""
-    scenes = get_grammar("dimsum_table").sample(np.random.default_rng(0), 64)
-    few = scenes.tensor.clone()
+    many = get_grammar("dimsum_table").sample(np.random.default_rng(0), 64).tensor[:, :12]
+    few = many.clone()
     few[:, 3:] = 0.0
     few[:, 3:, -1] = 1.0  # the table and two more
-    raw = torch.cat([scenes.tensor, few])
+    raw = torch.cat([many, few])
     prompts = [("A scene with many objects.",)] * 64 + [("A scene with 3 objects.",)] * 64
     config = PretrainConfig(
         network={"hidden": 32, "depth": 1, "heads": 2},

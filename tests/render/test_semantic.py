@@ -59,6 +59,7 @@ def outline_of_color(image, color):
     return np.array([[columns.min(), rows.min()], [columns.max() + 1, rows.max() + 1]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CAMERAS)
 def test_objects_are_where_the_pinhole_equations_put_them(name):
     scene_type = get_scene_type(name)
@@ -77,6 +78,7 @@ def test_objects_are_where_the_pinhole_equations_put_them(name):
         assert colors_of(image) == present
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CAMERAS)
 def test_the_fixed_object_is_drawn_where_it_is(name):
     scene_type = get_scene_type(name)

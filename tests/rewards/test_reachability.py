@@ -36,6 +36,7 @@ def test_what_is_outside_the_workspace_is_not_reached() -> None:
     assert Reachability()(cans((0.0, 0.5, 0.45)), RewardContext()).value.item() == 0.0
 
 
+@pytest.mark.slow
 def test_a_smaller_gripper_reaches_less() -> None:
     scenes = get_grammar("pantry_shelf").sample(np.random.default_rng(0), 2)
     large, small = (Reachability(opening=width)(scenes, RewardContext()) for width in (0.1, 0.04))
@@ -43,6 +44,7 @@ def test_a_smaller_gripper_reaches_less() -> None:
     assert torch.equal(large.object_flags["reachable"], large.per_object > 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene_type", ["dimsum_table", "living_room_shelf"])
 def test_it_keeps_the_contract(scene_type: str) -> None:
     assert len(check_reward("reachability", scene_type)) == 6

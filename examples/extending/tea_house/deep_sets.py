@@ -32,7 +32,7 @@ class DeepSets(nn.Module):
         self.out = nn.Linear(config.hidden, 12 + config.categories)
 
     def forward(self, pose: Tensor, states: Tensor, time: Tensor, **_: Any) -> tuple[Tensor, Tensor]:
-        """Predict; what else a denoiser is told (positions, text, given entries) is not read here."""
+        """Predict; what else a denoiser is told (positions, text, observed entries) is not read here."""
         when = (time / 1000.0)[:, None, None].expand(-1, pose.shape[1], 1)
         slots = self.read(torch.cat([pose, when], dim=-1)) + self.states(states)
         for layer in self.layers:
