@@ -73,8 +73,8 @@ class GuardSettings:
         limit: largest held-out loss, as a ratio to the base prior's, of a checkpoint worth keeping.
         action: ``report`` goes on beyond a limit, ``stop`` ends the run there, ``rollback`` takes the best checkpoint's
             weights again and goes on with half the learning rate.
-        samples: scenes that are sampled, from the same noise at each check, for the limits below; 0 looks at the loss
-            alone.
+        samples: scenes that are sampled, from the same noise at each check, for the limits below, at most as many as
+            ``scenes``; 0, or fewer than 20, looks at the loss alone.
         samples_every: iterations between checks that sample.
         count_limit: by how many objects the distance (Wasserstein-1) of the samples' counts from those of real scenes
             may exceed the base prior's; null takes the algorithm's.
@@ -87,7 +87,7 @@ class GuardSettings:
     scenes: int = 256
     limit: float = 1.5
     action: str = "report"
-    samples: int = 0
+    samples: int = 128
     samples_every: int = 20
     count_limit: float | None = None
     category_limit: float | None = None
@@ -98,11 +98,13 @@ class GuardSettings:
         at_least(self, 1, "every", "scenes", "max_invalid", "samples_every")
         positive(self, "limit")
         one_of(self, "action", ("report", "stop", "rollback"))
-        if self.samples and not FEWEST_SAMPLES <= self.samples <= self.scenes:
-            raise InvalidInputError(
-                f"guard.samples={self.samples} must be 0, or at least {FEWEST_SAMPLES} and at most guard.scenes="
-                f"{self.scenes}, the real scenes that samples are compared with"
-            )
+        at_least(self, 0, "samples")
+
+    @property
+    def sampled(self) -> int:
+        """Scenes that a check samples: no more than there are held-out real ones to compare with, and 0 for too few."""
+        count = min(self.samples, self.scenes)
+        return count if count >= FEWEST_SAMPLES else 0
 
     def limits(self, defaults: Mapping[str, float]) -> dict[str, float]:
         """Limits of figures of samples by name; ``defaults`` are the algorithm's."""

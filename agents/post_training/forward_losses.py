@@ -183,7 +183,7 @@ class ForwardProcessLoss(LossModule):
             weight = kept[:, None].to(expected)
         total = weight.sum().clamp(min=1)
         loss = ((expected - advantage).square() * weight).sum() / total
-        left = torch.where(weight > 0, advantage - expected.detach(), 0.0)
+        left = torch.where(weight > 0, advantage - expected.detach(), advantage)
         spread = (advantage.square() * weight).sum() / total
         return left, loss, 1.0 - loss.detach() / spread.clamp(min=1e-8)
 

@@ -139,7 +139,7 @@ class PostTrainer:
                 self.history.append({**row, "seconds": round(self.seconds, 2)})
                 last = self.iteration == config.iterations
                 sample = last or self.iteration % config.guard.samples_every == 0
-                if self.iteration % config.guard.every == 0 or last or (sample and config.guard.samples):
+                if self.iteration % config.guard.every == 0 or last or (sample and config.guard.sampled):
                     self._check(rollout, sample=sample)
                 if self.iteration % config.logger.checkpoint_every == 0 or last or self._stopped:
                     self.save()
@@ -215,7 +215,7 @@ class PostTrainer:
     def _sample_check(self, prompts: Sequence[str] | None) -> SampleCheck | None:
         """What the guard samples; None where it does not."""
         config = self.config
-        count = config.guard.samples
+        count = config.guard.sampled
         if not count:
             return None
         return SampleCheck(
