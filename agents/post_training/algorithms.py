@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, ClassVar, TypeVar
@@ -31,6 +31,8 @@ class AlgorithmSettings:
 
     learning_rate: ClassVar[float] = 5e-5
     """Learning rate unless ``optimizer.lr`` names another."""
+    sample_limits: ClassVar[Mapping[str, float]] = {}
+    """Limits of the guard's figures of samples, unless ``guard`` names others; a reward may ask for other counts."""
 
     name: str = ""
     scenes_per_prompt: int = 8
@@ -123,6 +125,11 @@ class ForwardProcessSettings(AlgorithmSettings):
     """
 
     learning_rate: ClassVar[float] = 2e-4
+    sample_limits: ClassVar[Mapping[str, float]] = {
+        "count_distance": 1.0,
+        "category_kl": 0.05,
+        "classifier_accuracy": 0.1,
+    }
 
     updates: int = 2
     draws: int = 2
@@ -157,17 +164,19 @@ class NFTSettings(ForwardProcessSettings):
         advantage_clip: advantage, in standard deviations, at which a sample is fully good or bad.
         push_limit: a bad pose pushes only while the squared error of the sampling policy on it is at most this many
             times that of the base prior; 0 for no limit.
+        critic_lr: learning rate of the critic, whose expectation leaves the advantage; 0 for no critic.
     """
 
     name: str = "nft"
     beta: float = 0.5
     advantage_clip: float = 2.0
     push_limit: float = 0.0
+    critic_lr: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         positive(self, "beta", "advantage_clip")
-        at_least(self, 0, "push_limit")
+        at_least(self, 0, "push_limit", "critic_lr")
 
 
 @dataclass
@@ -178,17 +187,19 @@ class AWMSettings(ForwardProcessSettings):
         beta: strength of the pull to the sampling policy, above 1.
         advantage_clip: largest advantage, in standard deviations.
         push_limit: as for ``nft``.
+        critic_lr: as for ``nft``.
     """
 
     name: str = "awm"
     beta: float = 2.0
     advantage_clip: float = 2.0
     push_limit: float = 0.0
+    critic_lr: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         positive(self, "advantage_clip")
-        at_least(self, 0, "push_limit")
+        at_least(self, 0, "push_limit", "critic_lr")
         if not self.beta > 1:
             raise InvalidInputError(f"beta={self.beta} must be above 1: below, a bad sample pushes without bound")
 

@@ -11,6 +11,7 @@ from torchrl.objectives import LossModule
 
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import Branching, Rollout
+from agents.priors.base import ScenePrior
 from agents.utils.weight_average import WeightAverage
 
 Credit = TypeVar("Credit")
@@ -71,6 +72,10 @@ class Algorithm(ABC, Generic[Credit]):
 
     def end_iteration(self) -> None:
         """Called after the last update of every batch."""
+        return
+
+    def return_to(self, prior: ScenePrior) -> None:
+        """Called when the weights in training became those of ``prior``, an earlier checkpoint."""
         return
 
     def state(self) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
+from agents.post_training.guard_report import guard_sections, guard_verdict
 from agents.post_training.report import Page, Picture, Section, Tile, write_report
 from agents.post_training.run_files import write_metrics
 from agents.post_training.trainer import PostTrainResult
@@ -113,6 +114,9 @@ def write_comparison(
         "before_ready": draw_gallery(before.ready, directory / "before_ready.png", before.is_ready),
         "after_ready": draw_gallery(after.ready, directory / "after_ready.png", after.is_ready),
     }
+    for name in ("guard_within", "guard_beyond"):
+        if (path := directory / f"{name}.safetensors").exists():
+            pictures[name] = draw_gallery(SceneBatch.load(path), directory / f"{name}.png")
     write_report(directory / "report.html", _page(title, metrics, directory / "curve.png", pictures, settings))
     write_metrics(directory, metrics)
     return metrics
@@ -161,14 +165,13 @@ def _page(
         Tile("held-out loss", f"{guard['ratio']:.2f}×", f"of the base prior; limit {guard['limit']:g}×"),
     ]
     over = guard["over_optimised_from"]
-    passed = (
-        "The held-out loss stayed within its limit" if over is None else f"Its limit was passed at iteration {over}"
-    )
-    verdict = f"{passed}; the prior kept is that of iteration {guard['best_iteration']}."
+    verdict = f"{guard_verdict(guard)} The prior kept is that of iteration {guard['best_iteration']}."
     if lost := metrics["reward"].get("invalid_scenes"):
         verdict += f" The reward could not score {lost} of the scenes; log.txt says why."
+    caption = f"Mean {reward} of each batch, and the guard." + ("" if over is None else " Shaded: over-optimised.")
     sections = [
-        Section("The curve", verdict, [Picture(curve, f"Mean {reward} of each batch, and the guard.")]),
+        Section("The curve", verdict, [Picture(curve, caption)]),
+        *guard_sections(guard, pictures),
         Section(
             "As sampled",
             "The first samples of each prior from the same noise, untouched.",

@@ -59,6 +59,10 @@ class RegularisationSettings:
             raise InvalidInputError(f"regularisation.weight={self.weight} must not be negative")
 
 
+FEWEST_SAMPLES = 20
+"""Samples that the guard's classifier needs."""
+
+
 @dataclass
 class GuardSettings:
     """What watches over a run.
@@ -67,7 +71,15 @@ class GuardSettings:
         every: iterations between guard checks.
         scenes: held-out real scenes of the guard.
         limit: largest held-out loss, as a ratio to the base prior's, of a checkpoint worth keeping.
-        action: ``report`` goes on beyond the limit, ``stop`` ends the run there.
+        action: ``report`` goes on beyond a limit, ``stop`` ends the run there, ``rollback`` takes the best checkpoint's
+            weights again and goes on with half the learning rate.
+        samples: scenes that are sampled, from the same noise at each check, for the limits below, at most as many as
+            ``scenes``; 0, or fewer than 20, looks at the loss alone.
+        samples_every: iterations between checks that sample.
+        count_limit: by how many objects the distance (Wasserstein-1) of the samples' counts from those of real scenes
+            may exceed the base prior's; null takes the algorithm's.
+        category_limit: the same for the KL divergence of the categories, nats.
+        classifier_limit: the same for the accuracy of a classifier that tells samples from real scenes.
         max_invalid: consecutive batches without one valid reward after which the run stops.
     """
 
@@ -75,12 +87,33 @@ class GuardSettings:
     scenes: int = 256
     limit: float = 1.5
     action: str = "report"
+    samples: int = 128
+    samples_every: int = 20
+    count_limit: float | None = None
+    category_limit: float | None = None
+    classifier_limit: float | None = None
     max_invalid: int = 3
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "every", "scenes", "max_invalid")
+        at_least(self, 1, "every", "scenes", "max_invalid", "samples_every")
         positive(self, "limit")
-        one_of(self, "action", ("report", "stop"))
+        one_of(self, "action", ("report", "stop", "rollback"))
+        at_least(self, 0, "samples")
+
+    @property
+    def sampled(self) -> int:
+        """Scenes that a check samples: no more than there are held-out real ones to compare with, and 0 for too few."""
+        count = min(self.samples, self.scenes)
+        return count if count >= FEWEST_SAMPLES else 0
+
+    def limits(self, defaults: Mapping[str, float]) -> dict[str, float]:
+        """Limits of figures of samples by name; ``defaults`` are the algorithm's."""
+        own = {
+            "count_distance": self.count_limit,
+            "category_kl": self.category_limit,
+            "classifier_accuracy": self.classifier_limit,
+        }
+        return {**defaults, **{name: limit for name, limit in own.items() if limit is not None}}
 
 
 @dataclass

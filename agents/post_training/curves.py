@@ -11,15 +11,21 @@ REWARD_COLOR, GUARD_COLOR, FAINT = "#0f766e", "#b45309", "#99a3ad"
 
 
 def draw_curve(
-    history: Sequence[Mapping[str, float]], path: Path, *, reward_name: str, limit: float | None = None
+    history: Sequence[Mapping[str, float]],
+    path: Path,
+    *,
+    reward_name: str,
+    limit: float | None = None,
+    beyond: int | None = None,
 ) -> Path:
-    """Reward and guard over iterations, as a PNG.
+    """Reward and guard over iterations, as a PNG; the reward of the guard's samples is dots.
 
     Args:
         history: rows with ``iteration``, ``reward``, ``reward_std`` and, at checks, ``guard_ratio``.
         path: where the picture goes.
         reward_name: label of the upper axis.
-        limit: of the guard, drawn as a line.
+        limit: of the guard's loss, drawn as a line.
+        beyond: iteration from which the run is over-optimised; shaded from there.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -35,6 +41,9 @@ def draw_curve(
     upper.fill_between(iteration, reward - spread, reward + spread, color=REWARD_COLOR, alpha=0.12, linewidth=0)
     upper.plot(iteration, reward, color=REWARD_COLOR, alpha=0.35, linewidth=1, label="a batch ± std")
     upper.plot(iteration, smooth(reward), color=REWARD_COLOR, linewidth=2.2, label="smoothed")
+    sampled = [(row["iteration"], row["guard_sample_reward"]) for row in history if "guard_sample_reward" in row]
+    if sampled:
+        upper.plot(*zip(*sampled, strict=True), "D", color=GUARD_COLOR, markersize=5, label="samples of the guard")
     upper.legend(frameon=False, fontsize=8)
     upper.set_ylabel(reward_name)
     if checks:
@@ -47,6 +56,8 @@ def draw_curve(
     lower.set_xlabel("iteration")
     lower.xaxis.set_major_locator(MaxNLocator(integer=True))
     for axes in (upper, lower):
+        if beyond is not None and len(iteration):
+            axes.axvspan(beyond, max(iteration[-1], beyond + 0.5), color=GUARD_COLOR, alpha=0.08, linewidth=0)
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="y", color="#e8ebee", linewidth=0.8)
         axes.set_axisbelow(True)

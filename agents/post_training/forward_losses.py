@@ -17,6 +17,7 @@ from torch.nn import functional as F
 from torchrl.objectives import LossModule
 
 from agents.networks.text import Text
+from agents.post_training.critic import Critic
 from agents.priors.base import ScenePrior
 from agents.priors.forward import NoisedScenes
 from scene_envs.errors import InvalidInputError
@@ -46,12 +47,14 @@ class ForwardProcessLoss(LossModule):
         prior: what is trained.
         sampler: what made the scenes, such as a slower copy of ``prior``; its weights get no gradient.
         base: what training began with; needed for ``push_limit``.
+        critic: what is expected of noised scenes; it leaves the advantage of poses. None for no critic.
         push_limit: a bad pose pushes only while the squared error of o_old on it is at most this many times that of
             the base prior; 0 for no limit.
         generator: source of timesteps, noise and observed entries (CPU); None for torch's own.
 
-    Returns (``forward``): ``loss_objective`` (), and detached ``distance`` (), the root mean square of o - o_old,
-        and ``limited`` (), the share of bad poses that do not push any more.
+    Returns (``forward``): ``loss_objective`` (); ``loss_critic`` (), its mean squared error, 0 without one; and
+        detached ``distance`` (), the root mean square of o - o_old, ``limited`` (), the share of bad poses that do not
+        push any more, and ``foreseen`` (), the share of the advantages' variance that the critic explains.
     """
 
     @dataclass
@@ -66,7 +69,7 @@ class ForwardProcessLoss(LossModule):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    out_keys = ["loss_objective", "distance", "limited"]  # noqa: RUF012  (torchrl reads lists)
+    out_keys = ["loss_objective", "loss_critic", "distance", "limited", "foreseen"]  # noqa: RUF012  (torchrl reads lists)
     prior: ScenePrior
     generator: Generator | None
 
@@ -77,6 +80,7 @@ class ForwardProcessLoss(LossModule):
         *,
         base: ScenePrior | None = None,
         push_limit: float = 0.0,
+        critic: Critic | None = None,
         generator: Generator | None = None,
     ) -> None:
         super().__init__()
@@ -87,6 +91,7 @@ class ForwardProcessLoss(LossModule):
         self.prior = prior
         self.generator = generator
         self.push_limit = push_limit
+        self.critic = critic
         self._others = (sampler, base)  # in a tuple: not modules of the loss, whose parameters are the prior's
 
     @property
@@ -149,16 +154,38 @@ class ForwardProcessLoss(LossModule):
         noised = self.prior.noised(scene, self.generator, None if timestep is None else timestep.reshape(-1))
         tokens, mask = flat.get(keys.text, None), flat.get(keys.text_mask, None)
         text = None if tokens is None or mask is None else (tokens.detach(), mask)
-        losses, distance, limited = self._losses(noised, text, advantage, credit)
         valid = flat.get(keys.valid, None)
-        kept = torch.ones_like(losses, dtype=torch.bool) if valid is None else valid.reshape(-1)
+        kept = torch.ones(len(scene), dtype=torch.bool, device=scene.device) if valid is None else valid.reshape(-1)
+        advantage, critic_loss, foreseen = self._criticised(noised, text, advantage, kept)
+        losses, distance, limited = self._losses(noised, text, advantage, credit)
         count = kept.sum().clamp(min=1)
         fields = {
             "loss_objective": torch.where(kept, losses, 0.0).sum() / count,
             "distance": (torch.where(kept, distance, 0.0).sum() / count).sqrt(),
             "limited": limited,
+            "loss_critic": critic_loss,
+            "foreseen": foreseen,
         }
         return TensorDict(fields, [])
+
+    def _criticised(
+        self, noised: NoisedScenes, text: Text | None, advantage: Tensor, kept: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Advantages of poses without what the critic expects, its squared error (), and what it explains ()."""
+        if self.critic is None:
+            return advantage, advantage.new_zeros(()), advantage.new_zeros(())
+        expected = self.critic(noised, text)  # (B, N)
+        present = (noised.weight[..., : self.prior.pose_width].sum(dim=-1) > 0) & kept[:, None]
+        present = present & (noised.category != self.prior.scene_type.num_assets)
+        weight = present.to(expected)
+        if advantage.shape[1] == 1:
+            expected = (expected * weight).sum(dim=1, keepdim=True) / weight.sum(dim=1, keepdim=True).clamp(min=1)
+            weight = kept[:, None].to(expected)
+        total = weight.sum().clamp(min=1)
+        loss = ((expected - advantage).square() * weight).sum() / total
+        left = torch.where(weight > 0, advantage - expected.detach(), advantage)
+        spread = (advantage.square() * weight).sum() / total
+        return left, loss, 1.0 - loss.detach() / spread.clamp(min=1e-8)
 
     def _losses(
         self, noised: NoisedScenes, text: Text | None, advantage: Tensor, credit: Tensor
@@ -223,7 +250,7 @@ class NFTLoss(ForwardProcessLoss):
     have the same with cross-entropies of l_plus and l_minus, which are made of logits as o_plus and o_minus are.
 
     Args:
-        prior, sampler, base, push_limit, generator: as in :class:`ForwardProcessLoss`.
+        prior, sampler, base, push_limit, critic, generator: as in :class:`ForwardProcessLoss`.
         beta: strength; smaller ones step further from the sampling policy.
         clip: c, the advantage at which a sample is fully good or bad.
 
@@ -232,7 +259,7 @@ class NFTLoss(ForwardProcessLoss):
     >>> scenes = TensorDict({"scene": prior.encode(prior.sample(2, num_steps=3)), "advantage": torch.ones(2, 34)}, [2])
     >>> loss = NFTLoss(prior, prior)(scenes)
     >>> sorted(loss.keys()), float(loss["distance"])
-    (['distance', 'limited', 'loss_objective'], 0.0)
+    (['distance', 'foreseen', 'limited', 'loss_critic', 'loss_objective'], 0.0)
     >>> loss["loss_objective"].backward()
     """
 
@@ -245,9 +272,10 @@ class NFTLoss(ForwardProcessLoss):
         clip: float = 1.0,
         base: ScenePrior | None = None,
         push_limit: float = 0.0,
+        critic: Critic | None = None,
         generator: Generator | None = None,
     ) -> None:
-        super().__init__(prior, sampler, base=base, push_limit=push_limit, generator=generator)
+        super().__init__(prior, sampler, base=base, push_limit=push_limit, critic=critic, generator=generator)
         _positive(beta=beta, clip=clip)
         self.beta, self.clip = beta, clip
 
@@ -276,7 +304,7 @@ class AWMLoss(ForwardProcessLoss):
     that of :class:`NFTLoss` divided by the latter's beta.
 
     Args:
-        prior, sampler, base, push_limit, generator: as in :class:`ForwardProcessLoss`.
+        prior, sampler, base, push_limit, critic, generator: as in :class:`ForwardProcessLoss`.
         beta: strength of the pull, above 1.
         clip: c, the largest advantage.
     """
@@ -290,9 +318,10 @@ class AWMLoss(ForwardProcessLoss):
         clip: float = 1.0,
         base: ScenePrior | None = None,
         push_limit: float = 0.0,
+        critic: Critic | None = None,
         generator: Generator | None = None,
     ) -> None:
-        super().__init__(prior, sampler, base=base, push_limit=push_limit, generator=generator)
+        super().__init__(prior, sampler, base=base, push_limit=push_limit, critic=critic, generator=generator)
         _positive(clip=clip)
         if not beta > 1:
             raise InvalidInputError(f"beta={beta} must be above 1: below, a bad sample pushes without bound")

@@ -1,8 +1,8 @@
-"""Guard against over-optimisation: pretraining loss and realism on held-out real scenes."""
+"""Guard against over-optimisation: held-out pretraining loss, and samples beside those of the base prior."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,6 +10,7 @@ import torch
 from torch import Generator, Tensor
 
 from agents.post_training.gradients import prompted_loss
+from agents.post_training.sample_check import SampleCheck, beyond
 from agents.priors.base import ScenePrior
 from scene_envs.scene import SceneBatch
 
@@ -27,6 +28,8 @@ class GuardReading:
         reward: mean valid reward since the check before.
         realism: figures of the last rollout's scenes, such as ``workspace_fraction``.
         kept: whether this became the best checkpoint.
+        samples: figures of samples; empty at a check of the loss alone.
+        beyond: names of the figures beyond their limit.
     """
 
     iteration: int
@@ -35,19 +38,24 @@ class GuardReading:
     reward: float
     realism: dict[str, float] = field(default_factory=dict)
     kept: bool = False
+    samples: dict[str, float] = field(default_factory=dict)
+    beyond: tuple[str, ...] = ()
 
 
 class Guard:
-    """Watches the held-out pretraining loss and keeps the best checkpoint under a limit.
+    """Watches the held-out pretraining loss and samples, and knows the best checkpoint within all limits.
 
-    The best is the one with the largest reward among checks whose ratio is within the limit; the reward of a
-    check is the mean over all batches since the one before, which single batches are too noisy for.
+    The best is the one with the largest reward among checks that find nothing beyond its limit. The reward of a check
+    is the mean over all batches since the one before, which single batches are too noisy for; where the guard samples,
+    it is that of the samples, whose noise is the same at every check, and checks of the loss alone keep nothing.
 
     Args:
         heldout: (K, N, D) normalised real scenes that the regularisation never sees.
         limit: largest ratio of a checkpoint worth keeping.
         seed: of the fixed timesteps and noise.
         prompts: one of each held-out scene; None measures without.
+        samples: how to sample and measure; None looks at the loss alone.
+        limits: by how much figures of samples may exceed those of the base prior, by name.
 
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior()
@@ -57,12 +65,24 @@ class Guard:
     1.0
     """
 
-    def __init__(self, heldout: Tensor, limit: float, seed: int, prompts: Sequence[str] | None = None) -> None:
+    def __init__(
+        self,
+        heldout: Tensor,
+        limit: float,
+        seed: int,
+        prompts: Sequence[str] | None = None,
+        samples: SampleCheck | None = None,
+        limits: Mapping[str, float] | None = None,
+    ) -> None:
         self.heldout = heldout
         self.prompts = prompts
         self.limit = limit
         self.seed = seed
+        self.samples = samples
+        self.limits = dict(limits or {})
         self.base_loss = float("nan")
+        self.base_figures: dict[str, float] = {}
+        self.last_samples: SceneBatch | None = None
         self.readings: list[GuardReading] = []
         self.best_reward = float("-inf")
         self.best_iteration = 0
@@ -70,6 +90,10 @@ class Guard:
     def start(self, base: ScenePrior) -> None:
         """Measure the base prior."""
         self.base_loss = self.loss(base)
+        if self.samples is not None:
+            self.last_samples = self.samples.sample(base)
+            self.base_figures = self.samples.figures(self.last_samples)
+            self.best_reward = _number(self.base_figures["sample_reward"])
 
     @torch.no_grad()
     def loss(self, prior: ScenePrior) -> float:
@@ -87,13 +111,35 @@ class Guard:
         return heldout_loss(prior, self.heldout.to(device), seed=self.seed)
 
     def check(
-        self, prior: ScenePrior, iteration: int, reward: float, realism: dict[str, float] | None = None
+        self,
+        prior: ScenePrior,
+        iteration: int,
+        reward: float,
+        realism: dict[str, float] | None = None,
+        *,
+        sample: bool = True,
     ) -> GuardReading:
-        """Measure ``prior``; the reading says whether it is the best so far."""
+        """Measure ``prior``; the reading says whether it is the best so far.
+
+        Args:
+            prior: with the weights that are evaluated and saved.
+            iteration: that is finished.
+            reward: mean over the batches since the check before.
+            realism: further figures, kept with the reading.
+            sample: whether to sample, where the guard does.
+        """
         loss = self.loss(prior)
         ratio = loss / self.base_loss
-        kept = ratio <= self.limit and reward > self.best_reward  # False for NaN
-        reading = GuardReading(iteration, loss, ratio, reward, realism or {}, kept)
+        over = [] if ratio <= self.limit else ["loss"]
+        figures: dict[str, float] = {}
+        if self.samples is not None and sample:
+            self.last_samples = self.samples.sample(prior)
+            figures = self.samples.figures(self.last_samples)
+            reward = figures["sample_reward"]
+            over += beyond(figures, self.base_figures, self.limits)
+        counts = self.samples is None or sample
+        kept = counts and not over and reward > self.best_reward  # False for NaN
+        reading = GuardReading(iteration, loss, ratio, reward, realism or {}, kept, figures, tuple(over))
         self.readings.append(reading)
         if kept:
             self.best_reward, self.best_iteration = reward, iteration
@@ -111,8 +157,13 @@ class Guard:
 
     @property
     def over_limit_at(self) -> int | None:
-        """First iteration whose ratio passed the limit, or None: from there on the reward is over-optimised."""
-        return next((r.iteration for r in self.readings if not r.ratio <= self.limit), None)
+        """First iteration that found something beyond its limit, or None: from there the reward is over-optimised."""
+        return next((r.iteration for r in self.readings if r.beyond), None)
+
+    @property
+    def is_beyond(self) -> bool:
+        """Whether the last check found something beyond its limit."""
+        return bool(self.readings) and bool(self.readings[-1].beyond)
 
     def summary(self) -> dict[str, Any]:
         """JSON-able: the ratio of what was kept, and where the limit was passed."""
@@ -121,6 +172,8 @@ class Guard:
             "last_ratio": self.ratio,
             "limit": self.limit,
             "base_loss": self.base_loss,
+            "base_samples": self.base_figures,
+            "sample_limits": self.limits,
             "best_iteration": self.best_iteration,
             "over_optimised_from": self.over_limit_at,
             "checks": [vars(reading) for reading in self.readings],
@@ -130,6 +183,7 @@ class Guard:
         """For a checkpoint."""
         return {
             "base_loss": self.base_loss,
+            "base_samples": self.base_figures,
             "readings": [dict(vars(reading)) for reading in self.readings],
             "best_reward": self.best_reward,
             "best_iteration": self.best_iteration,
@@ -137,9 +191,14 @@ class Guard:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Inverse of :meth:`state`."""
-        self.base_loss = state["base_loss"]
+        self.base_loss, self.base_figures = state["base_loss"], state["base_samples"]
         self.readings = [GuardReading(**reading) for reading in state["readings"]]
         self.best_reward, self.best_iteration = state["best_reward"], state["best_iteration"]
+
+
+def _number(value: float) -> float:
+    """-inf for NaN, than which every reward is larger."""
+    return value if value == value else float("-inf")
 
 
 def realism(batch: SceneBatch) -> dict[str, float]:

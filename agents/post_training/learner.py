@@ -161,9 +161,19 @@ class Learner:
             self.average.update(self.prior)
         return row
 
+    def return_to(self, prior: ScenePrior) -> None:
+        """Take the weights of an earlier checkpoint, forget the optimiser's state, and halve the learning rate."""
+        self.prior.load_state_dict(prior.state_dict())
+        self.algorithm.return_to(self.prior)
+        if self.average is not None:
+            self.average = WeightAverage(self.prior, self.average.decay)
+        self.lr *= 0.5
+        self.optimizer.state.clear()
+
     def state(self) -> dict[str, Any]:
         """For a checkpoint."""
         return {
+            "learning_rate": self.lr,
             "prior": self.prior.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "average": None if self.average is None else self.average.tensors,
@@ -181,6 +191,7 @@ class Learner:
         check_tensors(self.prior, state["prior"], self.config.directory / CHECKPOINT_NAME)
         self.prior.load_state_dict(state["prior"])
         self.optimizer.load_state_dict(state["optimizer"])
+        self.lr = state["learning_rate"]
         if self.average is not None:
             self.average.tensors, self.average.updates = state["average"], state["average_updates"]
         self.algorithm.restore(state["algorithm"])

@@ -17,7 +17,7 @@ from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.errors import InvalidInputError, TrainingError
 from scene_envs.scene import SceneBatch
 
-STREAMS = ("start", "noise", "steps", "real", "bank", "guard", "prompts")
+STREAMS = ("start", "noise", "steps", "real", "bank", "guard", "prompts", "samples")
 
 
 @dataclass(frozen=True)

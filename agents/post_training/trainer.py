@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import torch
 
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.curves import draw_curve
-from agents.post_training.guard import Guard, realism
+from agents.post_training.guard import Guard, GuardReading, realism
 from agents.post_training.learner import Learner, NonFiniteGradient
 from agents.post_training.progress import run_progress
 from agents.post_training.prompts import PROMPTS_NAME, PromptSets, prompts_beside, save_prompts
@@ -25,6 +26,7 @@ from agents.post_training.run_files import (
     write_log,
     write_metrics,
 )
+from agents.post_training.sample_check import SampleCheck
 from agents.post_training.scene_bank import SceneBank, real_scenes
 from agents.priors.base import ScenePrior
 from agents.priors.prompt_validation import check_object_count
@@ -35,6 +37,11 @@ from rewards import reward_name
 from scene_envs.errors import TrainingError
 from scene_envs.folders import claimed
 from scene_envs.scene import SceneBatch
+
+_MOST_ROLLBACKS = 3
+"""Returns to the best checkpoint after which a run ends."""
+_PICTURED = 8
+"""Samples of the guard that are kept for the report."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +111,7 @@ class PostTrainer:
         self.prior = self.learner.prior
         self.iteration = 0
         self.invalid_streak = 0
+        self.rollbacks = 0
         self.seconds = 0.0
         self.history: list[dict[str, float]] = []
         self.logger = make_logger(config.logger.name, self.directory)
@@ -138,9 +146,14 @@ class PostTrainer:
                 self.seconds = time.perf_counter() - started
                 self.history.append({**row, "seconds": round(self.seconds, 2)})
                 last = self.iteration == config.iterations
-                if self.iteration % config.guard.every == 0 or last:
-                    self._check(rollout)
-                if self.iteration % config.logger.checkpoint_every == 0 or last or self._stopped or end.pending:
+                sample = last or self.iteration % config.guard.samples_every == 0
+                checked = self.iteration % config.guard.every == 0 or last or (sample and config.guard.sampled > 0)
+                if checked:
+                    self._check(rollout, sample=sample)
+                due = self.iteration % config.logger.checkpoint_every == 0 or (
+                    checked and config.guard.action == "rollback"  # which reads prior/: both are of one iteration
+                )
+                if due or last or self._stopped or end.pending:
                     self.save()
                 write_log(self.directory, self.history)
                 self.logger.log(self.history[-1], self.iteration)
@@ -174,7 +187,9 @@ class PostTrainer:
         x0 = self.prior.encode(batch.to(config.device))
         self.scenes = SceneBank.split(x0, config.guard.scenes, prompts)
         asked = self.scenes.heldout_prompts()
-        self.guard = Guard(self.scenes.heldout, config.guard.limit, stream_seed(config.seed, "guard"), asked)
+        seed = stream_seed(config.seed, "guard")
+        limits = config.guard.limits(config.algorithm.sample_limits)
+        self.guard = Guard(self.scenes.heldout, config.guard.limit, seed, asked, self._sample_check(asked), limits)
         self.learner.deal_prompts(self.scenes)
 
     def step(self) -> tuple[Rollout, dict[str, float]]:
@@ -206,17 +221,51 @@ class PostTrainer:
 
     @property
     def _stopped(self) -> bool:
+        if self.config.guard.action == "rollback":
+            return self.rollbacks > _MOST_ROLLBACKS
         return self.config.guard.action == "stop" and self.guard.over_limit_at is not None
 
-    def _check(self, rollout: Rollout) -> None:
+    def _sample_check(self, prompts: Sequence[str] | None) -> SampleCheck | None:
+        """What the guard samples; None where it does not."""
+        config = self.config
+        count = config.guard.sampled
+        if not count:
+            return None
+        return SampleCheck(
+            self.prior.decode(self.scenes.heldout[:count]).to("cpu"),
+            self.learner.env.core.scorer,
+            count,
+            config.num_steps,
+            stream_seed(config.seed, "samples"),
+            self.learner.slots,
+            prompts[:count] if prompts is not None and config.prompt is not None else None,
+            config.guidance,
+        )
+
+    def _check(self, rollout: Rollout, *, sample: bool) -> None:
         since = self.guard.readings[-1].iteration if self.guard.readings else 0
         recent = [row["reward"] for row in self.history[since:] if math.isfinite(row["reward"])]
         reward = sum(recent) / len(recent) if recent else float("nan")
         with self.learner.averaged() as prior:
-            reading = self.guard.check(prior, self.iteration, reward, realism(rollout.batch))
+            reading = self.guard.check(prior, self.iteration, reward, realism(rollout.batch), sample=sample)
             if reading.kept:
                 self._save_prior()
-        self.history[-1] |= {"guard_loss": reading.loss, "guard_ratio": reading.ratio, **reading.realism}
+        figures = {f"guard_{name}": value for name, value in reading.samples.items()}
+        self.history[-1] |= {"guard_loss": reading.loss, "guard_ratio": reading.ratio, **figures, **reading.realism}
+        self._picture(reading)
+        if reading.beyond and self.config.guard.action == "rollback":
+            self.rollbacks += 1
+            self.learner.return_to(ScenePrior.load(self.directory / "prior"))
+
+    def _picture(self, reading: GuardReading) -> None:
+        """Keep the guard's samples of the best checkpoint, and of the first beyond a limit, for the report."""
+        batch = self.guard.last_samples
+        name = "guard_within" if reading.kept else "guard_beyond"
+        first = reading.beyond and self.guard.over_limit_at == reading.iteration
+        if batch is None or not reading.samples or not (reading.kept or first):
+            return
+        path = self.directory / f"{name}.safetensors"
+        _writing(f"the guard's samples {str(path)!r}", lambda: batch[:_PICTURED].save(path))
 
     def _count_invalid(self) -> None:
         self.invalid_streak += 1
@@ -244,6 +293,7 @@ class PostTrainer:
             "config": self.config.plain(),
             "iteration": self.iteration,
             "invalid_streak": self.invalid_streak,
+            "rollbacks": self.rollbacks,
             "seconds": self.seconds,
             "history": self.history,
             "guard": self.guard.state(),
@@ -253,6 +303,7 @@ class PostTrainer:
 
     def _restore(self, state: dict[str, Any]) -> None:
         self.iteration, self.invalid_streak = state["iteration"], state["invalid_streak"]
+        self.rollbacks = state["rollbacks"]
         self.seconds, self.history = state["seconds"], list(state["history"])
         self.guard.restore(state["guard"])
         self.learner.restore(state["learner"])
@@ -284,11 +335,17 @@ class PostTrainer:
                     sum((1.0 - row["valid_fraction"]) * self.config.batch_size for row in self.history)
                 ),
             },
-            "guard": self.guard.summary(),
+            "guard": {**self.guard.summary(), "rollbacks": self.rollbacks},
         }
         write_metrics(self.directory, metrics)
         name = f"mean {reward_name(self.config.reward).replace('_', ' ')}"
-        draw_curve(self.history, self.directory / "curve.png", reward_name=name, limit=self.config.guard.limit)
+        draw_curve(
+            self.history,
+            self.directory / "curve.png",
+            reward_name=name,
+            limit=self.config.guard.limit,
+            beyond=self.guard.over_limit_at,
+        )
         return PostTrainResult(
             ScenePrior.load(self.directory / "prior"), self.history, metrics, self.directory, self.config
         )

@@ -1,0 +1,86 @@
+"""Check of a prior by its samples: reward, counts, categories, and a classifier that tells them from real scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from agents.priors.base import ScenePrior
+from scene_envs.envs.scoring import RewardScorer
+from scene_envs.scene import SceneBatch
+
+FIGURES = ("count_distance", "category_kl", "classifier_accuracy")
+"""What is compared with the base prior's."""
+_CLASSIFIERS = 3
+"""Classifiers of which the accuracy is the mean."""
+
+
+@dataclass(frozen=True)
+class SampleCheck:
+    """Samples a prior from the same noise at every call, and measures the samples.
+
+    Attributes:
+        real: real scenes that training never sees.
+        scorer: of the run's reward.
+        count: samples.
+        num_steps: denoising steps per sample.
+        seed: of the noise.
+        slots: per sample.
+        prompts: one per sample; None without prompts.
+        guidance: of the prompts.
+
+    >>> from agents.priors.testing import tiny_prior
+    >>> scorer = RewardScorer("object_count")
+    >>> prior = tiny_prior()
+    >>> check = SampleCheck(prior.sample(20, num_steps=2, seed=1), scorer, 20, num_steps=2, seed=0)
+    >>> sorted(check.figures(check.sample(prior)))
+    ['category_kl', 'classifier_accuracy', 'count_distance', 'sample_reward']
+    """
+
+    real: SceneBatch
+    scorer: RewardScorer
+    count: int
+    num_steps: int
+    seed: int
+    slots: int | None = None
+    prompts: Sequence[str] | None = None
+    guidance: float = 0.0
+
+    @torch.no_grad()
+    def sample(self, prior: ScenePrior) -> SceneBatch:
+        """``count`` scenes, from the same noise for every prior."""
+        prompts = None if self.prompts is None else list(self.prompts)
+        guidance = self.guidance if prompts else 0.0
+        return prior.sample(
+            self.count, prompt=prompts, guidance=guidance, num_steps=self.num_steps, slots=self.slots, seed=self.seed
+        )
+
+    def figures(self, batch: SceneBatch) -> dict[str, float]:
+        """Mean reward, and each of :data:`FIGURES`: objects, nats, and a share of scenes.
+
+        Those that have no meaning, such as the categories of empty scenes, are NaN.
+        """
+        from agents.evaluation.classifier import classifier_accuracy
+        from agents.evaluation.metrics import category_kl, count_wasserstein
+
+        batch = batch.to("cpu")
+        score = self.scorer(batch, self.prompts)
+        valid = score.valid.cpu()
+        empty = not int(batch.counts.sum())
+        return {
+            "sample_reward": float(score.value.cpu()[valid].mean()) if bool(valid.any()) else float("nan"),
+            "count_distance": count_wasserstein(batch, self.real),
+            "category_kl": float("nan") if empty else category_kl(batch, self.real),
+            "classifier_accuracy": classifier_accuracy(self.real, batch, seeds=_CLASSIFIERS, seed=self.seed).mean,
+        }
+
+
+def beyond(figures: Mapping[str, float], base: Mapping[str, float], limits: Mapping[str, float]) -> list[str]:
+    """Names of the figures that exceed the base prior's by more than their limit; figures without a limit never do.
+
+    >>> beyond({"category_kl": 0.3}, {"category_kl": 0.1}, {"category_kl": 0.1})
+    ['category_kl']
+    """
+    return [name for name, most in limits.items() if not figures[name] <= base[name] + most]

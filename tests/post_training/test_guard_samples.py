@@ -1,0 +1,127 @@
+"""The guard's samples: paired noise, limits, the best checkpoint, rollback, and what the report shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from agents.evaluation.metrics import count_wasserstein
+from agents.post_training import post_train
+from agents.post_training.config import GuardSettings
+from agents.post_training.guard_report import guard_sections, guard_verdict
+from agents.post_training.sample_check import beyond
+from agents.post_training.trainer import PostTrainer
+from agents.priors.base import ScenePrior
+from agents.priors.testing import tiny_prior
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import SceneBatch
+from tests.helpers.small_runs import small_config
+
+SAMPLES = {"guard.scenes": 20, "guard.samples": 20, "guard.samples_every": 2, "bank_size": 40}
+
+
+def trainer(path: Path, **changes: object) -> PostTrainer:
+    """A prepared run whose base prior has been measured."""
+    made = PostTrainer(small_config(path, **(SAMPLES | changes)), prior=tiny_prior())
+    made.prepare()
+    made.guard.start(made.prior)
+    return made
+
+
+def test_the_base_prior_measures_as_itself(tmp_path: Path) -> None:
+    """The same prior has the same samples at every check, so nothing exceeds the base prior."""
+    guard = trainer(tmp_path, **{"guard.count_limit": 0.0, "guard.classifier_limit": 0.0}).guard
+    reading = guard.check(tiny_prior(), 5, reward=0.0)
+    assert reading.samples == guard.base_figures
+    assert reading.beyond == ()
+    assert not reading.kept  # no better than the base prior
+    assert guard.last_samples is not None
+    assert guard.samples is not None
+    assert reading.samples["count_distance"] == count_wasserstein(guard.last_samples, guard.samples.real)
+
+
+def test_a_figure_beyond_its_limit_is_named_and_keeps_nothing(tmp_path: Path) -> None:
+    made = trainer(tmp_path, **{"guard.count_limit": 1.0})
+    other = tiny_prior()
+    with torch.no_grad():
+        for parameter in other.parameters():
+            parameter.add_(0.3 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(0)))
+    made.guard.base_figures["count_distance"] = -10.0  # whatever the samples are, they are further than that
+    made.guard.best_reward = float("-inf")
+    reading = made.guard.check(other, 2, reward=1.0)
+    assert "count_distance" in reading.beyond
+    assert not reading.kept
+    assert made.guard.over_limit_at == 2
+
+
+def test_a_figure_that_is_not_a_number_is_beyond_its_limit() -> None:
+    assert beyond({"category_kl": float("nan")}, {"category_kl": 0.0}, {"category_kl": 1.0}) == ["category_kl"]
+
+
+def test_checks_of_the_loss_alone_keep_nothing_where_the_guard_samples(tmp_path: Path) -> None:
+    guard = trainer(tmp_path).guard
+    reading = guard.check(tiny_prior(), 1, reward=1e9, sample=False)
+    assert (reading.samples, reading.kept) == ({}, False)
+
+
+def test_rollback_takes_the_best_checkpoint_again(tmp_path: Path) -> None:
+    """With no room for the loss, every check returns to the base prior at half the learning rate, four times."""
+    config = small_config(
+        tmp_path, iterations=30, lr=3e-2, **SAMPLES, **{"guard.limit": 1e-6, "guard.action": "rollback"}
+    )
+    result = post_train(config, prior=tiny_prior())
+    rates = [row["learning_rate"] for row in result.history]
+    assert result.metrics["iterations"] == 8
+    assert result.metrics["guard"]["rollbacks"] == 4
+    assert rates[2] == pytest.approx(rates[1] / 2)
+    assert len(SceneBatch.load(tmp_path / "guard_beyond.safetensors")) == 8
+    base = tiny_prior().state_dict()
+    made = PostTrainer(config, prior=tiny_prior())
+    made.learner.return_to(ScenePrior.load(tmp_path / "prior"))
+    assert all(torch.equal(base[name], tensor) for name, tensor in made.learner.prior.state_dict().items())
+
+
+def test_a_resumed_run_samples_and_keeps_the_same(tmp_path: Path) -> None:
+    keys = {**SAMPLES, "iterations": 3, "algorithm": {"name": "nft", "critic_lr": 1e-3}}
+    whole = post_train(small_config(tmp_path / "a", **keys), prior=tiny_prior())
+    half = PostTrainer(small_config(tmp_path / "b", **keys), prior=tiny_prior())
+    step, count = half.step, 0
+
+    def interrupted() -> object:
+        nonlocal count
+        if count == 2:
+            raise KeyboardInterrupt
+        count += 1
+        return step()
+
+    half.step = interrupted  # type: ignore[assignment]
+    with pytest.raises(KeyboardInterrupt):
+        half.run()
+    again = post_train(small_config(tmp_path / "b", **keys), prior=tiny_prior())
+    drop = {"seconds"}
+    rows = [[{k: v for k, v in row.items() if k not in drop} for row in run.history] for run in (whole, again)]
+    assert str(rows[0]) == str(rows[1])
+    assert str(whole.metrics["guard"]) == str(again.metrics["guard"])
+
+
+def test_the_report_shows_figures_beside_the_base_prior(tmp_path: Path) -> None:
+    config = small_config(tmp_path, iterations=2, **SAMPLES, **{"guard.count_limit": 2.0})
+    guard = post_train(config, prior=tiny_prior()).metrics["guard"]
+    [section] = guard_sections(guard, {})
+    labels = [row[0] for row in section.table]
+    assert "KL divergence of categories (nats)" in labels
+    assert section.table[0] == ("", "base prior", "kept prior", "last check", "limit")
+    assert all(len(row) == 5 for row in section.table)
+    assert guard_verdict({"over_optimised_from": None}) == "The guard found nothing beyond its limits."
+    broken = {"over_optimised_from": 5, "checks": [{"iteration": 5, "beyond": ("category_kl",)}]}
+    assert "KL divergence" in guard_verdict(broken)
+    assert "iteration 5" in guard_verdict(broken)
+
+
+def test_the_guard_samples_no_more_than_it_compares_with() -> None:
+    assert GuardSettings(scenes=64, samples=500).sampled == 64
+    assert GuardSettings(scenes=64, samples=19).sampled == 0
+    with pytest.raises(InvalidInputError, match="samples=-1"):
+        GuardSettings(samples=-1)
