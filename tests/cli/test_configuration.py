@@ -89,6 +89,7 @@ def composes(command: str, folder: str, option: str) -> bool:
 def test_old_keys_name_the_new_ones(command: str) -> None:
     kind = CONFIGS[command]
     known = {*dotted_values(kind()), "algorithm.clip_epsilon", "algorithm.updates"}
+    known |= {"planner.exploration", "planner.parallel"}  # of planner=uct
     for old, new in kind.RENAMED.items():
         word = old if "=" in old else f"{old}=1"
         with pytest.raises(InvalidInputError, match="has another name now: " + new.split(",")[0]):
