@@ -31,9 +31,14 @@ _RESULTS = (
     "viewer.html",
 )
 """Files that a command must not write over, unless they are its own."""
-_RESUMES = {"generate": "metadata.json", "pretrain": "checkpoint.pt", "post-train": "checkpoint.pt"}
+_RESUMES = {
+    "generate": "metadata.json",
+    "pretrain": "checkpoint.pt",
+    "post-train": "checkpoint.pt",
+    "search": "best.safetensors",
+}
 """Commands that go on with what a run from Python left, and the file that says so."""
-_OWN_RULE = ("generate", "pretrain", "post-train", "doctor", "demo", "evaluate")
+_OWN_RULE = ("generate", "pretrain", "post-train", "search", "doctor", "demo", "evaluate")
 """Commands that compare their keys with what is there themselves."""
 _MAY_DIFFER = (
     "output",

@@ -20,6 +20,7 @@ from scene_envs.envs import SearchEnv, SearchState
 from scene_envs.envs.resolvers import resolve_prior
 from scene_envs.errors import InvalidInputError, SceneEnvsError
 from scene_envs.files import finite, write_json, write_text
+from scene_envs.folders import claimed
 from scene_envs.scene import SceneBatch
 
 _PLAIN = (bool, int, float, str, list, dict, type(None))
@@ -80,12 +81,27 @@ def run_search(
 
     Raises:
         SceneEnvsError: no scene could be scored.
+        InvalidInputError: another process writes into the folder, or it holds a search with other settings.
     """
     if config is not None and settings:
         raise InvalidInputError(f"give config= or single settings, not both (got {', '.join(sorted(settings))})")
     config = SearchConfig(**settings) if config is None else config
     named = {"prior": prior, "objective": objective, **plain_tree(config)}
-    folder = None if output is None else Path(output)
+    if output is None:
+        return _search(prior, objective, named, config, None, progress)
+    with claimed(output, "run_search") as folder:
+        return _search(prior, objective, named, config, folder, progress)
+
+
+def _search(
+    prior: Any,
+    objective: Any,
+    named: dict[str, Any],
+    config: SearchConfig,
+    folder: Path | None,
+    progress: Progress | None,
+) -> SearchOutcome:
+    """:func:`run_search` with its settings resolved, in a folder that no other process writes into."""
     loaded = resolve_prior(prior)
     fixed = {key: value for key, value in named.items() if key not in _LIMITS} | {"prior": loaded}
     run = _Run(loaded, objective, config, fixed, folder)
@@ -95,7 +111,7 @@ def run_search(
     env, session, searches = run.plan(planner, actions, scenes, config.count, "search", progress)
     searched = time.perf_counter()
     spent, best_of = sum(len(plan.values) for plan in searches), None
-    if config.baseline and spent and session.stopped != "interrupt":
+    if config.baseline and spent and session.stopped in ("", "time"):
         # As many actions as scenes: the same seeds by path, so the first scenes are those of the first search.
         _, _, (best_of,) = run.plan(BestOfPlanner(), spent, spent, 1, "best of N", progress)
     seconds = {"search": searched - started, "best_of": time.perf_counter() - searched}

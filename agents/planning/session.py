@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import queue
-import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from agents.planning.journal import Journal
 from agents.planning.ledger import PlanResult, Progress, Searchable, SearchStoppedError, state_value
+from agents.utils.interrupts import Terminated, terminable
 from scene_envs.errors import InvalidInputError
 
 Pairs = Sequence[tuple[Any, int]]
@@ -88,7 +87,7 @@ class Session:
         journal: of the rounds; None keeps none.
 
     Attributes:
-        stopped: ``"time"`` or ``"interrupt"``; empty when the plans came to their end.
+        stopped: ``"time"``, ``"interrupt"`` or ``"terminated"`` (SIGTERM); empty when the plans came to their end.
         lanes: what was seen of every plan.
     """
 
@@ -116,7 +115,7 @@ class Session:
         """
         lanes = self.lanes = [Lane(self.problem, root, budget, self._expand) for root in roots]
         told = None if progress is None else lambda *_: progress(*_overall(lanes))
-        with _terminated_as_interrupt():
+        with terminable():
             if len(lanes) == 1:
                 return [_plan(planner, lanes[0], told)]
             return self._run_together(planner, lanes, told)
@@ -160,8 +159,8 @@ class Session:
                         failure = failure or what
                     else:
                         waiting[index] = what
-            except KeyboardInterrupt:
-                self.stopped = "interrupt"
+            except KeyboardInterrupt as interrupt:
+                self.stopped = _reason(interrupt)
                 continue
             states: Sequence[Any] | None = None
             order = sorted(waiting)
@@ -198,11 +197,15 @@ class Session:
             states = self.problem.expand_batch(pairs[len(known) :])
             if self.journal is not None:
                 self.journal.add(states)
-        except KeyboardInterrupt:
-            self.stopped = "interrupt"
+        except KeyboardInterrupt as interrupt:
+            self.stopped = _reason(interrupt)
             raise SearchStoppedError("the search was interrupted") from None
         self._rounds += 1
         return [*known, *states]
+
+
+def _reason(interrupt: KeyboardInterrupt) -> str:
+    return "terminated" if isinstance(interrupt, Terminated) else "interrupt"
 
 
 def _plan(planner: Any, lane: Lane, told: Progress | None) -> PlanResult:
@@ -215,20 +218,3 @@ def _plan(planner: Any, lane: Lane, told: Progress | None) -> PlanResult:
 
 def _overall(lanes: Sequence[Lane]) -> tuple[int, float]:
     return sum(len(lane.values) for lane in lanes), max(0.0, min(lane.best[0] for lane in lanes))
-
-
-@contextmanager
-def _terminated_as_interrupt() -> Iterator[None]:
-    """SIGTERM is an interrupt while the block runs, where this is the main thread."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def interrupt(number: int, frame: Any) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

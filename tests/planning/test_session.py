@@ -107,10 +107,10 @@ def test_an_interrupt_keeps_the_best_and_the_same_call_goes_on(
     assert torch.equal(resumed.best.tensor, straight.best.tensor)
 
 
-def test_sigterm_is_an_interrupt(prior: ScenePrior) -> None:
+def test_sigterm_keeps_the_best(prior: ScenePrior) -> None:
     before = signal.getsignal(signal.SIGTERM)
     outcome = run_search(prior, Counting(lambda: os.kill(os.getpid(), signal.SIGTERM)), **SETTINGS)
-    assert outcome.metrics["stopped"] == "interrupt"
+    assert outcome.metrics["stopped"] == "terminated"
     assert outcome.best_of is None
     assert signal.getsignal(signal.SIGTERM) is before
 
@@ -219,14 +219,15 @@ def test_an_error_of_one_plan_ends_all_and_is_raised() -> None:
         Session(broken).run(Impatient(), [(), ()], budget=20)
 
 
-def test_an_interrupted_command_says_so_and_exits_with_130(
-    prior: ScenePrior, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(("act", "status"), [(interrupt, 130), (lambda: os.kill(os.getpid(), signal.SIGTERM), 143)])
+def test_an_interrupted_command_says_so_and_can_go_on(
+    prior: ScenePrior, tmp_path: Path, capsys: pytest.CaptureFixture[str], act: Callable[[], None], status: int
 ) -> None:
     folder, output = prior.save(tmp_path / "prior"), tmp_path / "run"
-    register_reward("interrupting")(Counting(interrupt))
+    register_reward("interrupting")(Counting(act))
     words = ["search", f"prior={folder}", "objective=interrupting", "budget=9", "branching=3"]
     words += ["num_steps=2", "slots=12", f"output={output}"]
-    assert main(words) == 130
+    assert main(words) == status
     shown = capsys.readouterr()
     assert "by greedy with 12 denoiser evaluations" in shown.out
     assert "the same command goes on" in shown.err

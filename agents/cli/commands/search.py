@@ -44,6 +44,7 @@ def run(settings: SearchKeys, run: Run) -> None:
     from rich.progress import Progress
 
     from agents.planning import run_search
+    from agents.utils.interrupts import Terminated
     from rewards.isolation import close_reward, is_foreign, run_reward
 
     search = SearchConfig(**{field.name: getattr(settings, field.name) for field in fields(SearchConfig)})
@@ -76,5 +77,5 @@ def run(settings: SearchKeys, run: Run) -> None:
     if metrics["stopped"] == "time":
         run.say(f"ended after max_seconds={search.max_seconds:g}; the same command with more time goes on")
     run.say(f"written to {run.directory}")
-    if metrics["stopped"] == "interrupt":
-        raise KeyboardInterrupt
+    if metrics["stopped"] in ("interrupt", "terminated"):
+        raise Terminated if metrics["stopped"] == "terminated" else KeyboardInterrupt
