@@ -39,7 +39,7 @@ _UPRIGHT: tuple[dict[str, Any], ...] = ({"duration": 0.1} | _STAYS, {"duration":
 _LEANING: tuple[dict[str, Any], ...] = tuple(
     {"tilt": (x * _LEAN / math.sqrt(2), y * _LEAN / math.sqrt(2))} | _HOLDS for x in (-1, 1) for y in (-1, 1)
 )
-"""The same and directions of gravity, by which the best round is judged in the end."""
+"""The same and directions of gravity: in a round for scenes that stay upright, in the end for the others."""
 _PATIENCE = 2
 """Rounds without more ready objects after which a scene is left as it is."""
 _UNMOVED = 1e-4
@@ -221,12 +221,12 @@ def make_ready(
         tensor[improved], ready[improved] = last.batch.tensor[better], last.ready[better]
         counts[improved], lasting[improved] = last.counts[better], last.lasting[better]
     final = SceneBatch(tensor, best.batch.scene_type)
-    holding = _strike(final, ready, _LEANING, units, pool)
-    due = (~lasting | (holding != ready).any(dim=-1)).nonzero()[:, 0]
+    due = (~lasting).nonzero()[:, 0]
     left = units[due]
-    holding[due] = _strike_until_still(final[due], holding[due], left, pool)
+    ready[due] = _strike(final[due], ready[due], _LEANING, left, pool)
+    ready[due] = _strike_until_still(final[due], ready[due], left, pool)
     units[due] = left
-    return ReadyResult(final, holding, holding.sum(dim=-1), best.valid & (units > 0), best.valid)
+    return ReadyResult(final, ready, ready.sum(dim=-1), best.valid & (units > 0), best.valid)
 
 
 def _keep(batch: SceneBatch, kept: Tensor) -> SceneBatch:
@@ -278,19 +278,22 @@ def _make_ready_once(
 
 
 def _judge_round(batch: SceneBatch, units: Tensor, pool: PhysicsPool | None) -> tuple[Tensor, Tensor]:
-    """(B, N) free objects that stay in the trials of a round, and (B,) whether the longest found nothing that moves.
+    """(B, N) free objects that stay in the trials of a round, and (B,) whether no trial at all found one that moves.
 
-    Only scenes of which everything in the workspace stays in the shorter trials go through the longest: the others go
-    through another round anyway. Takes the work done off ``units`` (B,), in place.
+    Only scenes of which everything in the workspace stays in the short trials go through the others, leaning gravity
+    first and then the longest: scenes that fail have another round. Takes the work done off ``units`` (B,), in place.
     """
     candidates = batch.is_free & batch.in_workspace
     ready = _strike(batch, candidates & (units > 0)[:, None], _UPRIGHT, units, pool)
     complete = ((ready == candidates).all(dim=-1) & (units > 0)).nonzero()[:, 0]
     lasting = torch.zeros(len(batch), dtype=torch.bool)
-    left = units[complete]
-    stays = _strike(batch[complete], ready[complete], _LASTING[:1], left, pool)
-    lasting[complete] = (stays == ready[complete]).all(dim=-1)
-    ready[complete], units[complete] = stays, left
+    for trials in (_LEANING, _LASTING[:1]):
+        left = units[complete]
+        stays = _strike(batch[complete], ready[complete], trials, left, pool)
+        unmoved = (stays == ready[complete]).all(dim=-1)
+        ready[complete], units[complete] = stays, left
+        complete = complete[unmoved]
+    lasting[complete] = True
     return ready, lasting
 
 
