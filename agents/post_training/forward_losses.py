@@ -17,7 +17,7 @@ from torch.nn import functional as F
 from torchrl.objectives import LossModule
 
 from agents.networks.text import Text
-from agents.post_training.critic import Critic
+from agents.post_training.expectation import Expectation
 from agents.priors.base import ScenePrior
 from agents.priors.forward import NoisedScenes
 from scene_envs.errors import InvalidInputError
@@ -30,6 +30,9 @@ class ForwardProcessLoss(LossModule):
     subclass says what the loss of an entry is, given the advantage of its slot. Squared errors are weighted and reduced
     as in pretraining: a mean over the entries of a scene, then over the valid scenes. Losses of categories are a mean
     over the slots whose category is masked at that timestep, times the prior's ``category_weight``.
+
+    The error of a sample is its target minus the mean target of own samples at that noised scene. ``expectation``
+    learns this mean; without one o_old stands for it, and where all samples are bad its own error drives it off.
 
     Poses take ``advantage``, categories ``category_advantage``; each is one number per scene or one per slot. In x_t
     every slot sees the others, so an advantage per slot credits an object for its own pose alone.
@@ -47,14 +50,14 @@ class ForwardProcessLoss(LossModule):
         prior: what is trained.
         sampler: what made the scenes, such as a slower copy of ``prior``; its weights get no gradient.
         base: what training began with; needed for ``push_limit``.
-        critic: what is expected of noised scenes; it leaves the advantage of poses. None for no critic.
+        expectation: of the targets over own samples, trained by ``loss_expectation``; None takes o_old for it.
         push_limit: a bad pose pushes only while the squared error of o_old on it is at most this many times that of
             the base prior; 0 for no limit.
         generator: source of timesteps, noise and observed entries (CPU); None for torch's own.
 
-    Returns (``forward``): ``loss_objective`` (); ``loss_critic`` (), its mean squared error, 0 without one; and
-        detached ``distance`` (), the root mean square of o - o_old, ``limited`` (), the share of bad poses that do not
-        push any more, and ``foreseen`` (), the share of the advantages' variance that the critic explains.
+    Returns (``forward``): ``loss_objective`` (); ``loss_expectation`` (), its pretraining loss on the scenes, 0 without
+        one; and detached ``distance`` (), the root mean square of o - o_old, and ``limited`` (), the share of bad poses
+        that do not push any more.
     """
 
     @dataclass
@@ -69,7 +72,7 @@ class ForwardProcessLoss(LossModule):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    out_keys = ["loss_objective", "loss_critic", "distance", "limited", "foreseen"]  # noqa: RUF012  (torchrl reads lists)
+    out_keys = ["loss_objective", "loss_expectation", "distance", "limited"]  # noqa: RUF012  (torchrl reads lists)
     prior: ScenePrior
     generator: Generator | None
 
@@ -80,7 +83,7 @@ class ForwardProcessLoss(LossModule):
         *,
         base: ScenePrior | None = None,
         push_limit: float = 0.0,
-        critic: Critic | None = None,
+        expectation: Expectation | None = None,
         generator: Generator | None = None,
     ) -> None:
         super().__init__()
@@ -91,7 +94,7 @@ class ForwardProcessLoss(LossModule):
         self.prior = prior
         self.generator = generator
         self.push_limit = push_limit
-        self.critic = critic
+        self.expectation = expectation
         self._others = (sampler, base)  # in a tuple: not modules of the loss, whose parameters are the prior's
 
     @property
@@ -156,41 +159,20 @@ class ForwardProcessLoss(LossModule):
         text = None if tokens is None or mask is None else (tokens.detach(), mask)
         valid = flat.get(keys.valid, None)
         kept = torch.ones(len(scene), dtype=torch.bool, device=scene.device) if valid is None else valid.reshape(-1)
-        advantage, critic_loss, foreseen = self._criticised(noised, text, advantage, kept)
-        losses, distance, limited = self._losses(noised, text, advantage, credit)
+        losses, expectation, distance, limited = self._losses(noised, text, advantage, credit)
         count = kept.sum().clamp(min=1)
         fields = {
             "loss_objective": torch.where(kept, losses, 0.0).sum() / count,
+            "loss_expectation": torch.where(kept, expectation, 0.0).sum() / count,
             "distance": (torch.where(kept, distance, 0.0).sum() / count).sqrt(),
             "limited": limited,
-            "loss_critic": critic_loss,
-            "foreseen": foreseen,
         }
         return TensorDict(fields, [])
 
-    def _criticised(
-        self, noised: NoisedScenes, text: Text | None, advantage: Tensor, kept: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Advantages of poses without what the critic expects, its squared error (), and what it explains ()."""
-        if self.critic is None:
-            return advantage, advantage.new_zeros(()), advantage.new_zeros(())
-        expected = self.critic(noised, text)  # (B, N)
-        present = (noised.weight[..., : self.prior.pose_width].sum(dim=-1) > 0) & kept[:, None]
-        present = present & (noised.category != self.prior.scene_type.num_assets)
-        weight = present.to(expected)
-        if advantage.shape[1] == 1:
-            expected = (expected * weight).sum(dim=1, keepdim=True) / weight.sum(dim=1, keepdim=True).clamp(min=1)
-            weight = kept[:, None].to(expected)
-        total = weight.sum().clamp(min=1)
-        loss = ((expected - advantage).square() * weight).sum() / total
-        left = torch.where(weight > 0, advantage - expected.detach(), advantage)
-        spread = (advantage.square() * weight).sum() / total
-        return left, loss, 1.0 - loss.detach() / spread.clamp(min=1e-8)
-
     def _losses(
         self, noised: NoisedScenes, text: Text | None, advantage: Tensor, credit: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """(B,) losses, (B,) mean squares of o - o_old, and the share () of bad poses that do not push any more."""
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """(B,) losses, (B,) those of the expectation, (B,) mean squares of o - o_old, and the limited share ()."""
         output = self.prior.output(noised, text)
         with torch.no_grad():
             old = self.sampler.output(noised, text)
@@ -202,14 +184,19 @@ class ForwardProcessLoss(LossModule):
                 [of_entries[..., :poses], credit[..., None].expand(*of_entries.shape[:2], features - poses)], dim=-1
             )
         weight = noised.weight / noised.weight.sum(dim=(1, 2), keepdim=True).clamp(min=1.0)
-        entries = self.continuous_loss(output.continuous, old.continuous, noised.target, of_entries)
+        target, expectation = noised.target, weight.new_zeros(len(weight))
+        if self.expectation is not None:
+            expected = self.expectation(noised, text)
+            expectation = ((expected - target).square() * weight).sum(dim=(1, 2)) * noised.scale
+            target = old.continuous + target - expected.detach()
+        entries = self.continuous_loss(output.continuous, old.continuous, target, of_entries)
         losses = (entries * weight).sum(dim=(1, 2)) * noised.scale
         distance = ((output.continuous - old.continuous).detach().square() * weight).sum(dim=(1, 2))
         if output.logits is not None and old.logits is not None and noised.drawn is not None:
             slots = self.category_loss(output.logits, old.logits, noised.category, credit)
             mean = (slots * noised.drawn).sum(dim=1) / noised.drawn.sum(dim=1).clamp(min=1.0)
             losses = losses + self.prior.config.category_weight * mean
-        return losses, distance, limited
+        return losses, expectation, distance, limited
 
     def _limited(
         self, noised: NoisedScenes, text: Text | None, advantage: Tensor, old: Tensor
@@ -250,7 +237,7 @@ class NFTLoss(ForwardProcessLoss):
     have the same with cross-entropies of l_plus and l_minus, which are made of logits as o_plus and o_minus are.
 
     Args:
-        prior, sampler, base, push_limit, critic, generator: as in :class:`ForwardProcessLoss`.
+        prior, sampler, base, push_limit, expectation, generator: as in :class:`ForwardProcessLoss`.
         beta: strength; smaller ones step further from the sampling policy.
         clip: c, the advantage at which a sample is fully good or bad.
 
@@ -259,7 +246,7 @@ class NFTLoss(ForwardProcessLoss):
     >>> scenes = TensorDict({"scene": prior.encode(prior.sample(2, num_steps=3)), "advantage": torch.ones(2, 34)}, [2])
     >>> loss = NFTLoss(prior, prior)(scenes)
     >>> sorted(loss.keys()), float(loss["distance"])
-    (['distance', 'foreseen', 'limited', 'loss_critic', 'loss_objective'], 0.0)
+    (['distance', 'limited', 'loss_expectation', 'loss_objective'], 0.0)
     >>> loss["loss_objective"].backward()
     """
 
@@ -272,10 +259,10 @@ class NFTLoss(ForwardProcessLoss):
         clip: float = 1.0,
         base: ScenePrior | None = None,
         push_limit: float = 0.0,
-        critic: Critic | None = None,
+        expectation: Expectation | None = None,
         generator: Generator | None = None,
     ) -> None:
-        super().__init__(prior, sampler, base=base, push_limit=push_limit, critic=critic, generator=generator)
+        super().__init__(prior, sampler, base=base, push_limit=push_limit, expectation=expectation, generator=generator)
         _positive(beta=beta, clip=clip)
         self.beta, self.clip = beta, clip
 
@@ -304,7 +291,7 @@ class AWMLoss(ForwardProcessLoss):
     that of :class:`NFTLoss` divided by the latter's beta.
 
     Args:
-        prior, sampler, base, push_limit, critic, generator: as in :class:`ForwardProcessLoss`.
+        prior, sampler, base, push_limit, expectation, generator: as in :class:`ForwardProcessLoss`.
         beta: strength of the pull, above 1.
         clip: c, the largest advantage.
     """
@@ -318,10 +305,10 @@ class AWMLoss(ForwardProcessLoss):
         clip: float = 1.0,
         base: ScenePrior | None = None,
         push_limit: float = 0.0,
-        critic: Critic | None = None,
+        expectation: Expectation | None = None,
         generator: Generator | None = None,
     ) -> None:
-        super().__init__(prior, sampler, base=base, push_limit=push_limit, critic=critic, generator=generator)
+        super().__init__(prior, sampler, base=base, push_limit=push_limit, expectation=expectation, generator=generator)
         _positive(clip=clip)
         if not beta > 1:
             raise InvalidInputError(f"beta={beta} must be above 1: below, a bad sample pushes without bound")

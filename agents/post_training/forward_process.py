@@ -15,7 +15,7 @@ from torch import Generator, Tensor
 from agents.post_training.advantages import compute_advantages, sibling_advantages
 from agents.post_training.algorithms import AWMSettings, ForwardProcessSettings, NFTSettings, RewardWeightedSettings
 from agents.post_training.base import Algorithm
-from agents.post_training.critic import Critic
+from agents.post_training.expectation import Expectation
 from agents.post_training.forward_losses import AWMLoss, ForwardProcessLoss, NFTLoss, RewardWeightedLoss
 from agents.post_training.gradients import credited_reward, gradient_norm
 from agents.post_training.policy import DenoisingPolicy
@@ -34,18 +34,16 @@ class ForwardGradient:
         norm: its gradient's norm.
         distance: root mean square of the trained denoiser's output minus that of the sampling policy's.
         limited: share of bad poses that do not push any more.
-        foreseen: share of the advantages' variance that the critic explains.
     """
 
     loss: float
     norm: float
     distance: float
     limited: float
-    foreseen: float
 
     def figures(self) -> Mapping[str, float]:
         """Further columns of the log."""
-        return {"distance": self.distance, "limited": self.limited, "foreseen": self.foreseen}
+        return {"distance": self.distance, "limited": self.limited}
 
 
 class ForwardProcess(Algorithm[TensorDict]):
@@ -69,8 +67,8 @@ class ForwardProcess(Algorithm[TensorDict]):
         self.sampler = deepcopy(self.prior).eval().requires_grad_(False)
         self._sampling_policy = DenoisingPolicy(self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance)
         self._average = WeightAverage(self.prior, settings.sampler_decay)
-        rate = getattr(settings, "critic_lr", 0.0)
-        self.critic = Critic(self.sampler, rate) if rate else None
+        rate = getattr(settings, "expectation_lr", 0.0)
+        self.expectation = Expectation(self.sampler, rate) if rate else None
         self.loss = self.make_loss()
 
     def make_loss(self) -> ForwardProcessLoss:
@@ -79,7 +77,7 @@ class ForwardProcess(Algorithm[TensorDict]):
         if isinstance(settings, NFTSettings | AWMSettings):
             kind = NFTLoss if isinstance(settings, NFTSettings) else AWMLoss
             base = deepcopy(self.sampler) if settings.push_limit else None
-            limits: dict[str, Any] = {"base": base, "push_limit": settings.push_limit, "critic": self.critic}
+            limits: dict[str, Any] = {"base": base, "push_limit": settings.push_limit, "expectation": self.expectation}
             return kind(*pair, beta=settings.beta, clip=settings.advantage_clip, **limits)
         assert isinstance(settings, RewardWeightedSettings)
         return RewardWeightedLoss(*pair, temperature=settings.temperature)
@@ -141,7 +139,7 @@ class ForwardProcess(Algorithm[TensorDict]):
         scenes = TensorDict(fields, [len(x0)])
         size = self.policy.chunk or len(x0)
         valid = max(1, int(rollout.valid.sum()))
-        total, distance, limited, foreseen = 0.0, 0.0, 0.0, 0.0
+        total, distance, limited = 0.0, 0.0, 0.0
         self.loss.generator = generator
         for _ in range(self.settings.draws):
             for start in range(0, len(x0), size):
@@ -149,14 +147,13 @@ class ForwardProcess(Algorithm[TensorDict]):
                 share = int(part["valid"].sum()) / valid / self.settings.draws
                 result = self.loss(part)
                 objective = result["loss_objective"] * share
-                (objective + result["loss_critic"] * share).backward()
+                (objective + result["loss_expectation"] * share).backward()
                 total += float(objective.detach())
-                foreseen += share * float(result["foreseen"])
                 distance += share * float(result["distance"]) ** 2
                 limited += share * float(result["limited"])
-        if self.critic is not None:
-            self.critic.step()
-        return ForwardGradient(total, gradient_norm(self.prior.parameters()), distance**0.5, limited, foreseen)
+        if self.expectation is not None:
+            self.expectation.step()
+        return ForwardGradient(total, gradient_norm(self.prior.parameters()), distance**0.5, limited)
 
     def end_iteration(self) -> None:
         """Move the sampling policy towards the prior in training."""
@@ -170,15 +167,15 @@ class ForwardProcess(Algorithm[TensorDict]):
 
     def state(self) -> dict[str, Any]:
         """The sampling policy's weights."""
-        critic = None if self.critic is None else self.critic.state()
-        return {"sampler": self._average.tensors, "updates": self._average.updates, "critic": critic}
+        expectation = None if self.expectation is None else self.expectation.state()
+        return {"sampler": self._average.tensors, "updates": self._average.updates, "expectation": expectation}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Inverse of :meth:`state`."""
         self._average.tensors, self._average.updates = state["sampler"], state["updates"]
         self._average.copy_to(self.sampler)
-        if self.critic is not None:
-            self.critic.restore(state["critic"])
+        if self.expectation is not None:
+            self.expectation.restore(state["expectation"])
 
 
 def _groups(rollout: Rollout) -> Tensor | None:

@@ -100,7 +100,7 @@ def test_credit_per_object_leaves_categories_alone(tmp_path: Path) -> None:
 
 
 def test_chunks_do_not_change_the_gradient_of_given_noise(tmp_path: Path) -> None:
-    trainer = PostTrainer(forward_config(tmp_path, "nft"), prior=tiny_prior())
+    trainer = PostTrainer(forward_config(tmp_path, "nft", {"expectation_lr": 0.0}), prior=tiny_prior())
     try:
         trainer.prepare()
         algorithm = trainer.learner.algorithm

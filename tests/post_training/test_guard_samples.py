@@ -84,7 +84,7 @@ def test_rollback_takes_the_best_checkpoint_again(tmp_path: Path) -> None:
 
 
 def test_a_resumed_run_samples_and_keeps_the_same(tmp_path: Path) -> None:
-    keys = {**SAMPLES, "iterations": 3, "algorithm": {"name": "nft", "critic_lr": 1e-3}}
+    keys = {**SAMPLES, "iterations": 3, "algorithm": {"name": "nft", "expectation_lr": 1e-3}}
     whole = post_train(small_config(tmp_path / "a", **keys), prior=tiny_prior())
     half = PostTrainer(small_config(tmp_path / "b", **keys), prior=tiny_prior())
     step, count = half.step, 0
