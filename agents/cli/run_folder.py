@@ -204,7 +204,7 @@ def _writer(folder: Path) -> str | None:
     """The command whose log a folder holds, None where there is none."""
     with suppress(OSError), (folder / "log.txt").open(encoding="utf-8", errors="replace") as file:
         for line in file:
-            if found := re.match(r"[-0-9]+ [:0-9]+ scene-envs ([-a-z]+)$", line):
+            if found := re.match(r"[-0-9]+ [:0-9]+ scene-envs ([-\w]+)$", line):
                 return found[1]
     return None
 

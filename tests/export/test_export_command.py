@@ -87,7 +87,7 @@ def test_sample_exports_what_it_made_ready(prior, tmp_path):
     [
         (["export"], "name either a scene file"),
         (["export", "scenes=a", "prior=b"], "name either a scene file"),
-        (["export", "scenes=nowhere.safetensors"], "no scene file at 'nowhere.safetensors'"),
+        (["export", "scenes=nowhere.safetensors"], "scenes='nowhere.safetensors': no scene file"),
         (["export", "scenes=OUT/..", "formats=npz"], "no parquet"),
         (["export", "scenes=a", "formats=mjfc"], "did you mean 'mjcf'?"),
         (["export", "scenes=a", "count=0"], "count must be at least 1"),
