@@ -31,8 +31,8 @@ TURNS = tuple(np.arange(4) * np.pi / 4)
 """Angles (rad) of the closing direction about the approach, counted from a level direction of the object."""
 PLACES = (0.5, 0.0, 1.0)
 """Where along the object's extent in the closing direction it is grasped: its middle, then its two edges."""
-PART_PAIRS = 50_000.0
-"""Pairs of convex parts that one scene may take, ten times what a crowded one takes: about 0.8 s."""
+PART_PAIRS = 35_000.0
+"""Pairs of convex parts that one scene may take, six times what a crowded one takes: about 0.6 s."""
 
 
 @dataclass(frozen=True)
