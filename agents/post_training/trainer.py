@@ -40,7 +40,7 @@ from scene_envs.scene import SceneBatch
 
 _MOST_ROLLBACKS = 3
 """Returns to the best checkpoint after which a run ends."""
-_PICTURED = 8
+_PICTURED = 6
 """Samples of the guard that are kept for the report."""
 
 

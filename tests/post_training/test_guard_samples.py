@@ -76,7 +76,7 @@ def test_rollback_takes_the_best_checkpoint_again(tmp_path: Path) -> None:
     assert result.metrics["iterations"] == 8
     assert result.metrics["guard"]["rollbacks"] == 4
     assert rates[2] == pytest.approx(rates[1] / 2)
-    assert len(SceneBatch.load(tmp_path / "guard_beyond.safetensors")) == 8
+    assert len(SceneBatch.load(tmp_path / "guard_beyond.safetensors")) == 6
     base = tiny_prior().state_dict()
     made = PostTrainer(config, prior=tiny_prior())
     made.learner.return_to(ScenePrior.load(tmp_path / "prior"))
