@@ -39,7 +39,8 @@ _RESUMES = {
 }
 """Commands that go on with what a run from Python left, and the file that says so."""
 _OWN_RULE = ("generate", "pretrain", "post-train", "search", "doctor", "demo", "evaluate")
-"""Commands that compare their keys with what is there themselves."""
+"""Commands that compare their keys with what is there themselves, as do programs whose settings say
+``compares_keys``."""
 _MAY_DIFFER = (
     "output",
     "workers",
@@ -117,7 +118,7 @@ class Run:
             raise InvalidInputError(
                 f"output={str(self.directory)!r} holds {found[0]} of {_named(writer)}; give another output"
             )
-        if self.command not in _OWN_RULE:
+        if self.command not in _OWN_RULE and not getattr(self.settings, "compares_keys", False):
             self._check_keys()
         return True
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from agents.configuration.tree import dotted, dotted_values
 from agents.pretraining.config import PretrainConfig
@@ -82,6 +82,9 @@ class TablesConfig:
         workers: physics worker processes; 0 computes in this one.
         output: folder for the runs, tables.md, tables.csv and plot.png; the same command goes on in it.
     """
+
+    compares_keys: ClassVar[bool] = True
+    """Rows of other settings may join those in a folder; the program refuses what does not fit them."""
 
     scene: str = "dimsum_table"
     data: str = "data/dimsum_table"

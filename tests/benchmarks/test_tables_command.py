@@ -118,7 +118,7 @@ def test_other_keys_in_the_same_folder_are_refused(
 ) -> None:
     before = records(whole)
     assert tables(folders, whole, "iterations=5") == 2
-    assert "is 5" in capsys.readouterr().err
+    assert "iterations was 3, is 5" in capsys.readouterr().err
     with _alone_in(whole):
         assert tables(folders, whole) == 2
     assert "another command is making tables in" in capsys.readouterr().err
