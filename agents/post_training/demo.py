@@ -16,7 +16,7 @@ def run_demo(
     seed: int = 0,
     workers: int = 2,
     *,
-    scenes: int = 64,
+    scenes: int = 24,
     num_steps: int = 50,
     recipe: PostTrainConfig | None = None,
     prior: ScenePrior | None = None,
