@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
@@ -15,7 +16,7 @@ ENTRY_POINT_GROUP = "scene_envs.planners"
 
 
 @dataclass(frozen=True)
-class PlannerSettings:
+class PlannerSettings(ABC):
     """A planner by name, and its keys.
 
     Attributes:
@@ -27,13 +28,13 @@ class PlannerSettings:
     """Whether it chooses itself how many children a state gets. The environment of a search run then has as many
     actions as the budget instead of ``branching``."""
 
+    @abstractmethod
     def make(self, branching: int) -> Any:
         """The planner: an object with ``plan(problem, budget, progress)``, as :class:`agents.planning.UCTPlanner`.
 
         Args:
             branching: children of a state, as the user asks for them.
         """
-        raise NotImplementedError(f"{type(self).__name__} must define make(branching)")
 
 
 _SHIPPED = ("beam", "best_of", "greedy", "mcts", "uct")

@@ -1,5 +1,7 @@
 """A reduced form of the reliability benchmark: nothing lost, nothing different, nothing silent."""
 
+from collections.abc import Callable
+
 import pytest
 
 from benchmarks.reliability import Figures, fuzzed_files, fuzzed_lines, hostile_rewards, kills, two_writers
@@ -15,20 +17,15 @@ def test_damaged_files_are_named_or_read_as_they_were():
 
 
 @pytest.mark.slow
-def test_fuzzed_command_lines_are_refused_in_our_own_words():
-    assert_clean(fuzzed_lines(20, seed=5), 20)
-
-
-@pytest.mark.slow
-def test_hostile_rewards_cost_their_scenes_alone():
-    assert_clean(hostile_rewards(3), 3)
-
-
-@pytest.mark.slow
-def test_killed_commands_go_on_to_the_same_result():
-    assert_clean(kills(3, seed=5), 3)
-
-
-@pytest.mark.slow
-def test_of_two_writers_one_works():
-    assert_clean(two_writers(1), 1)
+@pytest.mark.parametrize(
+    ("check", "count"),
+    [
+        (lambda count: fuzzed_lines(count, seed=5), 20),
+        (hostile_rewards, 3),
+        (lambda count: kills(count, seed=5), 3),
+        (two_writers, 1),
+    ],
+    ids=["fuzzed command lines", "hostile rewards", "killed commands", "two writers"],
+)
+def test_nothing_is_lost_different_or_silent(check: Callable[[int], Figures], count: int):
+    assert_clean(check(count), count)
