@@ -160,11 +160,6 @@ class Guard:
         """First iteration that found something beyond its limit, or None: from there the reward is over-optimised."""
         return next((r.iteration for r in self.readings if r.beyond), None)
 
-    @property
-    def is_beyond(self) -> bool:
-        """Whether the last check found something beyond its limit."""
-        return bool(self.readings) and bool(self.readings[-1].beyond)
-
     def summary(self) -> dict[str, Any]:
         """JSON-able: the ratio of what was kept, and where the limit was passed."""
         return {
