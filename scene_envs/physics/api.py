@@ -42,6 +42,8 @@ _LEANING: tuple[dict[str, Any], ...] = tuple(
 """The same and directions of gravity: in a round for scenes that stay upright, in the end for the others."""
 _PATIENCE = 2
 """Rounds without more ready objects after which a scene is left as it is."""
+_ROUNDS_SHARE = 2 / 3
+"""Share of a scene's work that the rounds may do; the rest is for the trials at the end."""
 _UNMOVED = 1e-4
 """Motion (m) below which an object is believed not to depend on others that move."""
 
@@ -187,8 +189,9 @@ def make_ready(
     Scenes with objects in the workspace that are not ready go through projection and settling again, with more solver
     iterations, up to ``rounds`` times in all, until two in a row have made no more of them ready. The round with most
     ready objects is kept, the earliest of equal ones. A heap, whose objects are so deep in each other that projection
-    has to spread them, is invalid. All rounds of a scene together do as much work as :func:`settle` may do; where it
-    does not suffice, the scene is as far as it got, what was not judged is not ready, and ``finished`` is False.
+    has to spread them, is invalid. All rounds of a scene together do two thirds of the work that :func:`settle` may do,
+    and the last trials the rest; where it does not suffice, the scene is the best of the rounds that ended, what was
+    not judged is not ready, and ``finished`` is False.
 
     Args:
         batch: B scenes of N slots.
@@ -201,6 +204,8 @@ def make_ready(
     if rounds < 1:
         raise InvalidInputError(f"rounds={rounds} must be at least 1: each projects and settles once")
     units = stack(run_kernel("units", batch, {}, pool), batch, "units", torch.float64, shape=())
+    reserve = (1.0 - _ROUNDS_SHARE) * units
+    units = units - reserve
     best = last = _make_ready_once(batch, duration, ITERATIONS, units, pool)
     tensor, ready, counts = best.batch.tensor.clone(), best.ready.clone(), best.counts.clone()
     lasting = best.lasting.clone()
@@ -221,12 +226,13 @@ def make_ready(
         tensor[improved], ready[improved] = last.batch.tensor[better], last.ready[better]
         counts[improved], lasting[improved] = last.counts[better], last.lasting[better]
     final = SceneBatch(tensor, best.batch.scene_type)
+    finished = best.valid & (units > 0)
     due = (~lasting).nonzero()[:, 0]
-    left = units[due]
+    left = (units + reserve)[due]
     ready[due] = _strike(final[due], ready[due], _LEANING, left, pool)
     ready[due] = _strike_until_still(final[due], ready[due], left, pool)
-    units[due] = left
-    return ReadyResult(final, ready, ready.sum(dim=-1), best.valid & (units > 0), best.valid)
+    finished[due] &= left > 0
+    return ReadyResult(final, ready, ready.sum(dim=-1), finished, best.valid)
 
 
 def _keep(batch: SceneBatch, kept: Tensor) -> SceneBatch:

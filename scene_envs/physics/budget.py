@@ -9,7 +9,7 @@ import numpy as np
 from scene_envs.physics.collision import ObjectPairs
 from scene_envs.physics.placement import Objects
 
-PER_SCENE, PER_OBJECT = 1_000.0, 10_000.0
+PER_SCENE, PER_OBJECT = 1_000.0, 2_500.0
 """Units of simulation (see :class:`Budget`) that a scene may take: so many, and so many more for each free object,"""
 _CROWDED = 0.75
 """unless more than this share of them do not stand clear of each other."""
