@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from agents.post_training.guard_report import guard_sections, guard_verdict
@@ -130,18 +132,45 @@ def draw_gallery(batch: SceneBatch, path: Path, is_ready: Tensor | None = None) 
         path: where the picture goes.
         is_ready: (B, N) bool; given, captions count these objects and the free ones that are not are red.
     """
-    from scene_envs.render import gallery, render
+    images, captions = _drawn(batch, is_ready, _GALLERY)
+    return _save_gallery(images, captions, path)
 
-    shown = batch[: min(_GALLERY, len(batch))]
+
+def draw_side_by_side(measured: Mapping[str, Measured], path: Path, *, ready: bool = False) -> Path:
+    """The first scenes of several priors as a PNG: a row per scene, a column per prior.
+
+    Args:
+        measured: samples of each prior from the same noise, by the name in the captions; three fit the page.
+        path: where the picture goes.
+        ready: show the scenes after projection and settling; objects that are not simulation-ready are red.
+    """
+    drawn = [
+        _drawn(part.ready if ready else part.raw, part.is_ready if ready else None, _GALLERY // 2)
+        for part in measured.values()
+    ]
+    images = [image for row in zip(*(images for images, _ in drawn), strict=True) for image in row]
+    texts = zip(*(captions for _, captions in drawn), strict=True)
+    captions = [f"{name}: {text}" for row in texts for name, text in zip(measured, row, strict=True)]
+    return _save_gallery(images, captions, path)
+
+
+def _drawn(batch: SceneBatch, is_ready: Tensor | None, most: int) -> tuple[NDArray[np.uint8], list[str]]:
+    """Images (b, H, W, 3) of the first scenes, and a caption each."""
+    from scene_envs.render import render
+
+    shown = batch[: min(most, len(batch))]
     width, height = _TILE
     if is_ready is None:
-        images = render(shown, width=width, height=height)
-        captions = [f"{count} objects" for count in shown.counts.tolist()]
-    else:
-        ready = is_ready[: len(shown)].cpu()
-        images = render(shown, width=width, height=height, highlight=shown.is_free.cpu() & ~ready)
-        free = shown.is_free.sum(dim=-1).tolist()
-        captions = [f"{good} of {total} ready" for good, total in zip(ready.sum(dim=-1).tolist(), free, strict=True)]
+        return render(shown, width=width, height=height), [f"{count} objects" for count in shown.counts.tolist()]
+    ready = is_ready[: len(shown)].cpu()
+    images = render(shown, width=width, height=height, highlight=shown.is_free.cpu() & ~ready)
+    free = shown.is_free.sum(dim=-1).tolist()
+    return images, [f"{good} of {total} ready" for good, total in zip(ready.sum(dim=-1).tolist(), free, strict=True)]
+
+
+def _save_gallery(images: Sequence[NDArray[np.uint8]] | NDArray[np.uint8], captions: list[str], path: Path) -> Path:
+    from scene_envs.render import gallery
+
     path.parent.mkdir(parents=True, exist_ok=True)
     gallery(images, columns=_COLUMNS, captions=captions).quantize(192).save(path, optimize=True)
     return path
@@ -183,7 +212,7 @@ def _page(
             "penetrate, or have left the workspace.",
             [Picture(pictures["before_ready"], "Before"), Picture(pictures["after_ready"], "After")],
         ),
-        Section("Numbers", table=_rows(before, after)),
+        Section("Numbers", table=_with_change(before, after)),
     ]
     return Page(title, lead, tiles, sections, settings)
 
@@ -202,15 +231,18 @@ _LABELS = {
 }
 
 
-def _rows(before: Mapping[str, float], after: Mapping[str, float]) -> list[tuple[str, ...]]:
-    rows: list[tuple[str, ...]] = [("", "before", "after", "change")]
-    for name, label in _LABELS.items():
-        if name in before and name in after:
-            change = _relative(before[name], after[name])
-            rows.append(
-                (label, _number(before, name), _number(after, name), "" if change is None else f"{change:+.0%}")
-            )
-    return rows
+def number_rows(columns: Mapping[str, Mapping[str, float]]) -> list[tuple[str, ...]]:
+    """Rows of a table with a column of figures per prior; figures that one of them lacks are left out."""
+    names = [name for name in _LABELS if all(name in figures for figures in columns.values())]
+    rows = [(_LABELS[name], *(_number(figures, name) for figures in columns.values())) for name in names]
+    return [("", *columns), *rows]
+
+
+def _with_change(before: Mapping[str, float], after: Mapping[str, float]) -> list[tuple[str, ...]]:
+    head, *rows = number_rows({"before": before, "after": after})
+    changes = [_relative(before[name], after[name]) for name in _LABELS if name in before and name in after]
+    texts = ["" if change is None else f"{change:+.0%}" for change in changes]
+    return [(*head, "change"), *((*row, text) for row, text in zip(rows, texts, strict=True))]
 
 
 def _number(figures: Mapping[str, float], name: str) -> str:

@@ -21,7 +21,7 @@ from scene_envs.scene import SceneBatch
 SAMPLE_SEED = 100_000
 """Added to the run's seed for the samples that are measured, so that training never saw their noise."""
 
-_PHYSICS_TIMEOUT = 300.0
+PHYSICS_TIMEOUT = 300.0
 """Seconds for a chunk of scenes: on a busy machine a slow scene must not become an invalid one."""
 
 
@@ -52,7 +52,7 @@ def post_train_and_compare(
     trained = time.perf_counter()
     seed = config.seed + SAMPLE_SEED
     asked = _measured_prompts(config, base, scenes)
-    with PhysicsPool(workers=config.workers, timeout=_PHYSICS_TIMEOUT) as pool:
+    with PhysicsPool(workers=config.workers, timeout=PHYSICS_TIMEOUT) as pool:
 
         def measure(prior: ScenePrior) -> Measured:
             return measure_prior(

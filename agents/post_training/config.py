@@ -170,7 +170,7 @@ class PostTrainConfig:
         reward_memory: GiB that such a reward may allocate.
         batch_size: scenes sampled per iteration.
         iterations: policy updates, that is batches of fresh scenes.
-        recipe: a named set of the other keys: ``ours``, or ``demo`` for the demonstration; keys given beside it win.
+        recipe: a named set of the other keys: ``ours``, ``demo_clutter``, ``demo_feasible``; keys beside it win.
         algorithm: how rewards become a gradient.
         optimizer: of the weights.
         regularisation: on real scenes.

@@ -1,14 +1,25 @@
-"""Demonstration: post-training of the shipped Dimsum prior toward clutter, with a report."""
+"""Demonstration: the shipped Dimsum prior steered toward clutter and toward feasible placement, with a report."""
 
 from __future__ import annotations
 
+import sys
+import time
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from agents.post_training.comparison_run import post_train_and_compare
+from agents.post_training.comparison import Measured, draw_side_by_side, measure_prior, number_rows
+from agents.post_training.comparison_run import PHYSICS_TIMEOUT, SAMPLE_SEED
 from agents.post_training.config import PostTrainConfig
+from agents.post_training.report import Page, Picture, Section, Tile, write_report
+from agents.post_training.run_files import write_metrics
+from agents.post_training.trainer import PostTrainResult, post_train
 from agents.priors.base import ScenePrior
+from rewards import reward_name
+
+RUNS = ("clutter", "feasible")
+"""Names of the two runs: their folders, and the columns of the report. Their recipes are ``demo_<name>``."""
 
 
 def run_demo(
@@ -18,23 +29,137 @@ def run_demo(
     *,
     scenes: int = 24,
     num_steps: int = 50,
-    recipe: PostTrainConfig | None = None,
+    recipes: Mapping[str, PostTrainConfig] | None = None,
     prior: ScenePrior | None = None,
 ) -> dict[str, Any]:
-    """Post-train, measure both priors on fresh samples, and write the report; see ``post_train_and_compare``.
+    """Post-train a prior in two ways, measure all three priors on fresh samples, and write the report.
+
+    All priors start from the same noise, every sample is measured, and physics says what is simulation-ready.
 
     Args:
-        output: run directory; ``prior=<output>`` loads the result. An interrupted demonstration goes on there.
+        output: folder for ``report.html``, ``metrics.json``, the pictures and a run folder each, ``clutter`` and
+            ``feasible``, which ``prior=`` loads. An interrupted demonstration goes on there.
         seed: of training; the measured samples have a seed of their own that follows from it.
         workers: physics worker processes.
         scenes: fresh samples measured of each prior.
         num_steps: denoiser evaluations per measured sample.
-        recipe: in place of that of ``configs/recipe/demo.yaml``: two minutes of training on two cores.
-        prior: in place of the recipe's.
+        recipes: the runs by name, in place of ``configs/recipe/demo_clutter.yaml`` and ``demo_feasible.yaml``.
+        prior: in place of the recipes'.
 
     Returns:
-        The numbers of ``metrics.json``: ``before`` and ``after`` (``objects``, ``feasible_objects`` raw,
-        ``ready_objects``), ``change``, ``guard``.
+        The numbers of ``metrics.json``: those of ``measure_prior`` for ``base`` and each run, ``runs`` (the metrics of
+        each run), and ``stage_seconds``.
     """
-    config = replace(recipe or PostTrainConfig(recipe="demo"), output=str(output), seed=seed, workers=workers)
-    return post_train_and_compare(config, scenes=scenes, num_steps=num_steps, prior=prior)
+    directory, started = Path(output), time.perf_counter()
+    recipes = recipes or {name: PostTrainConfig(recipe=f"demo_{name}") for name in RUNS}
+    configs = {
+        name: replace(recipe, output=str(directory / name), seed=seed, workers=workers)
+        for name, recipe in recipes.items()
+    }
+    base = ScenePrior.load(next(iter(configs.values())).prior if prior is None else prior)
+    results = {}
+    for name, config in configs.items():
+        _say(config, f"post-training toward {_goal(config)} with {_algorithm(config)}")
+        results[name] = post_train(config, prior=base)
+    trained = time.perf_counter()
+    measured = _measure(results, base, scenes, num_steps)
+    seconds = {"training": round(trained - started, 1), "measuring": round(time.perf_counter() - trained, 1)}
+    metrics = {
+        **{name: part.figures for name, part in measured.items()},
+        "runs": {name: result.metrics for name, result in results.items()},
+        "stage_seconds": seconds,
+        "num_steps": num_steps,
+    }
+    write_report(directory / "report.html", _page(directory, base, results, measured))
+    write_metrics(directory, metrics)
+    return metrics
+
+
+def _measure(
+    results: Mapping[str, PostTrainResult], base: ScenePrior, scenes: int, num_steps: int
+) -> dict[str, Measured]:
+    """Fresh samples of the base prior and of each result, all from the same noise."""
+    from scene_envs.physics import PhysicsPool
+
+    config = next(iter(results.values())).config
+    measured = {}
+    with PhysicsPool(workers=config.workers, timeout=PHYSICS_TIMEOUT) as pool:
+        for name, prior in {"base": base, **{name: result.prior for name, result in results.items()}}.items():
+            _say(config, f"measuring {scenes} samples of the prior {name!r}")
+            measured[name] = measure_prior(
+                prior, scenes, num_steps=num_steps, seed=config.seed + SAMPLE_SEED, pool=pool
+            )
+    return measured
+
+
+def _page(
+    directory: Path, base: ScenePrior, results: Mapping[str, PostTrainResult], measured: Mapping[str, Measured]
+) -> Page:
+    """The report; writes its pictures beside it."""
+    runs = " and ".join(
+        f"{_goal(result.config)} ({_algorithm(result.config)}, {len(result.history)} iterations)"
+        for result in results.values()
+    )
+    before = measured["base"].figures
+    tiles = []
+    for name, result in results.items():
+        after, ratio = measured[name].figures, result.metrics["guard"]["ratio"]
+        tiles += [
+            Tile(f"{name}: objects per scene", f"{after['objects']:.1f}", f"from {before['objects']:.1f}"),
+            Tile(f"{name}: feasible as sampled", _share(after), f"of free objects, from {_share(before)}"),
+            Tile(f"{name}: held-out loss", f"{ratio:.2f}×", "of the base prior"),
+        ]
+    raw = draw_side_by_side(measured, directory / "samples.png")
+    ready = draw_side_by_side(measured, directory / "ready.png", ready=True)
+    count = int(before["scenes"])
+    sections = [
+        Section(
+            "As sampled",
+            "The first samples of each prior, untouched. The scenes of a row start from the same noise.",
+            [Picture(raw, "Columns: " + ", ".join(measured))],
+        ),
+        Section(
+            "Simulation-ready",
+            "The same samples, projected out of penetration and settled. Red objects are not ready: they still move, "
+            "penetrate, or have left the workspace.",
+            [Picture(ready, "Columns: " + ", ".join(measured))],
+        ),
+        Section(
+            "Numbers", f"Means over {count} samples.", table=number_rows({n: m.figures for n, m in measured.items()})
+        ),
+        Section(
+            "The curves",
+            "Reward of each batch, and the held-out pretraining loss over that of the base prior.",
+            [
+                Picture(result.directory / "curve.png", f"{name}: {_goal(result.config)}")
+                for name, result in results.items()
+            ],
+        ),
+    ]
+    title = f"{base.scene_type.name.replace('_', ' ').capitalize()}, steered two ways"
+    lead = (
+        f"One prior, post-trained toward {runs}, each with the pretraining loss on real scenes as regularisation. "
+        f"All numbers are means over {count} fresh, seeded samples of each prior; none was selected."
+    )
+    settings = {
+        f"{name}: {key}": value for name, result in results.items() for key, value in result.config.plain().items()
+    }
+    return Page(title, lead, tiles, sections, settings)
+
+
+def _share(figures: Mapping[str, float]) -> str:
+    share = figures.get("feasible_fraction")
+    return "–" if share is None else f"{share:.0%}"
+
+
+def _goal(config: PostTrainConfig) -> str:
+    return reward_name(config.reward).replace("_", " ")
+
+
+def _algorithm(config: PostTrainConfig) -> str:
+    return config.algorithm.name.upper().replace("_", "-")
+
+
+def _say(config: PostTrainConfig, text: str) -> None:
+    if config.logger.progress != "none":
+        print(text, file=sys.stderr, flush=True)

@@ -58,7 +58,10 @@ def test_groups_have_a_dozen_keys_at_most(kind: type) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "recipe"), [(PretrainConfig, "paper"), (PostTrainConfig, "demo")])
+@pytest.mark.parametrize(
+    ("kind", "recipe"),
+    [(PretrainConfig, "paper"), (PostTrainConfig, "demo_clutter"), (PostTrainConfig, "demo_feasible")],
+)
 def test_a_recipe_is_the_same_in_python(kind: Any, recipe: str) -> None:
     assert kind(recipe=recipe) == compose("x", kind, [f"recipe={recipe}"]) != kind()
     given = kind(recipe=recipe, iterations=3, optimizer={"lr": 0.5})
@@ -130,7 +133,7 @@ def test_a_written_config_gives_the_same_settings(command: str, tmp_path: Path) 
 def test_words_win_over_a_file(tmp_path: Path) -> None:
     from agents.cli.keys import Sources
 
-    settings = PostTrainConfig(recipe="demo", algorithm="ddpo_is", reward={"name": "clip", "high": 3})
+    settings = PostTrainConfig(recipe="demo_clutter", algorithm="ddpo_is", reward={"name": "clip", "high": 3})
     (tmp_path / "config.yaml").write_text(config_text(settings))
     source = Sources(config=str(tmp_path / "config.yaml"))
     assert compose("post-train", PostTrainConfig, [], source) == settings

@@ -72,18 +72,18 @@ def test_page_needs_nothing_but_itself_and_escapes_text(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_demonstration_end_to_end(tmp_path: Path) -> None:
     pytest.importorskip("scene_envs.physics")
-    recipe = small_config(tmp_path, iterations=2)
-    metrics = run_demo(tmp_path / "demo", workers=0, scenes=2, num_steps=4, recipe=recipe, prior=tiny_prior(slots=6))
-    on_disk = json.loads((tmp_path / "demo" / "metrics.json").read_text())
-    for part in ("before", "after"):
-        assert {"objects", "feasible_objects", "ready_objects"} <= on_disk[part].keys()
-    assert on_disk["guard"]["ratio"] == pytest.approx(metrics["guard"]["ratio"])
-    for name in ("report.html", "curve.png", "before.png", "after.png", "config.yaml", "log.csv"):
-        assert (tmp_path / "demo" / name).stat().st_size > 0
-    base, steered = tiny_prior(slots=6), ScenePrior.load(tmp_path / "demo")
-    assert on_disk["before"]["objects"] == pytest.approx(
-        float(base.sample(2, num_steps=4, seed=100_000).counts.float().mean())
-    )
-    assert on_disk["after"]["objects"] == pytest.approx(
-        float(steered.sample(2, num_steps=4, seed=100_000).counts.float().mean())
-    )
+    recipes = {
+        "clutter": small_config(tmp_path, iterations=2),
+        "feasible": small_config(tmp_path, iterations=1, algorithm="nft", reward="feasible_share"),
+    }
+    folder = tmp_path / "demo"
+    metrics = run_demo(folder, workers=0, scenes=2, num_steps=4, recipes=recipes, prior=tiny_prior(slots=6))
+    on_disk = json.loads((folder / "metrics.json").read_text())
+    assert on_disk["runs"]["clutter"]["guard"]["ratio"] == metrics["runs"]["clutter"]["guard"]["ratio"]
+    priors = {"base": tiny_prior(slots=6), **{name: ScenePrior.load(folder / name) for name in recipes}}
+    for name, prior in priors.items():
+        assert {"objects", "feasible_objects", "ready_objects"} <= on_disk[name].keys()
+        counts = prior.sample(2, num_steps=4, seed=100_000).counts.float()
+        assert on_disk[name]["objects"] == pytest.approx(float(counts.mean()))
+    for name in ("report.html", "samples.png", "ready.png", "clutter/curve.png", "feasible/log.csv"):
+        assert (folder / name).stat().st_size > 0

@@ -23,7 +23,7 @@ COMMANDS = {
     "rewards": "list the rewards, those of installed packages included",
     "import-checkpoint": "make a prior of a checkpoint of the paper's authors",
     "check-reward": "check that a reward keeps its contract",
-    "demo": "post-train the shipped prior, compare before and after, write a report",
+    "demo": "steer the shipped prior two ways, compare the results, write a report",
 }
 """What each command does, in the order of the listing."""
 

@@ -14,7 +14,7 @@ class DemoConfig:
     """The demonstration.
 
     Attributes:
-        output: folder for report.html, curve.png, before.png, after.png, metrics.json and the post-trained prior.
+        output: folder for report.html, samples.png, ready.png, metrics.json and the two runs, clutter and feasible.
         seed: of training and of the samples.
         workers: physics worker processes.
     """
@@ -30,9 +30,11 @@ def config() -> type[DemoConfig]:
 
 
 def run(settings: DemoConfig, run: Run) -> None:
-    """Post-train, compare, report."""
-    from agents.cli.commands.post_train import say_change
-    from agents.post_training.demo import run_demo
+    """Post-train twice, compare, report."""
+    from agents.post_training.comparison import number_rows
+    from agents.post_training.demo import RUNS, run_demo
 
-    say_change(run_demo(settings.output, settings.seed, settings.workers), run)
-    run.say(f"open {run.directory / 'report.html'}; scene-envs sample prior={run.directory} draws more")
+    metrics = run_demo(settings.output, settings.seed, settings.workers)
+    for label, *cells in number_rows({name: metrics[name] for name in ("base", *RUNS)}):
+        run.say(f"{label:<40} " + "  ".join(f"{cell:>14}" for cell in cells))
+    run.say(f"open {run.directory / 'report.html'}; scene-envs sample prior={run.directory / RUNS[1]} draws more")
