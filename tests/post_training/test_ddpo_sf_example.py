@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -16,18 +15,12 @@ from agents.diffusion.reverse_steps import gaussian_log_prob
 from agents.post_training import compute_advantages
 from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
+from tests.helpers.examples import load_example
 
 
 @pytest.fixture(scope="module")
 def example() -> ModuleType:
-    path = Path(__file__).parents[2] / "examples" / "ddpo_sf.py"
-    spec = importlib.util.spec_from_file_location("ddpo_sf_example", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+    return load_example("ddpo_sf")
 
 
 SMALL = {"iterations": 2, "batch_size": 4, "num_steps": 5, "gradient_steps": 2, "real_scenes": 32}
