@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from scene_envs.envs import SearchState
+from scene_envs.envs import MaskChoiceState, SearchState
 from scene_envs.errors import CorruptFileError, InvalidInputError
 
 _MAGIC = b"scene-envs search 1\n"
@@ -69,7 +69,7 @@ class Journal:
 
     def add(self, states: Sequence[SearchState]) -> None:
         """Write the states of a round."""
-        self._append([{field.name: getattr(state, field.name) for field in fields(SearchState)} for state in states])
+        self._append([{field.name: getattr(state, field.name) for field in fields(state)} for state in states])
 
     def _begin(self, settings: Mapping[str, str]) -> None:
         self.path.write_bytes(_MAGIC)
@@ -108,7 +108,11 @@ class Journal:
                 raise InvalidInputError(
                     f"{self.path} is of a search with {name}={before}, not {now}; give another output, or that value"
                 )
-        self._states = [SearchState(**state) for states in records[1:] for state in states]
+        self._states = [_state(values) for states in records[1:] for values in states]
+
+
+def _state(values: Mapping[str, Any]) -> SearchState:
+    return MaskChoiceState(**values) if "masks" in values else SearchState(**values)
 
 
 def _described(value: Any) -> str:
