@@ -49,7 +49,8 @@ for (const card of document.querySelectorAll("button.card"))
 
 const [LEFT, RIGHT, TOP, BOTTOM] = [46, 990, 12, 336];
 const plot = element("plot");
-const values = [...data.objective.slice(1), ...data.baseline].filter((value) => value !== null);
+const baseline = data.baseline.slice(0, count); // as many samples as this search made
+const values = [...data.objective.slice(1), ...baseline].filter((value) => value !== null);
 const [lowest, highest] = [Math.min, Math.max].map((pick) => values.reduce((a, b) => pick(a, b)));
 const gap = tickSize(lowest, highest, 6);
 const [low, high] = [Math.floor(lowest / gap) * gap, Math.ceil(highest / gap) * gap];
@@ -84,7 +85,7 @@ function stairs(numbers) {
     path += path ? `H${x(index + 1).toFixed(1)}V${y(value).toFixed(1)}` : `M${x(index + 1).toFixed(1)} ${y(value).toFixed(1)}`;
     best = value;
   });
-  return path && `${path}H${x(Math.min(count, numbers.length)).toFixed(1)}`;
+  return path && `${path}H${x(numbers.length).toFixed(1)}`;
 }
 
 for (const value of ticks(low, high, gap)) {
@@ -99,7 +100,7 @@ draw("text", { x: 0, y: 0, transform: `translate(11 ${(TOP + BOTTOM) / 2}) rotat
 const scenes = data.parent.map((_, scene) => scene).filter(scored);
 draw("path", { class: "edges", d: scenes.filter((s) => scored(data.parent[s])).map((s) => `M${at(data.parent[s])}L${at(s)}`).join("") });
 draw("path", { class: "dots", d: scenes.map((s) => `M${at(s)}h0`).join("") });
-if (data.baseline.length) draw("path", { class: "base", d: stairs(data.baseline) });
+if (baseline.length) draw("path", { class: "base", d: stairs(baseline) });
 draw("path", { class: "best", d: stairs(data.objective.slice(1)) });
 draw("path", { class: "way", d: `M${data.path.map(at).join("L")}` });
 draw("path", { class: "way dots", d: data.path.map((s) => `M${at(s)}h0`).join("") });
