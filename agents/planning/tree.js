@@ -7,7 +7,7 @@ const viewer = element("viewer");
 
 // -- the 3-D view -------------------------------------------------------------------------------------------------
 
-const view = () => viewer.contentWindow.sceneViewer;
+const view = () => viewer.contentWindow && viewer.contentWindow.sceneViewer;
 let timer = 0;
 
 function show(frame) {
@@ -42,8 +42,35 @@ function visit(frame) {
   viewer.scrollIntoView({ block: "center", behavior: "smooth" });
 }
 
-for (const card of document.querySelectorAll("button.card"))
+// -- the cards: the 3-D view draws their pictures, one after another, those in sight alone -------------------------
+
+const due = [];
+
+function paint() {
+  if (!due.length) return;
+  if (!view()) return void setTimeout(paint, 50); // it is still loading
+  const card = due.shift(), canvas = card.firstElementChild;
+  const image = view().picture(Number(card.dataset.frame), canvas.width, canvas.height, data.masks[card.dataset.frame]);
+  if (image) canvas.getContext("2d").putImageData(image, 0, 0);
+  else canvas.hidden = true; // no WebGL
+  card.dataset.painted = "";
+  setTimeout(paint, 10);
+}
+
+const watcher = new IntersectionObserver((entries) => {
+  const idle = !due.length;
+  for (const { isIntersecting, target } of entries)
+    if (isIntersecting) {
+      watcher.unobserve(target);
+      due.push(target);
+    }
+  if (idle) paint();
+}, { rootMargin: "200px" });
+
+for (const card of document.querySelectorAll("button.card")) {
   card.addEventListener("click", () => visit(Number(card.dataset.frame)));
+  watcher.observe(card);
+}
 
 // -- the plot -----------------------------------------------------------------------------------------------------
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 import heapq
-import io
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,18 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from agents.planning.tree_file import SearchRecord, TreeNode
 from scene_envs.files import finite, write_text
 from scene_envs.scene import SceneBatch
 
 LONGEST_PATH = 60
-"""Scenes of the best path with a picture; a longer path has some of its steps left out."""
+"""Scenes of the best path that are shown; a longer path has some of its steps left out."""
 BEST_NODES = 24
-"""Other scenes with a picture, the best ones."""
-_WIDTH, _HEIGHT = 200, 150
-"""Size of a picture, pixels."""
+"""Other scenes that are shown, the best ones."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +32,7 @@ class Card:
         row: counted from 0; a first child is in the row of its parent.
         parent: index of the parent's card; None for a first sample.
         number: which scene of its search it is, counted from 1.
-        frame: its place in the 3-D view; None without a picture.
-        picture: as a data URI.
+        frame: its place in the 3-D view, which draws its picture; None without one.
         on_path: whether it leads to the best scene.
     """
 
@@ -48,7 +42,6 @@ class Card:
     parent: int | None
     number: int
     frame: int | None
-    picture: str | None
     on_path: bool
 
 
@@ -94,7 +87,7 @@ def write_tree_page(
     captions = [_caption(record.nodes[node], number, way) for node in shown]
     if returned is not None:
         captions.append("the scene that the search returned")
-    cards = _cards(record, dict(zip(shown, _pictures(record, scenes), strict=True)), way)
+    cards = _cards(record, shown, way)
     on_path = set(way)
     steps = [k for k, node in enumerate(shown) if node in on_path] + ([] if returned is None else [len(shown)])
     data = {
@@ -104,6 +97,7 @@ def write_tree_page(
         "depth": [node.depth for node in tree],
         "below": [node.visits for node in tree],
         "redo": [len(node.mask) for node in tree],
+        "masks": [record.nodes[node].mask for node in shown],
         "frame": {number[node]: frame for frame, node in enumerate(shown)},
         "path": [number[node] for node in way],
         "steps": steps,
@@ -135,15 +129,15 @@ def write_tree_page(
     return path
 
 
-def _cards(record: SearchRecord, pictures: Mapping[int, str], way: Sequence[int]) -> list[Card]:
-    """The scenes with pictures and all their ancestors but the root, parents first; the best path in the first row.
+def _cards(record: SearchRecord, shown: Sequence[int], way: Sequence[int]) -> list[Card]:
+    """The scenes that are shown and all their ancestors but the root, parents first; the best path in the first row.
 
     A chain of first children takes the highest row that is free in all its columns.
     """
-    frames, on_path = {node: frame for frame, node in enumerate(pictures)}, set(way)
+    frames, on_path = {node: frame for frame, node in enumerate(shown)}, set(way)
     number = {node.id: k for k, node in enumerate(record.tree_of(0))}
     children: dict[int | None, list[int]] = {}
-    for each in {ancestor for shown in pictures for ancestor in record.path(shown)[1:]}:
+    for each in {ancestor for node in shown for ancestor in record.path(node)[1:]}:
         children.setdefault(record.nodes[each].parent, []).append(each)
     for siblings in children.values():
         siblings.sort(key=lambda each: (each not in on_path, -(record.nodes[each].value or 0.0), each))
@@ -160,27 +154,9 @@ def _cards(record: SearchRecord, pictures: Mapping[int, str], way: Sequence[int]
         for column, node in enumerate(chain, start=first):
             used[column], parent = row + 1, None if node.parent is None else index.get(node.parent)
             index[node.id] = len(cards)
-            picture, shown = pictures.get(node.id), frames.get(node.id)
-            cards.append(Card(node, column, row, parent, number[node.id], shown, picture, node.id in on_path))
+            cards.append(Card(node, column, row, parent, number[node.id], frames.get(node.id), node.id in on_path))
             chains.extend(children.get(node.id, [])[1:])
     return cards
-
-
-def _pictures(record: SearchRecord, scenes: Mapping[int, SceneBatch]) -> list[str]:
-    """Small pictures as data URIs, what is regenerated next in red."""
-    from PIL import Image
-
-    from scene_envs.render import render
-
-    pictures = []
-    for node, scene in scenes.items():
-        marked = torch.zeros_like(scene.is_free)
-        marked[0, list(record.nodes[node].mask)] = True
-        image = render(scene, width=2 * _WIDTH, height=2 * _HEIGHT, highlight=marked & scene.is_free)[0]
-        buffer = io.BytesIO()
-        Image.fromarray(image).resize((_WIDTH, _HEIGHT), Image.Resampling.LANCZOS).save(buffer, "JPEG", quality=85)
-        pictures.append(f"data:image/jpeg;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}")
-    return pictures
 
 
 def _caption(node: TreeNode, number: Mapping[int, int], way: Sequence[int]) -> str:

@@ -60,7 +60,7 @@ def write_viewer(
 
 
 def viewer_page(batch: SceneBatch, *, captions: Sequence[str] | None = None, title: str | None = None) -> str:
-    """The page of :func:`write_viewer`; around a frame with it, ``sceneViewer.showScene(k)`` there shows scene k."""
+    """The page of :func:`write_viewer`; a script around its frame shows scene k with ``sceneViewer.showScene(k)``."""
     if len(batch) == 0:
         raise InvalidInputError("a viewer needs at least one scene; the batch is empty")
     if captions is None:
