@@ -215,13 +215,13 @@ function readAddress() {
   if (asked.has("select")) select(Math.round(number("select", -1)));
 }
 
-// A small picture of a scene as ImageData, with some slots in red; nothing without WebGL.
+// A small picture of a scene as ImageData, with some slots marked; nothing without WebGL.
 function picture(index, width, height, marked = []) {
   if (!renderer) return null;
-  const red = 65535; // a slot that no scene has
-  const objects = scenes[index].map((object) => (marked.includes(object.slot) ? { ...object, slot: red } : object));
+  const chosen = 65535; // a slot that no scene has
+  const objects = scenes[index].map((object) => (marked.includes(object.slot) ? { ...object, slot: chosen } : object));
   renderer.setObjects(objects, new Set());
-  const plain = { ...look(), colors: "natural", shape: "visual", hovered: -1, selected: marked.length ? red : -1 };
+  const plain = { ...look(), colors: "natural", shape: "visual", hovered: -1, selected: marked.length ? chosen : -1 };
   const image = renderer.snapshot(homeView(index, width / height), plain, width, height);
   renderer.setObjects(scenes[state.scene], state.hidden);
   return image;
