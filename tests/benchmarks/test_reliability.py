@@ -4,7 +4,11 @@ from collections.abc import Callable
 
 import pytest
 
-from benchmarks.reliability import Figures, fuzzed_files, fuzzed_lines, hostile_rewards, kills, two_writers
+from benchmarks.reliability.command_lines import fuzzed_lines
+from benchmarks.reliability.damaged_files import fuzzed_files
+from benchmarks.reliability.figures import Figures
+from benchmarks.reliability.interruptions import kills, two_writers
+from benchmarks.reliability.rewards import hostile_rewards
 
 
 def assert_clean(figures: Figures, tried: int) -> None:
