@@ -7,8 +7,6 @@ import hashlib
 import os
 import pickle
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -18,38 +16,33 @@ from scene_envs.datasets import StorageError, judge_scenes
 from scene_envs.datasets import shards as shards_module
 from scene_envs.errors import CorruptFileError
 from scene_envs.scene import SceneBatch
-from tests.helpers.toy_grammars import CUPS_COUNT, CUPS_SHARD, generate_cups
-
-ROOT = str(Path(__file__).parents[2])
+from tests.helpers.forked import forked
+from tests.helpers.toy_grammars import CUPS_COUNT, generate_cups
 
 
 def _hashes(folder: Path) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
 
 
-_SLOW = f"""
-import sys, time
-sys.path.insert(0, {ROOT!r})
-from tests.helpers import toy_grammars
-from scene_envs.datasets import generate, shards
-judge = shards.judge_scenes
-def slowly(batch):
-    time.sleep(0.05)
-    return judge(batch)
-shards.judge_scenes = slowly
-shards._MAX_CHUNK = 4
-generate("toy_cups", {CUPS_COUNT}, sys.argv[1], seed=3, shard_size={CUPS_SHARD}, workers=0, progress=False)
-"""
+def _generate_slowly(output: Path) -> None:
+    def slowly(batch: SceneBatch) -> list[str]:
+        time.sleep(0.05)
+        return judge_scenes(batch)
+
+    shards_module.judge_scenes = slowly
+    shards_module._MAX_CHUNK = 4
+    generate_cups(output)
 
 
 @pytest.mark.slow
 def test_killed_and_started_again_the_files_are_the_same(cups: Path, tmp_path: Path) -> None:
     """Killed in the middle of the second shard; the first is whole, and the journal holds what was judged."""
-    process = subprocess.Popen([sys.executable, "-c", _SLOW, str(tmp_path)])
-    while process.poll() is None and not (tmp_path / ".scenes-00001.parquet.journal").exists():
+    process = forked(_generate_slowly, tmp_path)
+    while process.is_alive() and not (tmp_path / ".scenes-00001.parquet.journal").exists():
         time.sleep(0.002)
     process.kill()
-    assert process.wait() == -signal.SIGKILL
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
     assert (tmp_path / "scenes-00000.parquet").is_file()
     assert not (tmp_path / "scenes-00001.parquet").exists()
     (tmp_path / ".scenes-00001.parquet.77.partial").write_bytes(b"PAR1 half a file")  # of yet another process

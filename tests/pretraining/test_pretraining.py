@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import csv
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
 from agents.cli import main
 from agents.configuration.tree import changed
@@ -265,17 +263,21 @@ def test_a_grammar_without_end_trains_a_prior_that_reads_prompts(tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_two_processes_take_the_steps_of_one_with_twice_the_parts(tmp_path: Path) -> None:
+def test_two_processes_take_the_steps_of_one_with_twice_the_parts(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     generate("dimsum_table", 16, tmp_path / "data", workers=0, verify=False, progress=False)
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
-    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
     keys = ["iterations=4", "batch_size=8", "network.hidden=16", "network.depth=1", "network.heads=2", "seed=3"]
     keys += ["optimizer.warmup=2", "logger.log_every=1"]
     data = [f"data={tmp_path / 'data'}", f"heldout={tmp_path / 'data'}"]
-    command = [*launcher, "-m", "agents.cli", "pretrain", *data, *keys, f"output={tmp_path / 'two'}"]
-    done = subprocess.run(command, env=environment, capture_output=True, timeout=240, text=True)
-    assert done.returncode == 0, done.stderr[-3000:]
-    assert done.stdout.count("held-out loss") == 1  # the first process alone speaks
+    settings = LaunchConfig(
+        1, 1, 2, rdzv_backend="c10d", rdzv_endpoint="localhost:0", start_method="fork", run_id="two"
+    )
+    done = elastic_launch(settings, main)(
+        ["pretrain", *data, *keys, f"output={tmp_path / 'two'}"]
+    )  # what torchrun does
+    assert done == {0: 0, 1: 0}
+    assert capfd.readouterr().out.count("held-out loss") == 1  # the first process alone speaks
     assert main(["pretrain", *data, *keys, "optimizer.accumulate=2", f"output={tmp_path / 'one'}"]) == 0
     for name in ("two", "one"):
         assert {"config.yaml", "metrics.json", "prior"} <= {path.name for path in (tmp_path / name).iterdir()}
