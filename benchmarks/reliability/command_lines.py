@@ -25,12 +25,12 @@ def fuzzed_lines(count: int, seed: int = 0) -> Figures:
     from importlib import import_module
 
     from agents.cli.commands import COMMANDS
-    from agents.cli.keys import describe_fields
+    from agents.cli.keys import describe_fields, keys_of
 
     rng, figures = random.Random(seed), Figures()
     names = [name for name in COMMANDS if name not in ("demo", "pretrain", "evaluate", "generate")]
     keys = {
-        name: [key.name for key in describe_fields(import_module(_module(name)).config()) if key.name != "output"]
+        name: [key.name for key in describe_fields(keys_of(import_module(_module(name)))) if key.name != "output"]
         for name in COMMANDS
     }
     with tempfile.TemporaryDirectory() as place:

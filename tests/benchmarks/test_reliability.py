@@ -1,8 +1,8 @@
 """A reduced form of the reliability benchmark: nothing lost, nothing different, nothing silent.
 
-Its trials that kill commands or let two write into one folder take minutes. Other tests hold the same: exact resume of
-killed runs in ``tests/post_training``, ``tests/pretraining`` and ``tests/datasets``, one writer per folder in ``tests/core``
-and ``tests/cli``.
+Its trials that kill commands or let two write into one folder take minutes. Other tests ask the same: exact resume of
+killed runs in ``tests/post_training``, ``tests/pretraining`` and ``tests/datasets``, one writer per folder in
+``tests/core`` and ``tests/cli``.
 """
 
 from collections.abc import Callable
@@ -20,6 +20,7 @@ def assert_clean(figures: Figures, tried: int) -> None:
     assert (figures.lost, figures.different, figures.silent) == (0, 0, 0), figures.notes
 
 
+@pytest.mark.slow
 def test_damaged_files_are_named_or_read_as_they_were():
     assert_clean(fuzzed_files(24, seed=5), 24)
 

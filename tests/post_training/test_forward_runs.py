@@ -57,16 +57,17 @@ def test_more_objects_after_training_on_their_number(tmp_path: Path, algorithm: 
     config = forward_config(
         tmp_path,
         algorithm,
-        iterations=30,
+        iterations=15,
         batch_size=16,
         regularisation={"weight": 0.0, "bank_size": 24},
-        optimizer={"lr": 3e-3},
+        optimizer={"lr": 5e-3},
         algorithm_settings={"credit": "scene", "sampler_decay": 0.3},
     )
     rewards = [row["reward"] for row in post_train(config, prior=tiny_prior(process=process)).history]
     assert sum(rewards[-5:]) / 5 > sum(rewards[:5]) / 5 + 1.0
 
 
+@pytest.mark.slow
 def test_what_sampled_the_scenes_is_saved(tmp_path: Path) -> None:
     trainer = PostTrainer(
         forward_config(tmp_path, "nft", guard={"scenes": 8, "every": 2, "limit": 100.0}), prior=tiny_prior()

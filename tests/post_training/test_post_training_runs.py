@@ -43,6 +43,7 @@ def test_the_base_prior_is_left_as_it_was(tmp_path: Path) -> None:
     assert all(torch.equal(before[name], tensor) for name, tensor in prior.state_dict().items())
 
 
+@pytest.mark.slow
 def test_chunks_do_not_change_the_gradient(tmp_path: Path) -> None:
     rows = []
     for chunk in (None, 2):
@@ -55,7 +56,7 @@ def test_chunks_do_not_change_the_gradient(tmp_path: Path) -> None:
 def test_more_objects_after_training_on_their_number(tmp_path: Path) -> None:
     config = small_config(
         tmp_path,
-        iterations=30,
+        iterations=20,
         batch_size=16,
         gradient_steps=4,
         credit="object",

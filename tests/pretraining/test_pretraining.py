@@ -270,12 +270,9 @@ def test_two_processes_take_the_steps_of_one_with_twice_the_parts(
     keys = ["iterations=4", "batch_size=8", "network.hidden=16", "network.depth=1", "network.heads=2", "seed=3"]
     keys += ["optimizer.warmup=2", "logger.log_every=1"]
     data = [f"data={tmp_path / 'data'}", f"heldout={tmp_path / 'data'}"]
-    settings = LaunchConfig(
-        1, 1, 2, rdzv_backend="c10d", rdzv_endpoint="localhost:0", start_method="fork", run_id="two"
-    )
-    done = elastic_launch(settings, main)(
-        ["pretrain", *data, *keys, f"output={tmp_path / 'two'}"]
-    )  # what torchrun does
+    place = {"rdzv_backend": "c10d", "rdzv_endpoint": "localhost:0", "run_id": "two"}
+    launch = elastic_launch(LaunchConfig(1, 1, 2, start_method="fork", **place), main)  # as torchrun does
+    done = launch(["pretrain", *data, *keys, f"output={tmp_path / 'two'}"])
     assert done == {0: 0, 1: 0}
     assert capfd.readouterr().out.count("held-out loss") == 1  # the first process alone speaks
     assert main(["pretrain", *data, *keys, "optimizer.accumulate=2", f"output={tmp_path / 'one'}"]) == 0
@@ -301,9 +298,9 @@ def test_one_prior_is_trained_on_several_scene_types(tmp_path: Path) -> None:
     )  # fmt: skip
     prior, data, heldout = prepare(config)
     assert prior.scene_type.name == "dimsum_table+pantry_shelf"
-    scenes, prompts = data.draw(400, torch.Generator().manual_seed(0), prompts=True)
+    scenes, prompts = data.draw(150, torch.Generator().manual_seed(0), prompts=True)
     tables = prior.decode(scenes).categories == prior.scene_type.assets.index("cafe_table")
-    assert float(tables.any(dim=1).float().mean()) == pytest.approx(0.5, abs=0.08)
-    assert len(prompts) == 400
+    assert float(tables.any(dim=1).float().mean()) == pytest.approx(0.5, abs=0.12)
+    assert len(prompts) == 150
     trained = Pretrainer(config, data, heldout if len(heldout) else scenes[:4], prior).run()
     assert trained.sample(2, prompt="A scene with 9 objects.", num_steps=2).tensor.shape[1] == 61

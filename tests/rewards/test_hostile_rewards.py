@@ -92,6 +92,7 @@ def test_rewards_of_this_package_and_objects_stay_in_this_process():
     assert not is_foreign("only_in_this_process")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("plugin")
 def test_an_installed_reward_is_run_elsewhere():
     assert is_foreign("open_space")
