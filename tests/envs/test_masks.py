@@ -189,7 +189,7 @@ def test_a_registered_mask_works_by_name_in_the_environment(prior: ToyPrior, fre
     observation, _ = env.reset(seed=0)
     welded = env.scene().is_welded[0].numpy()
     assert observation["regenerate"].tolist() == ((np.arange(34) % 2 == 1) & ~welded).tolist()
-    with pytest.raises(InvalidInputError, match="mask name"):
+    with pytest.raises(InvalidInputError, match="mask generator name"):
         register_mask("odd slots")
 
 
