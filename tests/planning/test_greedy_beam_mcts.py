@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from agents.planning import BeamPlanner, GreedyPlanner, MCTSPlanner, UCTPlanner
-from tests.planning.test_planners import Path, ToyTree, matches, scrambled
+from tests.helpers.toy_tree import Path, ToyTree, matches, scrambled
 
 PLANNERS = [
     BeamPlanner(children=3),
