@@ -65,10 +65,10 @@ def pool() -> Iterator[PhysicsPool]:
         yield pool
 
 
-@pytest.mark.parametrize(("name", "count"), [("dimsum_table", 2), ("pantry_shelf", 2), ("restaurant_low_clutter", 1)])
-def test_no_history_changes_a_result(name: str, count: int, pool: PhysicsPool) -> None:
+@pytest.mark.parametrize("name", ["dimsum_table", "pantry_shelf"])
+def test_no_history_changes_a_result(name: str, pool: PhysicsPool) -> None:
     """Each function of each scene alone, after others in a random order, and in workers with histories of their own."""
-    batch = crowded(name)[:count]
+    batch = crowded(name)
     expected = {key: function(batch) for key, function in FUNCTIONS.items()}
     calls = [(key, row) for key in FUNCTIONS for row in range(len(batch))]
     for index in np.random.default_rng(sum(map(ord, name))).permutation(len(calls)):
