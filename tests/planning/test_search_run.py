@@ -121,6 +121,7 @@ def test_progress_names_the_planner(run: Run) -> None:
     assert told[-1] == ("best of N", 24, 24)
 
 
+@pytest.mark.slow
 def test_an_objective_that_never_scores_is_an_error(run: Run) -> None:
     def broken(batch: SceneBatch, context: RewardContext) -> RewardOutput:
         raise RuntimeError("no such sensor")

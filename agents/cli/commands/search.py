@@ -33,11 +33,6 @@ class SearchKeys(SearchConfig):
     output: str = ""
 
 
-def config() -> type[SearchKeys]:
-    """The keys of this command."""
-    return SearchKeys
-
-
 def run(settings: SearchKeys, run: Run) -> None:
     """Search; the search writes its own metrics and pictures."""
     from rich.console import Console
