@@ -115,7 +115,7 @@ class DenoisingCore:
         return decode_scenes(self.prior, self._x)
 
     def object_mask(self) -> Tensor:
-        """(B, N) int8: slots whose arg-max category is not empty."""
+        """(B, N) int8: slots whose arg-max category is not empty; those not drawn yet are empty."""
         return occupied(self._x, self.scene_type)
 
     @property

@@ -68,9 +68,13 @@ def decode_scenes(prior: PriorLike, x: Tensor) -> SceneBatch:
 
 
 def occupied(x: Tensor, scene_type: SceneType) -> Tensor:
-    """(B, N) int8: 1 where the arg-max category of normalised or raw scenes (B, N, D) is not *empty*."""
+    """(B, N) int8: 1 where the arg-max category of normalised or raw scenes (B, N, D) is not *empty*.
+
+    Slots whose category is not drawn yet, rows of zeros of a mixed prior, count as empty.
+    """
     category = x[..., -(scene_type.num_assets + 1) :]
-    return (category.argmax(dim=-1) != category.shape[-1] - 1).to(torch.int8)
+    drawn = (category != 0).any(dim=-1)
+    return (drawn & (category.argmax(dim=-1) != category.shape[-1] - 1)).to(torch.int8)
 
 
 def check_action(action: Any, shape: tuple[int, ...], axes: tuple[str, ...]) -> Tensor:
