@@ -136,6 +136,8 @@ def compose(command: str, config: type, words: Sequence[str], sources: Sources =
             check_option("experiment", value, sources.config_dir)
             read.append(word)
             continue
+        key = getattr(config, "SHORT", {}).get(key, key)
+        word = f"{key}={value}"
         check_not_moved(config, word, command)
         head = key.partition(".")[0]
         if head not in fields:

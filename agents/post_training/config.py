@@ -13,6 +13,7 @@ from agents.configuration.fields import composed, moved, named, nested
 from agents.configuration.settings import LoggerSettings, OptimizerSettings
 from agents.configuration.tree import plain_tree
 from agents.post_training.algorithms import AlgorithmSettings, DDPOSFSettings, algorithm_settings, list_algorithms
+from agents.post_training.hold import Target
 from scene_envs.envs.settings import PROMPT_SOURCES
 from scene_envs.errors import InvalidInputError
 
@@ -39,16 +40,22 @@ class PostTrainOptimizerSettings(OptimizerSettings):
 
 @dataclass
 class RegularisationSettings:
-    """The pretraining loss on real scenes, which keeps a prior a prior.
+    """What keeps a prior a prior: the pretraining loss on real scenes, and the KL divergence from the base prior.
 
     Attributes:
         weight: coefficient of the pretraining loss.
+        kl: coefficient of the KL divergence from the base prior, on own samples, in nats per random variable of a
+            scene; null for none, or 1 with ``hold=kl:VALUE``.
+        hold: what the run may lose, held by a factor on both coefficients: ``guard:1.05`` for the held-out loss as a
+            ratio to the base prior's, ``kl:0.01`` for the KL divergence; null keeps the coefficients as they are.
         batch_size: real scenes per update.
         scenes: ``grammar``, or the directory of a dataset.
         bank_size: how many real scenes are drawn (grammar) or read (dataset), the held-out ones included.
     """
 
     weight: float = 0.5
+    kl: float | None = None
+    hold: str | None = None
     batch_size: int = 48
     scenes: str = "grammar"
     bank_size: int = 4096
@@ -57,6 +64,24 @@ class RegularisationSettings:
         at_least(self, 1, "batch_size")
         if self.weight < 0:
             raise InvalidInputError(f"regularisation.weight={self.weight} must not be negative")
+        if self.kl is not None and not self.kl >= 0:
+            raise InvalidInputError(f"regularisation.kl={self.kl} must not be negative")
+        if self.target is not None and not self.weight and not self.kl_weight:
+            raise InvalidInputError(
+                f"hold={self.hold} adjusts regularisation.weight and regularisation.kl, and both are 0; give one"
+            )
+
+    @property
+    def target(self) -> Target | None:
+        """What ``hold`` says."""
+        return None if self.hold is None else Target.parse(self.hold)
+
+    @property
+    def kl_weight(self) -> float:
+        """``kl``, or what null stands for."""
+        if self.kl is None:
+            return float(self.target is not None and self.target.figure == "kl")
+        return self.kl
 
 
 FEWEST_SAMPLES = 20
@@ -145,6 +170,7 @@ class PostTrainConfig:
 
         - step_scale * sum over gradient steps of mean over scenes of  A * log p(x_{t-1} | x_t)
         + regularisation.weight * pretraining loss on real scenes
+        + regularisation.kl * KL divergence from the base prior
 
     with ``step_scale = steps with weight > 0 / gradient_steps``, log p reduced over a scene's entries as
     ``algorithm.log_prob_reduction`` says, and the pretraining loss a mean over scenes and entries. The weight means
@@ -190,6 +216,8 @@ class PostTrainConfig:
         "updates": "algorithm.updates, of algorithm=ddpo_is",
     }
     """Keys of earlier versions, and their names."""
+    SHORT: ClassVar[Mapping[str, str]] = {"hold": "regularisation.hold"}
+    """Keys that may be written without their group."""
 
     prior: str = "dimsum_table_continuous"
     reward: Any = named("object_count", "reward")
@@ -222,6 +250,12 @@ class PostTrainConfig:
         check_prompt(self.prompt, self.guidance)
         if self.optimizer.lr is None:
             self.optimizer = replace(self.optimizer, lr=self.algorithm.learning_rate)
+        target = self.regularisation.target
+        if target is not None and target.figure == "guard" and target.value > self.guard.limit:
+            raise InvalidInputError(
+                f"hold={self.regularisation.hold} lies beyond guard.limit={self.guard.limit:g}, past which no prior is "
+                f"kept; raise guard.limit, or hold at most guard:{self.guard.limit:g}"
+            )
         if self.regularisation.bank_size < self.guard.scenes + 1:
             raise InvalidInputError(
                 f"regularisation.bank_size={self.regularisation.bank_size} must exceed guard.scenes="

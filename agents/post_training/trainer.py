@@ -215,6 +215,7 @@ class PostTrainer:
             except NonFiniteGradient as error:
                 raise self._not_finite(error.figures) from None
         self.learner.algorithm.end_iteration()
+        self.learner.regularisation.observe("kl", row.get("kl"), self.iteration + 1)
         return row
 
     # -- guard ----------------------------------------------------------------------------------
@@ -250,6 +251,7 @@ class PostTrainer:
             reading = self.guard.check(prior, self.iteration, reward, realism(rollout.batch), sample=sample)
             if reading.kept:
                 self._save_prior()
+        self.learner.regularisation.observe("guard", reading.ratio, self.iteration)
         figures = {f"guard_{name}": value for name, value in reading.samples.items()}
         self.history[-1] |= {"guard_loss": reading.loss, "guard_ratio": reading.ratio, **figures, **reading.realism}
         self._picture(reading)
@@ -336,6 +338,7 @@ class PostTrainer:
                 ),
             },
             "guard": {**self.guard.summary(), "rollbacks": self.rollbacks},
+            "hold": self.learner.regularisation.summary(),
         }
         write_metrics(self.directory, metrics)
         name = f"mean {reward_name(self.config.reward).replace('_', ' ')}"

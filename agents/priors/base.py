@@ -357,6 +357,11 @@ class ScenePrior(Inpainting, nn.Module, ABC):
             text: tokens (B, L, W) and their mask (B, L), as :meth:`encode_prompts` gives them; None without prompts.
         """
 
+    def denoised(self, noised: NoisedScenes, output: DenoiserOutput) -> Tensor:
+        """(B, N, F) what the continuous ``output`` of noised scenes says of x_0."""
+        features = output.continuous.shape[-1]
+        return self.process.x0_from_output(noised.x_t[..., :features], noised.t, output.continuous)
+
     @property
     def pose_width(self) -> int:
         """Leading features of the continuous output that are poses; the others, if any, are categories."""
