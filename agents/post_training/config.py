@@ -14,6 +14,7 @@ from agents.configuration.settings import LoggerSettings, OptimizerSettings
 from agents.configuration.tree import plain_tree
 from agents.post_training.algorithms import AlgorithmSettings, DDPOSFSettings, algorithm_settings, list_algorithms
 from agents.post_training.hold import Target
+from agents.priors.names import split_name
 from scene_envs.envs.settings import PROMPT_SOURCES
 from scene_envs.errors import InvalidInputError
 
@@ -21,12 +22,16 @@ RESUMABLE = ("recipe", "iterations", "output", "workers", "logger", "reward_time
 """Fields that may change between a run and its continuation."""
 
 
+_ADAPTER_RATE = 10.0
+"""Learning rate of low-rank updates over that of all weights."""
+
+
 @dataclass
 class PostTrainOptimizerSettings(OptimizerSettings):
     """The optimiser of a post-training run; its steps are updates.
 
     Attributes:
-        lr: peak learning rate; null takes the algorithm's own.
+        lr: peak learning rate; null takes the algorithm's own, ten times that with an adapter.
         chunk: scenes per forward and backward pass; null takes the whole batch at once.
     """
 
@@ -82,6 +87,28 @@ class RegularisationSettings:
         if self.kl is None:
             return float(self.target is not None and self.target.figure == "kl")
         return self.kl
+
+
+@dataclass
+class AdapterSettings:
+    """Low-rank updates of the attention and MLP matrices, which are trained in place of all weights.
+
+    Attributes:
+        rank: of the updates; 0 trains all weights.
+        alpha: updates are scaled by alpha / rank.
+    """
+
+    rank: int = 0
+    alpha: float = 16.0
+
+    def __post_init__(self) -> None:
+        at_least(self, 0, "rank")
+        positive(self, "alpha")
+
+    @property
+    def scale(self) -> float:
+        """Of the updates."""
+        return self.alpha / self.rank
 
 
 FEWEST_SAMPLES = 20
@@ -201,6 +228,7 @@ class PostTrainConfig:
         optimizer: of the weights.
         regularisation: on real scenes.
         guard: held-out real scenes.
+        adapter: low-rank updates, off by default.
         logger: files and screen.
     """
 
@@ -240,6 +268,7 @@ class PostTrainConfig:
     optimizer: PostTrainOptimizerSettings = nested(PostTrainOptimizerSettings, folder="optimizer", option="adamw")
     regularisation: RegularisationSettings = nested(RegularisationSettings)
     guard: GuardSettings = nested(GuardSettings)
+    adapter: AdapterSettings = nested(AdapterSettings)
     logger: PostTrainLoggerSettings = nested(PostTrainLoggerSettings, folder="logger", option="csv")
 
     def __post_init__(self) -> None:
@@ -249,7 +278,14 @@ class PostTrainConfig:
         self.prompt = list(self.prompt) if isinstance(self.prompt, tuple) else self.prompt
         check_prompt(self.prompt, self.guidance)
         if self.optimizer.lr is None:
-            self.optimizer = replace(self.optimizer, lr=self.algorithm.learning_rate)
+            factor = _ADAPTER_RATE if self.adapter.rank else 1.0
+            self.optimizer = replace(self.optimizer, lr=factor * self.algorithm.learning_rate)
+        prior, adapter = split_name(self.prior)
+        if self.adapter.rank and adapter:
+            raise InvalidInputError(
+                f"adapter.rank={self.adapter.rank} on {str(prior)!r} with {adapter!r}: an adapter has one prior; "
+                "start from the folder of the run that made the first, whose prior holds its updates"
+            )
         target = self.regularisation.target
         if target is not None and target.figure == "guard" and target.value > self.guard.limit:
             raise InvalidInputError(

@@ -94,7 +94,7 @@ def adjust(state: HoldState, target: Target, measured: float, iteration: int) ->
     """The state after a measurement: integral control of the factor's logarithm, within bounds.
 
     The KL controller of Ziegler et al. (2019, Eq. 4) with a gain per iteration, so that checks may come at any
-    distance.     The error is bounded; one that is not a number counts as the largest.
+    distance. The error is bounded; one that is not a number counts as the largest.
 
     Args:
         state: before.

@@ -80,7 +80,7 @@ class Regularisation:
             return f"hold={settings.hold} was held: {self.target.figure} {state.measured:.4g} at the last measurement."
         return (
             f"hold={settings.hold} could not be held: at iteration {state.lost_at} the weights of the regularisation "
-            f"were at their bound, {HIGHEST:g} times what they began with, and {self.target.figure} was still above the "
+            f"were at their bound, {HIGHEST:g} times the first ones, and {self.target.figure} was still above the "
             f"target ({state.measured:.4g} at the last measurement); lower optimizer.lr, raise the weights, or allow "
             "more"
         )
