@@ -12,9 +12,9 @@ import torch
 from torch import Generator
 
 from agents.post_training.base import Algorithm
-from agents.post_training.config import RegularisationSettings
 from agents.post_training.gradients import add_gradient
 from agents.post_training.hold import HIGHEST, HoldState, adjust
+from agents.post_training.regularisation_settings import RegularisationSettings
 from agents.post_training.rollouts import Rollout
 from agents.priors.base import ScenePrior
 from agents.utils.process_group import gather_rows

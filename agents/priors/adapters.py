@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, Protocol, TypeVar
 
 from torch import Tensor
 
@@ -17,9 +17,6 @@ from agents.networks.low_rank import add_low_rank, low_rank_tensors, merge, set_
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.files import write_json
 from scene_envs.tensor_files import read_tensors, tensors_digest, write_tensors
-
-if TYPE_CHECKING:
-    from agents.priors.base import ScenePrior
 
 ADAPTER_NAME = "adapter.safetensors"
 AdapterSpec = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
@@ -41,6 +38,24 @@ class AdapterFacts:
     scale: float
     prior: str
     digest: str
+
+
+class Adaptable(Protocol):
+    """What adapters ask of a prior; :class:`~agents.priors.base.ScenePrior` has it."""
+
+    adapter: AdapterFacts | None
+    denoiser: Any
+
+    def weights(self) -> dict[str, Tensor]:
+        """Trained tensors by name."""
+        ...
+
+    def requires_grad_(self, requires_grad: bool = True) -> Any:
+        """As of torch modules."""
+        ...
+
+
+Prior = TypeVar("Prior", bound=Adaptable)
 
 
 @dataclass(frozen=True)
@@ -80,7 +95,7 @@ def parse_adapters(spec: AdapterSpec) -> list[AdapterTerm]:
     return terms
 
 
-def attach_adapter(prior: ScenePrior, name: str, *, rank: int, scale: float, seed: int) -> None:
+def attach_adapter(prior: Adaptable, name: str, *, rank: int, scale: float, seed: int) -> None:
     """Freeze a prior, and give its network low-rank updates that are trained.
 
     Args:
@@ -95,7 +110,7 @@ def attach_adapter(prior: ScenePrior, name: str, *, rank: int, scale: float, see
     add_low_rank(prior.denoiser.network, rank, scale, seed)
 
 
-def save_adapter(prior: ScenePrior, directory: str | os.PathLike[str]) -> Path:
+def save_adapter(prior: Adaptable, directory: str | os.PathLike[str]) -> Path:
     """Write ``adapter.safetensors`` and ``adapter.json`` of a prior with low-rank updates into ``directory``."""
     assert prior.adapter is not None
     path = write_tensors(Path(directory) / ADAPTER_NAME, low_rank_tensors(prior.denoiser.network))
@@ -103,14 +118,14 @@ def save_adapter(prior: ScenePrior, directory: str | os.PathLike[str]) -> Path:
     return path
 
 
-def with_adapter_of(prior: ScenePrior, directory: str | os.PathLike[str]) -> ScenePrior:
+def with_adapter_of(prior: Prior, directory: str | os.PathLike[str]) -> Prior:
     """A copy of a prior with low-rank updates that has those saved in ``directory``."""
     copy = deepcopy(prior)
     set_low_rank(copy.denoiser.network, read_tensors(Path(directory) / ADAPTER_NAME)[0])
     return copy
 
 
-def merge_adapters(prior: ScenePrior, name: str, terms: Sequence[AdapterTerm]) -> None:
+def merge_adapters(prior: Adaptable, name: str, terms: Sequence[AdapterTerm]) -> None:
     """Add the updates of adapters to the weights of a prior.
 
     Args:
@@ -139,7 +154,7 @@ def merge_adapters(prior: ScenePrior, name: str, terms: Sequence[AdapterTerm]) -
             raise CorruptFileError(f"the tensors of {str(term.file)!r} do not fit {name!r}: {error}") from error
 
 
-def weights_digest(prior: ScenePrior) -> str:
+def weights_digest(prior: Adaptable) -> str:
     """SHA-256 of a prior's weights."""
     return tensors_digest({key: tensor.detach().cpu() for key, tensor in prior.weights().items()})
 
