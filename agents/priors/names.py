@@ -8,12 +8,12 @@ _JOINT = " with "
 
 
 def adapted_name(prior: str, adapter: str) -> str:
-    """The name of a prior with adapters.
+    """The name of a prior with adapters; those that it mentions already stay.
 
     >>> adapted_name("dimsum_table", "runs/a")
     'dimsum_table with runs/a'
     """
-    return f"{prior}{_JOINT}{adapter}"
+    return f"{prior}{'+' if _JOINT in prior else _JOINT}{adapter}"
 
 
 def split_name(name: str | os.PathLike[str]) -> tuple[str | os.PathLike[str], str]:

@@ -31,6 +31,7 @@ def setting(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Path, str]:
     return tiny_prior(process=process).save(tmp_path / "base"), algorithm
 
 
+@pytest.mark.slow
 def test_a_run_writes_an_adapter_that_makes_its_prior_of_the_base(setting: tuple[Path, str], tmp_path: Path) -> None:
     base, algorithm = setting
     result = post_train(_config(tmp_path / "run", base, algorithm))
@@ -43,6 +44,7 @@ def test_a_run_writes_an_adapter_that_makes_its_prior_of_the_base(setting: tuple
     assert all("linear" in name or "qkv" in name or "out" in name or "mlp" in name for name in moved)
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_bit_for_bit(setting: tuple[Path, str], tmp_path: Path) -> None:
     base, algorithm = setting
     whole = post_train(_config(tmp_path / "whole", base, algorithm))
@@ -54,6 +56,7 @@ def test_a_killed_run_goes_on_bit_for_bit(setting: tuple[Path, str], tmp_path: P
         assert torch.equal(tensor, resumed.prior.weights()[name])
 
 
+@pytest.mark.slow
 def test_a_rollback_takes_the_best_updates_again(setting: tuple[Path, str], tmp_path: Path) -> None:
     base, algorithm = setting
     config = _config(tmp_path / "run", base, algorithm, **{"guard.limit": 1e-6, "guard.action": "rollback"})

@@ -140,6 +140,7 @@ def test_both_estimates_of_the_kl_agree_on_long_chains(process: str) -> None:
     assert chain / 2 < forward < 2 * chain
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["ddpo_sf", "nft"])
 def test_a_penalty_on_the_kl_keeps_a_run_near_the_base(tmp_path: Path, algorithm: str) -> None:
     def last_kl(weight: float) -> float:
@@ -156,6 +157,7 @@ def _run(output: Path, algorithm: str, **changes: Any) -> PostTrainConfig:
     return changed(small_config(output, reward="object_count"), {"algorithm": settings, **values})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("hold", "algorithm", "process"),
     [("guard:1.05", "ddpo_sf", "continuous"), ("kl:1e-4", "ddpo_sf", "mixed"), ("kl:1e-4", "nft", "mixed")],
@@ -194,6 +196,7 @@ def test_a_killed_run_goes_on_with_the_weight_it_had(tmp_path: Path, hold: str, 
         assert [float(row["regularisation_weight"]) for row in csv.DictReader(file)] == factors
 
 
+@pytest.mark.slow
 def test_a_target_that_cannot_be_held_is_said_in_log_metrics_and_report(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
