@@ -173,7 +173,7 @@ def compose(command: str, config: type, words: Sequence[str], sources: Sources =
 
 def _with_adapter(command: str, settings: Any, adapter: str) -> Any:
     """Settings whose ``prior`` names its adapters as well, so that whatever loads a prior by name loads them."""
-    from agents.priors.names import adapted_name
+    from agents.configuration.prior_names import adapted_name
 
     if not settings.prior:
         raise InvalidInputError(f"{command}: adapter={adapter} needs prior=, the prior that the adapter was trained on")

@@ -10,11 +10,11 @@ from typing import Any, ClassVar
 
 from agents.configuration.checks import at_least, one_of, positive
 from agents.configuration.fields import composed, moved, named, nested
+from agents.configuration.prior_names import split_name
 from agents.configuration.settings import LoggerSettings, OptimizerSettings
 from agents.configuration.tree import plain_tree
 from agents.post_training.algorithms import AlgorithmSettings, DDPOSFSettings, algorithm_settings, list_algorithms
 from agents.post_training.regularisation_settings import AdapterSettings, RegularisationSettings
-from agents.priors.names import split_name
 from scene_envs.envs.settings import PROMPT_SOURCES
 from scene_envs.errors import InvalidInputError
 

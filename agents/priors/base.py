@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Generator, Tensor, nn
 
+from agents.configuration.prior_names import split_name
 from agents.diffusion import (
     GaussianProcess,
     Preconditioning,
@@ -26,7 +27,6 @@ from agents.networks.text import Text
 from agents.priors.adapters import AdapterFacts, AdapterSpec, merge_adapters, parse_adapters
 from agents.priors.forward import DenoiserOutput, NoisedScenes
 from agents.priors.inpainting import Inpainting
-from agents.priors.names import split_name
 from agents.priors.prompt_validation import check_prompts, no_text
 from agents.priors.storage import StoredPrior, explained, read_stored, write_stored
 from scene_envs.errors import InvalidInputError, unknown_name
