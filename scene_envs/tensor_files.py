@@ -35,7 +35,7 @@ def write_tensors(
     path = Path(path)
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     kept = dict(metadata or {})
-    content = _in_order(save(plain, {**kept, DIGEST: _digest(plain, kept)}))
+    content = _in_order(save(plain, {**kept, DIGEST: tensors_digest(plain, kept)}))
     with replacing(path) as partial, partial.open("wb") as file:
         file.write(content)
         file.flush()
@@ -66,7 +66,7 @@ def read_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[
             f"{str(path)!r} is truncated or not a safetensors file ({_short(error)}); copy it again or make it anew"
         ) from error
     digest = metadata.pop(DIGEST, None)
-    if digest is not None and digest != _digest(tensors, metadata):
+    if digest is not None and digest != tensors_digest(tensors, metadata):
         raise CorruptFileError(_changed(path))
     return tensors, metadata
 
@@ -93,10 +93,11 @@ def _in_order(content: bytes) -> bytes:
     return len(header).to_bytes(8, "little") + header + content[8 + size :]
 
 
-def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
+def tensors_digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> str:
+    """SHA-256 of tensors on the CPU, by name, and of texts beside them."""
     import torch
 
-    digest = hashlib.new(DIGEST, json.dumps(sorted(metadata.items())).encode())
+    digest = hashlib.new(DIGEST, json.dumps(sorted((metadata or {}).items())).encode())
     for name in sorted(tensors):
         tensor = tensors[name]
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())

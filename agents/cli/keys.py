@@ -36,6 +36,14 @@ class KeyHelp:
     meaning: str
 
 
+ADAPTER = KeyHelp(
+    "adapter",
+    "",
+    "low-rank updates of the prior, the folder of a run with adapter.rank or an adapter.safetensors; A+0.5*B adds two.",
+)
+"""The key that every command with ``prior=`` has besides its own."""
+
+
 @dataclass(frozen=True)
 class Sources:
     """Where the values of a command come from, beside its words.
@@ -85,6 +93,8 @@ def help_text(config: type | Any, words: Sequence[str] = (), config_dir: str = "
     chosen = dict(word.partition("=")[::2] for word in words)
     keys = describe_fields(config)
     plain = [key for key in keys if "." not in key.name]
+    after = next((place for place, key in enumerate(plain, 1) if key.name == "prior"), 0)
+    plain[after:after] = [ADAPTER] if after else []
     parts = [format_rows([(f"{key.name}={key.default}", key.meaning) for key in plain])] if plain else []
     for field in dataclasses.fields(config):
         rows = [(f"{k.name}={k.default}", k.meaning) for k in keys if k.name.startswith(f"{field.name}.")]
@@ -135,6 +145,7 @@ def compose(command: str, config: type, words: Sequence[str], sources: Sources =
     base = _without_output(read_config(sources.config)) if sources.config else None
     late: dict[str, Any] = {}
     read = []
+    adapter = ""
     for word in words:
         key, equals, value = word.partition("=")
         if not equals or not key:
@@ -143,6 +154,11 @@ def compose(command: str, config: type, words: Sequence[str], sources: Sources =
             check_option("experiment", value, sources.config_dir)
             read.append(word)
             continue
+        if key == ADAPTER.name and "prior" in fields and not value.startswith("{"):
+            adapter = value
+            continue
+        key = getattr(config, "SHORT", {}).get(key, key)
+        word = f"{key}={value}"
         check_not_moved(config, word, command)
         head = key.partition(".")[0]
         if head not in fields:
@@ -158,7 +174,17 @@ def compose(command: str, config: type, words: Sequence[str], sources: Sources =
         else:
             read.append(_override(word, _hint(config, key)))
     tree = compose_tree(command, config, read, base=base, config_dir=sources.config_dir)
-    return build(config, {**tree, **late}, command=command)
+    settings: Any = build(config, {**tree, **late}, command=command)
+    return _with_adapter(command, settings, adapter) if adapter else settings
+
+
+def _with_adapter(command: str, settings: Any, adapter: str) -> Any:
+    """Settings whose ``prior`` names its adapters as well, so that whatever loads a prior by name loads them."""
+    from agents.configuration.prior_names import adapted_name
+
+    if not settings.prior:
+        raise InvalidInputError(f"{command}: adapter={adapter} needs prior=, the prior that the adapter was trained on")
+    return dataclasses.replace(settings, prior=adapted_name(settings.prior, adapter.strip("[]").replace(",", "+")))
 
 
 def read_config(path: str) -> dict[str, Any]:

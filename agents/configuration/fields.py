@@ -68,6 +68,7 @@ def composed(kind: Kind) -> Kind:
 
     @functools.wraps(init)
     def __init__(self: Any, *arguments: Any, **keywords: Any) -> None:
+        _place_short(kind, keywords)
         for key in keywords:
             if key not in fields:
                 check_not_moved(kind, key)
@@ -78,6 +79,15 @@ def composed(kind: Kind) -> Kind:
 
     kind.__init__ = __init__  # type: ignore[misc]
     return kind
+
+
+def _place_short(kind: type, keywords: dict[str, Any]) -> None:
+    """Move keys that are written without their group, as ``kind.SHORT`` says, into it."""
+    short: Mapping[str, str] = getattr(kind, "SHORT", {})
+    for key in short.keys() & keywords.keys():
+        name, _, inner = short[key].partition(".")
+        group, value = keywords.get(name, {}), {inner: keywords.pop(key)}
+        keywords[name] = {**group, **value} if isinstance(group, Mapping) else dataclasses.replace(group, **value)
 
 
 def _complete(

@@ -9,7 +9,9 @@ here it is text, as in the comparison of Pfaff et al. (CoRL 2025). There is no p
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -76,6 +78,8 @@ class _AdaptiveNorm(nn.Module):
 
 class _Block(nn.Module):
     """Self-attention, cross-attention to the text when there is any, and a feed-forward layer."""
+
+    MATRICES: ClassVar[Sequence[str]] = ("feed.0", "feed.2")
 
     def __init__(self, config: _Size) -> None:
         super().__init__()

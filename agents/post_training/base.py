@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from typing import Any, Generic, Protocol, TypeVar
+from collections.abc import Iterator, Mapping
+from typing import Any, Generic, Protocol, TypeVar, cast
 
-from torch import Generator
+from torch import Generator, Tensor
 from torchrl.objectives import LossModule
 
+from agents.post_training.base_kl import forward_kl
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import Branching, Rollout
 from agents.priors.base import ScenePrior
@@ -69,6 +70,11 @@ class Algorithm(ABC, Generic[Credit]):
     @abstractmethod
     def accumulate(self, rollout: Rollout, advantage: Credit, generator: Generator) -> BatchGradient:
         """Add the gradient of a batch to ``.grad``; everything random is drawn from ``generator`` (CPU)."""
+
+    def kl(self, rollout: Rollout, base: ScenePrior, generator: Generator) -> Iterator[Tensor]:
+        """Terms () whose sum is the KL divergence of the prior in training from ``base``, nats per random variable."""
+        prior = cast(ScenePrior, self.policy.prior)
+        return forward_kl(prior, base, rollout, generator, self.policy.chunk)
 
     def end_iteration(self) -> None:
         """Called after the last update of every batch."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from agents.post_training.guard_report import guard_sections, guard_verdict
+from agents.post_training.hold_report import hold_sections
 from agents.post_training.report import Page, Picture, Section, Tile, write_report
 from agents.post_training.run_files import write_metrics
 from agents.post_training.trainer import PostTrainResult
@@ -119,7 +120,8 @@ def write_comparison(
     for name in ("guard_within", "guard_beyond"):
         if (path := directory / f"{name}.safetensors").exists():
             pictures[name] = draw_gallery(SceneBatch.load(path), directory / f"{name}.png")
-    write_report(directory / "report.html", _page(title, metrics, directory / "curve.png", pictures, settings))
+    held = hold_sections(metrics.get("hold"), result.history, directory / "hold.png")
+    write_report(directory / "report.html", _page(title, metrics, directory / "curve.png", pictures, settings, held))
     write_metrics(directory, metrics)
     return metrics
 
@@ -177,7 +179,12 @@ def _save_gallery(images: Sequence[NDArray[np.uint8]] | NDArray[np.uint8], capti
 
 
 def _page(
-    title: str, metrics: Mapping[str, Any], curve: Path, pictures: Mapping[str, Path], settings: Mapping[str, Any]
+    title: str,
+    metrics: Mapping[str, Any],
+    curve: Path,
+    pictures: Mapping[str, Path],
+    settings: Mapping[str, Any],
+    held: Sequence[Section],
 ) -> Page:
     reward = reward_name(settings["reward"]).replace("_", " ")
     algorithm = settings["algorithm"]["name"].upper().replace("_", "-")
@@ -200,6 +207,7 @@ def _page(
     caption = f"Mean {reward} of each batch, and the guard." + ("" if over is None else " Shaded: over-optimised.")
     sections = [
         Section("The curve", verdict, [Picture(curve, caption)]),
+        *held,
         *guard_sections(guard, pictures),
         Section(
             "As sampled",

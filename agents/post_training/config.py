@@ -10,14 +10,18 @@ from typing import Any, ClassVar
 
 from agents.configuration.checks import at_least, one_of, positive
 from agents.configuration.fields import composed, moved, named, nested
+from agents.configuration.prior_names import split_name
 from agents.configuration.settings import LoggerSettings, OptimizerSettings
 from agents.configuration.tree import plain_tree
 from agents.post_training.algorithms import AlgorithmSettings, DDPOSFSettings, algorithm_settings, list_algorithms
+from agents.post_training.regularisation_settings import AdapterSettings, RegularisationSettings
 from scene_envs.envs.settings import PROMPT_SOURCES
 from scene_envs.errors import InvalidInputError
 
 RESUMABLE = ("recipe", "iterations", "output", "workers", "logger", "reward_timeout", "reward_memory")
 """Fields that may change between a run and its continuation."""
+_ADAPTER_RATE = 10.0
+"""Learning rate of low-rank updates over that of all weights."""
 
 
 @dataclass
@@ -25,7 +29,7 @@ class PostTrainOptimizerSettings(OptimizerSettings):
     """The optimiser of a post-training run; its steps are updates.
 
     Attributes:
-        lr: peak learning rate; null takes the algorithm's own.
+        lr: peak learning rate; null takes the algorithm's own, ten times that with an adapter.
         chunk: scenes per forward and backward pass; null takes the whole batch at once.
     """
 
@@ -35,28 +39,6 @@ class PostTrainOptimizerSettings(OptimizerSettings):
     def __post_init__(self) -> None:
         if self.lr is not None:
             super().__post_init__()
-
-
-@dataclass
-class RegularisationSettings:
-    """The pretraining loss on real scenes, which keeps a prior a prior.
-
-    Attributes:
-        weight: coefficient of the pretraining loss.
-        batch_size: real scenes per update.
-        scenes: ``grammar``, or the directory of a dataset.
-        bank_size: how many real scenes are drawn (grammar) or read (dataset), the held-out ones included.
-    """
-
-    weight: float = 0.5
-    batch_size: int = 48
-    scenes: str = "grammar"
-    bank_size: int = 4096
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "batch_size")
-        if self.weight < 0:
-            raise InvalidInputError(f"regularisation.weight={self.weight} must not be negative")
 
 
 FEWEST_SAMPLES = 20
@@ -145,6 +127,7 @@ class PostTrainConfig:
 
         - step_scale * sum over gradient steps of mean over scenes of  A * log p(x_{t-1} | x_t)
         + regularisation.weight * pretraining loss on real scenes
+        + regularisation.kl * KL divergence from the base prior
 
     with ``step_scale = steps with weight > 0 / gradient_steps``, log p reduced over a scene's entries as
     ``algorithm.log_prob_reduction`` says, and the pretraining loss a mean over scenes and entries. The weight means
@@ -175,6 +158,7 @@ class PostTrainConfig:
         optimizer: of the weights.
         regularisation: on real scenes.
         guard: held-out real scenes.
+        adapter: low-rank updates, off by default.
         logger: files and screen.
     """
 
@@ -190,6 +174,8 @@ class PostTrainConfig:
         "updates": "algorithm.updates, of algorithm=ddpo_is",
     }
     """Keys of earlier versions, and their names."""
+    SHORT: ClassVar[Mapping[str, str]] = {"hold": "regularisation.hold"}
+    """Keys that may be written without their group."""
 
     prior: str = "dimsum_table_continuous"
     reward: Any = named("object_count", "reward")
@@ -212,6 +198,7 @@ class PostTrainConfig:
     optimizer: PostTrainOptimizerSettings = nested(PostTrainOptimizerSettings, folder="optimizer", option="adamw")
     regularisation: RegularisationSettings = nested(RegularisationSettings)
     guard: GuardSettings = nested(GuardSettings)
+    adapter: AdapterSettings = nested(AdapterSettings)
     logger: PostTrainLoggerSettings = nested(PostTrainLoggerSettings, folder="logger", option="csv")
 
     def __post_init__(self) -> None:
@@ -221,7 +208,20 @@ class PostTrainConfig:
         self.prompt = list(self.prompt) if isinstance(self.prompt, tuple) else self.prompt
         check_prompt(self.prompt, self.guidance)
         if self.optimizer.lr is None:
-            self.optimizer = replace(self.optimizer, lr=self.algorithm.learning_rate)
+            factor = _ADAPTER_RATE if self.adapter.rank else 1.0
+            self.optimizer = replace(self.optimizer, lr=factor * self.algorithm.learning_rate)
+        prior, adapter = split_name(self.prior)
+        if self.adapter.rank and adapter:
+            raise InvalidInputError(
+                f"adapter.rank={self.adapter.rank} on {str(prior)!r} with {adapter!r}: an adapter has one prior; "
+                "start from the folder of the run that made the first, whose prior holds its updates"
+            )
+        target = self.regularisation.target
+        if target is not None and target.figure == "guard" and target.value > self.guard.limit:
+            raise InvalidInputError(
+                f"hold={self.regularisation.hold} lies beyond guard.limit={self.guard.limit:g}, past which no prior is "
+                f"kept; raise guard.limit, or hold at most guard:{self.guard.limit:g}"
+            )
         if self.regularisation.bank_size < self.guard.scenes + 1:
             raise InvalidInputError(
                 f"regularisation.bank_size={self.regularisation.bank_size} must exceed guard.scenes="

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from torch import Generator, Tensor
 
 from agents.post_training.advantages import compute_advantages
 from agents.post_training.algorithms import DDPOISSettings, DDPOSFSettings
 from agents.post_training.base import Algorithm
+from agents.post_training.base_kl import chain_kl
 from agents.post_training.gradients import PolicyGradient, accumulate_policy_gradient, credited_reward, draw_steps
 from agents.post_training.losses import DDPOSFLoss
 from agents.post_training.policy import DenoisingPolicy, gradient_weights
 from agents.post_training.prompts import prompt_groups
 from agents.post_training.rollouts import Rollout
+from agents.priors.base import ScenePrior
 
 
 class DDPO(Algorithm[Tensor]):
@@ -51,3 +55,7 @@ class DDPO(Algorithm[Tensor]):
         """Add the policy gradient of a batch to ``.grad``; ``generator`` draws the steps that have part in it."""
         steps, scale = draw_steps(self.loss.step_weights.cpu(), self.settings.gradient_steps, generator)
         return accumulate_policy_gradient(self.loss, rollout, advantage, steps, scale=scale)
+
+    def kl(self, rollout: Rollout, base: ScenePrior, generator: Generator) -> Iterator[Tensor]:
+        """Terms of the KL divergence of the chain, ``gradient_steps`` of its steps standing for all."""
+        return chain_kl(self.policy, base, rollout, self.settings.gradient_steps, generator)

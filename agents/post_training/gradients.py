@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -99,17 +99,32 @@ def add_regularisation_gradient(
     """
     if coefficient == 0:
         return 0.0, 0.0
-    parameters = [p for p in prior.parameters() if p.requires_grad]
-    value, gradients = 0.0, [torch.zeros_like(p) for p in parameters]
     size = chunk or len(x0)
-    for start in range(0, len(x0), size):
-        part, texts = x0[start : start + size], None if prompts is None else prompts[start : start + size]
-        loss = prompted_loss(prior, part, texts, generator).mean() * (len(part) / len(x0))
-        value += float(loss.detach())
-        for total, gradient in zip(gradients, torch.autograd.grad(loss, parameters, allow_unused=True), strict=True):
+
+    def terms() -> Iterator[Tensor]:
+        for start in range(0, len(x0), size):
+            part, texts = x0[start : start + size], None if prompts is None else prompts[start : start + size]
+            yield prompted_loss(prior, part, texts, generator).mean() * (len(part) / len(x0))
+
+    return add_gradient(terms(), prior.parameters(), coefficient)
+
+
+def add_gradient(
+    terms: Iterable[Tensor], parameters: Iterable[nn.Parameter], coefficient: float
+) -> tuple[float, float]:
+    """Add ``coefficient`` times the gradient of a sum to ``.grad``, one term () and its graph at a time.
+
+    Returns:
+        The sum, and the norm of ``coefficient`` times its gradient.
+    """
+    trained = [p for p in parameters if p.requires_grad]
+    value, gradients = 0.0, [torch.zeros_like(p) for p in trained]
+    for term in terms:
+        value += float(term.detach())
+        for total, gradient in zip(gradients, torch.autograd.grad(term, trained, allow_unused=True), strict=True):
             if gradient is not None:
                 total.add_(gradient, alpha=coefficient)
-    for parameter, gradient in zip(parameters, gradients, strict=True):
+    for parameter, gradient in zip(trained, gradients, strict=True):
         parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
     return value, float(_norm(gradients))
 

@@ -15,9 +15,11 @@ from agents.post_training.config import PostTrainConfig
 from agents.post_training.gradients import add_regularisation_gradient
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.prompts import PromptDeck
+from agents.post_training.regularisation import Regularisation
 from agents.post_training.rollouts import Rollout, collect, stream_seed
 from agents.post_training.run_files import CHECKPOINT_NAME
 from agents.post_training.scene_bank import SceneBank
+from agents.priors.adapters import attach_adapter
 from agents.priors.base import ScenePrior
 from agents.priors.prompt_validation import no_text
 from agents.utils.checkpoints import check_tensors
@@ -49,6 +51,10 @@ class Learner:
         if config.prompt is not None and not self.prior.conditional:
             raise no_text(self.prior.scene_type, str(config.prompt))
         self.prior.freeze_text()
+        self.regularisation = Regularisation(config.regularisation, self.prior)
+        if config.adapter.rank:
+            adapter = config.adapter
+            attach_adapter(self.prior, config.prior, rank=adapter.rank, scale=adapter.scale, seed=config.seed)
         self.slots = self.prior.config.slots if config.slots is None else config.slots
         self.policy = DenoisingPolicy(
             self.prior, config.num_steps, chunk=config.optimizer.chunk, guidance=config.guidance
@@ -128,16 +134,18 @@ class Learner:
         config = self.config
         self.optimizer.zero_grad(set_to_none=True)
         policy = self.algorithm.accumulate(rollout, advantage, self._generator("steps", index))
+        held = self.regularisation.accumulate(self.algorithm, rollout, self._generator("kl", index))
         generator = self._generator("real", index)
         x0, prompts = scenes.batch(config.regularisation.batch_size, generator)
         real_loss, real_norm = add_regularisation_gradient(
-            self.prior, x0, config.regularisation.weight, generator, chunk=config.optimizer.chunk, prompts=prompts
+            self.prior, x0, self.regularisation.weight, generator, chunk=config.optimizer.chunk, prompts=prompts
         )
         return {
             "policy_loss": policy.loss,
             "policy_gradient_norm": policy.norm,
             "pretraining_loss": real_loss,
             "pretraining_gradient_norm": real_norm,
+            **held,
             **policy.figures(),
         }
 
@@ -179,6 +187,7 @@ class Learner:
             "average": None if self.average is None else self.average.tensors,
             "average_updates": 0 if self.average is None else self.average.updates,
             "algorithm": self.algorithm.state(),
+            "regularisation": self.regularisation.state_dict(),
             "random": torch.get_rng_state(),
         }
 
@@ -195,6 +204,7 @@ class Learner:
         if self.average is not None:
             self.average.tensors, self.average.updates = state["average"], state["average_updates"]
         self.algorithm.restore(state["algorithm"])
+        self.regularisation.load_state_dict(state.get("regularisation"))
         torch.set_rng_state(state["random"])
 
     def averaged(self) -> AveragedWeights[ScenePrior]:

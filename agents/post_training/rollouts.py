@@ -17,7 +17,7 @@ from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.errors import InvalidInputError, TrainingError
 from scene_envs.scene import SceneBatch
 
-STREAMS = ("start", "noise", "steps", "real", "bank", "guard", "prompts", "samples")
+STREAMS = ("start", "noise", "steps", "real", "bank", "guard", "prompts", "samples", "kl")
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from agents.post_training.run_files import (
 )
 from agents.post_training.sample_check import SampleCheck
 from agents.post_training.scene_bank import SceneBank, real_scenes
+from agents.priors.adapters import save_adapter, with_adapter_of
 from agents.priors.base import ScenePrior
 from agents.priors.prompt_validation import check_object_count
 from agents.utils.checkpoints import save_checkpoint
@@ -215,6 +216,7 @@ class PostTrainer:
             except NonFiniteGradient as error:
                 raise self._not_finite(error.figures) from None
         self.learner.algorithm.end_iteration()
+        self.learner.regularisation.observe("kl", row.get("kl"), self.iteration + 1)
         return row
 
     # -- guard ----------------------------------------------------------------------------------
@@ -250,12 +252,17 @@ class PostTrainer:
             reading = self.guard.check(prior, self.iteration, reward, realism(rollout.batch), sample=sample)
             if reading.kept:
                 self._save_prior()
+        self.learner.regularisation.observe("guard", reading.ratio, self.iteration)
         figures = {f"guard_{name}": value for name, value in reading.samples.items()}
         self.history[-1] |= {"guard_loss": reading.loss, "guard_ratio": reading.ratio, **figures, **reading.realism}
         self._picture(reading)
         if reading.beyond and self.config.guard.action == "rollback":
             self.rollbacks += 1
-            self.learner.return_to(ScenePrior.load(self.directory / "prior"))
+            self.learner.return_to(
+                ScenePrior.load(self.directory / "prior")
+                if self.prior.adapter is None
+                else with_adapter_of(self.prior, self.directory)
+            )
 
     def _picture(self, reading: GuardReading) -> None:
         """Keep the guard's samples of the best checkpoint, and of the first beyond a limit, for the report."""
@@ -321,6 +328,8 @@ class PostTrainer:
         }
         path = self.directory / "prior"
         _writing(f"the prior {str(path)!r}", lambda: self.prior.save(path))
+        if self.prior.adapter is not None:
+            _writing("the adapter", lambda: save_adapter(self.prior, self.directory))
 
     def _finish(self) -> PostTrainResult:
         rewards = [row["reward"] for row in self.history if math.isfinite(row["reward"])]
@@ -336,6 +345,7 @@ class PostTrainer:
                 ),
             },
             "guard": {**self.guard.summary(), "rollbacks": self.rollbacks},
+            "hold": self.learner.regularisation.summary(),
         }
         write_metrics(self.directory, metrics)
         name = f"mean {reward_name(self.config.reward).replace('_', ' ')}"

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Generator, Tensor, nn
 
+from agents.configuration.prior_names import split_name
 from agents.diffusion import (
     GaussianProcess,
     Preconditioning,
@@ -20,8 +21,10 @@ from agents.diffusion import (
     StepTable,
 )
 from agents.networks.count_conditioning import CountConditioning
+from agents.networks.low_rank import merged_weights
 from agents.networks.mixed_denoiser import Observed
 from agents.networks.text import Text
+from agents.priors.adapters import AdapterFacts, AdapterSpec, merge_adapters, parse_adapters
 from agents.priors.forward import DenoiserOutput, NoisedScenes
 from agents.priors.inpainting import Inpainting
 from agents.priors.prompt_validation import check_prompts, no_text
@@ -56,6 +59,8 @@ class ScenePrior(Inpainting, nn.Module, ABC):
     process: GaussianProcess
     """The process of what is continuous."""
     _timestep_weights: Tensor
+    adapter: AdapterFacts | None = None
+    """Facts about the low-rank updates in training; None for a prior without."""
 
     def __init_subclass__(cls, **settings: Any) -> None:
         super().__init_subclass__(**settings)
@@ -126,15 +131,23 @@ class ScenePrior(Inpainting, nn.Module, ABC):
         """From the ``prior`` entry of a configuration file."""
 
     @classmethod
-    def load(cls, name: str | os.PathLike[str] | ScenePrior) -> ScenePrior:
+    def load(cls, name: str | os.PathLike[str] | ScenePrior, adapter: AdapterSpec | None = None) -> ScenePrior:
         """A shipped prior by name, or one from a prior or run directory; in evaluation mode.
+
+        Args:
+            name: of the prior; ``NAME with ADAPTER`` names its adapters as well.
+            adapter: low-rank updates that are added to its weights: the file or the run folder of one, several joined
+                by ``+`` or in a list, each with a factor before ``*`` if need be.
 
         Raises:
             UnknownNameError: no shipped prior has that name.
+            InvalidInputError: an adapter is missing, or was trained on another prior.
             CorruptFileError: its files are not those of a prior, or do not fit each other.
         """
         if isinstance(name, ScenePrior):
             return name
+        name, named = split_name(name)
+        terms = [term for spec in (named, adapter) if spec for term in parse_adapters(spec)]
         stored = read_stored(name)
         with explained(name):
             kind = prior_class(stored.process)
@@ -142,6 +155,8 @@ class ScenePrior(Inpainting, nn.Module, ABC):
                 stored.fields, stored.normalizer, stored.preconditioning, stored.card, stored.residual
             )
             prior.load_weights(stored.tensors)
+        if terms:
+            merge_adapters(prior, str(name), terms)
         return prior.eval()
 
     def save(self, directory: str | os.PathLike[str], precision: str = "float32") -> Path:
@@ -165,7 +180,7 @@ class ScenePrior(Inpainting, nn.Module, ABC):
 
     def weights(self) -> dict[str, Tensor]:
         """Trained tensors by name, as a prior's file holds them."""
-        return dict(self.denoiser.network.state_dict())
+        return merged_weights(self.denoiser.network)
 
     def load_weights(self, tensors: dict[str, Tensor]) -> None:
         """Inverse of :meth:`weights`; raises RuntimeError when names or shapes differ."""
@@ -356,6 +371,11 @@ class ScenePrior(Inpainting, nn.Module, ABC):
             noised: as :meth:`noised` gives them.
             text: tokens (B, L, W) and their mask (B, L), as :meth:`encode_prompts` gives them; None without prompts.
         """
+
+    def denoised(self, noised: NoisedScenes, output: DenoiserOutput) -> Tensor:
+        """(B, N, F) what the continuous ``output`` of noised scenes says of x_0."""
+        features = output.continuous.shape[-1]
+        return self.process.x0_from_output(noised.x_t[..., :features], noised.t, output.continuous)
 
     @property
     def pose_width(self) -> int:

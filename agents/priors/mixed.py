@@ -121,7 +121,7 @@ class MixedPrior(TrainableMixedPrior):
 
     def weights(self) -> dict[str, Tensor]:
         """Tensors of the network, and those of the text encoder under ``text_encoder.``."""
-        tensors = dict(self.denoiser.network.state_dict())
+        tensors = super().weights()
         if self.denoiser.text_encoder is not None:
             tensors |= {f"{_TEXT}{name}": value for name, value in self.denoiser.text_encoder.state_dict().items()}
         return tensors

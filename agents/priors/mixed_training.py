@@ -124,6 +124,12 @@ class TrainableMixedPrior(PromptReader, ScenePrior):
         text = self.unconditional(len(noised.t)) if text is None else text
         return DenoiserOutput(*self.denoiser.output(noised.x_t, noised.t, noised.observed, text))
 
+    def denoised(self, noised: NoisedScenes, output: DenoiserOutput) -> Tensor:
+        """(B, N, 12) what the pose output of noised scenes says of the clean poses."""
+        poses, states = noised.x_t[..., :POSE_FEATURES], state_of(noised.x_t[..., POSE_FEATURES:])
+        moments = self.denoiser.moments(states, noised.t)
+        return self.process.x0_from_output(poses, noised.t, output.continuous, moments)
+
     def draw_observed(self, x0: Tensor, generator: Generator | None) -> Observed:
         """Random observed entries: slots (completion), all categories (rearrangement), or any attribute of any slot."""
         batch, slots = x0.shape[:2]

@@ -1,0 +1,110 @@
+"""KL divergence of a prior in training from the base prior, on scenes of its own.
+
+Both estimates are of one quantity: the KL divergence of the reverse chains, in nats per random variable of a scene.
+They come as terms, of which each has a graph of its own, so that memory does not grow with their number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Generator, Tensor
+
+from agents.diffusion.divergence import categorical_kl, step_kl
+from agents.diffusion.reverse_steps import state_of
+from agents.networks.text import Text
+from agents.post_training.policy import DenoisingPolicy
+from agents.post_training.rollouts import Rollout
+from agents.priors.base import ScenePrior
+from agents.priors.forward import NoisedScenes
+from agents.priors.mixed_training import TrainableMixedPrior
+
+
+def chain_kl(
+    policy: DenoisingPolicy, base: ScenePrior, rollout: Rollout, count: int, generator: Generator
+) -> Iterator[Tensor]:
+    """Terms () whose sum is the KL divergence of the chain that made a rollout from the base prior's (Fan et al. 2023).
+
+    Steps differ much more than scenes do, so every random step has part in it, with as many scenes as the budget
+    allows.
+
+    Args:
+        policy: in training.
+        base: what it is compared with.
+        rollout: B episodes of the policy.
+        count: passes over the batch that the estimate may cost, at most one per step.
+        generator: draws the scenes of each step.
+    """
+    first = DenoisingPolicy(base, len(policy), guidance=policy.guidance)
+    batch = rollout.scenes.shape[1]
+    steps = torch.nonzero(policy.table.previous > 0).flatten().tolist()  # the last step is certain
+    drawn = max(1, min(batch, round(batch * count / len(steps))))
+    for step in steps:
+        for rows in torch.randperm(batch, generator=generator)[:drawn].split(policy.chunk or drawn):
+            x_t, text = rollout.scenes[step][rows], _rows(rollout.text, rows)
+            with torch.no_grad():
+                then = first.distribution(x_t, step, text)
+            now = policy.distribution(x_t, step, text)
+            yield step_kl(now, then).sum() / (drawn * now.entries)
+
+
+def forward_kl(
+    prior: ScenePrior, base: ScenePrior, rollout: Rollout, generator: Generator, chunk: int | None = None
+) -> Iterator[Tensor]:
+    """Terms () whose sum estimates the same from finished scenes, noised again, without the chains that made them.
+
+    The scenes of a batch take timesteps that are spread evenly over the chain of all timesteps.
+
+    Args:
+        prior: in training.
+        base: what it is compared with.
+        rollout: B finished scenes.
+        generator: source of timesteps and noise (CPU).
+        chunk: scenes per pass.
+    """
+    x0 = prior.encode(rollout.batch.to(prior.device))
+    count, total = len(x0), prior.config.num_timesteps
+    even = (torch.randperm(count, generator=generator) + torch.rand((), generator=generator)) / count
+    timesteps = (2 + even * (total - 1)).long().clamp(max=total).to(x0.device)  # the last step, t = 1, is certain
+    size = chunk or count
+    for start in range(0, count, size):
+        rows = slice(start, start + size)
+        fixed = prior.observed_entries(x0[rows]) if isinstance(prior, TrainableMixedPrior) else None
+        noised = prior.noised(x0[rows], generator, timesteps[rows], fixed)
+        yield noised_kl(prior, base, noised, _rows(rollout.text, rows)).sum() * ((total - 1) / count)
+
+
+def noised_kl(prior: ScenePrior, base: ScenePrior, noised: NoisedScenes, text: Text | None = None) -> Tensor:
+    """(B,) KL divergences of the reverse steps t -> t - 1 from noised scenes, nats per random variable.
+
+    For normals it is half the difference of the signal-to-noise ratios at t - 1 and t times the squared difference of
+    the denoised scenes: the weight that the pretraining loss has in the evidence lower bound (Kingma et al. 2021,
+    Eq. 13). Known and observed entries have no part in it.
+    """
+    now = prior.output(noised, text)
+    with torch.no_grad():
+        then = base.output(noised, text)
+        before = base.denoised(noised, then)
+    alpha_bar = prior.process.schedule.alpha_bar
+    ratio = alpha_bar / (1.0 - alpha_bar)
+    rise = (ratio[noised.t.cpu() - 1] - ratio[noised.t.cpu()]).float().to(before.device)
+    random = (noised.weight > 0).float()
+    square = (prior.denoised(noised, now) - before).square() * random
+    total, entries = 0.5 * rise * square.sum(dim=(1, 2)), random.sum(dim=(1, 2))
+    if isinstance(prior, TrainableMixedPrior):
+        assert now.logits is not None
+        assert then.logits is not None
+        drawn = torch.ones_like(random[..., 0]) if noised.drawn is None else noised.drawn
+        state = state_of(noised.x_t[..., prior.pose_width :])
+        probs, others = (
+            prior.categories.posterior(state, logits.softmax(dim=-1), noised.t, noised.t - 1)
+            for logits in (now.logits, then.logits)
+        )
+        total = total + (categorical_kl(probs, others) * drawn).sum(dim=1)
+        entries = entries + (random.sum(dim=2) > 0).sum(dim=1)
+    return total / entries.clamp(min=1.0)
+
+
+def _rows(text: Text | None, rows: slice | Tensor) -> Text | None:
+    return None if text is None else (text[0][rows], text[1][rows])

@@ -1,0 +1,48 @@
+"""What a report says of a target that a run held: a sentence, and a picture of the figure and of the weight."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from agents.post_training.curves import FAINT, GUARD_COLOR, REWARD_COLOR
+from agents.post_training.hold import Target
+from agents.post_training.report import Picture, Section
+
+_COLUMNS = {"guard": ("guard_ratio", "held-out loss over base"), "kl": ("kl", "KL from the base prior")}
+
+
+def hold_sections(hold: Mapping[str, Any] | None, history: Sequence[Mapping[str, float]], path: Path) -> list[Section]:
+    """A section on the target, whose picture goes to ``path``; none for a run without."""
+    if hold is None or hold["measured"] is None:
+        return []
+    caption = "The figure with its target, and the weights of the regularisation as a multiple of their first value."
+    return [
+        Section(
+            "What was held", hold["verdict"], [Picture(_draw(Target.parse(hold["target"]), history, path), caption)]
+        )
+    ]
+
+
+def _draw(target: Target, history: Sequence[Mapping[str, float]], path: Path) -> Path:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    column, label = _COLUMNS[target.figure]
+    measured = [(row["iteration"], row[column]) for row in history if column in row]
+    weights = [(row["iteration"], row["hold_factor"]) for row in history if "hold_factor" in row]
+    figure = Figure(figsize=(8.4, 4.2), dpi=130, layout="constrained")
+    FigureCanvasAgg(figure)
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    upper.plot(*zip(*measured, strict=True), ".-", color=GUARD_COLOR)
+    upper.axhline(target.value, color=FAINT, linestyle="--", linewidth=1)
+    upper.set_ylabel(label)
+    lower.semilogy(*zip(*weights, strict=True), color=REWARD_COLOR)
+    lower.set_ylabel("factor on the weights")
+    lower.set_xlabel("iteration")
+    for axes in (upper, lower):
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(labelsize=9)
+    figure.savefig(path)
+    return path

@@ -1,0 +1,107 @@
+"""Regularisation of a run: its weights, the factor on them that holds a target, and the KL from the base prior."""
+
+from __future__ import annotations
+
+import logging
+import math
+from copy import deepcopy
+from dataclasses import asdict
+from typing import Any
+
+import torch
+from torch import Generator
+
+from agents.post_training.base import Algorithm
+from agents.post_training.gradients import add_gradient
+from agents.post_training.hold import HIGHEST, HoldState, adjust
+from agents.post_training.regularisation_settings import RegularisationSettings
+from agents.post_training.rollouts import Rollout
+from agents.priors.base import ScenePrior
+from agents.utils.process_group import gather_rows
+
+logger = logging.getLogger(__name__)
+
+
+class Regularisation:
+    """What keeps a prior in training near the base prior, and how strongly.
+
+    Args:
+        settings: its keys.
+        prior: the base prior; it is copied where the KL divergence is needed.
+    """
+
+    def __init__(self, settings: RegularisationSettings, prior: ScenePrior) -> None:
+        self.settings = settings
+        self.target = settings.target
+        self.state = HoldState()
+        measures = settings.kl_weight > 0 or (self.target is not None and self.target.figure == "kl")
+        self.base = deepcopy(prior).eval().requires_grad_(False) if measures else None
+
+    @property
+    def weight(self) -> float:
+        """Coefficient of the pretraining loss on real scenes."""
+        return self.settings.weight * self.state.factor
+
+    @property
+    def kl_weight(self) -> float:
+        """Coefficient of the KL divergence."""
+        return self.settings.kl_weight * self.state.factor
+
+    def accumulate(self, algorithm: Algorithm[Any], rollout: Rollout, generator: Generator) -> dict[str, float]:
+        """Add the gradient of the KL divergence to ``.grad``; returns columns of the log."""
+        row = {} if self.target is None else {"regularisation_weight": self.weight, "hold_factor": self.state.factor}
+        if self.base is None:
+            return row
+        terms = algorithm.kl(rollout, self.base, generator)
+        value, norm = math.nan, 0.0
+        if self.kl_weight:
+            value, norm = add_gradient(terms, algorithm.policy.parameters(), self.kl_weight)
+        else:
+            with torch.no_grad():
+                value = sum(float(term) for term in terms)
+        value = float(gather_rows(torch.tensor([value])).mean())
+        return {**row, "kl": value, "kl_weight": self.kl_weight, "kl_gradient_norm": norm}
+
+    def observe(self, figure: str, value: float | None, iteration: int) -> None:
+        """Adjust the weights after a measurement; does nothing where another figure is held, or none."""
+        if self.target is None or self.target.figure != figure or value is None:
+            return
+        held = self.state.lost_at is None
+        self.state = adjust(self.state, self.target, value, iteration)
+        if held and self.state.lost_at is not None:
+            logger.warning("%s", self.verdict())
+
+    def verdict(self) -> str:
+        """Whether the target was held, in one sentence; empty without a target."""
+        state, settings = self.state, self.settings
+        if self.target is None or state.measured is None:
+            return ""
+        if state.lost_at is None:
+            return f"hold={settings.hold} was held: {self.target.figure} {state.measured:.4g} at the last measurement."
+        return (
+            f"hold={settings.hold} could not be held: at iteration {state.lost_at} the weights of the regularisation "
+            f"were at their bound, {HIGHEST:g} times the first ones, and {self.target.figure} was still above the "
+            f"target ({state.measured:.4g} at the last measurement); lower optimizer.lr, raise the weights, or allow "
+            "more"
+        )
+
+    def summary(self) -> dict[str, Any] | None:
+        """JSON-able, for the metrics; None without a target."""
+        if self.target is None:
+            return None
+        return {
+            "target": self.settings.hold,
+            "measured": self.state.measured,
+            "weight": self.weight,
+            "kl_weight": self.kl_weight,
+            "not_held_from": self.state.lost_at,
+            "verdict": self.verdict(),
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """For a checkpoint."""
+        return asdict(self.state)
+
+    def load_state_dict(self, state: dict[str, Any] | None) -> None:
+        """Inverse of :meth:`state_dict`; None, of an earlier version's checkpoint, leaves all as it is."""
+        self.state = HoldState(**(state or {}))

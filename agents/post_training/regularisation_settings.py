@@ -1,0 +1,77 @@
+"""Keys of what keeps a prior near where it began: regularisation and adapters; imports no torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from agents.configuration.checks import at_least, positive
+from agents.post_training.hold import Target
+from scene_envs.errors import InvalidInputError
+
+
+@dataclass
+class RegularisationSettings:
+    """What keeps a prior a prior: the pretraining loss on real scenes, and the KL divergence from the base prior.
+
+    Attributes:
+        weight: coefficient of the pretraining loss.
+        kl: coefficient of the KL divergence from the base prior, on own samples, in nats per random variable of a
+            scene; null for none, or 1 with ``hold=kl:VALUE``.
+        hold: what the run may lose, held by a factor on both coefficients: ``guard:1.05`` for the held-out loss as a
+            ratio to the base prior's, ``kl:0.01`` for the KL divergence; null keeps the coefficients as they are.
+        batch_size: real scenes per update.
+        scenes: ``grammar``, or the directory of a dataset.
+        bank_size: how many real scenes are drawn (grammar) or read (dataset), the held-out ones included.
+    """
+
+    weight: float = 0.5
+    kl: float | None = None
+    hold: str | None = None
+    batch_size: int = 48
+    scenes: str = "grammar"
+    bank_size: int = 4096
+
+    def __post_init__(self) -> None:
+        at_least(self, 1, "batch_size")
+        if self.weight < 0:
+            raise InvalidInputError(f"regularisation.weight={self.weight} must not be negative")
+        if self.kl is not None and not self.kl >= 0:
+            raise InvalidInputError(f"regularisation.kl={self.kl} must not be negative")
+        if self.target is not None and not self.weight and not self.kl_weight:
+            raise InvalidInputError(
+                f"hold={self.hold} adjusts regularisation.weight and regularisation.kl, and both are 0; give one"
+            )
+
+    @property
+    def target(self) -> Target | None:
+        """What ``hold`` says."""
+        return None if self.hold is None else Target.parse(self.hold)
+
+    @property
+    def kl_weight(self) -> float:
+        """``kl``, or what null stands for."""
+        if self.kl is None:
+            return float(self.target is not None and self.target.figure == "kl")
+        return self.kl
+
+
+@dataclass
+class AdapterSettings:
+    """Low-rank updates of the attention and MLP matrices, which are trained in place of all weights.
+
+    Attributes:
+        rank: of the updates; 0 trains all weights.
+        alpha: updates are scaled by alpha / rank.
+    """
+
+    rank: int = 0
+    alpha: float = 16.0
+
+    def __post_init__(self) -> None:
+        at_least(self, 0, "rank")
+        positive(self, "alpha")
+
+    @property
+    def scale(self) -> float:
+        """Of the updates."""
+        return self.alpha / self.rank

@@ -1,0 +1,179 @@
+"""Adapters of priors: low-rank updates in a file of their own, which belong to the weights of one prior."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from torch import Tensor
+
+from agents.networks.low_rank import add_low_rank, low_rank_tensors, merge, set_low_rank
+from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.files import write_json
+from scene_envs.tensor_files import read_tensors, tensors_digest, write_tensors
+
+ADAPTER_NAME = "adapter.safetensors"
+AdapterSpec = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
+"""A file, or the folder of a run; several joined by ``+``, or in a list; each may have a factor before ``*``."""
+
+
+@dataclass(frozen=True)
+class AdapterFacts:
+    """What an adapter says of itself, in the JSON file beside its tensors.
+
+    Attributes:
+        rank: of the updates.
+        scale: of the updates.
+        prior: name of the prior that it was trained on.
+        digest: SHA-256 of that prior's weights.
+    """
+
+    rank: int
+    scale: float
+    prior: str
+    digest: str
+
+
+class Adaptable(Protocol):
+    """What adapters ask of a prior; :class:`~agents.priors.base.ScenePrior` has it."""
+
+    adapter: AdapterFacts | None
+    denoiser: Any
+
+    def weights(self) -> dict[str, Tensor]:
+        """Trained tensors by name."""
+        ...
+
+    def requires_grad_(self, requires_grad: bool = True) -> Any:
+        """As of torch modules."""
+        ...
+
+
+Prior = TypeVar("Prior", bound=Adaptable)
+
+
+@dataclass(frozen=True)
+class AdapterTerm:
+    """One adapter of a sum.
+
+    Attributes:
+        path: its file, or a folder that holds it.
+        factor: on its updates.
+    """
+
+    path: Path
+    factor: float = 1.0
+
+    @property
+    def file(self) -> Path:
+        """Where the tensors are."""
+        return self.path / ADAPTER_NAME if self.path.is_dir() else self.path
+
+
+def parse_adapters(spec: AdapterSpec) -> list[AdapterTerm]:
+    """The adapters that a user named; a path that exists is one adapter, whatever characters it has.
+
+    >>> parse_adapters("runs/a+0.5*runs/b")
+    [AdapterTerm(path=PosixPath('runs/a'), factor=1.0), AdapterTerm(path=PosixPath('runs/b'), factor=0.5)]
+    """
+    if not isinstance(spec, str | os.PathLike):
+        return [term for each in spec for term in parse_adapters(each)]
+    if Path(spec).exists():
+        return [AdapterTerm(Path(spec))]
+    terms = []
+    for part in str(spec).split("+"):
+        factor, _, path = part.rpartition("*")
+        if not path or (factor and not re.fullmatch(r"-?\d+(\.\d*)?", factor.strip())):
+            raise InvalidInputError(f"adapter={str(spec)!r}: write PATH or FACTOR*PATH in place of {part!r}")
+        terms.append(AdapterTerm(Path(path.strip()), float(factor or 1)))
+    return terms
+
+
+def attach_adapter(prior: Adaptable, name: str, *, rank: int, scale: float, seed: int) -> None:
+    """Freeze a prior, and give its network low-rank updates that are trained.
+
+    Args:
+        prior: is changed.
+        name: that the adapter's file gives for it.
+        rank: of the updates.
+        scale: of the updates.
+        seed: of their random halves.
+    """
+    prior.adapter = AdapterFacts(rank, scale, name, weights_digest(prior))
+    prior.requires_grad_(False)
+    add_low_rank(prior.denoiser.network, rank, scale, seed)
+
+
+def save_adapter(prior: Adaptable, directory: str | os.PathLike[str]) -> Path:
+    """Write ``adapter.safetensors`` and ``adapter.json`` of a prior with low-rank updates into ``directory``."""
+    assert prior.adapter is not None
+    path = write_tensors(Path(directory) / ADAPTER_NAME, low_rank_tensors(prior.denoiser.network))
+    write_json(path.with_suffix(".json"), asdict(prior.adapter))
+    return path
+
+
+def with_adapter_of(prior: Prior, directory: str | os.PathLike[str]) -> Prior:
+    """A copy of a prior with low-rank updates that has those saved in ``directory``."""
+    copy = deepcopy(prior)
+    set_low_rank(copy.denoiser.network, read_tensors(Path(directory) / ADAPTER_NAME)[0])
+    return copy
+
+
+def merge_adapters(prior: Adaptable, name: str, terms: Sequence[AdapterTerm]) -> None:
+    """Add the updates of adapters to the weights of a prior.
+
+    Args:
+        prior: is changed.
+        name: of the prior, for messages.
+        terms: adapters that were all trained on this prior.
+
+    Raises:
+        InvalidInputError: a file is missing, or an adapter is of another prior.
+        CorruptFileError: a file is not an adapter.
+    """
+    digest = weights_digest(prior)
+    found = [(term, _read_facts(term), _read_tensors(term)) for term in terms]
+    for term, facts, _ in found:
+        if facts.digest != digest:
+            same = "" if facts.prior != name else ", whose weights have changed since"
+            raise InvalidInputError(
+                f"the adapter {str(term.path)!r} was trained on the prior {facts.prior!r} (weights {facts.digest[:8]})"
+                f"{same}, and not on {name!r} (weights {digest[:8]}); load it with prior={facts.prior}, or train one "
+                f"of {name!r}"
+            )
+    for term, facts, tensors in found:
+        try:
+            merge(prior.denoiser.network, tensors, term.factor * facts.scale)
+        except (KeyError, RuntimeError) as error:
+            raise CorruptFileError(f"the tensors of {str(term.file)!r} do not fit {name!r}: {error}") from error
+
+
+def weights_digest(prior: Adaptable) -> str:
+    """SHA-256 of a prior's weights."""
+    return tensors_digest({key: tensor.detach().cpu() for key, tensor in prior.weights().items()})
+
+
+def _read_facts(term: AdapterTerm) -> AdapterFacts:
+    file = term.file.with_suffix(".json")
+    try:
+        return AdapterFacts(**json.loads(file.read_text(encoding="utf-8")))
+    except (FileNotFoundError, NotADirectoryError):
+        raise InvalidInputError(
+            f"adapter={str(term.path)!r}: there is no {str(file)!r}; name an adapter.safetensors with its adapter.json "
+            "beside it, or the folder of a run with adapter.rank"
+        ) from None
+    except (ValueError, TypeError, UnicodeDecodeError) as error:
+        raise CorruptFileError(f"{str(file)!r} is not the description of an adapter: {error}") from error
+
+
+def _read_tensors(term: AdapterTerm) -> dict[str, Tensor]:
+    try:
+        return read_tensors(term.file)[0]
+    except FileNotFoundError:
+        raise InvalidInputError(f"adapter={str(term.path)!r}: there is no {str(term.file)!r}") from None

@@ -1,0 +1,151 @@
+"""Adapters: low-rank updates of a prior's attention and MLP matrices, in files of their own."""
+
+from __future__ import annotations
+
+import json
+from copy import deepcopy
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Generator
+
+from agents.cli.commands.sample import SampleConfig
+from agents.cli.keys import compose, help_text
+from agents.networks import network_config
+from agents.networks.low_rank import low_rank_tensors, matrices
+from agents.networks.registry import build_network
+from agents.priors import ScenePrior, list_priors
+from agents.priors.adapters import ADAPTER_NAME, attach_adapter, save_adapter
+from agents.priors.testing import tiny_prior
+from scene_envs.envs.resolvers import resolve_prior
+from scene_envs.errors import CorruptFileError, InvalidInputError
+
+RANK, SCALE = 2, 4.0
+
+
+def _adapted(base: ScenePrior, name: str, seed: int, *, moved: bool = True) -> ScenePrior:
+    """A copy with an adapter, whose updates are random if ``moved``."""
+    prior = deepcopy(base)
+    attach_adapter(prior, name, rank=RANK, scale=SCALE, seed=seed)
+    if moved:
+        generator = Generator().manual_seed(seed)
+        with torch.no_grad():
+            for tensor in low_rank_tensors(prior.denoiser.network).values():
+                tensor.copy_(0.05 * torch.randn(tensor.shape, generator=generator))
+    return prior
+
+
+@pytest.fixture(params=["continuous", "mixed"])
+def base(request: pytest.FixtureRequest) -> ScenePrior:
+    return tiny_prior(process=request.param)
+
+
+def test_a_new_adapter_changes_nothing(base: ScenePrior) -> None:
+    prior = _adapted(base, "tiny", 0, moved=False)
+    before, after = (each.sample(2, num_steps=4, seed=1).tensor for each in (base, prior))
+    assert torch.equal(before, after)
+
+
+def test_the_gradient_reaches_the_adapter_alone(base: ScenePrior) -> None:
+    prior = _adapted(base, "tiny", 0)
+    prior.pretraining_loss(prior.encode(prior.sample(2, num_steps=3)), Generator().manual_seed(0)).backward()
+    trained = {id(tensor) for tensor in low_rank_tensors(prior.denoiser.network).values()}
+    assert trained
+    assert {id(p) for p in prior.parameters() if p.requires_grad} == trained
+    with_gradient = {id(p) for p in prior.parameters() if p.grad is not None}
+    assert with_gradient <= trained
+    assert len(with_gradient) >= len(trained) - 8  # blocks that read text have none here
+
+
+def test_a_saved_prior_has_the_updates_in_its_weights(base: ScenePrior, tmp_path: Path) -> None:
+    """base + scale * up @ down, by the prior's own file, by its adapter, and by hand; names are those of the base."""
+    base.save(tmp_path / "base")
+    prior = _adapted(base, str(tmp_path / "base"), 0)
+    save_adapter(prior, tmp_path)
+    prior.save(tmp_path / "whole")
+    loaded = ScenePrior.load(tmp_path / "base", adapter=tmp_path)
+    whole, plain, updates = (
+        ScenePrior.load(tmp_path / "whole"),
+        base.weights(),
+        low_rank_tensors(prior.denoiser.network),
+    )
+    assert whole.weights().keys() == plain.keys()
+    for name, weight in plain.items():
+        layer = name.removesuffix(".weight")
+        change = SCALE * updates[f"{layer}.up"] @ updates[f"{layer}.down"] if f"{layer}.up" in updates else 0.0
+        for found in (whole, loaded):
+            assert torch.allclose(found.weights()[name], weight + change, atol=1e-6)
+    samples = [each.sample(2, num_steps=3, seed=0).tensor for each in (prior, whole, loaded)]
+    assert torch.allclose(samples[0], samples[1], atol=1e-3)
+    assert torch.allclose(samples[0], samples[2], atol=1e-3)
+
+
+def test_adapters_add_with_factors_and_any_spelling_of_a_sum(tmp_path: Path) -> None:
+    base = tiny_prior()
+    folder = base.save(tmp_path / "base")
+    a, b = (_adapted(base, str(folder), seed) for seed in (1, 2))
+    paths = [str(save_adapter(prior, tmp_path / name).parent) for prior, name in ((a, "a"), (b, "b"))]
+    key = next(matrices(base.denoiser.network))[0] + ".weight"
+    weight = base.weights()[key]
+    expected = weight + (a.weights()[key] - weight) + 0.5 * (b.weights()[key] - weight)
+    for prior in (
+        ScenePrior.load(folder, adapter=f"{paths[0]}+0.5*{paths[1]}"),
+        ScenePrior.load(folder, adapter=[paths[0], f"0.5*{paths[1]}"]),
+        ScenePrior.load(f"{folder} with {paths[0]}+0.5*{paths[1]}/{ADAPTER_NAME}"),
+        resolve_prior(f"{folder} with {paths[0]}+0.5*{paths[1]}"),
+    ):
+        assert torch.allclose(prior.weights()[key], expected, atol=1e-6)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("word", "spec"),
+    [("adapter=a", "a"), ("adapter=a+0.5*b", "a+0.5*b"), ("adapter=[a,b]", "a+b"), ("adapter=a,b", "a+b")],
+)
+def test_commands_take_adapters_where_they_take_a_prior(word: str, spec: str) -> None:
+    assert compose("sample", SampleConfig, ["prior=pantry_shelf", word]).prior == f"pantry_shelf with {spec}"
+    assert "adapter=" in help_text(SampleConfig)
+
+
+def test_an_adapter_of_another_prior_is_refused_and_both_are_named(tmp_path: Path) -> None:
+    base, other = tiny_prior(), tiny_prior(seed=1)
+    folder, others = base.save(tmp_path / "base"), other.save(tmp_path / "other")
+    save_adapter(_adapted(base, str(folder), 0), tmp_path)
+    with pytest.raises(InvalidInputError, match=r"base'.* not on .*other'"):
+        ScenePrior.load(others, adapter=tmp_path)
+    other.save(folder)
+    with pytest.raises(InvalidInputError, match="have changed since"):
+        ScenePrior.load(folder, adapter=tmp_path)
+
+
+def test_bad_files_and_sums_are_refused(tmp_path: Path) -> None:
+    base = tiny_prior()
+    folder = base.save(tmp_path / "base")
+    save_adapter(_adapted(base, str(folder), 0), tmp_path)
+    for spec, said in (("nowhere", "nowhere"), ("x*a", "FACTOR"), ("a+", "FACTOR"), (str(folder), "no .*adapter")):
+        with pytest.raises(InvalidInputError, match=said):
+            ScenePrior.load(folder, adapter=spec)
+    (tmp_path / ADAPTER_NAME).write_bytes(b"not tensors")
+    with pytest.raises(CorruptFileError):
+        ScenePrior.load(folder, adapter=tmp_path)
+    (tmp_path / "adapter.json").write_text("{}")
+    with pytest.raises(CorruptFileError, match="description"):
+        ScenePrior.load(folder, adapter=tmp_path)
+    (tmp_path / ADAPTER_NAME).unlink()
+    with pytest.raises(InvalidInputError, match="rank=99"):
+        attach_adapter(base, "tiny", rank=99, scale=1.0, seed=0)
+
+
+@pytest.mark.parametrize("name", list_priors())
+def test_adapters_of_shipped_priors_are_small(name: str, tmp_path: Path) -> None:
+    prior = ScenePrior.load(name)
+    attach_adapter(prior, name, rank=4, scale=1.0, seed=0)
+    assert save_adapter(prior, tmp_path).stat().st_size < 2**20
+    assert json.loads((tmp_path / "adapter.json").read_text())["prior"] == name
+
+
+@pytest.mark.parametrize("name", ["flux", "midiffusion", "diffuscene"])
+@pytest.mark.parametrize("process", ["continuous", "mixed"])
+def test_every_network_has_attention_matrices(name: str, process: str) -> None:
+    network = build_network(network_config(name, process, features=20, categories=8, hidden=16, depth=1, heads=2))
+    assert any(layer.weight.shape[0] >= 16 for _, layer in matrices(network))
