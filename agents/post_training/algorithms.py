@@ -31,6 +31,8 @@ class AlgorithmSettings:
 
     learning_rate: ClassVar[float] = 5e-5
     """Learning rate unless ``optimizer.lr`` names another."""
+    regularisation_weight: ClassVar[float] = 0.5
+    """Coefficient of the pretraining loss unless ``regularisation.weight`` names another."""
     sample_limits: ClassVar[Mapping[str, float]] = {}
     """Limits of the guard's figures of samples, unless ``guard`` names others; a reward may ask for other counts."""
 
@@ -125,6 +127,7 @@ class ForwardProcessSettings(AlgorithmSettings):
     """
 
     learning_rate: ClassVar[float] = 2e-4
+    regularisation_weight: ClassVar[float] = 0.2
     sample_limits: ClassVar[Mapping[str, float]] = {
         "count_distance": 1.0,
         "category_kl": 0.05,

@@ -210,6 +210,8 @@ class PostTrainConfig:
         if self.optimizer.lr is None:
             factor = _ADAPTER_RATE if self.adapter.rank else 1.0
             self.optimizer = replace(self.optimizer, lr=factor * self.algorithm.learning_rate)
+        if self.regularisation.weight is None:
+            self.regularisation = replace(self.regularisation, weight=self.algorithm.regularisation_weight)
         prior, adapter = split_name(self.prior)
         if self.adapter.rank and adapter:
             raise InvalidInputError(

@@ -183,17 +183,18 @@ def _advice(report: DoctorReport, config: PostTrainConfig) -> list[str]:
             "The rewards differ between prompts but not within any: there is nothing to learn. Raise scenes_per_prompt "
             f"from {config.algorithm.scenes_per_prompt}, or use a reward that differs between scenes of one prompt."
         )
-    if config.regularisation.weight > 0 and report.policy_gradient_norm > 0:
+    weight = config.regularisation.pretraining_weight
+    if weight > 0 and report.policy_gradient_norm > 0:
         if report.gradient_ratio < QUIET:
             advice.append(
                 f"Regularisation drowns the reward (ratio {report.gradient_ratio:.2g}): "
-                f"lower regularisation.weight from {config.regularisation.weight:g}, or change "
+                f"lower regularisation.weight from {weight:g}, or change "
                 "algorithm.log_prob_reduction."
             )
         if report.gradient_ratio > LOUD:
             advice.append(
                 f"The reward drowns the regularisation (ratio {report.gradient_ratio:.2g}): "
-                f"raise regularisation.weight from {config.regularisation.weight:g}, or expect the guard to stop you."
+                f"raise regularisation.weight from {weight:g}, or expect the guard to stop you."
             )
     if not report.steps:
         return advice

@@ -40,7 +40,7 @@ class Regularisation:
     @property
     def weight(self) -> float:
         """Coefficient of the pretraining loss on real scenes."""
-        return self.settings.weight * self.state.factor
+        return self.settings.pretraining_weight * self.state.factor
 
     @property
     def kl_weight(self) -> float:

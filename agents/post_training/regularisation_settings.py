@@ -14,7 +14,7 @@ class RegularisationSettings:
     """What keeps a prior a prior: the pretraining loss on real scenes, and the KL divergence from the base prior.
 
     Attributes:
-        weight: coefficient of the pretraining loss.
+        weight: coefficient of the pretraining loss; null takes the algorithm's own.
         kl: coefficient of the KL divergence from the base prior, on own samples, in nats per random variable of a
             scene; null for none, or 1 with ``hold=kl:VALUE``.
         hold: what the run may lose, held by a factor on both coefficients: ``guard:1.05`` for the held-out loss as a
@@ -24,7 +24,7 @@ class RegularisationSettings:
         bank_size: how many real scenes are drawn (grammar) or read (dataset), the held-out ones included.
     """
 
-    weight: float = 0.5
+    weight: float | None = None
     kl: float | None = None
     hold: str | None = None
     batch_size: int = 48
@@ -33,11 +33,11 @@ class RegularisationSettings:
 
     def __post_init__(self) -> None:
         at_least(self, 1, "batch_size")
-        if self.weight < 0:
+        if self.weight is not None and not self.weight >= 0:
             raise InvalidInputError(f"regularisation.weight={self.weight} must not be negative")
         if self.kl is not None and not self.kl >= 0:
             raise InvalidInputError(f"regularisation.kl={self.kl} must not be negative")
-        if self.target is not None and not self.weight and not self.kl_weight:
+        if self.target is not None and self.weight == 0 and not self.kl_weight:
             raise InvalidInputError(
                 f"hold={self.hold} adjusts regularisation.weight and regularisation.kl, and both are 0; give one"
             )
@@ -46,6 +46,11 @@ class RegularisationSettings:
     def target(self) -> Target | None:
         """What ``hold`` says."""
         return None if self.hold is None else Target.parse(self.hold)
+
+    @property
+    def pretraining_weight(self) -> float:
+        """``weight``; 0 for null, which a run's config has replaced by the algorithm's own."""
+        return self.weight or 0.0
 
     @property
     def kl_weight(self) -> float:

@@ -11,6 +11,7 @@ from gymnasium import spaces
 from scene_envs.envs.denoising import DenoisingCore
 from scene_envs.envs.settings import DenoisingSettings, takes
 from scene_envs.envs.spaces import STATE_BOUND, check_action, check_render_mode, picture, scene_box
+from scene_envs.envs.specs import SpecMixin
 from scene_envs.envs.trajectories import StepResult
 
 Observation = dict[str, np.ndarray]
@@ -29,7 +30,7 @@ def denoising_observation_space(core: DenoisingCore) -> spaces.Dict:
     return spaces.Dict(observed)
 
 
-class DenoisingEnv(gym.Env[Any, np.ndarray]):
+class DenoisingEnv(SpecMixin, gym.Env[Any, np.ndarray]):
     """The denoising process of a scene prior as an environment.
 
     ## Description

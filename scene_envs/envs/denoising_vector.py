@@ -13,11 +13,12 @@ from scene_envs.envs.denoising import DenoisingCore
 from scene_envs.envs.denoising_gymnasium import Observation, denoising_observation_space
 from scene_envs.envs.settings import DenoisingSettings, takes
 from scene_envs.envs.spaces import check_render_mode, check_reset_mask, picture, scene_box
+from scene_envs.envs.specs import SpecMixin
 from scene_envs.envs.trajectories import BoolArray, StepResult
 from scene_envs.errors import InvalidInputError, unknown_name
 
 
-class DenoisingVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
+class DenoisingVectorEnv(SpecMixin, VectorEnv[Observation, np.ndarray, np.ndarray]):
     """B denoising environments as one batch; the page of the environment is :class:`DenoisingEnv`.
 
     Args:

@@ -13,13 +13,14 @@ from scene_envs.envs.errors import ResetNeededError
 from scene_envs.envs.search import SearchProblem, SearchState
 from scene_envs.envs.settings import SearchSettings, takes
 from scene_envs.envs.spaces import STATE_BOUND, check_render_mode, occupied, picture, scene_box
+from scene_envs.envs.specs import SpecMixin
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
 Observation = dict[str, np.ndarray]
 
 
-class SearchEnv(gym.Env[Any, Any]):
+class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     """Inference-time search over partial scenes as an environment.
 
     ## Description

@@ -78,6 +78,14 @@ def test_the_spec_goes_to_json_and_back(prior, monkeypatch):
     assert data_equivalence(env.reset(seed=1), again.reset(seed=1), exact=True)
 
 
+@pytest.mark.parametrize("env_id", ["SceneEnvs/Denoising-v0", "SceneEnvs/Search-v0"])
+def test_a_spec_with_a_function_says_why_it_is_no_json(env_id, height):
+    key = "reward" if "Denoising" in env_id else "objective"
+    env = gym.make(env_id, scene="dimsum_table", num_steps=2, **{key: height})
+    with pytest.raises(InvalidInputError, match=f"{key}=.* is no text, number or list; register it"):
+        env.spec.to_json()
+
+
 def test_single_face_names_bad_actions(prior, height):
     env = gym.make(ID, prior=prior, reward=height, num_steps=3)
     env.reset(seed=0)
