@@ -92,14 +92,24 @@ class DenoisingPolicy(TensorDictModuleBase):
             reverse = prior.transition(x_t, step, self.table, text=text, guidance=self.guidance)
         return reverse
 
+    @torch.no_grad()
     def draw(
-        self, x_t: Tensor, step: int, generator: Generator | None = None, text: Text | None = None
+        self,
+        x_t: Tensor,
+        step: int,
+        generator: Generator | None = None,
+        text: Text | None = None,
+        noise: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """An action (B, N, D) and its log-probability per slot (B, N), without gradients."""
-        with torch.no_grad():
-            reverse = self.distribution(x_t, step, text)
-            action = reverse.from_noise(torch.randn(x_t.shape, generator=generator, device=x_t.device))
-            return action, reverse.log_prob(action)
+        """An action (B, N, D) and its log-probability per slot (B, N), without gradients.
+
+        The action is made of standard normal ``noise`` (B, N, D), which is drawn from ``generator`` where it is None.
+        """
+        reverse = self.distribution(x_t, step, text)
+        if noise is None:
+            noise = torch.randn(x_t.shape, generator=generator, device=x_t.device)
+        action = reverse.from_noise(noise)
+        return action, reverse.log_prob(action)
 
     def log_prob(self, x_t: Tensor, step: int, action: Tensor, text: Text | None = None) -> Tensor:
         """(B, N) log-probability per slot of ``action``; states and actions are taken as constants."""

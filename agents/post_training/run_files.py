@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,14 @@ def write_text(path: Path, text: str) -> None:
         files.write_text(path, text)
     except OSError as error:
         raise TrainingError(f"could not write {str(path)!r} ({error}); free some space and run again") from error
+
+
+def writing(what: str, write: Callable[[], object]) -> None:
+    """Run ``write``; a disk that refuses ``what`` becomes a TrainingError."""
+    try:
+        write()
+    except (OSError, RuntimeError) as error:
+        raise TrainingError(f"could not write {what} ({error}); free some space and run the same again") from error
 
 
 def write_config(directory: Path, config: PostTrainConfig) -> None:
