@@ -187,3 +187,17 @@ def gathered(rollout: Rollout) -> tuple[Tensor, Tensor, dict[str, Tensor], Scene
     terms = {name: gather_rows(term) for name, term in rollout.terms.items()}
     scenes = SceneBatch(gather_rows(rollout.batch.tensor), rollout.batch.scene_type)
     return gather_rows(rollout.reward), gather_rows(rollout.valid), terms, scenes
+
+
+def reward_figures(rollout: Rollout) -> dict[str, float]:
+    """Figures of the rewards of all processes, for a row of the log; means are over valid scenes, NaN without one."""
+    reward, valid, terms, scenes = gathered(rollout)
+    reward = reward[valid]
+    some = len(reward) > 0
+    figures = {
+        "reward": float(reward.mean()) if some else float("nan"),
+        "reward_std": float(reward.std(unbiased=False)) if some else float("nan"),
+        "valid_fraction": float(valid.float().mean()),
+        "objects": float(scenes.counts.float().mean()),
+    }
+    return figures | {f"term_{name}": float(term[valid].mean()) for name, term in terms.items() if some}

@@ -18,18 +18,17 @@ from agents.post_training.guard_files import GuardFiles, make_guard
 from agents.post_training.learner import Learner, NonFiniteGradient
 from agents.post_training.processes import check_shares
 from agents.post_training.progress import run_progress
-from agents.post_training.prompts import PROMPTS_NAME, PromptSets, prompts_beside, save_prompts
-from agents.post_training.rollouts import Rollout, gathered, stream_seed
+from agents.post_training.prompts import PromptSets, prompts_beside
+from agents.post_training.rollouts import Rollout, gathered, reward_figures, stream_seed
 from agents.post_training.run_files import (
     CHECKPOINT_NAME,
-    SCENES_NAME,
     load_resumable,
+    run_metrics,
     write_config,
     write_log,
     write_metrics,
-    writing,
 )
-from agents.post_training.scene_bank import SceneBank, real_scenes
+from agents.post_training.scene_bank import SceneBank, kept_scenes
 from agents.priors.base import ScenePrior
 from agents.priors.prompt_validation import check_object_count
 from agents.utils.checkpoints import save_checkpoint
@@ -39,7 +38,6 @@ from agents.utils.process_group import ProcessGroup, launched_processes
 from rewards import reward_name
 from scene_envs.errors import TrainingError
 from scene_envs.folders import claimed
-from scene_envs.scene import SceneBatch
 
 _MOST_ROLLBACKS = 3
 """Returns to the best checkpoint after which a run ends."""
@@ -175,32 +173,14 @@ class PostTrainer:
 
     def prepare(self, *, reuse_scenes: bool = False) -> None:
         """Draw the real scenes, or reuse those kept beside a run that is resumed, and make the guard."""
-        config, path, texts = self.config, self.directory / SCENES_NAME, self.directory / PROMPTS_NAME
-        seed = stream_seed(config.seed, "bank")
-        if not self.processes.is_first:
-            self.processes.wait()  # until the first has written them
-            batch = SceneBatch.load(path)
-        elif reuse_scenes and path.exists():
-            batch = SceneBatch.load(path)
-        else:
-            slots = self.learner.slots
-            batch, found = real_scenes(
-                self.prior, config.regularisation.scenes, config.regularisation.bank_size, seed=seed, slots=slots
-            )
-            writing(f"the real scenes {str(path)!r}", lambda: batch.save(path))
-            texts.unlink(missing_ok=True)  # of other scenes, by a run that never reached a checkpoint
-            if found is not None and self.prior.conditional:
-                writing(f"their prompts {str(texts)!r}", lambda: save_prompts(texts, found))
-        if self.processes.is_first:
-            self.processes.wait()
+        config, seed, slots = self.config, stream_seed(self.config.seed, "bank"), self.learner.slots
+        batch = kept_scenes(self.directory, self.prior, config.regularisation, seed, slots, reuse=reuse_scenes)
         prompts: PromptSets | None = None
         if self.prior.conditional:
             prompts = prompts_beside(self.directory, batch, seed)
             if config.prompt == "data":
-                large = torch.nonzero(batch.counts > self.learner.slots)[:, 0].tolist()
-                check_object_count(
-                    [text for i in large for text in prompts(i)], self.prior.scene_type, self.learner.slots
-                )
+                large = torch.nonzero(batch.counts > slots)[:, 0].tolist()
+                check_object_count([text for i in large for text in prompts(i)], self.prior.scene_type, slots)
         x0 = self.prior.encode(batch.to(config.device))
         self.scenes = SceneBank.split(x0, config.guard.scenes, prompts)
         self.guard = make_guard(config, self.learner, self.scenes)
@@ -209,7 +189,7 @@ class PostTrainer:
     def step(self) -> tuple[Rollout, dict[str, float]]:
         """One iteration: a batch of fresh scenes and its updates. Returns the scenes and the row for the log."""
         rollout = self.learner.rollout(self.iteration)
-        row = {"iteration": float(self.iteration + 1), **_reward_figures(rollout)}
+        row = {"iteration": float(self.iteration + 1), **reward_figures(rollout)}
         if row["valid_fraction"] > 0:
             self.invalid_streak = 0
             row |= self._learn(rollout)
@@ -303,20 +283,8 @@ class PostTrainer:
         self.learner.restore(state["learner"])
 
     def _finish(self) -> PostTrainResult:
-        rewards = [row["reward"] for row in self.history if math.isfinite(row["reward"])]
-        metrics = {
-            "iterations": self.iteration,
-            "seconds": round(self.seconds, 1),
-            "reward": {
-                "first": rewards[0] if rewards else None,
-                "last": rewards[-1] if rewards else None,
-                "best": self.guard.best_reward,
-                "invalid_scenes": round(
-                    sum((1.0 - row["valid_fraction"]) * self.config.batch_size for row in self.history)
-                ),
-            },
-            "guard": {**self.guard.summary(), "rollbacks": self.rollbacks},
-        }
+        guard = {**self.guard.summary(), "rollbacks": self.rollbacks}
+        metrics = run_metrics(self.history, self.config.batch_size, self.seconds, self.guard.best_reward, guard)
         if self.processes.is_first:
             write_metrics(self.directory, metrics)
             draw_curve(
@@ -327,17 +295,3 @@ class PostTrainer:
                 beyond=self.guard.over_limit_at,
             )
         return PostTrainResult(self.files.best(), self.history, metrics, self.directory, self.config)
-
-
-def _reward_figures(rollout: Rollout) -> dict[str, float]:
-    """Of the scenes of all processes."""
-    reward, valid, terms, batch = gathered(rollout)
-    reward = reward[valid]
-    some = len(reward) > 0
-    figures = {
-        "reward": float(reward.mean()) if some else float("nan"),
-        "reward_std": float(reward.std(unbiased=False)) if some else float("nan"),
-        "valid_fraction": float(valid.float().mean()),
-        "objects": float(batch.counts.float().mean()),
-    }
-    return figures | {f"term_{name}": float(term[valid].mean()) for name, term in terms.items() if some}
