@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
@@ -18,17 +18,17 @@ Run = tuple[PostTrainConfig, str, torch.dtype]
 """A configuration, the process of its prior (``continuous`` or ``mixed``), and the dtype of everything."""
 
 
-def train(run: Run) -> None:
-    """Post-train an untrained prior that reads prompts where the run has some."""
-    config, process, dtype = run
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(dtype)
-    hook = register_module_forward_pre_hook(lambda module, inputs: tuple(_as_default(x) for x in inputs))
-    try:
-        post_train(config, prior=tiny_prior(process=process, text=config.prompt is not None).to(dtype))
-    finally:
-        hook.remove()
-        torch.set_default_dtype(before)
+def train(runs: Iterable[Run]) -> None:
+    """Post-train untrained priors, which read prompts where a run has some."""
+    for config, process, dtype in runs:
+        before = torch.get_default_dtype()
+        torch.set_default_dtype(dtype)
+        hook = register_module_forward_pre_hook(lambda module, inputs: tuple(map(_as_default, inputs)))
+        try:
+            post_train(config, prior=tiny_prior(process=process, text=config.prompt is not None).to(dtype))
+        finally:
+            hook.remove()
+            torch.set_default_dtype(before)
 
 
 def _as_default(x: Any) -> Any:
@@ -36,22 +36,27 @@ def _as_default(x: Any) -> Any:
     return x.to(torch.get_default_dtype()) if isinstance(x, torch.Tensor) and x.is_floating_point() else x
 
 
-def train_all(runs: Sequence[Run]) -> None:
-    """Several runs, one after the other."""
-    for run in runs:
-        train(run)
-
-
-def in_processes(function: Callable[..., None], *arguments: Any, count: int = 2) -> None:
-    """Call ``function`` in ``count`` processes that find each other as under ``torchrun``; raises what one raises."""
+def in_processes(function: Callable[..., None], *arguments: Any, count: int = 2) -> list[int]:
+    """Call ``function`` in ``count`` processes that find each other as under ``torchrun``; returns their statuses."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    multiprocessing.spawn(_launched, (count, port, function, arguments), nprocs=count)
+        address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1]), "WORLD_SIZE": str(count)}
+    context = multiprocessing.get_context("spawn")
+    processes = [
+        context.Process(target=_launched, args=({"RANK": str(rank), **address}, function, arguments))
+        for rank in range(count)
+    ]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join(timeout=200)
+        if process.exitcode is None:
+            process.kill()
+            process.join()
+    return [process.exitcode for process in processes]
 
 
-def _launched(rank: int, count: int, port: int, function: Callable[..., None], arguments: tuple[Any, ...]) -> None:
+def _launched(environment: dict[str, str], function: Callable[..., None], arguments: tuple[Any, ...]) -> None:
     torch.set_num_threads(1)
-    address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
-    os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": str(count), **address}
+    os.environ |= environment
     function(*arguments)
