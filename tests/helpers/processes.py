@@ -49,7 +49,7 @@ def in_processes(function: Callable[..., None], *arguments: Any, count: int = 2)
     for process in processes:
         process.start()
     for process in processes:
-        process.join(timeout=200)
+        process.join(timeout=500)
         if process.exitcode is None:
             process.kill()
             process.join()
