@@ -70,8 +70,9 @@ class DenoisingPolicy(TensorDictModuleBase):
 
         Without gradients: post-training leaves the text encoder as it is.
         """
-        tokens, mask = cast(PromptedPriorLike, self.prior).encode_tokens(prompt)
-        return tokens, mask
+        reader, size = cast(PromptedPriorLike, self.prior), self.chunk or len(prompt)
+        parts = [reader.encode_tokens(part) for part in prompt.split(size)]
+        return torch.cat([tokens for tokens, _ in parts]), torch.cat([mask for _, mask in parts])
 
     def distribution(self, x_t: Tensor, step: int, text: Text | None = None) -> ReverseStep:
         """p(x_{t-1} | x_t) of ``x_t`` (B, N, D) given ``text``; differentiable in the prior's parameters."""
