@@ -1,4 +1,4 @@
-"""Process group of a training run on several processes, as ``torchrun`` and ``accelerate launch`` start them."""
+"""Process group of a training run on several processes, as ``torchrun`` starts them."""
 
 from __future__ import annotations
 

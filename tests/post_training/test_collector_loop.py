@@ -44,7 +44,7 @@ def test_every_step_of_the_loop_improves_its_batch_and_the_next_is_sampled_with_
         optimizer.step()
         assert float(before["log_ratio"]) == 0.0  # the collector samples with the weights of now
         after = loss(batch)
-        assert float(after["loss_objective"]) < float(before["loss_objective"])
+        assert float(after["loss_objective"].detach()) < float(before["loss_objective"].detach())
         assert float(after["log_ratio"]) > 0.0
         iterations += 1
     collector.shutdown()
