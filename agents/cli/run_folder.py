@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import Any
 
 from agents.configuration.tree import config_text, dotted
-from agents.utils.process_group import is_first_process
+from agents.utils.process_group import is_first_process, launched_processes
 from scene_envs.errors import InvalidInputError
 from scene_envs.files import storage_error, write_json, write_text
 from scene_envs.folders import claimed
@@ -219,7 +219,15 @@ def _empty_files(folder: Path) -> set[Path]:
 
 
 def fresh_directory(command: str) -> str:
-    """``runs/<command>-<time>``, with a number behind it when two commands start in the same second."""
+    """``runs/<command>-<time>``, with a number behind it when two commands start in the same second.
+
+    Raises:
+        InvalidInputError: this is one of several processes, which need the same folder.
+    """
+    if (count := launched_processes()) > 1:
+        raise InvalidInputError(
+            f"the {count} processes of this run share a folder; give output=, such as runs/{command}"
+        )
     base = Path("runs") / f"{command}-{time.strftime('%Y%m%d-%H%M%S')}"
     directory, number = base, 1
     while directory.exists():

@@ -40,6 +40,10 @@ class Observed:
     pose: Tensor
     category: Tensor
 
+    def rows(self, rows: slice) -> Observed:
+        """Those of some of the scenes."""
+        return Observed(self.x[rows], self.pose[rows], self.category[rows])
+
     def flags(self) -> Tensor:
         """(B, N) int64 as the network reads them."""
         return self.pose.long() + 2 * self.category.long()

@@ -24,12 +24,7 @@ class BatchGradient(Protocol):
 
     @property
     def loss(self) -> float:
-        """Value of the objective."""
-        ...
-
-    @property
-    def norm(self) -> float:
-        """Norm of its gradient."""
+        """Value of the objective, over the scenes of all processes."""
         ...
 
     def figures(self) -> Mapping[str, float]:
@@ -69,7 +64,10 @@ class Algorithm(ABC, Generic[Credit]):
 
     @abstractmethod
     def accumulate(self, rollout: Rollout, advantage: Credit, generator: Generator) -> BatchGradient:
-        """Add the gradient of a batch to ``.grad``; everything random is drawn from ``generator`` (CPU)."""
+        """Add the gradient of a batch to ``.grad``; everything random is drawn from ``generator`` (CPU).
+
+        On several processes each adds the part of its own scenes in the mean over all, and the loop sums the parts.
+        """
 
     def kl(self, rollout: Rollout, base: ScenePrior, generator: Generator) -> Iterator[Tensor]:
         """Terms () whose sum is the KL divergence of the prior in training from ``base``, nats per random variable."""

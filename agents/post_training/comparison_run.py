@@ -15,6 +15,7 @@ from agents.post_training.rollouts import stream_seed
 from agents.post_training.run_files import SCENES_NAME
 from agents.post_training.trainer import post_train
 from agents.priors.base import ScenePrior
+from agents.utils.process_group import ProcessGroup
 from rewards import reward_name
 from scene_envs.scene import SceneBatch
 
@@ -42,13 +43,15 @@ def post_train_and_compare(
     Returns:
         The numbers of ``metrics.json``: ``before`` and ``after`` (``objects``, ``feasible_objects`` raw,
         ``ready_objects``, and ``prompt_match`` with prompts), ``change``, ``guard``, ``seconds`` of each part, and the
-        run's own.
+        run's own; of several processes the first alone measures, the others return the run's own.
     """
     from scene_envs.physics import PhysicsPool
 
     started = time.perf_counter()
     base = ScenePrior.load(config.prior if prior is None else prior)
     result = post_train(config, prior=base)
+    if not ProcessGroup.current().is_first:
+        return result.metrics
     trained = time.perf_counter()
     seed = config.seed + SAMPLE_SEED
     asked = _measured_prompts(config, base, scenes)

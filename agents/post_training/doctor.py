@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from agents.configuration.tree import changed
 from agents.post_training.config import PostTrainConfig
-from agents.post_training.gradients import accumulate_policy_gradient
+from agents.post_training.gradients import accumulate_policy_gradient, gradient_norm
 from agents.post_training.learner import Learner
 from agents.post_training.losses import DDPOSFLoss
 from agents.post_training.trainer import PostTrainer
@@ -161,7 +161,7 @@ def _step_rows(learner: Learner, rollout: Rollout, advantage: Any) -> tuple[list
         if weight > 0:
             learner.optimizer.zero_grad(set_to_none=True)
             found = accumulate_policy_gradient(loss, rollout, advantage, [step])
-            norm, largest = found.norm, max(largest, found.log_ratio)
+            norm, largest = gradient_norm(learner.parameters), max(largest, found.log_ratio)
         rows.append(StepRow(step, timesteps[step], float(learner.stds[step]), weight, norm))
     learner.optimizer.zero_grad(set_to_none=True)
     return rows, largest

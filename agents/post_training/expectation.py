@@ -12,6 +12,7 @@ from agents.networks.low_rank import LowRank
 from agents.networks.text import Text
 from agents.priors.base import ScenePrior
 from agents.priors.forward import NoisedScenes
+from agents.utils.process_group import ProcessGroup
 
 
 class Expectation(nn.Module):
@@ -41,16 +42,17 @@ class Expectation(nn.Module):
         for update in (module for module in self.prior.modules() if isinstance(module, LowRank)):
             update.requires_grad_(False)  # the copy learns with all weights
         self.prior.freeze_text()
-        self._trained = [p for p in self.prior.parameters() if p.requires_grad]
-        self.optimizer = torch.optim.AdamW(self._trained, lr=learning_rate, weight_decay=0.0)
+        self.trained = [p for p in self.prior.parameters() if p.requires_grad]
+        self.optimizer = torch.optim.AdamW(self.trained, lr=learning_rate, weight_decay=0.0)
 
     def forward(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
         """(B, N, F) expected targets."""
         return self.prior.output(noised, text).continuous
 
     def step(self, clip: float = 1.0) -> None:
-        """Apply the gradient that was accumulated; one that is not finite is dropped."""
-        if bool(torch.isfinite(nn.utils.clip_grad_norm_(self._trained, clip))):
+        """Apply the gradient that all processes accumulated; one that is not finite is dropped."""
+        ProcessGroup.current().sum_gradients(self.trained)
+        if bool(torch.isfinite(nn.utils.clip_grad_norm_(self.trained, clip))):
             self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
 

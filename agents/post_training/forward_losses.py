@@ -148,13 +148,18 @@ class ForwardProcessLoss(LossModule):
         Raises:
             InvalidInputError: an advantage has neither one value per scene nor one per slot.
         """
-        keys = self.tensor_keys
         flat = tensordict.reshape(-1)
-        scene = flat.get(keys.scene).detach()
+        timestep = flat.get(self.tensor_keys.timestep, None)
+        scene = flat.get(self.tensor_keys.scene).detach()
+        noised = self.prior.noised(scene, self.generator, None if timestep is None else timestep.reshape(-1))
+        return self.of_noised(noised, flat)
+
+    def of_noised(self, noised: NoisedScenes, flat: TensorDictBase) -> TensorDict:
+        """The loss of a batch of shape [B] whose scenes the prior has noised already."""
+        keys = self.tensor_keys
+        scene = flat.get(keys.scene)
         advantage = self._advantage(flat, keys.advantage, scene)
         credit = self._advantage(flat, keys.category_advantage, scene)
-        timestep = flat.get(keys.timestep, None)
-        noised = self.prior.noised(scene, self.generator, None if timestep is None else timestep.reshape(-1))
         tokens, mask = flat.get(keys.text, None), flat.get(keys.text_mask, None)
         text = None if tokens is None or mask is None else (tokens.detach(), mask)
         valid = flat.get(keys.valid, None)

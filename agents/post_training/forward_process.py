@@ -17,11 +17,12 @@ from agents.post_training.algorithms import AWMSettings, ForwardProcessSettings,
 from agents.post_training.base import Algorithm
 from agents.post_training.expectation import Expectation
 from agents.post_training.forward_losses import AWMLoss, ForwardProcessLoss, NFTLoss, RewardWeightedLoss
-from agents.post_training.gradients import credited_reward, gradient_norm
+from agents.post_training.gradients import GradientSum, credited_reward
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.prompts import prompt_groups
 from agents.post_training.rollouts import Branching, Rollout
 from agents.priors.base import ScenePrior
+from agents.utils.process_group import ProcessGroup, gather_rows
 from agents.utils.weight_average import WeightAverage
 
 
@@ -31,13 +32,11 @@ class ForwardGradient:
 
     Attributes:
         loss: value of the objective.
-        norm: its gradient's norm.
         distance: root mean square of the trained denoiser's output minus that of the sampling policy's.
         limited: share of bad poses that do not push any more.
     """
 
     loss: float
-    norm: float
     distance: float
     limited: float
 
@@ -127,33 +126,45 @@ class ForwardProcess(Algorithm[TensorDict]):
         """(B, 1), among siblings where there are any."""
         groups = _groups(rollout)
         if self.settings.siblings > 1:
-            groups = torch.arange(len(rollout.reward), device=rollout.reward.device) // self.settings.siblings
+            first = ProcessGroup.current().rank * len(rollout.reward)
+            rows = torch.arange(first, first + len(rollout.reward), device=rollout.reward.device)
+            groups = rows // self.settings.siblings
         return compute_advantages(rollout.reward, rollout.valid, clip=math.inf, groups=groups)[:, None]
 
     def accumulate(self, rollout: Rollout, advantage: TensorDict, generator: Generator) -> ForwardGradient:
-        """Add the gradient of a batch to ``.grad``: ``draws`` timesteps and noises of every scene."""
+        """Add the gradient of a batch to ``.grad``: ``draws`` timesteps and noises of every scene.
+
+        On several processes ``.grad`` holds the part of this one's scenes in the mean over all.
+        """
         x0 = self.prior.encode(rollout.batch.to(self.prior.device))
         fields: dict[str, Any] = {"scene": x0, "valid": rollout.valid, **advantage}
         if rollout.text is not None:
             fields |= {"text": rollout.text[0], "text_mask": rollout.text[1]}
         scenes = TensorDict(fields, [len(x0)])
-        size = self.policy.chunk or len(x0)
-        valid = max(1, int(rollout.valid.sum()))
+        size, processes = self.policy.chunk or len(x0), ProcessGroup.current()
+        valid = max(1.0, processes.sum_numbers(int(rollout.valid.sum()))[0])
+        everything, own = gather_rows(x0), processes.rows(processes.size * len(x0))
+        draws = [self.prior.noised(everything, generator).rows(own) for _ in range(self.settings.draws)]
         total, distance, limited = 0.0, 0.0, 0.0
-        self.loss.generator = generator
-        for _ in range(self.settings.draws):
-            for start in range(0, len(x0), size):
-                part = scenes[start : start + size]
-                share = int(part["valid"].sum()) / valid / self.settings.draws
-                result = self.loss(part)
+        learned = [] if self.expectation is None else self.expectation.trained
+        gradient = GradientSum([*self.prior.parameters(), *learned])
+        for start in range(0, len(x0), size):
+            rows = slice(start, start + size)
+            part = scenes[rows]
+            share = int(part["valid"].sum()) / valid / self.settings.draws
+            for noised in draws:
+                result = self.loss.of_noised(noised.rows(rows), part)
                 objective = result["loss_objective"] * share
                 (objective + result["loss_expectation"] * share).backward()
                 total += float(objective.detach())
                 distance += share * float(result["distance"]) ** 2
                 limited += share * float(result["limited"])
+            gradient.add_part()
+        gradient.write()
         if self.expectation is not None:
             self.expectation.step()
-        return ForwardGradient(total, gradient_norm(self.prior.parameters()), distance**0.5, limited)
+        total, distance, limited = processes.sum_numbers(total, distance, limited)
+        return ForwardGradient(total, distance**0.5, limited)
 
     def end_iteration(self) -> None:
         """Move the sampling policy towards the prior in training."""

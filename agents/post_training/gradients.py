@@ -1,16 +1,18 @@
-"""Policy and regularisation gradients of an update, accumulated into ``.grad`` and measured separately."""
+"""Policy and regularisation gradients of an update, accumulated into ``.grad``."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Generator, Tensor, nn
 
+from agents.networks.text import Text
 from agents.post_training.losses import DDPOSFLoss
 from agents.post_training.rollouts import Rollout
 from agents.priors.base import ScenePrior
+from agents.utils.process_group import ProcessGroup
 from scene_envs.errors import InvalidInputError
 
 
@@ -20,19 +22,53 @@ class PolicyGradient:
 
     Attributes:
         loss: value of the objective, summed over the steps taken.
-        norm: its gradient's norm.
         log_ratio: largest |log p_now - log p_sampling| of a scene's step; 0 before the first update.
         clip_fraction: mean share of clipped ratios.
     """
 
     loss: float
-    norm: float
     log_ratio: float
     clip_fraction: float
 
     def figures(self) -> Mapping[str, float]:
         """Further columns of the log."""
         return {"log_ratio": self.log_ratio, "clip_fraction": self.clip_fraction}
+
+
+class GradientSum:
+    """Sum of the gradients of parts of a batch, each of which is complete before it is added.
+
+    Two parts have the same sum, bit for bit, in one process as in two that have one each.
+
+    Args:
+        parameters: of which ``.grad`` is summed; what it holds already is the first part.
+
+    >>> weight = nn.Parameter(torch.ones(1))
+    >>> total = GradientSum([weight])
+    >>> for factor in (2.0, 3.0):
+    ...     (factor * weight).sum().backward()
+    ...     total.add_part()
+    >>> total.write()
+    >>> weight.grad
+    tensor([5.])
+    """
+
+    def __init__(self, parameters: Iterable[nn.Parameter]) -> None:
+        self._parameters = [p for p in parameters if p.requires_grad]
+        self._total: list[Tensor | None] = [None] * len(self._parameters)
+        self.add_part()
+
+    def add_part(self) -> None:
+        """Take ``.grad`` away and add it."""
+        for index, parameter in enumerate(self._parameters):
+            before, gradient = self._total[index], parameter.grad
+            self._total[index] = before if gradient is None else gradient if before is None else before.add_(gradient)
+            parameter.grad = None
+
+    def write(self) -> None:
+        """Put the sum into ``.grad``."""
+        for parameter, total in zip(self._parameters, self._total, strict=True):
+            parameter.grad = total
 
 
 def draw_steps(weights: Tensor, count: int, generator: Generator) -> tuple[list[int], float]:
@@ -45,9 +81,10 @@ def draw_steps(weights: Tensor, count: int, generator: Generator) -> tuple[list[
 def accumulate_policy_gradient(
     loss: DDPOSFLoss, rollout: Rollout, advantage: Tensor, steps: Sequence[int], *, scale: float = 1.0
 ) -> PolicyGradient:
-    """Add the policy gradient of a rollout to ``.grad``, one step and one chunk of scenes at a time.
+    """Add the policy gradient of a rollout to ``.grad``, one chunk of scenes and one step at a time.
 
-    No graph outlives its chunk, so memory does not depend on the number of steps.
+    No graph outlives its step, so memory does not depend on the number of steps. On several processes ``.grad`` holds
+    the part of this one's scenes in the mean over all.
 
     Args:
         loss: the objective; its policy's ``chunk`` bounds the scenes per pass.
@@ -59,20 +96,23 @@ def accumulate_policy_gradient(
     total, largest, clipped = 0.0, 0.0, 0.0
     batch = rollout.reward.shape[0]
     size = loss.policy.chunk or batch
-    valid_count = max(1, int(rollout.valid.sum()))
-    for step in steps:
-        for start in range(0, batch, size):
-            rows = slice(start, min(start + size, batch))
-            share = int(rollout.valid[rows].sum()) / valid_count  # a chunk's mean to the batch's mean
-            if share == 0:
-                continue
+    processes = ProcessGroup.current()
+    valid_count = max(1.0, processes.sum_numbers(int(rollout.valid.sum()))[0])
+    gradient = GradientSum(loss.policy.parameters())
+    for start in range(0, batch, size):
+        rows = slice(start, min(start + size, batch))
+        share = int(rollout.valid[rows].sum()) / valid_count  # a chunk's mean to the batch's mean
+        for step in steps if share else ():
             result = loss(rollout.transitions(step, advantage, rows))
             objective = result["loss_objective"] * (scale * share)
             objective.backward()
             total += float(objective.detach())
             largest = max(largest, float(result["log_ratio"]))
             clipped += float(result["clip_fraction"]) * share / len(steps)
-    return PolicyGradient(total, gradient_norm(loss.policy.parameters()), largest, clipped)
+        gradient.add_part()
+    gradient.write()
+    total, clipped = processes.sum_numbers(total, clipped)
+    return PolicyGradient(total, processes.largest(largest), clipped)
 
 
 def add_regularisation_gradient(
@@ -88,25 +128,38 @@ def add_regularisation_gradient(
 
     Args:
         prior: the prior in training.
-        x0: (B, N, D) normalised real scenes.
+        x0: (B, N, D) normalised real scenes, of all processes; each takes its share of them.
         coefficient: of the loss, which is a mean over scenes and entries.
         generator: source of timesteps and noise (CPU).
         chunk: scenes per pass.
         prompts: of the scenes, ``""`` for none; None for a prior that reads none.
 
     Returns:
-        The pretraining loss, and the norm of ``coefficient`` times its gradient.
+        The pretraining loss of all, and the norm of ``coefficient`` times its gradient.
     """
     if coefficient == 0:
         return 0.0, 0.0
+    processes, parameters = ProcessGroup.current(), [p for p in prior.parameters() if p.requires_grad]
+    before = [p.grad for p in parameters]
+    for parameter in parameters:
+        parameter.grad = None
+    value, total = 0.0, GradientSum(parameters)
+    noised, own = prior.noised(x0, generator), processes.rows(len(x0))
     size = chunk or len(x0)
-
-    def terms() -> Iterator[Tensor]:
-        for start in range(0, len(x0), size):
-            part, texts = x0[start : start + size], None if prompts is None else prompts[start : start + size]
-            yield prompted_loss(prior, part, texts, generator).mean() * (len(part) / len(x0))
-
-    return add_gradient(terms(), prior.parameters(), coefficient)
+    for start in range(own.start, own.stop, size):
+        rows = slice(start, min(start + size, own.stop))
+        text = None if prompts is None else encoded(prior, prompts[rows])
+        loss = prior.noised_loss(noised.rows(rows), text).mean() * ((rows.stop - start) / len(x0))
+        value += float(loss.detach())
+        (coefficient * loss).backward()
+        total.add_part()
+    total.write()
+    processes.sum_gradients(parameters)
+    norm = gradient_norm(parameters)
+    for parameter, gradient in zip(parameters, before, strict=True):
+        if gradient is not None:
+            parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
+    return processes.sum_numbers(value)[0], norm
 
 
 def add_gradient(
@@ -114,33 +167,42 @@ def add_gradient(
 ) -> tuple[float, float]:
     """Add ``coefficient`` times the gradient of a sum to ``.grad``, one term () and its graph at a time.
 
+    With several processes the sum is the mean of theirs.
+
     Returns:
         The sum, and the norm of ``coefficient`` times its gradient.
     """
+    processes = ProcessGroup.current()
     trained = [p for p in parameters if p.requires_grad]
     value, gradients = 0.0, [torch.zeros_like(p) for p in trained]
     for term in terms:
         value += float(term.detach())
         for total, gradient in zip(gradients, torch.autograd.grad(term, trained, allow_unused=True), strict=True):
             if gradient is not None:
-                total.add_(gradient, alpha=coefficient)
+                total.add_(gradient, alpha=coefficient / processes.size)
+    gradients = [processes.sum(gradient) for gradient in gradients]
     for parameter, gradient in zip(trained, gradients, strict=True):
         parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
-    return value, float(_norm(gradients))
+    norm = float(torch.stack([gradient.norm() for gradient in gradients]).norm()) if gradients else 0.0
+    return processes.sum_numbers(value)[0] / processes.size, norm
 
 
 def prompted_loss(prior: ScenePrior, x0: Tensor, prompts: Sequence[str] | None, generator: Generator | None) -> Tensor:
     """(B,) pretraining losses of real scenes ``x0`` (B, N, D), given their prompts if there are any."""
-    if prompts is None or not prior.conditional:
-        return prior.pretraining_loss(x0, generator, "none")
-    with torch.no_grad():
-        text = prior.encode_prompts(prompts)
+    text = None if prompts is None else encoded(prior, prompts)
     return prior.pretraining_loss(x0, generator, "none", text=text)
+
+
+@torch.no_grad()
+def encoded(prior: ScenePrior, prompts: Sequence[str]) -> Text | None:
+    """Text of ``prompts`` without gradients; None for a prior that reads none."""
+    return prior.encode_prompts(prompts) if prior.conditional else None
 
 
 def gradient_norm(parameters: Iterable[nn.Parameter]) -> float:
     """Euclidean norm of all ``.grad``; 0 when there is none."""
-    return float(_norm([p.grad for p in parameters if p.grad is not None]))
+    norms = [p.grad.norm() for p in parameters if p.grad is not None]
+    return float(torch.stack(norms).norm()) if norms else 0.0
 
 
 def credited_reward(rollout: Rollout, credit: str) -> tuple[Tensor, Tensor]:
@@ -156,9 +218,3 @@ def credited_reward(rollout: Rollout, credit: str) -> tuple[Tensor, Tensor]:
     free = torch.ones(rollout.per_object.shape, dtype=torch.bool, device=rollout.per_object.device)
     free[:, : len(rollout.batch.scene_type.fixed)] = False  # welded slots are not drawn
     return rollout.per_object.float(), free & rollout.valid.unsqueeze(-1)
-
-
-def _norm(gradients: Sequence[Tensor]) -> Tensor:
-    if not gradients:
-        return torch.zeros(())
-    return torch.stack([g.norm() for g in gradients]).norm()

@@ -12,6 +12,7 @@ from torch import Generator, Tensor
 from agents.post_training.gradients import prompted_loss
 from agents.post_training.sample_check import SampleCheck, beyond
 from agents.priors.base import ScenePrior
+from agents.utils.process_group import ProcessGroup
 from scene_envs.scene import SceneBatch
 
 _CHUNK = 256
@@ -89,11 +90,21 @@ class Guard:
 
     def start(self, base: ScenePrior) -> None:
         """Measure the base prior."""
-        self.base_loss = self.loss(base)
-        if self.samples is not None:
-            self.last_samples = self.samples.sample(base)
-            self.base_figures = self.samples.figures(self.last_samples)
+        self.base_loss, self.base_figures = self._measure(base, sample=True)
+        if self.base_figures:
             self.best_reward = _number(self.base_figures["sample_reward"])
+
+    def _measure(self, prior: ScenePrior, sample: bool) -> tuple[float, dict[str, float]]:
+        """The loss, and figures of samples where the guard samples; all processes get those of the first."""
+        check = self.samples if sample else None
+        batch = None if check is None else check.sample(prior)
+        if batch is not None:
+            self.last_samples = batch
+
+        def measured() -> tuple[float, dict[str, float]]:
+            return self.loss(prior), {} if check is None or batch is None else check.figures(batch)
+
+        return ProcessGroup.current().from_first(measured)
 
     @torch.no_grad()
     def loss(self, prior: ScenePrior) -> float:
@@ -128,13 +139,10 @@ class Guard:
             realism: further figures, kept with the reading.
             sample: whether to sample, where the guard does.
         """
-        loss = self.loss(prior)
+        loss, figures = self._measure(prior, sample)
         ratio = loss / self.base_loss
         over = [] if ratio <= self.limit else ["loss"]
-        figures: dict[str, float] = {}
-        if self.samples is not None and sample:
-            self.last_samples = self.samples.sample(prior)
-            figures = self.samples.figures(self.last_samples)
+        if figures:
             reward = figures["sample_reward"]
             over += beyond(figures, self.base_figures, self.limits)
         counts = self.samples is None or sample

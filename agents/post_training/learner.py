@@ -12,8 +12,9 @@ from torch import Generator, nn
 from agents.post_training.algorithms import make_algorithm
 from agents.post_training.base import Algorithm
 from agents.post_training.config import PostTrainConfig
-from agents.post_training.gradients import add_regularisation_gradient
+from agents.post_training.gradients import add_regularisation_gradient, gradient_norm
 from agents.post_training.policy import DenoisingPolicy
+from agents.post_training.processes import WholeBatchReward
 from agents.post_training.prompts import PromptDeck
 from agents.post_training.regularisation import Regularisation
 from agents.post_training.rollouts import Rollout, collect, stream_seed
@@ -23,9 +24,12 @@ from agents.priors.adapters import attach_adapter
 from agents.priors.base import ScenePrior
 from agents.priors.prompt_validation import no_text
 from agents.utils.checkpoints import check_tensors
+from agents.utils.process_group import ProcessGroup
 from agents.utils.weight_average import AveragedWeights, WeightAverage
+from rewards import depends_on_batch
 from rewards.isolation import close_reward, run_reward
 from scene_envs.envs import DenoisingTorchRLEnv
+from scene_envs.envs.scoring import RewardScorer
 from scene_envs.errors import InvalidInputError
 
 
@@ -51,6 +55,8 @@ class Learner:
         if config.prompt is not None and not self.prior.conditional:
             raise no_text(self.prior.scene_type, str(config.prompt))
         self.prior.freeze_text()
+        self.processes = ProcessGroup.current()
+        self.processes.share(self.prior.parameters())
         self.regularisation = Regularisation(config.regularisation, self.prior)
         if config.adapter.rank:
             adapter = config.adapter
@@ -68,16 +74,18 @@ class Learner:
             memory=config.reward_memory,
             workers=config.workers,
         )
+        shared = self.processes.size > 1 and depends_on_batch(self.reward)
         self.env = DenoisingTorchRLEnv(
-            config.batch_size,
+            config.batch_size // self.processes.size,
             scene=self.prior.scene_type,
-            reward=self.reward,
+            reward=WholeBatchReward(self.reward, self.processes) if shared else self.reward,
             num_steps=config.num_steps,
             prior=self.prior,
             slots=self.slots,
             workers=config.workers,
             prompt=config.prompt,
         )
+        self.scorer = RewardScorer(self.reward, config.workers) if shared else self.env.core.scorer
         self.deck: PromptDeck | None = None
         self.parameters = [p for p in self.prior.parameters() if p.requires_grad]
         self.lr = config.optimizer.lr or config.algorithm.learning_rate
@@ -94,6 +102,7 @@ class Learner:
     def close(self) -> None:
         """Stop the workers of physics and of the reward, if any."""
         self.env.close()
+        self.scorer.close()
         close_reward(self.reward)
 
     def deal_prompts(self, scenes: SceneBank) -> None:
@@ -106,13 +115,13 @@ class Learner:
             )
 
     def rollout(self, iteration: int) -> Rollout:
-        """A batch of fresh scenes."""
+        """A batch of fresh scenes, or this process's share of it."""
         algorithm, batch = self.algorithm, self.config.batch_size
         branching = algorithm.branching
         prompts = None
         if self.deck is not None:
             dealt = self.deck.deal(branching.groups(batch), self._generator("prompts", iteration))
-            prompts = [text for text in dealt for _ in range(branching.siblings)]
+            prompts = [text for text in dealt for _ in range(branching.siblings)][self.processes.rows(batch)]
         return collect(
             self.env,
             algorithm.sampling_policy,
@@ -123,7 +132,7 @@ class Learner:
         )
 
     def accumulate(self, rollout: Rollout, advantage: Any, scenes: SceneBank, index: int) -> dict[str, float]:
-        """Put both gradients into ``.grad`` and measure them apart.
+        """Put both gradients, summed over all processes, into ``.grad`` and measure them apart.
 
         Args:
             rollout: the batch.
@@ -134,6 +143,8 @@ class Learner:
         config = self.config
         self.optimizer.zero_grad(set_to_none=True)
         policy = self.algorithm.accumulate(rollout, advantage, self._generator("steps", index))
+        self.processes.sum_gradients(self.parameters)
+        policy_norm = gradient_norm(self.parameters)
         held = self.regularisation.accumulate(self.algorithm, rollout, self._generator("kl", index))
         generator = self._generator("real", index)
         x0, prompts = scenes.batch(config.regularisation.batch_size, generator)
@@ -142,7 +153,7 @@ class Learner:
         )
         return {
             "policy_loss": policy.loss,
-            "policy_gradient_norm": policy.norm,
+            "policy_gradient_norm": policy_norm,
             "pretraining_loss": real_loss,
             "pretraining_gradient_norm": real_norm,
             **held,

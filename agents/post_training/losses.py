@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import LossModule
@@ -41,7 +41,10 @@ class DDPOSFLoss(LossModule):
         advantage: (B,) or (B, 1) float, or (B, N) for credit per slot. Default ``"advantage"``.
         sample_log_prob: (B, N) float, log-probability per slot at sampling; read when clipping, and optional
             without. Default ``"slot_log_prob"``.
-        valid: (B,) or (B, 1) bool, optional; False rows are left out of the mean. Default ``"valid"``.
+        valid: (B,) or (B, 1) bool, optional; False rows are left out of the mean. Default ``"valid"``. Where
+            ``("next", valid)`` is there, as in what a collector gives, the whole episode of a scene that the reward
+            could not score is left out: rows are transitions in order along the last dimension, as ``("next", "done")``
+            parts them.
         text, text_mask: (B, L, W) tokens and (B, L) their mask, optional, as the policy saw them. Default ``"text"``
             and ``"text_mask"``.
         prompt: (B, L) int64 token indices, optional, read where ``text`` is missing. Default ``"prompt"``.
@@ -53,7 +56,7 @@ class DDPOSFLoss(LossModule):
         clip_epsilon: half-width of the ratio's clip, or None for the plain score function.
 
     Returns (``forward``): ``loss_objective`` (), and detached ``log_ratio`` (), the largest |log ratio|, and
-    ``clip_fraction`` () when old log-probabilities are given.
+    ``clip_fraction`` (); both are 0 where no old log-probabilities are given.
 
     >>> from agents.priors.testing import tiny_prior
     >>> policy = DenoisingPolicy(tiny_prior(), num_steps=4)
@@ -137,8 +140,7 @@ class DDPOSFLoss(LossModule):
         old = flat.get(keys.sample_log_prob, None)
         if old is None and self.clip_epsilon is not None:
             raise InvalidInputError(f"clipping needs the log-probabilities at sampling under {keys.sample_log_prob!r}")
-        valid = flat.get(keys.valid, None)
-        kept = torch.ones_like(timestep, dtype=torch.bool) if valid is None else valid.reshape(-1)
+        kept = self._kept(tensordict)
         text = self._text(flat)
         total = scene.new_zeros(())
         largest, clipped = scene.new_zeros(()), scene.new_zeros(())
@@ -154,10 +156,9 @@ class DDPOSFLoss(LossModule):
             total = total + self.step_weights[step] * torch.where(kept[rows], objective, 0.0).sum()
             clipped = clipped + torch.where(kept[rows], beyond, 0.0).sum()
         count = kept.sum().clamp(min=1)
-        fields = {"loss_objective": -total / count}
-        if old is not None:
-            fields |= {"log_ratio": largest, "clip_fraction": clipped / count}
-        return TensorDict(fields, [])
+        return TensorDict(
+            {"loss_objective": -total / count, "log_ratio": largest, "clip_fraction": clipped / count}, []
+        )
 
     def _objective(self, log_prob: Tensor, advantage: Tensor, old: Tensor | None) -> tuple[Tensor, Tensor]:
         """(b,) objective and (b,) share of clipped terms, from (b, N) log-probabilities and advantages."""
@@ -172,6 +173,23 @@ class DDPOSFLoss(LossModule):
         bounded = ratio.clamp(1 - self.clip_epsilon, 1 + self.clip_epsilon)
         surrogate = torch.minimum(ratio * advantage, bounded * advantage)
         return surrogate.sum(dim=1), (ratio != bounded).float().mean(dim=1).detach()
+
+    def _kept(self, tensordict: TensorDictBase) -> Tensor:
+        """(rows,) bool: transitions of scenes that the reward could score."""
+        shape, key = tensordict.batch_size, self.tensor_keys.valid
+        here, after = tensordict.get(key, None), tensordict.get(unravel_key(("next", key)), None)
+        kept = torch.ones(shape, dtype=torch.bool, device=tensordict.get(self.tensor_keys.scene).device)
+        if here is not None:
+            kept = kept & here.reshape(shape)
+        if after is None:
+            return kept.reshape(-1)
+        episode = after.reshape(shape).clone()
+        done = tensordict.get(("next", "done"), None)
+        if done is not None and len(shape) > 1:
+            ends = done.reshape(shape)
+            for step in reversed(range(shape[-1] - 1)):
+                episode[..., step] &= ends[..., step] | episode[..., step + 1]
+        return (kept & episode).reshape(-1)
 
     def _text(self, flat: TensorDictBase) -> tuple[Tensor, Tensor] | None:
         keys = self.tensor_keys

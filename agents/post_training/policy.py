@@ -20,8 +20,8 @@ class DenoisingPolicy(TensorDictModuleBase):
     """The reverse chain of a prior as a policy: action x_{t-1} ~ p(. | x_t), state (x_t, t, prompt).
 
     Works as a torchrl policy (``env.rollout(n, policy)``): reads ``scene`` (B, N, D), ``timestep`` (B, 1) and, when the
-    prior reads prompts, ``prompt`` (B, L), writes ``action`` (B, N, D) and ``action_log_prob`` (B,), the latter summed
-    over all random entries.
+    prior reads prompts, ``prompt`` (B, L), writes ``action`` (B, N, D), ``slot_log_prob`` (B, N), which is summed over
+    the random entries of each slot, and ``action_log_prob`` (B,), summed over all.
 
     Args:
         prior: what denoises; its parameters are the policy's.
@@ -38,7 +38,7 @@ class DenoisingPolicy(TensorDictModuleBase):
     """
 
     in_keys = ["scene", "timestep"]  # noqa: RUF012  (torchrl reads lists)
-    out_keys = ["action", "action_log_prob"]  # noqa: RUF012
+    out_keys = ["action", "action_log_prob", "slot_log_prob"]  # noqa: RUF012
 
     def __init__(self, prior: PriorLike, num_steps: int, *, chunk: int | None = None, guidance: float = 0.0) -> None:
         super().__init__()
@@ -70,8 +70,9 @@ class DenoisingPolicy(TensorDictModuleBase):
 
         Without gradients: post-training leaves the text encoder as it is.
         """
-        tokens, mask = cast(PromptedPriorLike, self.prior).encode_tokens(prompt)
-        return tokens, mask
+        reader, size = cast(PromptedPriorLike, self.prior), self.chunk or len(prompt)
+        parts = [reader.encode_tokens(part) for part in prompt.split(size)]
+        return torch.cat([tokens for tokens, _ in parts]), torch.cat([mask for _, mask in parts])
 
     def distribution(self, x_t: Tensor, step: int, text: Text | None = None) -> ReverseStep:
         """p(x_{t-1} | x_t) of ``x_t`` (B, N, D) given ``text``; differentiable in the prior's parameters."""
@@ -92,14 +93,24 @@ class DenoisingPolicy(TensorDictModuleBase):
             reverse = prior.transition(x_t, step, self.table, text=text, guidance=self.guidance)
         return reverse
 
+    @torch.no_grad()
     def draw(
-        self, x_t: Tensor, step: int, generator: Generator | None = None, text: Text | None = None
+        self,
+        x_t: Tensor,
+        step: int,
+        generator: Generator | None = None,
+        text: Text | None = None,
+        noise: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """An action (B, N, D) and its log-probability per slot (B, N), without gradients."""
-        with torch.no_grad():
-            reverse = self.distribution(x_t, step, text)
-            action = reverse.from_noise(torch.randn(x_t.shape, generator=generator, device=x_t.device))
-            return action, reverse.log_prob(action)
+        """An action (B, N, D) and its log-probability per slot (B, N), without gradients.
+
+        The action is made of standard normal ``noise`` (B, N, D), which is drawn from ``generator`` where it is None.
+        """
+        reverse = self.distribution(x_t, step, text)
+        if noise is None:
+            noise = torch.randn(x_t.shape, generator=generator, device=x_t.device)
+        action = reverse.from_noise(noise)
+        return action, reverse.log_prob(action)
 
     def log_prob(self, x_t: Tensor, step: int, action: Tensor, text: Text | None = None) -> Tensor:
         """(B, N) log-probability per slot of ``action``; states and actions are taken as constants."""
@@ -128,16 +139,16 @@ class DenoisingPolicy(TensorDictModuleBase):
         prompt = tensordict.get("prompt", None)
         text = None if prompt is None else self.read(prompt)
         action = scene.clone()
-        log_prob = torch.zeros(scene.shape[:-2], device=scene.device)
+        log_prob = torch.zeros(scene.shape[:-1], device=scene.device)
         for t in timestep.unique().tolist():
             rows = timestep == t
             if t == 0:  # a finished episode that waits for its reset
                 continue
             asked = None if text is None else (text[0][rows], text[1][rows])
-            action[rows], per_slot = self.draw(scene[rows], self.step_of(t), text=asked)
-            log_prob[rows] = per_slot.sum(dim=-1)
+            action[rows], log_prob[rows] = self.draw(scene[rows], self.step_of(t), text=asked)
         tensordict.set("action", action)
-        tensordict.set("action_log_prob", log_prob)
+        tensordict.set("action_log_prob", log_prob.sum(dim=-1))
+        tensordict.set("slot_log_prob", log_prob)
         return tensordict
 
 

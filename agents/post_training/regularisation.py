@@ -17,7 +17,7 @@ from agents.post_training.hold import HIGHEST, HoldState, adjust
 from agents.post_training.regularisation_settings import RegularisationSettings
 from agents.post_training.rollouts import Rollout
 from agents.priors.base import ScenePrior
-from agents.utils.process_group import gather_rows
+from agents.utils.process_group import ProcessGroup
 
 logger = logging.getLogger(__name__)
 
@@ -58,8 +58,8 @@ class Regularisation:
             value, norm = add_gradient(terms, algorithm.policy.parameters(), self.kl_weight)
         else:
             with torch.no_grad():
-                value = sum(float(term) for term in terms)
-        value = float(gather_rows(torch.tensor([value])).mean())
+                processes = ProcessGroup.current()
+                value = processes.sum_numbers(sum(float(term) for term in terms))[0] / processes.size
         return {**row, "kl": value, "kl_weight": self.kl_weight, "kl_gradient_norm": norm}
 
     def observe(self, figure: str, value: float | None, iteration: int) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from gymnasium.utils import seeding
@@ -12,6 +12,7 @@ from torch import Generator, Tensor
 
 from agents.networks.text import Text
 from agents.post_training.policy import DenoisingPolicy
+from agents.utils.process_group import ProcessGroup, gather_rows
 from agents.utils.seeds import derived_seed
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.errors import InvalidInputError, TrainingError
@@ -108,6 +109,9 @@ def collect(
 ) -> Rollout:
     """Run ``policy`` to the end of one episode in each of the environment's rows.
 
+    On several processes the rows of all are one batch, and those of the first come first: an episode starts from the
+    same x_T and meets the same noise, whichever process it is on.
+
     Args:
         env: the torchrl adapter, in ``next_sample`` mode.
         policy: draws x_{t-1}; must have the environment's number of steps.
@@ -120,11 +124,16 @@ def collect(
     branching.groups(env.core.num_envs)
     together = branching.siblings
     start = stream_seed(seed, "start", iteration)
-    rngs = [seeding.np_random(start + row // together)[0] for row in range(env.core.num_envs)]
-    device = env.core.device
+    processes, device = ProcessGroup.current(), env.core.device
+    first_row = processes.rank * env.core.num_envs
+    rngs = [seeding.np_random(start + (first_row + row) // together)[0] for row in range(env.core.num_envs)]
     generator = Generator(device).manual_seed(stream_seed(seed, "noise", iteration))
     log_probs: list[Tensor] = []
     texts: list[Text] = []
+
+    def noise(x_t: Tensor) -> Tensor:
+        count = processes.size * len(x_t)
+        return torch.randn(count, *x_t.shape[1:], generator=generator, device=device)[processes.rows(count)]
 
     def act(x_t: Tensor, step: int) -> Tensor:
         if step == 0 and env.core.prompting.reader is not None:
@@ -132,10 +141,11 @@ def collect(
         text = texts[0] if texts else None
         if together > 1 and step < branching.steps:
             first = None if text is None else (text[0][::together], text[1][::together])
-            drawn = policy.draw(x_t[::together], step, generator, first)
+            x_t = x_t[::together]
+            drawn = policy.draw(x_t, step, text=first, noise=noise(x_t))
             action, log_prob = (part.repeat_interleave(together, dim=0) for part in drawn)
         else:
-            action, log_prob = policy.draw(x_t, step, generator, text)
+            action, log_prob = policy.draw(x_t, step, text=text, noise=noise(x_t))
         if not bool(torch.isfinite(log_prob).all()):
             raise TrainingError(
                 f"the prior gave values that are not finite at step {step} of iteration {iteration + 1}; "
@@ -145,7 +155,7 @@ def collect(
         return action
 
     result = env.core.collect(act, rngs, prompts)
-    return Rollout(
+    rollout = Rollout(
         scenes=result.scenes,
         actions=result.actions,
         slot_log_prob=torch.stack(log_probs),
@@ -158,3 +168,36 @@ def collect(
         prompts=result.prompts,
         text=texts[0] if texts else None,
     )
+    return _with_equal_parts(rollout, processes)
+
+
+def _with_equal_parts(rollout: Rollout, processes: ProcessGroup) -> Rollout:
+    """The rollout with the credit and the terms that any process has; where a reward failed altogether, zeros."""
+    found = processes.gather((rollout.per_object is not None, list(rollout.terms)))
+    per_object, reward = rollout.per_object, rollout.reward
+    if per_object is None and any(has for has, _ in found):
+        per_object = torch.zeros(rollout.slot_log_prob.shape[1:], device=reward.device)
+    names = dict.fromkeys(name for _, names in found for name in names)
+    terms = {name: rollout.terms.get(name, torch.zeros_like(reward)) for name in names}
+    return replace(rollout, per_object=per_object, terms=terms)
+
+
+def gathered(rollout: Rollout) -> tuple[Tensor, Tensor, dict[str, Tensor], SceneBatch]:
+    """Rewards (B,), their validity (B,), terms (B,) and scenes of all processes."""
+    terms = {name: gather_rows(term) for name, term in rollout.terms.items()}
+    scenes = SceneBatch(gather_rows(rollout.batch.tensor), rollout.batch.scene_type)
+    return gather_rows(rollout.reward), gather_rows(rollout.valid), terms, scenes
+
+
+def reward_figures(rollout: Rollout) -> dict[str, float]:
+    """Figures of the rewards of all processes, for a row of the log; means are over valid scenes, NaN without one."""
+    reward, valid, terms, scenes = gathered(rollout)
+    reward = reward[valid]
+    some = len(reward) > 0
+    figures = {
+        "reward": float(reward.mean()) if some else float("nan"),
+        "reward_std": float(reward.std(unbiased=False)) if some else float("nan"),
+        "valid_fraction": float(valid.float().mean()),
+        "objects": float(scenes.counts.float().mean()),
+    }
+    return figures | {f"term_{name}": float(term[valid].mean()) for name, term in terms.items() if some}

@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +34,39 @@ def write_text(path: Path, text: str) -> None:
         raise TrainingError(f"could not write {str(path)!r} ({error}); free some space and run again") from error
 
 
+def writing(what: str, write: Callable[[], object]) -> None:
+    """Run ``write``; a disk that refuses ``what`` becomes a TrainingError."""
+    try:
+        write()
+    except (OSError, RuntimeError) as error:
+        raise TrainingError(f"could not write {what} ({error}); free some space and run the same again") from error
+
+
 def write_config(directory: Path, config: PostTrainConfig) -> None:
     """``config.yaml``, every field."""
     write_text(directory / "config.yaml", config_text(config.plain()))
+
+
+def run_metrics(
+    history: Sequence[Mapping[str, float]],
+    batch_size: int,
+    seconds: float,
+    best_reward: float,
+    guard: Mapping[str, Any],
+) -> dict[str, Any]:
+    """What ``metrics.json`` says of a run with the log ``history``."""
+    rewards = [row["reward"] for row in history if math.isfinite(row["reward"])]
+    return {
+        "iterations": len(history),
+        "seconds": round(seconds, 1),
+        "reward": {
+            "first": rewards[0] if rewards else None,
+            "last": rewards[-1] if rewards else None,
+            "best": best_reward,
+            "invalid_scenes": round(sum((1.0 - row["valid_fraction"]) * batch_size for row in history)),
+        },
+        "guard": dict(guard),
+    }
 
 
 def write_metrics(directory: Path, metrics: Mapping[str, Any]) -> None:

@@ -6,13 +6,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from agents.priors.base import ScenePrior
+from agents.utils.process_group import ProcessGroup
+from agents.utils.seeds import derived_seed
 from scene_envs.envs.scoring import RewardScorer
 from scene_envs.scene import SceneBatch
 
 FIGURES = ("count_distance", "category_kl", "classifier_accuracy")
 """What is compared with the base prior's."""
+_AT_ONCE = 32
+"""Scenes sampled together."""
 _CLASSIFIERS = 3
 """Classifiers of which the accuracy is the mean."""
 
@@ -50,12 +55,26 @@ class SampleCheck:
 
     @torch.no_grad()
     def sample(self, prior: ScenePrior) -> SceneBatch:
-        """``count`` scenes, from the same noise for every prior."""
-        prompts = None if self.prompts is None else list(self.prompts)
-        guidance = self.guidance if prompts else 0.0
-        return prior.sample(
-            self.count, prompt=prompts, guidance=guidance, num_steps=self.num_steps, slots=self.slots, seed=self.seed
+        """``count`` scenes, from the same noise for every prior; each process of a run samples a share of them."""
+        processes = ProcessGroup.current()
+        starts = range(0, self.count, _AT_ONCE)
+        own = {start: self._chunk(prior, start) for start in starts[processes.rank :: processes.size]}
+        parts = {start: tensor for found in processes.gather(own) for start, tensor in found.items()}
+        return SceneBatch(torch.cat([parts[start] for start in starts]), self.real.scene_type)
+
+    def _chunk(self, prior: ScenePrior, start: int) -> Tensor:
+        """Scenes (b, N, D) from number ``start`` on, whose noise hangs on that number."""
+        count = min(_AT_ONCE, self.count - start)
+        prompts = None if self.prompts is None else list(self.prompts[start : start + count])
+        batch = prior.sample(
+            count,
+            prompt=prompts,
+            guidance=self.guidance if prompts else 0.0,
+            num_steps=self.num_steps,
+            slots=self.slots,
+            seed=derived_seed(self.seed, start),
         )
+        return batch.tensor.cpu()
 
     def figures(self, batch: SceneBatch) -> dict[str, float]:
         """Mean reward, and each of :data:`FIGURES`: objects, nats, and a share of scenes.

@@ -9,8 +9,11 @@ import numpy as np
 import torch
 from torch import Generator, Tensor
 
-from agents.post_training.prompts import PromptSets
+from agents.post_training.config import RegularisationSettings
+from agents.post_training.prompts import PROMPTS_NAME, PromptSets, save_prompts
+from agents.post_training.run_files import SCENES_NAME, writing
 from agents.priors.base import ScenePrior
+from agents.utils.process_group import ProcessGroup
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
@@ -60,6 +63,28 @@ class SceneBank:
             return None
         first = len(self.train)
         return [(group := self.prompts(first + i))[i % len(group)] for i in range(len(self.heldout))]
+
+
+def kept_scenes(
+    directory: Path, prior: ScenePrior, settings: RegularisationSettings, seed: int, slots: int, *, reuse: bool
+) -> SceneBatch:
+    """The real scenes of a run, kept in its folder with the prompts of a dataset; the first process draws them.
+
+    Args:
+        directory: of the run.
+        prior, seed, slots: as for :func:`real_scenes`.
+        settings: where they come from, and how many.
+        reuse: take those that are there, as a resumed run does.
+    """
+    path, texts, processes = directory / SCENES_NAME, directory / PROMPTS_NAME, ProcessGroup.current()
+    if processes.is_first and not (reuse and path.exists()):
+        batch, found = real_scenes(prior, settings.scenes, settings.bank_size, seed=seed, slots=slots)
+        writing(f"the real scenes {str(path)!r}", lambda: batch.save(path))
+        texts.unlink(missing_ok=True)  # of other scenes, by a run that never reached a checkpoint
+        if found is not None and prior.conditional:
+            writing(f"their prompts {str(texts)!r}", lambda: save_prompts(texts, found))
+    processes.wait()
+    return SceneBatch.load(path)
 
 
 def real_scenes(

@@ -331,7 +331,6 @@ class ScenePrior(Inpainting, nn.Module, ABC):
         """(count,) int64 training timesteps, ln(noise-to-signal) being normal."""
         return torch.multinomial(self._timestep_weights, count, replacement=True, generator=generator)
 
-    @abstractmethod
     def pretraining_loss(
         self,
         x0: Tensor,
@@ -349,6 +348,12 @@ class ScenePrior(Inpainting, nn.Module, ABC):
             t: (B,) timesteps, drawn when None.
             text: tokens (B, L, W) and their mask (B, L), as :meth:`encode_prompts` gives them; None without prompts.
         """
+        per_scene = self.noised_loss(self.noised(x0, generator, t), text)
+        return per_scene.mean() if reduction == "mean" else per_scene
+
+    @abstractmethod
+    def noised_loss(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
+        """(B,) training losses of scenes that :meth:`noised` has noised; arguments as for :meth:`output`."""
 
     @abstractmethod
     def noised(

@@ -194,32 +194,14 @@ class ContinuousPrior(ScenePrior):
                 x = self.transition(x, step, table).from_noise(draw_noise(x0, generators))
         return torch.where(keep, x0, x)
 
-    def pretraining_loss(
-        self,
-        x0: Tensor,
-        generator: Generator | None = None,
-        reduction: str = "mean",
-        t: Tensor | None = None,
-        text: Text | None = None,
-    ) -> Tensor:
-        """Weighted mean square of the network's error, over entries that are not known.
+    def noised_loss(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
+        """(B,) weighted mean squares of the network's error, over entries that are not known.
 
-        Scenes are weighted by their timestep as ``config.loss_weighting`` says.
-
-        Args:
-            x0: (B, N, D) normalised scenes.
-            generator: source of timesteps and noise (CPU).
-            reduction: ``"mean"`` over scenes, or ``"none"`` for (B,); always the mean over entries.
-            t: (B,) timesteps, drawn when None.
-            text: must be None: the prior reads no prompts.
+        Scenes are weighted by their timestep as ``config.loss_weighting`` says; ``text`` must be None.
         """
-        if text is not None:
-            raise no_text(self.scene_type, "")
-        noised = self.noised(x0, generator, t)
-        error = self.output(noised).continuous - noised.target
+        error = self.output(noised, text).continuous - noised.target
         weight = noised.weight[0]
-        per_scene = (error.square() * weight).sum(dim=(1, 2)) / weight.sum() * noised.scale
-        return per_scene.mean() if reduction == "mean" else per_scene
+        return (error.square() * weight).sum(dim=(1, 2)) / weight.sum() * noised.scale
 
     def noised(
         self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None, observed: Observed | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from torch import Tensor
 
@@ -32,6 +32,16 @@ class NoisedScenes:
     category: Tensor
     drawn: Tensor | None = None
     observed: Observed | None = None
+
+    def rows(self, rows: slice) -> NoisedScenes:
+        """Some of the scenes."""
+        named = ("x_t", "t", "target", "weight", "scale", "category")
+        return replace(
+            self,
+            **{name: getattr(self, name)[rows] for name in named},
+            drawn=None if self.drawn is None else self.drawn[rows],
+            observed=None if self.observed is None else self.observed.rows(rows),
+        )
 
 
 @dataclass(frozen=True)

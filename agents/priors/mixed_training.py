@@ -50,27 +50,10 @@ class TrainableMixedPrior(PromptReader, ScenePrior):
     def add_noise(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
         """A sample of q(x_t | x_0) from standard normal noise (B, N, D)."""
 
-    def pretraining_loss(
-        self, x0: Tensor, generator: Generator | None = None, reduction: str = "mean", t: Tensor | None = None,
-        text: Text | None = None,
-    ) -> Tensor:  # fmt: skip
-        """Mean square of the pose output plus ``category_weight`` times the category loss, on unobserved entries.
-
-        Args:
-            x0: (B, N, D) scenes as :meth:`encode` gives them.
-            generator: source of timesteps, noise and observed entries (CPU).
-            reduction: ``"mean"`` over scenes, or ``"none"`` for (B,); always the mean over entries.
-            t: (B,) timesteps, drawn when None.
-            text: tokens and their mask.
-        """
-        per_scene = self._losses(x0, generator, t, text)
-        return per_scene.mean() if reduction == "mean" else per_scene
-
-    def _losses(self, x0: Tensor, generator: Generator | None, t: Tensor | None, text: Text | None) -> Tensor:
-        """(B,) losses of scenes, arguments as in :meth:`pretraining_loss`."""
+    def noised_loss(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
+        """(B,) mean squares of the pose output plus ``category_weight`` times the category loss, where unobserved."""
         config = self.mixed
-        noised = self.noised(x0, generator, t)
-        text = self.unconditional(len(x0)) if text is None else text
+        text = self.unconditional(len(noised.t)) if text is None else text
         output = self.output(noised, text)
         logits, drawn, weight = output.logits, noised.drawn, noised.weight
         assert logits is not None

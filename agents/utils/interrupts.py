@@ -65,10 +65,10 @@ class Ending:
         """The step took too long."""
         _raise(self.number, frame)
 
-    def __call__(self) -> None:
-        """Raise what waits."""
-        if self.number:
-            _raise(self.number, None)
+    def __call__(self, elsewhere: bool = False) -> None:
+        """Raise what waits; a signal that waits ``elsewhere``, in another process of the run, counts as SIGTERM."""
+        if self.number or elsewhere:
+            _raise(self.number or signal.SIGTERM, None)
 
 
 def _raise(number: int, frame: FrameType | None) -> None:

@@ -3,80 +3,177 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import timedelta
+from typing import Any, TypeVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor, distributed, nn
+
+from scene_envs.errors import InvalidInputError, TrainingError
+
+Value = TypeVar("Value")
+
+_PATIENCE = 600.0
+"""Seconds that a process waits for the others."""
 
 
 @dataclass(frozen=True)
 class ProcessGroup:
     """The processes of a run.
 
+    A process that ends or hangs ends the others: what they wait for raises a :class:`TrainingError`.
+
     Attributes:
         rank: number of this process.
-        size: how many there are; 1 without ``torchrun``.
+        size: how many there are; 1 without a launcher.
+
+    >>> group = ProcessGroup(rank=1, size=2)
+    >>> group.rows(6), group.is_first
+    (slice(3, 6, None), False)
     """
 
     rank: int = 0
     size: int = 1
 
     @classmethod
-    def join(cls, device: str = "cpu") -> ProcessGroup:
-        """The group that ``torchrun`` set up, joined on first use; this process alone without it."""
-        size = int(os.environ.get("WORLD_SIZE", "1"))
+    def join(cls, device: str = "cpu", patience: float = _PATIENCE) -> ProcessGroup:
+        """The group that the launcher set up, joined on first use; this process alone without one.
+
+        Args:
+            device: of the training; each process of ``"cuda"`` takes a GPU of its own.
+            patience: seconds that a process waits for the others.
+
+        Raises:
+            InvalidInputError: ``WORLD_SIZE`` is set, and the other variables of a launcher are not.
+            TrainingError: the others do not come.
+        """
+        size = launched_processes()
         if size == 1:
             return cls()
         if device == "cuda":  # each process on a GPU of its own
             torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
-        if not torch.distributed.is_initialized():
-            torch.distributed.init_process_group("nccl" if device.startswith("cuda") else "gloo")
-        return cls(torch.distributed.get_rank(), size)
+        if not distributed.is_initialized():
+            backend = "cpu:gloo,cuda:nccl" if device.startswith("cuda") else "gloo"
+            try:
+                with _reaching_others():
+                    distributed.init_process_group(backend, timeout=timedelta(seconds=patience))
+            except ValueError as error:
+                raise InvalidInputError(
+                    f"WORLD_SIZE={size} asks for several processes, which cannot meet ({error}); start them with "
+                    "torchrun, or unset WORLD_SIZE"
+                ) from None
+        return cls.current()
+
+    @classmethod
+    def current(cls) -> ProcessGroup:
+        """The group that was joined; this process alone before."""
+        if not (distributed.is_available() and distributed.is_initialized()):
+            return cls()
+        return cls(distributed.get_rank(), distributed.get_world_size())
 
     @property
     def is_first(self) -> bool:
         """Whether this process writes files and logs."""
         return self.rank == 0
 
+    def rows(self, count: int) -> slice:
+        """The rows of this process in a batch of ``count`` of all."""
+        return slice(count * self.rank // self.size, count * (self.rank + 1) // self.size)
+
     def sum(self, value: Tensor) -> Tensor:
         """The sum of ``value`` over all processes."""
         if self.size > 1:
             value = value.clone()
-            torch.distributed.all_reduce(value)
+            with _reaching_others():
+                distributed.all_reduce(value)
         return value
 
+    def sum_numbers(self, *values: float) -> list[float]:
+        """The sum of each number over all processes."""
+        return list(values) if self.size == 1 else self.sum(torch.tensor(values, dtype=torch.float64)).tolist()
+
+    def largest(self, value: float) -> float:
+        """The largest ``value`` of all processes."""
+        return max(self.gather(value))
+
+    def any(self, flag: bool) -> bool:
+        """Whether ``flag`` is set in one process at least."""
+        return self.sum_numbers(float(flag))[0] > 0
+
     def sum_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
-        """Replace every ``.grad`` by its sum over all processes, in one message."""
+        """Replace every ``.grad`` by its sum over all processes, in one message; where all are None it stays None."""
         if self.size == 1:
             return
-        gradients = [p.grad if p.grad is not None else torch.zeros_like(p) for p in parameters]
+        taken = list(parameters)
+        present = self.sum(torch.tensor([float(p.grad is not None) for p in taken])).tolist()
+        taken = [p for p, some in zip(taken, present, strict=True) if some]
+        gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in taken]
+        if not gradients:
+            return
         flat = self.sum(torch.cat([gradient.flatten() for gradient in gradients]))
-        for gradient, total in zip(gradients, flat.split([g.numel() for g in gradients]), strict=True):
-            gradient.copy_(total.view_as(gradient))
+        for parameter, total in zip(taken, flat.split([p.numel() for p in taken]), strict=True):
+            parameter.grad = total.view_as(parameter).clone()
 
     def share(self, parameters: Iterable[nn.Parameter]) -> None:
         """Replace the values of every process by those of the first."""
         if self.size > 1:
             for parameter in parameters:
-                torch.distributed.broadcast(parameter.data, src=0)
+                with _reaching_others():
+                    distributed.broadcast(parameter.data, src=0)
+
+    def gather(self, value: Value) -> list[Value]:
+        """The ``value`` of every process, in their order; anything that can be pickled."""
+        if self.size == 1:
+            return [value]
+        found: list[Any] = [None] * self.size
+        with _reaching_others():
+            distributed.all_gather_object(found, value)
+        return found
+
+    def from_first(self, make: Callable[[], Value]) -> Value:
+        """What ``make`` returns in the first process, in all of them."""
+        if self.size == 1:
+            return make()
+        made: list[Any] = [make() if self.is_first else None]
+        with _reaching_others():
+            distributed.broadcast_object_list(made, src=0)
+        return made[0]  # type: ignore[no-any-return]
 
     def wait(self) -> None:
         """Go on when all processes are here."""
-        if self.size > 1:
-            torch.distributed.barrier()
+        self.sum_numbers(0.0)
 
 
 def gather_rows(x: Tensor) -> Tensor:
-    """``x`` (B, ...) of every worker, stacked along rows; ``x`` itself without ``torch.distributed``."""
-    distributed = torch.distributed
-    if not (distributed.is_available() and distributed.is_initialized()) or distributed.get_world_size() == 1:
+    """``x`` (B, ...) of every process, stacked along rows; ``x`` itself without a process group."""
+    size = ProcessGroup.current().size
+    if size == 1:
         return x
-    parts = [torch.empty_like(x) for _ in range(distributed.get_world_size())]
-    distributed.all_gather(parts, x.contiguous())
+    parts = [torch.empty_like(x, memory_format=torch.contiguous_format) for _ in range(size)]
+    with _reaching_others():
+        distributed.all_gather(parts, x.contiguous())
     return torch.cat(parts)
 
 
+def launched_processes() -> int:
+    """How many processes the launcher of this one started; 1 without a launcher."""
+    return int(os.environ.get("WORLD_SIZE", "1"))
+
+
 def is_first_process() -> bool:
-    """Whether this process, of those that ``torchrun`` started, is the one that writes files and speaks."""
+    """Whether this process, of those that a launcher started, is the one that writes files and speaks."""
     return int(os.environ.get("RANK", "0")) == 0
+
+
+@contextmanager
+def _reaching_others() -> Iterator[None]:
+    try:
+        yield
+    except RuntimeError as error:  # of gloo and of NCCL
+        raise TrainingError(
+            "another process of this run ended or did not answer in time, what it says is the cause; the same command "
+            f"goes on from the last checkpoint ({str(error).splitlines()[0][:200]})"
+        ) from error

@@ -78,7 +78,7 @@ def occupied(x: Tensor, scene_type: SceneType) -> Tensor:
 
 
 def check_action(action: Any, shape: tuple[int, ...], axes: tuple[str, ...]) -> Tensor:
-    """``action`` as a finite float32 tensor of ``shape``.
+    """``action`` as a finite tensor of ``shape`` and of torch's default dtype, float32 unless a program changes it.
 
     Args:
         action: anything array-like.
@@ -92,7 +92,7 @@ def check_action(action: Any, shape: tuple[int, ...], axes: tuple[str, ...]) -> 
         tensor = action if isinstance(action, Tensor) else torch.from_numpy(np.asarray(action, dtype=np.float32))
     except (TypeError, ValueError) as error:
         raise InvalidInputError(f"the action is not an array of numbers of shape {shape}: {error}") from error
-    tensor = tensor.detach().float()
+    tensor = tensor.detach().to(torch.get_default_dtype())
     if tuple(tensor.shape) != shape:
         raise InvalidInputError(
             f"the action has shape {tuple(tensor.shape)}, it must be {shape}, that is ({', '.join(axes)})"

@@ -23,6 +23,8 @@ SMALLER: dict[str, dict[str, str]] = {
             'iterations=1, batch_size=2, num_steps=3, **SMALL, output="runs/short"'
         ),
         "post_train_and_compare(config)": "post_train_and_compare(config, scenes=1, num_steps=20)",
+        "scenes, steps = 32, 25": "scenes, steps = 2, 3",
+        "40 * scenes": "2 * scenes",
     },
     "docs/datasets.md": {
         "10_000,": "12,",

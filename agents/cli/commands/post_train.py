@@ -14,8 +14,11 @@ if TYPE_CHECKING:
 def run(settings: PostTrainConfig, run: Run) -> None:
     """Post-train and report; the trainer and the report write the metrics."""
     from agents.post_training import post_train, post_train_and_compare
+    from agents.utils.process_group import is_first_process
 
-    if settings.logger.report_scenes:
+    if not is_first_process():
+        post_train(settings)
+    elif settings.logger.report_scenes:
         metrics = post_train_and_compare(settings, scenes=settings.logger.report_scenes)
         say_change(metrics, run)
         run.say(f"open {run.directory / 'report.html'}")

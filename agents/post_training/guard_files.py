@@ -1,0 +1,85 @@
+"""Guard of a run: how it is made, and its files, the best prior and the samples that the report shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from agents.post_training.config import PostTrainConfig
+from agents.post_training.guard import Guard, GuardReading
+from agents.post_training.learner import Learner
+from agents.post_training.rollouts import stream_seed
+from agents.post_training.run_files import writing
+from agents.post_training.sample_check import SampleCheck
+from agents.post_training.scene_bank import SceneBank
+from agents.priors.adapters import save_adapter, with_adapter_of
+from agents.priors.base import ScenePrior
+from agents.utils.process_group import ProcessGroup
+
+_PICTURED = 6
+"""Samples of the guard that are kept for the report."""
+
+
+def make_guard(config: PostTrainConfig, learner: Learner, scenes: SceneBank) -> Guard:
+    """The guard of a run, which samples where the configuration says so."""
+    asked, count, check = scenes.heldout_prompts(), config.guard.sampled, None
+    if count:
+        check = SampleCheck(
+            learner.prior.decode(scenes.heldout[:count]).to("cpu"),
+            learner.scorer,
+            count,
+            config.num_steps,
+            stream_seed(config.seed, "samples"),
+            learner.slots,
+            asked[:count] if asked is not None and config.prompt is not None else None,
+            config.guidance,
+        )
+    limits = config.guard.limits(config.algorithm.sample_limits)
+    return Guard(scenes.heldout, config.guard.limit, stream_seed(config.seed, "guard"), asked, check, limits)
+
+
+class GuardFiles:
+    """What the guard keeps in a run's folder; the first process alone writes.
+
+    Args:
+        directory: the folder.
+        reward: of the run, as its configuration has it.
+    """
+
+    def __init__(self, directory: Path, reward: Any) -> None:
+        self.directory, self.reward = directory, reward
+        self._processes = ProcessGroup.current()
+
+    def keep(self, prior: ScenePrior, guard: Guard, iteration: int) -> None:
+        """Write the evaluated weights to ``prior/``, with a card that says how they were made."""
+        prior.card = {
+            **prior.card,
+            "post_training": {
+                "reward": self.reward,
+                "iteration": iteration,
+                "mean_reward": guard.best_reward if iteration else None,
+                "guard_ratio": guard.ratio,
+            },
+        }
+        path = self.directory / "prior"
+        if self._processes.is_first:
+            writing(f"the prior {str(path)!r}", lambda: prior.save(path))
+            if prior.adapter is not None:
+                writing("the adapter", lambda: save_adapter(prior, self.directory))
+
+    def best(self, beside: ScenePrior | None = None) -> ScenePrior:
+        """The prior that was kept last; with the adapter of its own that ``beside`` has, if any."""
+        self._processes.wait()  # until it is written
+        if beside is not None and beside.adapter is not None:
+            return with_adapter_of(beside, self.directory)
+        return ScenePrior.load(self.directory / "prior")
+
+    def picture(self, guard: Guard, reading: GuardReading) -> None:
+        """Keep the samples of the best checkpoint, and of the first beyond a limit, for the report."""
+        batch = guard.last_samples
+        name = "guard_within" if reading.kept else "guard_beyond"
+        first = reading.beyond and guard.over_limit_at == reading.iteration
+        if batch is None or not reading.samples or not (reading.kept or first) or not self._processes.is_first:
+            return
+        path = self.directory / f"{name}.safetensors"
+        writing(f"the guard's samples {str(path)!r}", lambda: batch[:_PICTURED].save(path))

@@ -1,0 +1,63 @@
+"""Shares of a post-training run's batch on several processes: their sizes, and rewards that need all of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from agents.post_training.config import PostTrainConfig
+from agents.utils.process_group import ProcessGroup, gather_rows
+from rewards import RewardContext, RewardOutput, reward_name
+from rewards.evaluation import evaluate_reward
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import SceneBatch
+
+
+def check_shares(config: PostTrainConfig, processes: int) -> None:
+    """Refuse a batch that cannot be parted among ``processes`` without parting siblings.
+
+    Raises:
+        InvalidInputError: the number of processes does not divide the batch.
+    """
+    siblings = int(getattr(config.algorithm, "siblings", 1))
+    unit = processes * siblings
+    if processes > 1 and config.batch_size % unit:
+        among = f"{processes} processes" + (f" times algorithm.siblings={siblings}" if siblings > 1 else "")
+        lower = config.batch_size // unit * unit
+        nearest = f"{lower} or {lower + unit}" if lower else str(unit)
+        raise InvalidInputError(
+            f"batch_size={config.batch_size} is not a multiple of {unit}, the {among}; give batch_size={nearest}, or "
+            "another number of processes"
+        )
+
+
+class WholeBatchReward:
+    """A reward that depends on the other scenes of a batch, scored on the scenes of all processes in each of them.
+
+    Args:
+        reward: what scores, resolved.
+        processes: each of which calls this at the same time, with equally many scenes.
+    """
+
+    depends_on_batch = True
+
+    def __init__(self, reward: Any, processes: ProcessGroup) -> None:
+        self._reward, self._processes = reward, processes
+        self.name = reward_name(reward)
+
+    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        """Scores of ``batch``."""
+        everything = SceneBatch(gather_rows(batch.tensor), batch.scene_type)
+        prompts = context.prompts
+        if prompts is not None:
+            prompts = tuple(text for texts in self._processes.gather(tuple(prompts)) for text in texts)
+        output = evaluate_reward(self._reward, everything, replace(context, prompts=prompts))
+        rows = self._processes.rows(len(everything))
+        return replace(
+            output,
+            value=output.value[rows],
+            valid=None if output.valid is None else output.valid[rows],
+            per_object=None if output.per_object is None else output.per_object[rows],
+            terms={name: term[rows] for name, term in output.terms.items()},
+            object_flags={name: flags[rows] for name, flags in output.object_flags.items()},
+        )
