@@ -37,7 +37,7 @@ class PlannerSettings(ABC):
         """
 
 
-_SHIPPED = ("beam", "best_of", "greedy", "mcts", "uct")
+_SHIPPED = ("beam", "best_of", "evolution", "feynman_kac", "greedy", "mcts", "uct")
 """Modules of this package that register a planner each."""
 _PLANNERS: dict[str, type[PlannerSettings]] = {}
 Settings = TypeVar("Settings", bound=type[PlannerSettings])
