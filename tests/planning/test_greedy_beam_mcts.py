@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from agents.planning import BeamPlanner, GreedyPlanner, MCTSPlanner, UCTPlanner
+from agents.planning import BeamPlanner, EvolutionPlanner, GreedyPlanner, MCTSPlanner, UCTPlanner
 from tests.planning.test_planners import Path, ToyTree, matches, scrambled
 
 PLANNERS = [
     BeamPlanner(children=3),
+    EvolutionPlanner(children=3, population=3),
     GreedyPlanner(children=3),
     MCTSPlanner(children=3),
     UCTPlanner(parallel=3, children=3),

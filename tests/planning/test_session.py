@@ -151,6 +151,16 @@ def test_searches_side_by_side_are_those_alone(prior: ScenePrior) -> None:
     assert sorted(plan.values for plan in alone) == sorted(plan.values for plan in together.searches)
 
 
+@pytest.mark.parametrize("planner", ["evolution", "feynman_kac"])
+def test_side_by_side_as_alone_with_planners_that_score_on_the_way(planner: str, prior: ScenePrior) -> None:
+    settings = {**SETTINGS, "planner": {"name": planner, **ROUNDS_OF_THREE[planner], "crossover": 0.9}}
+    if planner == "feynman_kac":
+        del settings["planner"]["crossover"]
+    together = run_search(prior, near_middle, count=2, **settings)
+    alone = [run_search(prior, near_middle, **{**settings, "seed": seed}).search for seed in (3, 4)]
+    assert sorted(plan.values for plan in alone) == sorted(plan.values for plan in together.searches)
+
+
 def test_a_larger_budget_goes_on(prior: ScenePrior, tmp_path: Path) -> None:
     settings = {**SETTINGS, "planner": "greedy", "slots": None}
     small = run_search(prior, Counting(), output=tmp_path, **{**settings, "budget": 10})
@@ -188,6 +198,8 @@ def test_another_search_in_the_folder_is_refused(prior: ScenePrior, tmp_path: Pa
         ({"planner": "beem"}, "did you mean 'beam'"),
         ({"planner": {"name": "beam", "width": 0}}, "planner beam: width must be a number >= 1, got 0"),
         ({"planner": {"name": "mcts", "rollout": "some"}}, "unknown rollout 'some'"),
+        ({"planner": {"name": "evolution", "crossover": 2}}, "planner evolution: crossover=2 is a chance"),
+        ({"planner": {"name": "feynman_kac", "begin": 1}}, "planner feynman_kac: begin=1 is a share"),
         ({"mask": {"name": "empty", "cuont": 1}}, "did you mean 'count'"),
     ],
 )
@@ -211,6 +223,21 @@ class Failing:
     def plan(self, problem: Any, budget: int, progress: Any = None) -> PlanResult:
         problem.expand_batch([(problem.clone_state(), 0)])
         raise ZeroDivisionError("in the planner")
+
+
+class Interrupted:
+    """A planner that is interrupted between two rounds."""
+
+    def plan(self, problem: Any, budget: int, progress: Any = None) -> PlanResult:
+        problem.expand_batch([(problem.clone_state(), 0)])
+        raise KeyboardInterrupt
+
+
+def test_an_interrupt_between_rounds_keeps_the_best() -> None:
+    session = Session(ToyTree(scrambled))
+    (result,) = session.run(Interrupted(), [()], budget=20)
+    assert session.stopped == "interrupt"
+    assert (result.best_state, result.best_value) == ((0,), scrambled((0,)))
 
 
 def test_a_planner_that_never_ends_is_ended_at_its_budget() -> None:
