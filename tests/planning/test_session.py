@@ -15,6 +15,7 @@ import pytest
 import torch
 
 from agents.cli import main
+from agents.cli.commands.scenes import load_scenes
 from agents.planning import PlanResult, Session, list_planners, run_search
 from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
@@ -151,6 +152,35 @@ def test_searches_side_by_side_are_those_alone(prior: ScenePrior) -> None:
     assert sorted(plan.values for plan in alone) == sorted(plan.values for plan in together.searches)
 
 
+def test_many_searches_run_in_parts_whose_scenes_are_kept_after_a_kill(prior: ScenePrior, tmp_path: Path) -> None:
+    settings = {**SETTINGS, "budget": 6, "count": 5, "side_by_side": 2, "planner": "greedy"}
+    sizes: list[int] = []
+
+    def objective(batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        sizes.append(len(batch))
+        return near_middle(batch, context)
+
+    def dies(name: str, done: int, total: int, best: float) -> None:
+        assert total == 5 * 6
+        if done == 2 * 6 + 2 * 3:  # the first part, and a round of the second
+            raise MemoryError
+
+    with pytest.raises(MemoryError):
+        run_search(prior, objective, output=tmp_path, progress=dies, **settings)
+    assert max(sizes) == 2 * 3  # never more than two searches at once
+    kept = load_scenes(tmp_path)
+    assert len(kept) == 2
+    sizes.clear()
+    whole = run_search(prior, objective, output=tmp_path, **settings)
+    assert sum(sizes) == 5 + 5 * 6 - (2 * 6 + 2 * 3)  # the roots, and what the first run had not made
+    assert len(whole.searches) == len(load_scenes(tmp_path)) == 5
+    assert whole.metrics["nfe"] == 5 * 6 * 2
+    alone = [run_search(prior, near_middle, **{**settings, "count": 1, "seed": 3 + i}).search for i in range(5)]
+    assert sorted(plan.values for plan in whole.searches) == sorted(plan.values for plan in alone)
+    assert all(any(torch.equal(scene, other) for other in whole.best.tensor) for scene in kept.tensor)
+    assert [plan.best_value for plan in whole.searches] == sorted((p.best_value for p in alone), reverse=True)
+
+
 @pytest.mark.parametrize("planner", ["evolution", "feynman_kac"])
 def test_side_by_side_as_alone_with_planners_that_score_on_the_way(planner: str, prior: ScenePrior) -> None:
     settings = {**SETTINGS, "planner": {"name": planner, **ROUNDS_OF_THREE[planner], "crossover": 0.9}}
@@ -193,13 +223,14 @@ def test_another_search_in_the_folder_is_refused(prior: ScenePrior, tmp_path: Pa
         ({"max_nfe": 5}, "max_nfe=5 does not cover the 3 first samples .* raise it to 6"),
         ({"max_seconds": 0}, "max_seconds=0 must be more than 0"),
         ({"count": 0}, "count=0: give the number of scenes"),
+        ({"side_by_side": 0}, "side_by_side=0: at least one search"),
         ({"num_steps": 0}, "num_steps=0 must be"),
         ({"slots": 1}, "slots=1: scenes of .* need at least 2 slots"),
         ({"planner": "beem"}, "did you mean 'beam'"),
         ({"planner": {"name": "beam", "width": 0}}, "planner beam: width must be a number >= 1, got 0"),
         ({"planner": {"name": "mcts", "rollout": "some"}}, "unknown rollout 'some'"),
-        ({"planner": {"name": "evolution", "crossover": 2}}, "planner evolution: crossover=2 is a chance"),
-        ({"planner": {"name": "feynman_kac", "begin": 1}}, "planner feynman_kac: begin=1 is a share"),
+        ({"planner": {"name": "evolution", "crossover": 2}}, "planner evolution: crossover=2.0 is a chance"),
+        ({"planner": {"name": "feynman_kac", "begin": 1}}, "planner feynman_kac: begin=1.0 is a share"),
         ({"mask": {"name": "empty", "cuont": 1}}, "did you mean 'count'"),
     ],
 )
