@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -103,8 +105,8 @@ class FeynmanKacPlanner(PlannerSettings):
     name: str = "feynman_kac"
     widens = True
     particles: int = 8
-    resamplings: int = 4
-    begin: float = 0.5
+    resamplings: int = 2
+    begin: float = 0.7
     strength: float = 50.0
 
     def __post_init__(self) -> None:
@@ -118,7 +120,14 @@ class FeynmanKacPlanner(PlannerSettings):
         return self
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
-        """Spend up to ``budget`` expansions below the current state of an environment that steers."""
+        """Spend up to ``budget`` expansions below the current state.
+
+        Raises:
+            InvalidInputError: the expansions of ``problem`` cannot be steered.
+        """
+        if "steering" not in inspect.signature(problem.expand_batch).parameters:
+            takes = f"expand_batch of {type(problem).__name__} takes no steering="
+            raise InvalidInputError(f"planner {self.name} steers the denoising, and {takes}; choose another planner")
         return GreedyPlanner(children=self.particles).plan(_Steered(problem, self._steer), budget, progress)
 
     def _steer(self, pairs: Sequence[tuple[Any, int]], values: Callable[[SceneBatch], Tensor]) -> Particles:
@@ -134,11 +143,8 @@ class _Steered:
     """A problem whose expansions are steered."""
 
     def __init__(self, problem: Any, steering: Any) -> None:
-        self.problem, self.steering = problem, steering
-
-    def expand_batch(self, pairs: Sequence[tuple[Any, int]]) -> Sequence[Any]:
-        """The child of every pair; those of one parent are particles."""
-        return self.problem.expand_batch(pairs, self.steering)  # type: ignore[no-any-return]
+        self.problem = problem
+        self.expand_batch = partial(problem.expand_batch, steering=steering)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.problem, name)

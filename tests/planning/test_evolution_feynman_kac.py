@@ -15,7 +15,9 @@ from agents.planning.feynman_kac import Particles, systematic
 from agents.priors.testing import tiny_prior
 from rewards import RewardContext, RewardOutput
 from scene_envs.envs import SearchEnv
+from scene_envs.errors import InvalidInputError
 from scene_envs.scene import CATEGORY, TRANSLATION, SceneBatch
+from tests.planning.test_planners import ToyTree, scrambled
 
 SLOTS = 12
 
@@ -155,6 +157,11 @@ def test_without_strength_particles_are_greedy_repair(process: str) -> None:
     steered, _ = plan(FeynmanKacPlanner(particles=3, strength=0.0), process)
     greedy, _ = plan(GreedyPlanner(children=3), process)
     assert steered.values == greedy.values
+
+
+def test_a_problem_that_cannot_be_steered_is_refused() -> None:
+    with pytest.raises(InvalidInputError, match="expand_batch of ToyTree takes no steering="):
+        FeynmanKacPlanner().plan(ToyTree(scrambled), budget=5)
 
 
 @pytest.mark.parametrize("process", ["mixed", "continuous"])
