@@ -133,6 +133,12 @@ def _search(
         # As many actions as scenes: the same seeds by path, so the first scenes are those of the first search.
         _, _, (best_of,) = run.plan(BestOfPlanner(), spent, spent, range(1), "best of N", progress)
     seconds = {"search": searched - started, "best_of": time.perf_counter() - searched}
+    root = session.lanes[0].root
+    if not searches and root.value >= 1:
+        raise InvalidInputError(
+            f"the objective {objective!r} is {root.objective:.4g} for the empty scene already, and the search ends at "
+            f"objective_scale={env.problem.scale:.4g}; give a larger objective_scale"
+        )
     if not searches:
         raise SceneEnvsError(
             f"the search was interrupted before its first {config.branching} scenes were there; call it again"

@@ -75,6 +75,11 @@ def run(settings: SearchKeys, run: Run) -> None:
         found = [plan.best_state.objective for plan in outcome.searches]
         each = ", ".join(f"{objective:.4g}" for objective in found[:16])
         run.say(f"best scenes of {len(found)} searches: {each}" + (f", ..., {found[-1]:.4g}" if found[16:] else ""))
+    if metrics["saturated"]:
+        run.say(
+            f"that is beyond objective_scale={metrics['objective_scale']:.4g}, where the search takes a scene for "
+            "perfect and ends; raise objective_scale to search on"
+        )
     if metrics["stopped"] == "time":
         run.say(f"ended after max_seconds={search.max_seconds:g}; the same command with more time goes on")
     run.say(f"written to {run.directory}")
