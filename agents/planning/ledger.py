@@ -68,11 +68,16 @@ class PlanResult:
 
     @property
     def curve(self) -> list[float]:
-        """Best objective after each expansion; failed ones leave it as it was."""
+        """Best objective after each expansion; failed ones leave it as it was.
+
+        A better state that cost no expansion counts with the last one.
+        """
         best, curve = -math.inf, []
         for value in self.values:
             best = max(best, value) if math.isfinite(value) else best
             curve.append(best)
+        if curve and self.best_value > curve[-1]:
+            curve[-1] = self.best_value
         return curve
 
 
