@@ -14,20 +14,18 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 
 def _registries() -> list[dict[str, Any]]:
     """Every registry that users add to by name, the built-in entries in place."""
-    from agents.networks.registry import _ENTRIES as networks
-    from agents.planning.registry import _PLANNERS as planners
-    from agents.planning.registry import _load_shipped as load_planners
-    from agents.post_training.algorithms import _ENTRIES as algorithms
-    from rewards.registry import _registry as rewards
+    from agents.networks.registry import _ENTRIES
+    from agents.planning.registry import _PLANNERS
+    from agents.post_training.algorithms import _ALGORITHMS
+    from rewards.registry import _REWARDS
     from scene_envs.envs.masks import _MASKS
     from scene_envs.export.formats import _FORMATS
-    from scene_envs.grammars import list_grammars
     from scene_envs.grammars.grammar import GRAMMARS
-    from scene_envs.scene_types.registry import _REGISTRY
+    from scene_envs.scene_types.registry import _SCENE_TYPES
 
-    list_grammars()  # registers the built-in ones, which happens once per process
-    load_planners()
-    return [_REGISTRY, GRAMMARS, _MASKS, _FORMATS, rewards, networks, planners, algorithms]
+    for registry in (GRAMMARS, _PLANNERS):
+        registry.load()  # what modules of this project register comes once per process
+    return [_SCENE_TYPES, GRAMMARS, _MASKS, _FORMATS, _REWARDS, _ENTRIES, _PLANNERS, _ALGORITHMS]
 
 
 @contextmanager

@@ -9,8 +9,9 @@ The names below load their modules, and torch with them, when they are first use
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from scene_envs.lazy import lazy_names
 
 if TYPE_CHECKING:
     from agents.evaluation import evaluate
@@ -33,20 +34,16 @@ __all__ = [
     "run_search",
 ]
 
-_ROOMS = {
-    "agents.evaluation": ("evaluate",),
-    "agents.planning": ("SearchConfig", "SearchOutcome", "run_search"),
-    "agents.post_training": ("PostTrainConfig", "PostTrainResult", "post_train"),
-    "agents.pretraining": ("PretrainConfig", "pretrain"),
-    "agents.priors": ("ScenePrior", "list_priors"),
-}
-
-
-def __getattr__(name: str) -> Any:
-    for room, names in _ROOMS.items():
-        if name in names:
-            return getattr(import_module(room), name)
-    raise AttributeError(f"module 'agents' has no attribute {name!r}")
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "agents.evaluation": ["evaluate"],
+        "agents.planning": ["SearchConfig", "SearchOutcome", "run_search"],
+        "agents.post_training": ["PostTrainConfig", "PostTrainResult", "post_train"],
+        "agents.pretraining": ["PretrainConfig", "pretrain"],
+        "agents.priors": ["ScenePrior", "list_priors"],
+    },
+)
 
 
 def __dir__() -> list[str]:

@@ -1,4 +1,4 @@
-"""What the environment adapters cost over a bare sampling loop with the same prior.
+"""Cost of the environment adapters over a bare sampling loop with the same prior.
 
     python benchmarks/env_overhead.py [--prior dimsum_table] [--batch 128] [--steps 10] [--rounds 3]
 

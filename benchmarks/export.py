@@ -1,4 +1,4 @@
-"""How far objects move in simulators that load an export, beside the time and size of the export itself.
+"""Distances that objects move in simulators that load an export, beside the time and size of the export itself.
 
     python benchmarks/export.py [--scenes FILE | --scene dimsum_table] [--count 5] [--duration 1.0] [--seed 0]
 

@@ -21,7 +21,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from scene_envs.datasets import SceneDataset, SceneStream, describe_all, generate, judge_scenes
+from scene_envs.datasets import SceneDataset, describe_all, generate, judge_scenes
 from scene_envs.datasets.ranges import fixed_normalizer
 from scene_envs.datasets.verification import verify_scenes
 from scene_envs.grammars import get_grammar
@@ -61,7 +61,6 @@ def measure(scene: str, count: int, seed: int, console: Console) -> None:
         run = rate(count, lambda: generate(scene, count, folder, workers=0, shard_size=count, progress=False))
         table.add_row("all, to parquet", f"{run:.1f}")
         table.add_row("reading", f"{rate(count, lambda: SceneDataset.load(folder)):.0f}")
-        table.add_row("streaming", f"{rate(4 * count, lambda: SceneStream(folder).take(4 * count)):.0f}")
         size = (folder / "scenes-00000.parquet").stat().st_size / count
     console.print(table)
     console.print(f"normalizer, once per dataset: {normalizer_seconds:.1f} s; {size / 1000:.2f} kB per scene on disk")

@@ -1,4 +1,4 @@
-"""How many objects the scenes of a type have: the figures, tables and histograms of docs/scene_types.
+"""Numbers of objects in the scenes of a type: the figures, tables and histograms of docs/scene_types.
 
     python benchmarks/scene_statistics.py [--scene pantry_shelf …] [--count 20000] [--seed 0] [--workers 2]
         [--pictures docs/scene_types] [--gallery 6]

@@ -1,4 +1,4 @@
-"""How the set encoder is made: self-supervised, on grammar scenes of all types."""
+"""Training of the set encoder: self-supervised, on grammar scenes of all types."""
 
 from __future__ import annotations
 

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from rewards.base import Reward, RewardContext, RewardOutput
 from rewards.local_files import is_local, load_local
-from scene_envs.errors import InvalidInputError, RewardError, unknown_name
-from scene_envs.plugins import plugin_entry_points
+from scene_envs.errors import InvalidInputError, RewardError
+from scene_envs.registry import Registry
 from scene_envs.scene import SceneBatch
 
 ENTRY_POINT_GROUP = "scene_envs.rewards"
@@ -24,7 +24,7 @@ ENTRY_POINT_GROUP = "scene_envs.rewards"
 
 Maker = TypeVar("Maker", bound=Callable[..., Any])
 
-_registry: dict[str, Callable[..., Any]] = {}
+_REWARDS: Registry[Callable[..., Any]] = Registry("reward", ENTRY_POINT_GROUP, read=lambda point: _of_plugin(point))
 _allowed_targets: list[str] = ["rewards"]
 
 
@@ -100,10 +100,10 @@ def register_reward(name: str) -> Callable[[Maker], Maker]:
     def register(maker: Maker) -> Maker:
         if not callable(maker):
             raise InvalidInputError(f"reward {name!r}: {maker!r} cannot be called; decorate a class or a function")
-        taken = _registry.get(name)
+        taken = _REWARDS.get(name)
         if taken is not None and _origin(taken) != _origin(maker):
             raise InvalidInputError(f"reward name {name!r} is taken by {_origin(taken)}; choose another name")
-        _registry[name] = maker
+        _REWARDS[name] = maker
         return maker
 
     return register
@@ -111,7 +111,7 @@ def register_reward(name: str) -> Callable[[Maker], Maker]:
 
 def list_rewards() -> list[str]:
     """Names of all rewards, those of installed packages included, sorted. Imports no plug-in."""
-    return sorted({*_registry, *_plugins()})
+    return _REWARDS.names()
 
 
 def reward_info(name: str) -> RewardInfo:
@@ -198,12 +198,12 @@ def allowed_targets() -> list[str]:
 
 def registered_module(name: str) -> str | None:
     """The module of the reward registered under ``name`` in this process, None where there is none."""
-    return getattr(_registry.get(name), "__module__", None)
+    return getattr(_REWARDS.get(name), "__module__", None)
 
 
 def plugin_module(name: str) -> str | None:
     """The module of the installed plug-in that offers ``name``, which is not imported; None where there is none."""
-    point = _plugins().get(name)
+    point = _REWARDS.points().get(name)
     return None if point is None else point.module
 
 
@@ -221,19 +221,13 @@ def is_own(reward: Any) -> bool:
 # -- looking up --------------------------------------------------------------------------------------
 
 
-def _plugins() -> dict[str, EntryPoint]:
-    return plugin_entry_points(ENTRY_POINT_GROUP)
-
-
 def _find(name: str) -> Callable[..., Any]:
-    if name in _registry:
-        return _registry[name]
-    if is_local(name):
-        return load_local(name)
-    plugins = _plugins()
-    if name not in plugins:
-        raise unknown_name("reward", name, {*_registry, *plugins})
-    point = plugins[name]
+    return load_local(name) if name not in _REWARDS and is_local(name) else _REWARDS[name]
+
+
+def _of_plugin(point: EntryPoint) -> Callable[..., Any]:
+    """The reward of an installed package; importing its module may register it."""
+    name = point.name
     package = point.dist.name if point.dist is not None else point.module
     try:
         loaded = point.load()
@@ -250,13 +244,11 @@ def _find(name: str) -> Callable[..., Any]:
             f"{type(error).__name__}: {error}"
         ) from error
     if isinstance(loaded, ModuleType):  # its decorators have run
-        if name not in _registry:
+        if name not in _REWARDS:
             raise RewardError(f"module {point.value!r} of package {package!r} registers no reward called {name!r}")
     elif not callable(loaded):
         raise RewardError(f"reward {name!r} of package {package!r}: {point.value!r} is not a class or a function")
-    else:
-        _registry.setdefault(name, loaded)
-    return _registry[name]
+    return _REWARDS.get(name, loaded)
 
 
 def _from_mapping(settings: dict[str, Any]) -> Reward:
@@ -273,7 +265,7 @@ def _from_mapping(settings: dict[str, Any]) -> Reward:
 
 def _find_target(target: Any) -> Callable[..., Any]:
     """The class or function ``target`` names, if an allowed package itself defines it."""
-    allowed = {*_allowed_targets, *(point.module.split(".")[0] for point in _plugins().values())}
+    allowed = {*_allowed_targets, *(point.module.split(".")[0] for point in _REWARDS.points().values())}
     module, _, attribute = str(target).rpartition(".")
     if not _within(module, allowed):
         raise InvalidInputError(

@@ -82,7 +82,7 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
         partial.write_text(text, encoding="utf-8")
 
 
-def write_json(path: str | os.PathLike[str], content: Any, *, indent: int = 1) -> None:
+def write_json(path: str | os.PathLike[str], content: Any, *, indent: int | None = 1) -> None:
     """Replace the file at ``path`` by ``content`` as JSON; numbers that JSON lacks become null."""
     write_text(path, json.dumps(finite(content), indent=indent, allow_nan=False) + "\n")
 

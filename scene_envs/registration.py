@@ -21,3 +21,8 @@ def register_envs() -> None:
         entry_point="scene_envs.envs.search_gymnasium:SearchEnv",
         disable_env_checker=True,
     )
+    gymnasium.register(
+        id="SceneEnvs/SearchMask-v0",
+        entry_point="scene_envs.envs.search_masks_gymnasium:SearchMaskEnv",
+        disable_env_checker=True,
+    )

@@ -49,6 +49,13 @@ class Sources:
     config: str = ""
 
 
+def keys_of(command: Any) -> type:
+    """The dataclass of a command's keys: what ``settings``, the argument of its ``run``, is annotated with."""
+    annotation = command.run.__annotations__["settings"]
+    keys: type = command.run.__globals__[annotation] if isinstance(annotation, str) else annotation
+    return keys
+
+
 def describe_fields(config: type | Any, prefix: str = "") -> list[KeyHelp]:
     """The keys of a config, or of the default one of its class, those of groups last.
 

@@ -19,7 +19,7 @@ from types import ModuleType
 from typing import Any
 
 from agents.cli.commands import COMMANDS, RENAMED
-from agents.cli.keys import Sources, compose, format_rows, help_text
+from agents.cli.keys import Sources, compose, format_rows, help_text, keys_of
 from agents.cli.sweep import expand_sweeps
 from agents.configuration.tree import config_text
 from agents.utils.interrupts import Terminated, terminable
@@ -58,7 +58,7 @@ def main_of(command: str, meaning: str, module: ModuleType, argv: Sequence[str] 
     Args:
         command: its name in messages and in the name of its folder.
         meaning: what it does, in one phrase.
-        module: has ``config()`` and ``run(settings, run)``, as a module of :mod:`agents.cli.commands`.
+        module: has ``run(settings, run)``, as a module of :mod:`agents.cli.commands`.
         argv: the words after the program; those of the process by default.
     """
     return _guarded(
@@ -122,15 +122,16 @@ def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str
         raise InvalidInputError(f"--cfg {shown}: only --cfg job is known, which prints the keys and runs nothing")
     command, sources = program.removeprefix("scene-envs "), Sources(config_dir, file)
     named = _named(words, getattr(module, "POSITIONAL", ()))
+    keys = keys_of(module)
     if asked:
-        config = module.config() if sweep or not named else compose(command, module.config(), named, sources)
+        config = keys if sweep or not named else compose(command, keys, named, sources)
         print(f"{program}: {meaning}.\n\n{help_text(config, named, config_dir)}")
         return DONE
     if not sweep:
-        settings = compose(command, module.config(), named, sources)
+        settings = compose(command, keys, named, sources)
         _check(settings, allow_local, bool(shown))
         return _run(command, module, settings, bool(shown))
-    runs = [(compose(command, module.config(), variant, sources), label) for variant, label in expand_sweeps(named)]
+    runs = [(compose(command, keys, variant, sources), label) for variant, label in expand_sweeps(named)]
     for settings, _ in runs:
         _check(settings, allow_local, bool(shown))
     return _run_all(command, module, runs, bool(shown))

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from agents.planning.search_run import SearchOutcome, run_search
     from agents.planning.session import Session
     from agents.planning.tree import Node, Tree
+    from agents.planning.tree_file import SearchRecord, TreeNode
     from agents.planning.uct import UCTPlanner
 
 __all__ = [
@@ -34,10 +35,12 @@ __all__ = [
     "PlannerSettings",
     "SearchConfig",
     "SearchOutcome",
+    "SearchRecord",
     "SearchStoppedError",
     "Searchable",
     "Session",
     "Tree",
+    "TreeNode",
     "UCTPlanner",
     "list_planners",
     "register_planner",
@@ -60,6 +63,7 @@ __getattr__ = lazy_names(
         "agents.planning.search_run": ("SearchOutcome", "run_search"),
         "agents.planning.session": ("Session",),
         "agents.planning.tree": ("Node", "Tree"),
+        "agents.planning.tree_file": ("SearchRecord", "TreeNode"),
         "agents.planning.uct": ("UCTPlanner",),
     },
 )

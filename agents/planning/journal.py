@@ -7,14 +7,15 @@ import io
 import os
 import struct
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 
-from scene_envs.envs import SearchState
+from scene_envs.envs import MaskChoiceState, SearchState
 from scene_envs.errors import CorruptFileError, InvalidInputError
 
 _MAGIC = b"scene-envs search 1\n"
@@ -69,7 +70,13 @@ class Journal:
 
     def add(self, states: Sequence[SearchState]) -> None:
         """Write the states of a round."""
-        self._append([{field.name: getattr(state, field.name) for field in fields(SearchState)} for state in states])
+        self._append([{field.name: getattr(state, field.name) for field in fields(state)} for state in states])
+
+    def states(self) -> Iterator[SearchState]:
+        """All states in the file in the order they were made, one round in memory at a time."""
+        with self.path.open("rb") as file:
+            for record in islice(self._records(file), 1, None):
+                yield from map(_state, record)
 
     def _begin(self, settings: Mapping[str, str]) -> None:
         self.path.write_bytes(_MAGIC)
@@ -84,31 +91,43 @@ class Journal:
             file.flush()
 
     def _read(self, settings: Mapping[str, str]) -> None:
-        data, position, records = self.path.read_bytes(), len(_MAGIC), []
-        if not data.startswith(_MAGIC[: len(data)]):
-            raise CorruptFileError(f"{self.path} is no journal of a search; remove it, or give another output")
-        while position + _HEAD.size <= len(data):
-            length, checksum = _HEAD.unpack_from(data, position)
-            record = data[position + _HEAD.size : position + _HEAD.size + length]
-            if len(record) < length:
-                break
-            if zlib.crc32(record) != checksum:
-                raise CorruptFileError(f"{self.path} is damaged at byte {position}; remove it, or give another output")
-            records.append(torch.load(io.BytesIO(record), weights_only=True))
-            position += _HEAD.size + length
-        if not records:  # killed at its very beginning
+        records = []
+        with self.path.open("r+b") as file:
+            begun = file.read(len(_MAGIC))
+            if not _MAGIC.startswith(begun):
+                raise CorruptFileError(f"{self.path} is no journal of a search; remove it, or give another output")
+            whole = len(begun)
+            for record in self._records(file):
+                records.append(record)
+                whole = file.tell()
+            file.truncate(whole)  # a process was killed while writing the rest
+        if not records:  # at its very beginning
             self._begin(settings)
             return
-        if position < len(data):  # killed while writing
-            with self.path.open("r+b") as file:
-                file.truncate(position)
         for name in sorted({*settings, *records[0]}):
             before, now = records[0].get(name), settings.get(name)
             if before != now:
                 raise InvalidInputError(
                     f"{self.path} is of a search with {name}={before}, not {now}; give another output, or that value"
                 )
-        self._states = [SearchState(**state) for states in records[1:] for state in states]
+        self._states = [_state(values) for states in records[1:] for values in states]
+
+    def _records(self, file: BinaryIO) -> Iterator[Any]:
+        """What was written whole; the file stands behind the record that is given."""
+        file.seek(len(_MAGIC))
+        while len(head := file.read(_HEAD.size)) == _HEAD.size:
+            length, checksum = _HEAD.unpack(head)
+            record = file.read(length)
+            if len(record) < length:
+                return
+            if zlib.crc32(record) != checksum:
+                start = file.tell() - length - _HEAD.size
+                raise CorruptFileError(f"{self.path} is damaged at byte {start}; remove it, or give another output")
+            yield torch.load(io.BytesIO(record), weights_only=True)
+
+
+def _state(values: Mapping[str, Any]) -> SearchState:
+    return MaskChoiceState(**values) if "masks" in values else SearchState(**values)
 
 
 def _described(value: Any) -> str:

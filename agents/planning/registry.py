@@ -5,11 +5,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any, ClassVar, TypeVar
 
-from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.plugins import load_plugins
+from scene_envs.errors import InvalidInputError
+from scene_envs.registry import Registry
 
 ENTRY_POINT_GROUP = "scene_envs.planners"
 """Entry points of installed packages: modules that call :func:`register_planner` when they are imported."""
@@ -37,9 +36,13 @@ class PlannerSettings(ABC):
         """
 
 
-_SHIPPED = ("beam", "best_of", "evolution", "feynman_kac", "greedy", "mcts", "uct")
-"""Modules of this package that register a planner each."""
-_PLANNERS: dict[str, type[PlannerSettings]] = {}
+_PLANNERS: Registry[type[PlannerSettings]] = Registry(
+    "planner",
+    ENTRY_POINT_GROUP,
+    modules=[
+        f"agents.planning.{name}" for name in ("beam", "best_of", "evolution", "feynman_kac", "greedy", "mcts", "uct")
+    ],
+)
 Settings = TypeVar("Settings", bound=type[PlannerSettings])
 
 
@@ -49,8 +52,7 @@ def register_planner(name: str) -> Callable[[Settings], Settings]:
     Raises:
         InvalidInputError: the name is not one word.
     """
-    if not name.isidentifier():
-        raise InvalidInputError(f"planner name {name!r}: use letters, digits and underscores, such as 'beam'")
+    _PLANNERS.check_name(name, "beam")
 
     def register(settings: Settings) -> Settings:
         _PLANNERS[name] = settings
@@ -61,9 +63,7 @@ def register_planner(name: str) -> Callable[[Settings], Settings]:
 
 def list_planners() -> list[str]:
     """Names of all planners, those of installed packages included, sorted."""
-    _load_shipped()
-    load_plugins(ENTRY_POINT_GROUP)
-    return sorted(_PLANNERS)
+    return _PLANNERS.names()
 
 
 def planner_settings(name: str) -> type[PlannerSettings]:
@@ -72,19 +72,7 @@ def planner_settings(name: str) -> type[PlannerSettings]:
     Raises:
         UnknownNameError: no planner has that name; the nearest known one is offered.
     """
-    if name not in _PLANNERS:
-        _load_shipped()
-    if name not in _PLANNERS:
-        load_plugins(ENTRY_POINT_GROUP)
-    if name not in _PLANNERS:
-        raise unknown_name("planner", str(name), list_planners())
     return _PLANNERS[name]
-
-
-def _load_shipped() -> None:
-    """Import the planners of this package, each of which imports this module."""
-    for name in _SHIPPED:
-        import_module(f"agents.planning.{name}")
 
 
 def check_at_least(planner: PlannerSettings, least: float, *names: str) -> None:

@@ -6,8 +6,11 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from agents.configuration.tree import config_text, plain_tree
 from agents.planning.best_of import BestOfPlanner
@@ -16,6 +19,8 @@ from agents.planning.journal import Journal
 from agents.planning.ledger import PlanResult
 from agents.planning.search_report import draw_curve, draw_scene
 from agents.planning.session import Session
+from agents.planning.tree_file import SearchRecord
+from agents.planning.tree_page import shown_nodes, write_tree_page
 from scene_envs.envs import SearchEnv, SearchState
 from scene_envs.envs.resolvers import resolve_prior
 from scene_envs.errors import InvalidInputError, SceneEnvsError
@@ -76,8 +81,9 @@ def run_search(
         prior: a prior, or the name or path of one.
         objective: any reward: name, mapping, function or object.
         config: the settings; or give its fields as keywords.
-        output: folder for ``curve.png``, ``before.png``, ``after.png``, ``best.safetensors``, ``metrics.json``, the
-            journals, and ``config.yaml``, in which functions and objects are left out; None writes nothing.
+        output: folder for ``curve.png``, ``before.png``, ``after.png``, ``best.safetensors``, ``metrics.json``,
+            ``tree.json``, ``tree.html``, the journals, and ``config.yaml``, in which functions and objects are left
+            out; None writes nothing.
         progress: told of every round.
         **settings: fields of :class:`SearchConfig`.
 
@@ -158,6 +164,8 @@ def _search(
     )
     if folder is not None:
         _write(outcome, config, first, folder)
+        if len(parts) == 1:
+            _write_tree(outcome, env, session, folder)
         plain = {key: value for key, value in named.items() if isinstance(value, _PLAIN)}
         write_text(folder / "config.yaml", config_text(plain))
     return outcome
@@ -284,3 +292,22 @@ def _write(outcome: SearchOutcome, config: SearchConfig, first: SearchState, out
     )
     draw_scene(outcome.first, first, output / "before.png")
     draw_scene(outcome.best[0], outcome.search.best_state, output / "after.png")
+
+
+def _write_tree(outcome: SearchOutcome, env: SearchEnv, session: Session, output: Path) -> None:
+    """``tree.json`` and ``tree.html``, from the journal: it has the states of every planner."""
+    assert session.journal is not None
+    roots = [lane.root for lane in session.lanes]
+    made = sum(len(lane.values) for lane in session.lanes)
+    metrics = outcome.metrics
+    settings = {name: metrics[name] for name in ("planner", "objective", "objective_scale")}
+    settings["nfe_per_scene"] = env.problem.nfe_per_scene
+    best = {plan.best_state.seed: tuple(plan.best_path) for plan in outcome.searches}
+    record = SearchRecord.of(roots, islice(session.journal.states(), made), best, settings)
+    record.save(output / "tree.json")
+    shown = shown_nodes(record)
+    kept = {node: env.scene(s) for node, s in enumerate(session.journal.states(), start=len(roots)) if node in shown}
+    last = kept.get(record.searches[0]["best"])
+    returned = None if last is not None and torch.equal(last.tensor, outcome.best[0].tensor) else outcome.best[0]
+    scenes = {node: kept[node] for node in shown}
+    write_tree_page(output / "tree.html", record, scenes, metrics, returned=returned)

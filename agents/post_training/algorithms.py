@@ -8,8 +8,8 @@ from importlib import import_module
 from typing import Any, ClassVar, TypeVar
 
 from agents.configuration.checks import at_least, one_of, positive
-from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.plugins import load_plugins
+from scene_envs.errors import InvalidInputError
+from scene_envs.registry import Registry
 
 ENTRY_POINT_GROUP = "scene_envs.algorithms"
 """Entry points of installed packages: modules that call :func:`register_algorithm` when they are imported."""
@@ -229,13 +229,17 @@ class _Entry:
 
 
 _FORWARD = "agents.post_training.forward_process:ForwardProcess"
-_ENTRIES = {
-    "ddpo_sf": _Entry(DDPOSFSettings, "agents.post_training.ddpo:DDPO"),
-    "ddpo_is": _Entry(DDPOISSettings, "agents.post_training.ddpo:DDPO"),
-    "nft": _Entry(NFTSettings, _FORWARD),
-    "awm": _Entry(AWMSettings, _FORWARD),
-    "reward_weighted": _Entry(RewardWeightedSettings, _FORWARD),
-}
+_ALGORITHMS = Registry(
+    "algorithm",
+    ENTRY_POINT_GROUP,
+    {
+        "ddpo_sf": _Entry(DDPOSFSettings, "agents.post_training.ddpo:DDPO"),
+        "ddpo_is": _Entry(DDPOISSettings, "agents.post_training.ddpo:DDPO"),
+        "nft": _Entry(NFTSettings, _FORWARD),
+        "awm": _Entry(AWMSettings, _FORWARD),
+        "reward_weighted": _Entry(RewardWeightedSettings, _FORWARD),
+    },
+)
 
 
 def register_algorithm(
@@ -253,11 +257,10 @@ def register_algorithm(
     Raises:
         InvalidInputError: the name is not one word.
     """
-    if not name.isidentifier():
-        raise InvalidInputError(f"algorithm name {name!r}: use letters, digits and underscores, such as 'my_ddpo'")
+    _ALGORITHMS.check_name(name, "my_ddpo")
 
     def register(algorithm: Algorithm) -> Algorithm:
-        _ENTRIES[name] = _Entry(settings, algorithm)
+        _ALGORITHMS[name] = _Entry(settings, algorithm)
         return algorithm
 
     return register
@@ -265,8 +268,7 @@ def register_algorithm(
 
 def list_algorithms() -> list[str]:
     """Names of all algorithms, those of installed packages included, sorted."""
-    load_plugins(ENTRY_POINT_GROUP)
-    return sorted(_ENTRIES)
+    return _ALGORITHMS.names()
 
 
 def algorithm_settings(name: str) -> type[AlgorithmSettings]:
@@ -275,21 +277,13 @@ def algorithm_settings(name: str) -> type[AlgorithmSettings]:
     Raises:
         UnknownNameError: no algorithm has that name; the nearest known one is offered.
     """
-    return _entry(name).settings
+    return _ALGORITHMS[name].settings
 
 
 def make_algorithm(settings: AlgorithmSettings, policy: Any, stds: Any) -> Any:
     """The algorithm of these settings for a policy, whose steps have the standard deviations ``stds`` (S,)."""
-    code = _entry(settings.name).code
+    code = _ALGORITHMS[settings.name].code
     if isinstance(code, str):
         module, _, attribute = code.partition(":")
         code = getattr(import_module(module), attribute)
     return code(settings, policy, stds)
-
-
-def _entry(name: str) -> _Entry:
-    if name not in _ENTRIES:
-        load_plugins(ENTRY_POINT_GROUP)
-    if name not in _ENTRIES:
-        raise unknown_name("algorithm", str(name), list_algorithms())
-    return _ENTRIES[name]

@@ -1,4 +1,4 @@
-"""What a report says of the guard: its verdict, its figures and its samples."""
+"""The guard's part of a report: its verdict, its figures and its samples."""
 
 from __future__ import annotations
 

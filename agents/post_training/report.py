@@ -94,7 +94,7 @@ def render_page(page: Page) -> str:
     loader = PackageLoader("agents", "post_training")
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, keep_trailing_newline=True)
     environment.filters["png"] = _png
-    style = resources.files("agents.post_training").joinpath("report.css").read_text(encoding="utf-8")
+    style = resources.files("agents.utils").joinpath("report.css").read_text(encoding="utf-8")
     return environment.get_template("report.html").render(page=page, style=Markup(style))
 
 

@@ -15,11 +15,6 @@ if TYPE_CHECKING:
 MEANING = "train and measure priors for the paper's tables and that of precision"
 
 
-def config() -> type[TablesConfig]:
-    """The keys of this program."""
-    return TablesConfig
-
-
 def run(settings: TablesConfig, run: Run) -> None:
     """Train, measure and tabulate; the runner writes the files."""
     from benchmarks.paper_tables.runner import run_tables

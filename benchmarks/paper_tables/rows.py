@@ -1,4 +1,4 @@
-"""What tables are made of: rows, which are training runs, and lines that show them."""
+"""Rows of tables, which are training runs, and the lines that show them."""
 
 from __future__ import annotations
 

@@ -191,8 +191,7 @@ class SceneDataset:
     def stable_split(self, fractions: Sequence[float], seed: int = 0) -> tuple[SceneDataset, ...]:
         """Disjoint parts decided scene by scene, so that a scene keeps its part when the dataset grows.
 
-        The parts are those of :class:`~scene_envs.datasets.splits.Part`, which streams use too; their sizes are as
-        asked for on average.
+        Their sizes are as asked for on average.
 
         Raises:
             InvalidInputError: a fraction is negative, or they sum to more than one.

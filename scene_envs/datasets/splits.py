@@ -19,7 +19,7 @@ Keys = NDArray[np.uint64]
 class Part:
     """One of several disjoint parts of a dataset, decided scene by scene from the scene's key.
 
-    A scene stays in its part when the dataset grows, is read in another order or streamed, and rows that repeat a
+    A scene stays in its part when the dataset grows, or is read in another order, and rows that repeat a
     scene share its part. Sizes are therefore as asked for on average only.
 
     Attributes:

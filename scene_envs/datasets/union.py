@@ -6,11 +6,10 @@ from collections.abc import Sequence
 
 import torch
 
-from scene_envs.datasets.layout import place_fixed
 from scene_envs.errors import InvalidInputError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import POSE, SceneBatch
-from scene_envs.scene_types import SceneType, get_scene_type
+from scene_envs.scene_types import SceneType
 
 
 def to_union(batch: SceneBatch, union: SceneType) -> SceneBatch:
@@ -23,18 +22,15 @@ def to_union(batch: SceneBatch, union: SceneType) -> SceneBatch:
     Raises:
         InvalidInputError: an asset that ``union`` lacks.
     """
-    return _recategorise(batch, union).with_slots(max(union.slots, batch.tensor.shape[1]))
-
-
-def from_union(batch: SceneBatch, scene_type: str | SceneType) -> SceneBatch:
-    """Scenes of a union as scenes of one of its types; the inverse of :func:`to_union`.
-
-    Fixed objects move to the first slots. Scenes keep all slots, however many the type has.
-
-    Raises:
-        InvalidInputError: a scene holds an asset that the scene type lacks, or a fixed object stands elsewhere.
-    """
-    return place_fixed(_recategorise(batch, get_scene_type(scene_type)), tolerance=torch.inf)
+    known = {name: index for index, name in enumerate(union.assets)}
+    table = torch.tensor([known.get(name, -1) for name in batch.scene_type.assets] + [union.num_assets])
+    categories = table[batch.categories]
+    if bool((categories < 0).any()):
+        scene, slot = torch.nonzero(categories < 0)[0].tolist()
+        asset = batch.scene_type.assets[int(batch.categories[scene, slot])]
+        raise InvalidInputError(f"scene {scene} holds {asset!r}, which scene type {union.name!r} does not have")
+    there = SceneBatch.from_parts(batch.translations, batch.rotations, categories, union)
+    return there.with_slots(max(union.slots, batch.tensor.shape[1]))
 
 
 def union_normalizer(normalizers: Sequence[Normalizer], union: SceneType) -> Normalizer:
@@ -49,15 +45,3 @@ def union_normalizer(normalizers: Sequence[Normalizer], union: SceneType) -> Nor
     low[POSE] = torch.stack([n.input_min[POSE] for n in normalizers]).amin(dim=0)
     high[POSE] = torch.stack([n.input_max[POSE] for n in normalizers]).amax(dim=0)
     return Normalizer.from_range(low, high)
-
-
-def _recategorise(batch: SceneBatch, target: SceneType) -> SceneBatch:
-    source = batch.scene_type
-    known = {name: index for index, name in enumerate(target.assets)}
-    table = torch.tensor([known.get(name, -1) for name in source.assets] + [target.num_assets])
-    categories = table[batch.categories]
-    if bool((categories < 0).any()):
-        scene, slot = torch.nonzero(categories < 0)[0].tolist()
-        asset = source.assets[int(batch.categories[scene, slot])]
-        raise InvalidInputError(f"scene {scene} holds {asset!r}, which scene type {target.name!r} does not have")
-    return SceneBatch.from_parts(batch.translations, batch.rotations, categories, target)

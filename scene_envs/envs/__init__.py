@@ -1,6 +1,6 @@
 """The denoising and search environments, their adapters, and the masks of the search.
 
-``gym.make("scene_envs:SceneEnvs/Denoising-v0")`` and ``…/Search-v0`` need no import from here.
+``gym.make("scene_envs:SceneEnvs/Denoising-v0")``, ``…/Search-v0`` and ``…/SearchMask-v0`` need no import from here.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from scene_envs.envs.scoring import Score
     from scene_envs.envs.search import SearchProblem, SearchState
     from scene_envs.envs.search_gymnasium import SearchEnv
+    from scene_envs.envs.search_masks import MaskChoiceProblem, MaskChoiceState
+    from scene_envs.envs.search_masks_gymnasium import SearchMaskEnv
     from scene_envs.envs.trajectories import StepResult, Trajectories
 
 __all__ = [
@@ -27,11 +29,14 @@ __all__ = [
     "DenoisingEnv",
     "DenoisingTorchRLEnv",
     "DenoisingVectorEnv",
+    "MaskChoiceProblem",
+    "MaskChoiceState",
     "MaskGenerator",
     "NotBranchableError",
     "ResetNeededError",
     "Score",
     "SearchEnv",
+    "SearchMaskEnv",
     "SearchProblem",
     "SearchState",
     "StepResult",
@@ -54,6 +59,8 @@ __getattr__ = lazy_names(
         "scene_envs.envs.scoring": ["Score"],
         "scene_envs.envs.search": ["SearchProblem", "SearchState"],
         "scene_envs.envs.search_gymnasium": ["SearchEnv"],
+        "scene_envs.envs.search_masks": ["MaskChoiceProblem", "MaskChoiceState"],
+        "scene_envs.envs.search_masks_gymnasium": ["SearchMaskEnv"],
         "scene_envs.envs.trajectories": ["StepResult", "Trajectories"],
     },
 )

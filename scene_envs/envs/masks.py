@@ -12,7 +12,7 @@ from torch import Tensor
 from scene_envs.envs import mask_generators as shipped
 from scene_envs.envs.scoring import Score
 from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.plugins import plugin_entry_points
+from scene_envs.registry import Registry
 from scene_envs.scene import SceneBatch
 
 MaskGenerator = Callable[[SceneBatch, Score, np.random.Generator], Tensor]
@@ -27,7 +27,7 @@ ENTRY_POINT_GROUP = "scene_envs.masks"
 
 Generator = TypeVar("Generator", bound=MaskGenerator)
 
-_MASKS: dict[str, MaskGenerator] = {
+_SHIPPED: dict[str, MaskGenerator] = {
     "culprits": shipped.CulpritsMask(),
     "empty": shipped.EmptyMask(),
     "given": shipped.GivenMask(),
@@ -40,6 +40,9 @@ _MASKS: dict[str, MaskGenerator] = {
     "region": shipped.RegionMask(),
     "unstable": shipped.unstable_mask,
 }
+_MASKS: Registry[MaskGenerator] = Registry(
+    "mask generator", ENTRY_POINT_GROUP, _SHIPPED, read=lambda point: _checked(point.name, point.load())
+)
 
 
 def register_mask(name: str) -> Callable[[Generator], Generator]:
@@ -54,21 +57,24 @@ def register_mask(name: str) -> Callable[[Generator], Generator]:
     >>> "doctest_empty" in list_masks()
     True
     """
-    if not name.isidentifier():
-        raise InvalidInputError(f"mask name {name!r}: use letters, digits and underscores, such as 'top_shelf'")
+    _MASKS.check_name(name, "top_shelf")
 
     def register(generator: Generator) -> Generator:
-        if not callable(generator):
-            raise InvalidInputError(f"mask {name!r}: {generator!r} cannot be called; give (scene, score, rng) -> mask")
-        _MASKS[name] = generator
+        _MASKS[name] = _checked(name, generator)
         return generator
 
     return register
 
 
+def _checked(name: str, generator: Any) -> Any:
+    if not callable(generator):
+        raise InvalidInputError(f"mask {name!r}: {generator!r} cannot be called; give (scene, score, rng) -> mask")
+    return generator
+
+
 def list_masks() -> list[str]:
     """Names of all mask generators, those of installed packages included, sorted."""
-    return sorted({*_MASKS, *plugin_entry_points(ENTRY_POINT_GROUP)})
+    return _MASKS.names()
 
 
 def resolve_mask(mask: Any) -> MaskGenerator:
@@ -82,12 +88,7 @@ def resolve_mask(mask: Any) -> MaskGenerator:
     LowestScoringMask(count=2)
     """
     if isinstance(mask, str):
-        if mask in _MASKS:
-            return _MASKS[mask]
-        plugins = plugin_entry_points(ENTRY_POINT_GROUP)
-        if mask not in plugins:
-            raise unknown_name("mask generator", mask, list_masks())
-        return register_mask(mask)(plugins[mask].load())
+        return _MASKS[mask]
     if isinstance(mask, Mapping) and "name" in mask:
         return _with_settings(resolve_mask(str(mask["name"])), {k: v for k, v in mask.items() if k != "name"}, mask)
     if callable(mask):

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from scene_envs.envs.mask_generators import OffPromptMask
-from scene_envs.envs.masks import resolve_mask
+from scene_envs.envs.masks import MaskGenerator, resolve_mask
 from scene_envs.envs.prompts import EnvPrompts
 from scene_envs.envs.scoring import RewardScorer, Score
-from scene_envs.envs.settings import SearchSettings, takes
+from scene_envs.envs.settings import SearchSettings, TreeSettings, takes
 from scene_envs.envs.spaces import check_slots, prior_device, resolve_scene_and_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
@@ -114,6 +114,7 @@ class SearchProblem:
     Attributes:
         evaluations: denoiser evaluations (NFE) spent so far, ``num_steps`` per generated scene and twice that many with
             guidance.
+        num_actions: actions of a state, legal or not.
 
     >>> problem = SearchProblem(objective="object_count", num_steps=2, max_depth=1)
     >>> root = problem.root(seed=0)
@@ -122,24 +123,35 @@ class SearchProblem:
     ([(0,), (1,), (2,), (3,)], 10)
     """
 
+    state_type: type[SearchState] = SearchState
+
     @takes(SearchSettings)
     def __init__(self, **settings: Any) -> None:
         chosen = SearchSettings(**settings)
+        self._begin(chosen)
+        self.mask_generator = self._resolve_mask(chosen.mask)
+
+    def _begin(self, chosen: TreeSettings) -> None:
+        """Resolve all settings but the mask."""
         self.scene_type, self.prior = resolve_scene_and_prior(chosen.scene, chosen.prior)
         self.slots = check_slots(self.scene_type, chosen.slots)
         self.device = prior_device(self.prior)
         self.branching, self.max_depth, self.num_steps = chosen.branching, chosen.max_depth, chosen.num_steps
+        self.num_actions, self.max_nfe = chosen.branching, chosen.max_nfe
         self.prior.step_table(self.num_steps)  # says now, not later, that num_steps is more than the prior has
         free_slots = self.slots - len(self.scene_type.fixed)
         self.scale = float(free_slots) if chosen.objective_scale is None else chosen.objective_scale
         self.prompting = EnvPrompts(self.prior, chosen.prompt, chosen.guidance, self.slots)
         self.prompt = self.prompting.draw(np.random.default_rng(0)) if self.prompting.given else None
-        self.mask_generator = resolve_mask(chosen.mask)
-        if isinstance(self.mask_generator, OffPromptMask) and self.mask_generator.prompt is None:
-            self.mask_generator = OffPromptMask(self.prompt)
         self.scorer = RewardScorer(chosen.objective, chosen.workers)
         self.evaluations = 0
         self._told_of_scale = False
+
+    def _resolve_mask(self, mask: Any) -> MaskGenerator:
+        generator = resolve_mask(mask)
+        if isinstance(generator, OffPromptMask) and generator.prompt is None:
+            return OffPromptMask(self.prompt)
+        return generator
 
     # -- states ---------------------------------------------------------------------------------
 
@@ -164,7 +176,7 @@ class SearchProblem:
         With ``steering`` the children of one parent depend on each other.
 
         Raises:
-            InvalidInputError: an action is not in 0..branching-1, or a state is at ``max_depth``.
+            InvalidInputError: an action is not legal in its state.
         """
         if not pairs:
             return []
@@ -172,7 +184,7 @@ class SearchProblem:
             self._check_legal(state, action)
         paths = [(*state.path, int(action)) for state, action in pairs]
         parents = SceneBatch(torch.stack([state.scene for state, _ in pairs]), self.scene_type)
-        masks = torch.stack([state.mask for state, _ in pairs])
+        masks = torch.stack([self.mask_of(state, action) for state, action in pairs])
         noises = [NodeRandomness.at(state.seed, path).noise for (state, _), path in zip(pairs, paths, strict=True)]
         watch = None if steering is None else steering(pairs, self._values)
         children = self._inpaint(parents, masks, noises, watch)
@@ -185,7 +197,11 @@ class SearchProblem:
 
     def legal_actions(self, state: SearchState) -> Sequence[int]:
         """All inpaintings; none at ``max_depth`` and where nothing is left to improve."""
-        return range(0 if state.depth >= self.max_depth or self.is_solved(state) else self.branching)
+        return () if state.depth >= self.max_depth or self.is_solved(state) else self._open_actions(state)
+
+    def mask_of(self, state: SearchState, action: int) -> Tensor:
+        """(N,) bool, the slots that ``action`` regenerates in ``state``."""
+        return state.mask
 
     def is_solved(self, state: SearchState) -> bool:
         """Whether nothing is left to improve: no slot is masked, or Φ is 1, the most there is."""
@@ -201,9 +217,13 @@ class SearchProblem:
         batch = SceneBatch(scene.unsqueeze(0), self.scene_type)
         return self._score(batch, [(state.seed, state.path, state.value)])[0]
 
+    def _open_actions(self, state: SearchState) -> Sequence[int]:
+        """Actions that regenerate something in ``state``, in the order in which planners try them."""
+        return range(self.branching)
+
     def _check_legal(self, state: SearchState, action: int) -> None:
-        if not isinstance(action, (int, np.integer)) or not 0 <= action < self.branching:
-            raise InvalidInputError(f"action={action!r}: choose one of the inpaintings 0..{self.branching - 1}")
+        if not isinstance(action, (int, np.integer)) or not 0 <= action < self.num_actions:
+            raise InvalidInputError(f"action={action!r}: choose one of the inpaintings 0..{self.num_actions - 1}")
         if state.depth >= self.max_depth:
             raise InvalidInputError(
                 f"the state at path {state.path} is at max_depth={self.max_depth}: it has no children"
@@ -251,9 +271,6 @@ class SearchProblem:
         self, scene: SceneBatch, score: Score, seed: int, path: tuple[int, ...], parent_value: float
     ) -> SearchState:
         valid, objective = bool(score.valid[0]), float(score.value[0])
-        changeable = self._changeable() & ~scene.is_welded[0]
-        if bool(scene.is_free.any()):
-            changeable &= self.mask_generator(scene, score, NodeRandomness.at(seed, path).mask)
         if objective > self.scale and not self._told_of_scale:
             self._told_of_scale = True
             _LOGGER.warning(
@@ -262,9 +279,9 @@ class SearchProblem:
                 objective,
                 self.scale,
             )
-        return SearchState(
+        return self.state_type(
             scene=scene.tensor[0].clone(),
-            mask=changeable,
+            **self._masks(scene, score, seed, path),
             depth=len(path),
             path=path,
             seed=seed,
@@ -272,6 +289,19 @@ class SearchProblem:
             objective=objective,
             valid=valid,
         )
+
+    def _masks(self, scene: SceneBatch, score: Score, seed: int, path: tuple[int, ...]) -> dict[str, Tensor]:
+        """The fields of the state that say what is regenerated."""
+        return {"mask": self._mask(self.mask_generator, scene, score, seed, path)}
+
+    def _mask(
+        self, generator: MaskGenerator, scene: SceneBatch, score: Score, seed: int, path: tuple[int, ...]
+    ) -> Tensor:
+        """(N,) bool: what ``generator`` masks at this node, welded objects left out; all without free objects."""
+        changeable = self._changeable() & ~scene.is_welded[0]
+        if bool(scene.is_free.any()):
+            changeable &= generator(scene, score, NodeRandomness.at(seed, path).mask)
+        return changeable
 
     def close(self) -> None:
         """Stop physics workers, if any."""

@@ -111,20 +111,24 @@ class SearchEnv(gym.Env[Any, Any]):
 
     @takes(SearchSettings)
     def __init__(self, *, render_mode: str | None = None, **settings: Any) -> None:
+        problem = SearchProblem(**settings)
+        self._begin(problem, render_mode, spaces.MultiBinary(problem.slots))
+
+    def _begin(self, problem: SearchProblem, render_mode: str | None, regenerate: spaces.MultiBinary) -> None:
+        """Spaces and state of an environment over ``problem``; ``regenerate`` is what is observed of its masks."""
         self.render_mode = check_render_mode(render_mode)
-        self.problem = SearchProblem(**settings)
-        self.max_nfe: int | None = settings.get("max_nfe")
-        slot_count = self.problem.slots
+        self.problem = problem
+        slot_count = problem.slots
         self.observation_space = spaces.Dict(
             {
                 "scene": scene_box(STATE_BOUND, slot_count, self.problem.scene_type.features),
                 "object_mask": spaces.MultiBinary(slot_count),
-                "regenerate": spaces.MultiBinary(slot_count),
+                "regenerate": regenerate,
                 "depth": spaces.Box(0, self.problem.max_depth, (1,), np.int64),
                 "value": spaces.Box(0.0, 1.0, (1,), np.float32),
             }
         )
-        self.action_space = spaces.Discrete(self.problem.branching)
+        self.action_space = spaces.Discrete(problem.num_actions)
         self._state: SearchState | None = None
         self._best: SearchState | None = None
         self._nfe_at_reset = 0
@@ -161,11 +165,14 @@ class SearchEnv(gym.Env[Any, Any]):
         parent = self.state
         if why := self._end(parent):
             raise ResetNeededError(f"the episode ended, {why}; call reset() first")
-        self._state = self.expand(parent, action)
+        self._state = self._child(parent, action)
         observation, info = self._observe(self._state)
         terminated = self.problem.is_solved(self._state)
         truncated = not terminated and bool(self._end(self._state))
         return observation, self._state.value - parent.value, terminated, truncated, info
+
+    def _child(self, state: SearchState, action: int) -> SearchState:
+        return self.expand(state, action)
 
     def _end(self, state: SearchState) -> str:
         """Why the episode ends at ``state``; empty where it goes on."""
@@ -173,8 +180,9 @@ class SearchEnv(gym.Env[Any, Any]):
             return "with nothing left to improve"
         if state.depth >= self.problem.max_depth:
             return f"at max_depth={self.problem.max_depth}"
-        if self.max_nfe is not None and self.nfe + self.problem.nfe_per_scene > self.max_nfe:
-            return f"as max_nfe={self.max_nfe} denoiser evaluations are spent"
+        max_nfe = self.problem.max_nfe
+        if max_nfe is not None and self.nfe + self.problem.nfe_per_scene > max_nfe:
+            return f"as max_nfe={max_nfe} denoiser evaluations are spent"
         return ""
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
@@ -208,8 +216,8 @@ class SearchEnv(gym.Env[Any, Any]):
         return self.problem.legal_actions(self.state if state is None else state)
 
     def action_masks(self) -> np.ndarray:
-        """(branching,) bool, the legal actions of the current state, as maskable agents ask for them."""
-        return np.isin(np.arange(self.problem.branching), list(self.legal_actions()))
+        """(number of actions,) bool, the legal ones of the current state, as maskable agents ask for them."""
+        return np.isin(np.arange(self.problem.num_actions), list(self.legal_actions()))
 
     def expand(self, state: SearchState, action: int) -> SearchState:
         """The child of ``state`` under ``action``; the current state stays."""
@@ -257,9 +265,10 @@ class SearchEnv(gym.Env[Any, Any]):
     # -- helpers --------------------------------------------------------------------------------
 
     def _check_state(self, state: Any) -> SearchState:
-        if not isinstance(state, SearchState):
+        kind = self.problem.state_type
+        if not isinstance(state, kind):
             raise InvalidInputError(
-                f"a SearchState is needed, as clone_state() or expand() gives, not {type(state).__name__}"
+                f"a {kind.__name__} is needed, as clone_state() or expand() gives, not {type(state).__name__}"
             )
         shape = (self.problem.slots, self.problem.scene_type.features)
         if tuple(state.scene.shape) != shape:

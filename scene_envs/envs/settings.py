@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -84,14 +84,13 @@ class DenoisingSettings(EnvSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchSettings(EnvSettings):
-    """Settings of the search environment.
+class TreeSettings(EnvSettings):
+    """Settings of both search environments.
 
     Attributes:
         objective: any reward: name, mapping, function or reward object.
         branching: B, inpaintings to choose from.
         max_depth: actions per episode.
-        mask: name of a mask generator, or a function; see :mod:`scene_envs.envs.masks`.
         objective_scale: objective at which Φ is 1; None means the number of free slots.
         max_nfe: denoiser evaluations per episode; None for any number.
 
@@ -102,7 +101,6 @@ class SearchSettings(EnvSettings):
     objective: Any = "feasible_objects"
     branching: int = 4
     max_depth: int = 10
-    mask: Any = "culprits"
     objective_scale: float | None = None
     max_nfe: int | None = None
 
@@ -117,6 +115,36 @@ class SearchSettings(EnvSettings):
             raise InvalidInputError(f"objective_scale={scale!r} must be positive and finite")
         if self.prompt is not None and not isinstance(self.prompt, str):
             raise InvalidInputError(f"prompt={self.prompt!r}: a search follows one text, or None")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchSettings(TreeSettings):
+    """Settings of the search environment with one mask.
+
+    Attributes:
+        mask: name of a mask generator, a mapping with its settings, or a function; see :mod:`scene_envs.envs.masks`.
+    """
+
+    mask: Any = "culprits"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchMaskSettings(TreeSettings):
+    """Settings of the search environment with a choice of masks.
+
+    Attributes:
+        masks: K of them, each as ``mask`` of :class:`SearchSettings`.
+
+    Raises:
+        InvalidInputError: no list, or an empty one.
+    """
+
+    masks: Sequence[Any] = ("culprits", "infeasible", "empty", "infeasible_or_empty")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if isinstance(self.masks, str) or not isinstance(self.masks, Sequence) or not self.masks:
+            raise InvalidInputError(f"masks={self.masks!r}: give a list of at least one mask, as ['culprits', 'empty']")
 
 
 def takes(settings: type[EnvSettings]) -> Callable[[Init], Init]:

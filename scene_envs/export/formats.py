@@ -9,8 +9,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from scene_envs.errors import InvalidInputError, MissingDependencyError, unknown_name
-from scene_envs.plugins import plugin_entry_points
+from scene_envs.errors import InvalidInputError, MissingDependencyError
+from scene_envs.registry import Registry
 
 if TYPE_CHECKING:
     from scene_envs.export.asset_files import AssetFiles
@@ -56,19 +56,22 @@ class ExportFormat:
 
 
 _HERE = "scene_envs.export"
-_FORMATS: dict[str, ExportFormat] = {
-    entry.name: entry
-    for entry in (
-        ExportFormat("urdf", "URDF per asset, poses as JSON", f"{_HERE}.urdf:write_scene"),
-        ExportFormat("sdf", "SDF world (Gazebo, Drake)", f"{_HERE}.sdf:write_scene"),
-        ExportFormat("drake", "Drake model directives", f"{_HERE}.drake:write_scene"),
-        ExportFormat("mjcf", "MJCF (MuJoCo)", f"{_HERE}.mjcf:write_scene"),
-        ExportFormat("usd", "USD with UsdPhysics", f"{_HERE}.usd:write_scene", "pxr", "usd-core"),
-        ExportFormat("glb", "coloured mesh, no physics", f"{_HERE}.glb:write_scene"),
-        ExportFormat("npz", "numpy arrays", f"{_HERE}.arrays:write_npz"),
-        ExportFormat("pickle", "dictionary of numpy arrays", f"{_HERE}.arrays:write_pickle"),
-    )
-}
+_SHIPPED = (
+    ExportFormat("urdf", "URDF per asset, poses as JSON", f"{_HERE}.urdf:write_scene"),
+    ExportFormat("sdf", "SDF world (Gazebo, Drake)", f"{_HERE}.sdf:write_scene"),
+    ExportFormat("drake", "Drake model directives", f"{_HERE}.drake:write_scene"),
+    ExportFormat("mjcf", "MJCF (MuJoCo)", f"{_HERE}.mjcf:write_scene"),
+    ExportFormat("usd", "USD with UsdPhysics", f"{_HERE}.usd:write_scene", "pxr", "usd-core"),
+    ExportFormat("glb", "coloured mesh, no physics", f"{_HERE}.glb:write_scene"),
+    ExportFormat("npz", "numpy arrays", f"{_HERE}.arrays:write_npz"),
+    ExportFormat("pickle", "dictionary of numpy arrays", f"{_HERE}.arrays:write_pickle"),
+)
+_FORMATS = Registry(
+    "export format",
+    ENTRY_POINT_GROUP,
+    {entry.name: entry for entry in _SHIPPED},
+    read=lambda point: ExportFormat(point.name, f"from {point.module}", point.value),
+)
 
 
 def register_format(name: str, *, summary: str = "") -> Callable[[SceneWriter], SceneWriter]:
@@ -85,8 +88,7 @@ def register_format(name: str, *, summary: str = "") -> Callable[[SceneWriter], 
     >>> "doctest_poses" in list_formats()
     True
     """
-    if not name.isidentifier():
-        raise InvalidInputError(f"format name {name!r}: use letters, digits and underscores, such as 'my_format'")
+    _FORMATS.check_name(name, "my_format")
 
     def register(write: SceneWriter) -> SceneWriter:
         _FORMATS[name] = ExportFormat(name, summary or (write.__doc__ or "").strip().split("\n")[0], write)
@@ -97,7 +99,7 @@ def register_format(name: str, *, summary: str = "") -> Callable[[SceneWriter], 
 
 def list_formats() -> list[str]:
     """Names of all formats, those of installed packages included, sorted."""
-    return sorted({*_FORMATS, *plugin_entry_points(ENTRY_POINT_GROUP)})
+    return _FORMATS.names()
 
 
 def get_format(name: str) -> ExportFormat:
@@ -106,12 +108,7 @@ def get_format(name: str) -> ExportFormat:
     Raises:
         UnknownNameError: no such format; the nearest known one is offered.
     """
-    if name in _FORMATS:
-        return _FORMATS[name]
-    point = plugin_entry_points(ENTRY_POINT_GROUP).get(name)
-    if point is not None:
-        return ExportFormat(name, f"from {point.module}", point.value)
-    raise unknown_name("export format", name, list_formats())
+    return _FORMATS[name]
 
 
 def resolve_formats(formats: str | Sequence[str]) -> tuple[str, ...]:

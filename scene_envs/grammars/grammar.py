@@ -14,8 +14,11 @@ from numpy.typing import NDArray
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars.layout import Frame, Layout, Pose
 from scene_envs.grammars.towers import Surface, Tower
+from scene_envs.registry import Registry
 from scene_envs.scene import POSE, POSE_FEATURES, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
+from scene_envs.scene_types.built_in import BUILT_IN
+from scene_envs.scene_types.registry import PLUGINS
 
 _MAX_STRUCTURES = 10_000
 """Structures drawn for one scene before the grammar is called impossible."""
@@ -121,8 +124,10 @@ class Grammar:
             scene[slot, POSE_FEATURES + self._category[pose.asset]] = 1.0
 
 
-GRAMMARS: dict[str, Callable[[], Grammar]] = {}
-"""Functions registered so far, each of which makes a grammar, by name."""
+GRAMMARS: Registry[Callable[[], Grammar]] = Registry(
+    "grammar", PLUGINS, modules=[f"scene_envs.grammars.{scene_type.name}" for scene_type in BUILT_IN]
+)
+"""Functions that make a grammar each, by name."""
 
 
 def register_grammar(name: str) -> Callable[[Callable[[], Grammar]], Callable[[], Grammar]]:

@@ -42,7 +42,7 @@ _LEANING: tuple[dict[str, Any], ...] = tuple(
 """The same and directions of gravity: in a round for scenes that stay upright, in the end for the others."""
 _PATIENCE = 2
 """Rounds without more ready objects after which a scene is left as it is."""
-_ROUNDS_SHARE = 2 / 3
+_ROUNDS_SHARE = 0.5
 """Share of a scene's work that the rounds may do; the rest is for the trials at the end."""
 _UNMOVED = 1e-4
 """Motion (m) below which an object is believed not to depend on others that move."""
@@ -189,9 +189,9 @@ def make_ready(
     Scenes with objects in the workspace that are not ready go through projection and settling again, with more solver
     iterations, up to ``rounds`` times in all, until two in a row have made no more of them ready. The round with most
     ready objects is kept, the earliest of equal ones. A heap, whose objects are so deep in each other that projection
-    has to spread them, is invalid. All rounds of a scene together do two thirds of the work that :func:`settle` may do,
-    and the last trials the rest; where it does not suffice, the scene is the best of the rounds that ended, what was
-    not judged is not ready, and ``finished`` is False.
+    has to spread them, is invalid. All rounds of a scene together do half of the work that :func:`settle` may do, and
+    the last trials the rest; where it does not suffice, the scene is the best of the rounds that ended, what was not
+    judged is not ready, and ``finished`` is False.
 
     Args:
         batch: B scenes of N slots.

@@ -9,8 +9,9 @@ import numpy as np
 from scene_envs.physics.collision import ObjectPairs
 from scene_envs.physics.placement import Objects
 
-PER_SCENE, PER_OBJECT = 1_000.0, 2_500.0
-"""Units of simulation (see :class:`Budget`) that a scene may take: so many, and so many more for each free object,"""
+PER_SCENE, PER_OBJECT, PER_PAIR, MOST_PER_OBJECT = 1_000.0, 1_200.0, 500.0, 10_000.0
+"""Units of simulation (see :class:`Budget`) that a scene may take: so many, so many more for each free object and for
+each pair of them, which may meet, and in all at most so many for each object beyond the first number,"""
 _CROWDED = 0.75
 """unless more than this share of them do not stand clear of each other."""
 _COINCIDENT = 0.9
@@ -60,4 +61,7 @@ def simulation_units(objects: Objects, pairs: ObjectPairs) -> float:
     close &= ~(objects.fixed[first] | objects.fixed[second])
     crowded = np.isin(np.arange(len(objects)), np.concatenate([first[close], second[close]]))
     free = int((~objects.fixed).sum())
-    return PER_SCENE + PER_OBJECT * free * (int(crowded.sum()) <= _CROWDED * free)
+    if crowded.sum() > _CROWDED * free:
+        return PER_SCENE
+    more = PER_OBJECT * free + PER_PAIR * free * (free - 1) / 2
+    return PER_SCENE + min(more, MOST_PER_OBJECT * free)

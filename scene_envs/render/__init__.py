@@ -3,6 +3,6 @@
 from scene_envs.render.cameras import picture_camera
 from scene_envs.render.galleries import gallery
 from scene_envs.render.pictures import render
-from scene_envs.render.viewer import write_viewer
+from scene_envs.render.viewer import viewer_page, write_viewer
 
-__all__ = ["gallery", "picture_camera", "render", "write_viewer"]
+__all__ = ["gallery", "picture_camera", "render", "viewer_page", "write_viewer"]

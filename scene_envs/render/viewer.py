@@ -55,6 +55,12 @@ def write_viewer(
     Raises:
         InvalidInputError: no scenes, or another number of captions.
     """
+    write_text(path, viewer_page(batch, captions=captions, title=title))
+    return Path(path)
+
+
+def viewer_page(batch: SceneBatch, *, captions: Sequence[str] | None = None, title: str | None = None) -> str:
+    """The page of :func:`write_viewer`; a script around its frame shows scene k with ``sceneViewer.showScene(k)``."""
     if len(batch) == 0:
         raise InvalidInputError("a viewer needs at least one scene; the batch is empty")
     if captions is None:
@@ -62,10 +68,7 @@ def write_viewer(
     if len(captions) != len(batch):
         raise InvalidInputError(f"{len(batch)} scenes need {len(batch)} captions, got {len(captions)}")
     title = batch.scene_type.name.replace("_", " ") if title is None else title
-    page = _page(title, _viewer_data(batch, captions))
-    path = Path(path)
-    write_text(path, page)
-    return path
+    return _page(title, _viewer_data(batch, captions))
 
 
 def _page(title: str, data: dict[str, Any]) -> str:

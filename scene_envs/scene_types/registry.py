@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.plugins import load_plugins
+from scene_envs.errors import InvalidInputError
+from scene_envs.registry import Registry
 from scene_envs.scene_types.base import SceneType
 from scene_envs.scene_types.built_in import BUILT_IN
 from scene_envs.scene_types.unions import union_of
@@ -13,12 +13,12 @@ from scene_envs.scene_types.unions import union_of
 PLUGINS = "scene_envs.scene_types"
 """Entry-point group of modules that register scene types and their grammars when they are imported."""
 
-_REGISTRY: dict[str, SceneType] = {scene_type.name: scene_type for scene_type in BUILT_IN}
+_SCENE_TYPES = Registry("scene type", PLUGINS, {scene_type.name: scene_type for scene_type in BUILT_IN})
 
 
 def register_scene_type(scene_type: SceneType) -> SceneType:
     """Make ``scene_type`` available by name everywhere; the same name again replaces it."""
-    _REGISTRY[scene_type.name] = scene_type
+    _SCENE_TYPES[scene_type.name] = scene_type
     return scene_type
 
 
@@ -33,19 +33,14 @@ def get_scene_type(name: str | SceneType) -> SceneType:
     """
     if isinstance(name, SceneType):
         return name
-    if name not in _REGISTRY:
-        load_plugins(PLUGINS)
-    if name not in _REGISTRY and "+" in name:
+    if name not in _SCENE_TYPES and "+" in name:
         return union_scene_type(name.split("+"), name)
-    if name not in _REGISTRY:
-        raise unknown_name("scene type", name, _REGISTRY)
-    return _REGISTRY[name]
+    return _SCENE_TYPES[name]
 
 
 def list_scene_types() -> list[str]:
     """Names of all registered scene types, those of installed packages included, sorted."""
-    load_plugins(PLUGINS)
-    return sorted(_REGISTRY)
+    return _SCENE_TYPES.names()
 
 
 def union_scene_type(types: Sequence[str | SceneType], name: str | None = None) -> SceneType:

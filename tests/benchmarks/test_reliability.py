@@ -1,10 +1,18 @@
-"""A reduced form of the reliability benchmark: nothing lost, nothing different, nothing silent."""
+"""A reduced form of the reliability benchmark: nothing lost, nothing different, nothing silent.
+
+Its trials that kill commands or let two write into one folder take minutes. Other tests ask the same: exact resume of
+killed runs in ``tests/post_training``, ``tests/pretraining`` and ``tests/datasets``, one writer per folder in
+``tests/core`` and ``tests/cli``.
+"""
 
 from collections.abc import Callable
 
 import pytest
 
-from benchmarks.reliability import Figures, fuzzed_files, fuzzed_lines, hostile_rewards, kills, two_writers
+from benchmarks.reliability.command_lines import fuzzed_lines
+from benchmarks.reliability.damaged_files import fuzzed_files
+from benchmarks.reliability.figures import Figures
+from benchmarks.reliability.rewards import hostile_rewards
 
 
 def assert_clean(figures: Figures, tried: int) -> None:
@@ -12,6 +20,7 @@ def assert_clean(figures: Figures, tried: int) -> None:
     assert (figures.lost, figures.different, figures.silent) == (0, 0, 0), figures.notes
 
 
+@pytest.mark.slow
 def test_damaged_files_are_named_or_read_as_they_were():
     assert_clean(fuzzed_files(24, seed=5), 24)
 
@@ -21,11 +30,9 @@ def test_damaged_files_are_named_or_read_as_they_were():
     ("check", "count"),
     [
         (lambda count: fuzzed_lines(count, seed=5), 20),
-        (hostile_rewards, 3),
-        (lambda count: kills(count, seed=5), 3),
-        (two_writers, 1),
+        (hostile_rewards, 1),
     ],
-    ids=["fuzzed command lines", "hostile rewards", "killed commands", "two writers"],
+    ids=["fuzzed command lines", "hostile rewards"],
 )
 def test_nothing_is_lost_different_or_silent(check: Callable[[int], Figures], count: int):
     assert_clean(check(count), count)

@@ -10,7 +10,7 @@ import pytest
 
 from agents.cli import main, parser
 from agents.cli.commands import COMMANDS
-from agents.cli.keys import describe_fields
+from agents.cli.keys import describe_fields, keys_of
 from scene_envs.errors import PhysicsError
 
 
@@ -25,8 +25,7 @@ def test_without_a_command_it_lists_all_of_them(capsys):
 def test_help_lists_every_key_with_its_meaning(command, capsys):
     assert main([command, "--help"]) == 0
     assert COMMANDS[command] in capsys.readouterr().out
-    config = import_module(f"agents.cli.commands.{command.replace('-', '_')}").config()
-    keys = describe_fields(config)
+    keys = describe_fields(keys_of(import_module(f"agents.cli.commands.{command.replace('-', '_')}")))
     assert all(key.meaning for key in keys), [key.name for key in keys if not key.meaning]
 
 
@@ -112,10 +111,7 @@ class EchoCommand:
         self.seen: list[EchoConfig] = []
         self.work = lambda settings, run: run.write_metrics({"text": settings.text, "nothing": float("nan")})
 
-    def config(self) -> type[EchoConfig]:
-        return EchoConfig
-
-    def run(self, settings, run):
+    def run(self, settings: EchoConfig, run):
         self.seen.append(settings)
         self.work(settings, run)
 

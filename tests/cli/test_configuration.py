@@ -13,12 +13,12 @@ import yaml
 from agents import PostTrainConfig, PretrainConfig, SearchConfig
 from agents.cli import main
 from agents.cli.commands import COMMANDS
-from agents.cli.keys import compose
+from agents.cli.keys import compose, keys_of
 from agents.cli.sweep import expand_sweeps
 from agents.configuration import changed, config_text, dotted_values, group_options
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
-CONFIGS = {name: import_module(f"agents.cli.commands.{name.replace('-', '_')}").config() for name in COMMANDS}
+CONFIGS = {name: keys_of(import_module(f"agents.cli.commands.{name.replace('-', '_')}")) for name in COMMANDS}
 GROUPS = [
     "algorithm",
     "reward",

@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from agents.cli import main, parser
+from agents.cli.commands.rewards import RewardsConfig
 from agents.priors.testing import tiny_prior
 from agents.utils.interrupts import Terminated, finishing_steps, terminable
 from scene_envs.folders import claimed
@@ -91,13 +92,7 @@ def test_sigterm_ends_a_command_like_ctrl_c_with_its_own_status(monkeypatch, tmp
         WRITES = False
 
         @staticmethod
-        def config():
-            from agents.cli.commands.rewards import RewardsConfig
-
-            return RewardsConfig
-
-        @staticmethod
-        def run(settings):
+        def run(settings: RewardsConfig):
             os.kill(os.getpid(), signal.SIGTERM)
 
     monkeypatch.setattr(parser, "import_module", lambda name: Told)
@@ -135,6 +130,7 @@ def test_a_second_signal_does_not_wait_for_the_step():
         work()
 
 
+@pytest.mark.slow
 def test_post_training_saves_when_it_is_told_to_end_and_goes_on_as_if_nothing_had_been(tmp_path, monkeypatch):
     from agents.post_training import post_train
     from agents.post_training.trainer import PostTrainer

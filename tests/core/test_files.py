@@ -115,6 +115,7 @@ def test_every_shipped_prior_has_a_checksum():
         assert weights.with_name("model.safetensors.sha256").is_file() or b"sha256" in weights.read_bytes()[:100_000]
 
 
+@pytest.mark.slow
 def test_a_flipped_bit_in_the_pages_of_a_shard_is_found(tmp_path):
     from scene_envs.datasets import SceneDataset, generate
 

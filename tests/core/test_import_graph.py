@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from tests.helpers.import_graph import LAYERS, ROOT, import_graph
@@ -79,3 +81,8 @@ def test_production_code_imports_no_testing_module() -> None:
 
 def test_nothing_is_at_the_top_of_agents_but_its_surface() -> None:
     assert [path.name for path in (ROOT / "agents").glob("*.py")] == ["__init__.py"]
+
+
+def test_what_tests_share_is_in_helpers() -> None:
+    shared = re.compile(r"^\s*(?:from|import) tests\.(?!helpers\b)", re.MULTILINE)
+    assert [file.name for file in (ROOT / "tests").rglob("*.py") if shared.search(file.read_text())] == []

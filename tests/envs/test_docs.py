@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from scene_envs.envs import DenoisingEnv, SearchEnv
+from scene_envs.envs import DenoisingEnv, SearchEnv, SearchMaskEnv
 
 DOCS = Path(__file__).parents[2] / "docs" / "envs"
 SECTIONS = [
@@ -23,14 +23,16 @@ SECTIONS = [
 ]
 
 
-@pytest.mark.parametrize(("page", "env"), [("denoising", DenoisingEnv), ("search", SearchEnv)])
+@pytest.mark.parametrize(
+    ("page", "env"), [("denoising", DenoisingEnv), ("search", SearchEnv), ("search_mask", SearchMaskEnv)]
+)
 def test_page_is_the_docstring_in_gymnasiums_order(page, env):
     docstring = inspect.getdoc(env) or ""
     assert (DOCS / f"{page}.md").read_text().endswith(f"\n{docstring}\n"), "copy the docstring into the page"
     assert [line[3:] for line in docstring.splitlines() if line.startswith("## ")] == SECTIONS
 
 
-@pytest.mark.parametrize("env", [DenoisingEnv, SearchEnv])
+@pytest.mark.parametrize("env", [DenoisingEnv, SearchEnv, SearchMaskEnv])
 def test_every_argument_is_in_the_table_with_its_default(env):
     rows = (inspect.getdoc(env) or "").splitlines()
     for name, parameter in inspect.signature(env).parameters.items():

@@ -13,7 +13,7 @@ import torch
 
 from agents.planning.search_run import SearchConfig
 from rewards import RewardOutput
-from scene_envs.envs import masks, register_mask
+from scene_envs.envs import register_mask
 from scene_envs.envs.mask_generators import (
     CulpritsMask,
     EmptyMask,
@@ -189,13 +189,13 @@ def test_a_registered_mask_works_by_name_in_the_environment(prior: ToyPrior, fre
     observation, _ = env.reset(seed=0)
     welded = env.scene().is_welded[0].numpy()
     assert observation["regenerate"].tolist() == ((np.arange(34) % 2 == 1) & ~welded).tolist()
-    with pytest.raises(InvalidInputError, match="mask name"):
+    with pytest.raises(InvalidInputError, match="mask generator name"):
         register_mask("odd slots")
 
 
 def test_a_mask_of_an_installed_package_works_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     point = EntryPoint("everything", "torch:ones_like", "scene_envs.masks")
-    monkeypatch.setattr(masks, "plugin_entry_points", lambda group: {"everything": point})
+    monkeypatch.setattr("scene_envs.registry.plugin_entry_points", lambda group: {"everything": point})
     assert "everything" in list_masks()
     assert resolve_mask("everything") is torch.ones_like
 

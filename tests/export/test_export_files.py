@@ -118,6 +118,7 @@ def test_angle_axis_and_quaternion_are_exact_at_every_angle(angle):
         np.testing.assert_allclose(back, rotation, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_translations_are_written_to_the_last_bit(folder, scenes):
     text = (folder / "scene_003" / "scene.xml").read_text()
     for thing in scenes[3].objects:
@@ -239,7 +240,7 @@ def test_an_installed_package_can_offer_a_format(tmp_path, monkeypatch):
     point = importlib.metadata.EntryPoint(
         "their_arrays", "scene_envs.export.arrays:write_npz", formats.ENTRY_POINT_GROUP
     )
-    monkeypatch.setattr(formats, "plugin_entry_points", {formats.ENTRY_POINT_GROUP: {point.name: point}}.get)
+    monkeypatch.setattr("scene_envs.registry.plugin_entry_points", {formats.ENTRY_POINT_GROUP: {point.name: point}}.get)
     assert "their_arrays" in list_formats()
     assert export(laid_scene(), tmp_path, "their_arrays").scenes[0]["their_arrays"].name == "scene.npz"
 

@@ -25,7 +25,7 @@ def page() -> Any:
     """The names that the page defines, its blocks run in order."""
     names: dict[str, Any] = {}
     grammars.list_grammars()  # the built-in ones are registered for good, before the registry is swapped
-    with patch.dict(registry._REGISTRY), patch.dict(GRAMMARS):
+    with patch.dict(registry._SCENE_TYPES), patch.dict(GRAMMARS):
         for block in BLOCKS:
             exec(compile(block, "docs/grammars.md", "exec"), names)
     return names

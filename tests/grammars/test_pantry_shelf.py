@@ -24,7 +24,7 @@ RADIUS = {asset.name: float(np.abs(asset.bounds[:, :2]).max()) for asset in SCEN
 
 @pytest.fixture(scope="module")
 def arrays() -> NDArray[np.float32]:
-    return get_grammar(NAME).sample_array(np.random.default_rng(1), 40)
+    return get_grammar(NAME).sample_array(np.random.default_rng(1), 24)
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,7 @@ def test_every_kind_is_as_frequent_as_the_others(scenes: list[list[Thing]]) -> N
 
 
 def test_kept_by_physics(arrays: NDArray[np.float32]) -> None:
-    check_physics(arrays[:16], SCENE_TYPE)
+    check_physics(arrays[:8], SCENE_TYPE)
 
 
 def test_the_same_seed_gives_the_same_scenes_and_another_gives_others() -> None:

@@ -34,6 +34,7 @@ def _share_a_point(first: Placed, second: Placed) -> float:
     return float(solution.x[2])
 
 
+@pytest.mark.slow
 def test_rectangles_meet_exactly_when_a_common_point_exists() -> None:
     rng = np.random.default_rng(0)
     verdicts = set()

@@ -8,7 +8,7 @@ from types import ModuleType
 
 from agents import cli
 from agents.cli.commands import COMMANDS
-from agents.cli.keys import describe_fields
+from agents.cli.keys import describe_fields, keys_of
 from tests.helpers.doc_folders import prepare
 from tests.helpers.doc_pages import INSTEAD, NOT_RUN, ROOT, ROWS, SMALL_KEYS
 
@@ -62,7 +62,7 @@ def _keys(name: str) -> set[str]:
         module = import_module(f"{name}.__main__")
     else:
         module = import_module(f"agents.cli.commands.{name.replace('-', '_')}")
-    keys = {key.name for key in describe_fields(module.config())}
+    keys = {key.name for key in describe_fields(keys_of(module))}
     return keys | {key.rpartition(".")[0] for key in keys}
 
 

@@ -173,7 +173,7 @@ def test_what_has_no_support_is_not_ready() -> None:
 
 @pytest.mark.slow
 def test_jittered_scenes_become_ready() -> None:
-    batch = jittered(dimsum(6, 10), 3)
+    batch = jittered(dimsum(4, 10), 3)
     raw, ready = feasibility(batch), make_ready(batch)
     free = int(batch.is_free.sum())
     assert int(raw.counts.sum()) < 0.6 * free
@@ -182,7 +182,7 @@ def test_jittered_scenes_become_ready() -> None:
 
 @pytest.mark.slow
 def test_what_is_not_ready_gets_more_rounds_and_the_rest_stays() -> None:
-    breakfast = get_grammar("breakfast_table_low_clutter").sample(np.random.default_rng(3), 6)
+    breakfast = get_grammar("breakfast_table_low_clutter").sample(np.random.default_rng(3), 4)
     batch = jittered(breakfast, 5, times=6.0)
     once, more = make_ready(batch, rounds=1), make_ready(batch)
     free = batch.is_free.sum(dim=-1)

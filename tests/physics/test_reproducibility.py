@@ -65,7 +65,7 @@ def pool() -> Iterator[PhysicsPool]:
         yield pool
 
 
-@pytest.mark.parametrize("name", ["dimsum_table", "pantry_shelf", "restaurant_low_clutter"])
+@pytest.mark.parametrize("name", ["dimsum_table", "pantry_shelf"])
 def test_no_history_changes_a_result(name: str, pool: PhysicsPool) -> None:
     """Each function of each scene alone, after others in a random order, and in workers with histories of their own."""
     batch = crowded(name)
@@ -81,9 +81,9 @@ def test_no_history_changes_a_result(name: str, pool: PhysicsPool) -> None:
 
 def test_a_fresh_process_gives_the_same(tmp_path: Path) -> None:
     """A new interpreter that has simulated nothing else, and this one, which has."""
-    batch = crowded("dimsum_table", seed=9)
+    batch = crowded("dimsum_table", seed=9)[:1]
     batch.save(tmp_path / "scenes.safetensors")
-    settled(crowded("dimsum_table", seed=10))
+    settled(crowded("dimsum_table", seed=10)[:1])
     script = (
         "import sys, torch\n"
         "from scene_envs.physics import settle\n"
@@ -105,10 +105,10 @@ def test_the_order_of_slots_changes_no_verdict() -> None:
 
 def test_a_spent_budget_ends_at_the_same_step(pool: PhysicsPool) -> None:
     """Coincident objects: the simulation is cut short, after another one, and in workers, at the same poses."""
-    clean = get_grammar("dimsum_table").sample(np.random.default_rng(2), 4)
+    clean = get_grammar("dimsum_table").sample(np.random.default_rng(2), 2)
     batch = SceneBatch(torch.cat([clean.tensor, clean.tensor[:, 1:]], dim=1), clean.scene_type)
     first = settle(batch)
     assert not bool(first.finished.any())
-    settled(crowded("dimsum_table", seed=10))
+    settled(crowded("dimsum_table", seed=10)[:1])
     for again in (settle(batch), settle(batch, pool=pool)):
         assert same([first.batch.tensor, first.finished], [again.batch.tensor, again.finished])

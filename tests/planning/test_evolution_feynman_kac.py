@@ -17,7 +17,7 @@ from rewards import RewardContext, RewardOutput
 from scene_envs.envs import SearchEnv
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import CATEGORY, TRANSLATION, SceneBatch
-from tests.planning.test_planners import ToyTree, scrambled
+from tests.helpers.toy_tree import ToyTree, scrambled
 
 SLOTS = 12
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from agents.planning import BeamPlanner, EvolutionPlanner, GreedyPlanner, MCTSPlanner, UCTPlanner
-from tests.planning.test_planners import Path, ToyTree, matches, scrambled
+from tests.helpers.toy_tree import Path, ToyTree, matches, scrambled
 
 PLANNERS = [
     BeamPlanner(children=3),
@@ -42,6 +42,7 @@ def test_every_planner_ends_at_the_largest_value_and_at_the_end_of_the_tree(plan
     assert sorted(whole.values) == sorted(scrambled((action,)) for action in range(3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("planner", PLANNERS, ids=lambda planner: planner.name)
 def test_a_chain_may_be_longer_than_the_stack(planner) -> None:
     result = planner.plan(ToyTree(lambda path: len(path) / 1201, branching=1, depth=1200), budget=1200)

@@ -100,7 +100,8 @@ def test_children_keep_what_is_not_masked_bit_for_bit(run: Run) -> None:
 def test_files_hold_what_was_found(run: Run) -> None:
     names = {path.name for path in run.output.iterdir()}
     pictures, journals = {"curve.png", "before.png", "after.png"}, {"search.journal", "best_of_N.journal"}
-    assert names == {*pictures, *journals, "best.safetensors", "metrics.json", "config.yaml"}
+    trees = {"tree.json", "tree.html"}
+    assert names == {*pictures, *journals, *trees, "best.safetensors", "metrics.json", "config.yaml"}
     assert torch.equal(SceneBatch.load(run.output / "best.safetensors").tensor, run.outcome.best.tensor)
     metrics = json.loads((run.output / "metrics.json").read_text())
     assert metrics["search"]["curve"][-1] == metrics["search"]["value"] == run.outcome.search.best_value
@@ -121,6 +122,7 @@ def test_progress_names_the_planner(run: Run) -> None:
     assert told[-1] == ("best of N", 24, 24)
 
 
+@pytest.mark.slow
 def test_an_objective_that_never_scores_is_an_error(run: Run) -> None:
     def broken(batch: SceneBatch, context: RewardContext) -> RewardOutput:
         raise RuntimeError("no such sensor")

@@ -22,7 +22,7 @@ from agents.priors.testing import tiny_prior
 from rewards import RewardContext, RewardOutput, register_reward
 from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError
 from scene_envs.scene import SceneBatch
-from tests.planning.test_planners import ToyTree, scrambled
+from tests.helpers.toy_tree import ToyTree, scrambled
 
 SETTINGS: dict[str, Any] = {"budget": 15, "branching": 3, "num_steps": 2, "seed": 3, "baseline": False, "slots": 12}
 PLANNERS = ("beam", "best_of", "evolution", "feynman_kac", "greedy", "mcts", "uct")

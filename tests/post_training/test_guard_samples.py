@@ -66,6 +66,7 @@ def test_checks_of_the_loss_alone_keep_nothing_where_the_guard_samples(tmp_path:
     assert (reading.samples, reading.kept) == ({}, False)
 
 
+@pytest.mark.slow
 def test_rollback_takes_the_best_checkpoint_again(tmp_path: Path) -> None:
     """With no room for the loss, every check returns to the base prior at half the learning rate, four times."""
     config = small_config(
@@ -83,6 +84,7 @@ def test_rollback_takes_the_best_checkpoint_again(tmp_path: Path) -> None:
     assert all(torch.equal(base[name], tensor) for name, tensor in made.learner.prior.state_dict().items())
 
 
+@pytest.mark.slow
 def test_a_resumed_run_samples_and_keeps_the_same(tmp_path: Path) -> None:
     keys = {**SAMPLES, "iterations": 3, "algorithm": {"name": "nft", "expectation_lr": 1e-3}}
     whole = post_train(small_config(tmp_path / "a", **keys), prior=tiny_prior())
@@ -106,6 +108,7 @@ def test_a_resumed_run_samples_and_keeps_the_same(tmp_path: Path) -> None:
     assert str(whole.metrics["guard"]) == str(again.metrics["guard"])
 
 
+@pytest.mark.slow
 def test_the_report_shows_figures_beside_the_base_prior(tmp_path: Path) -> None:
     config = small_config(tmp_path, iterations=2, **SAMPLES, **{"guard.count_limit": 2.0})
     guard = post_train(config, prior=tiny_prior()).metrics["guard"]

@@ -20,6 +20,7 @@ def rewards_of(output: Path, seed: int) -> list[float]:
     return [row["reward"] for row in post_train(config, prior=tiny_prior()).history]
 
 
+@pytest.mark.slow
 def test_a_reward_that_draws_from_global_generators_gives_the_same_run_for_the_same_seed(tmp_path):
     torch.manual_seed(1)
     first = rewards_of(tmp_path / "a", 0)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -19,6 +18,7 @@ from agents.priors.testing import tiny_prior
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.errors import CorruptFileError, InvalidInputError, TrainingError, UnknownNameError
 from scene_envs.scene import SceneBatch
+from tests.helpers.forked import forked
 from tests.helpers.small_runs import count_objects, not_a_number, small_config
 
 
@@ -43,6 +43,7 @@ def test_the_base_prior_is_left_as_it_was(tmp_path: Path) -> None:
     assert all(torch.equal(before[name], tensor) for name, tensor in prior.state_dict().items())
 
 
+@pytest.mark.slow
 def test_chunks_do_not_change_the_gradient(tmp_path: Path) -> None:
     rows = []
     for chunk in (None, 2):
@@ -55,7 +56,7 @@ def test_chunks_do_not_change_the_gradient(tmp_path: Path) -> None:
 def test_more_objects_after_training_on_their_number(tmp_path: Path) -> None:
     config = small_config(
         tmp_path,
-        iterations=30,
+        iterations=20,
         batch_size=16,
         gradient_steps=4,
         credit="object",
@@ -105,31 +106,26 @@ def test_stopped_and_resumed_run_equals_the_uninterrupted_one(tmp_path: Path, ch
     assert parts.metrics["guard"] == whole.metrics["guard"]
 
 
-KILLED = """
-import os, signal, sys
-sys.path.insert(0, {root!r})
-import torch
-torch.set_num_threads(1)
-from tests.helpers.small_runs import count_objects, small_config
-from agents.post_training import post_train
-from agents.priors.testing import tiny_prior
+def killed_in_iteration_four(output: Path) -> None:
+    torch.set_num_threads(1)
+    calls = 0
 
-calls = 0
-def deadly(batch, context):
-    global calls
-    calls += 1
-    if calls == 5:  # one probe, then iteration 4
-        os.kill(os.getpid(), signal.SIGKILL)
-    return count_objects(batch, context)
-deadly.__qualname__ = "count_objects"
-post_train(small_config({output!r}, reward=deadly), prior=tiny_prior())
-"""
+    def deadly(batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        nonlocal calls
+        calls += 1
+        if calls == 5:  # one probe, then iteration 4
+            os.kill(os.getpid(), signal.SIGKILL)
+        return count_objects(batch, context)
+
+    deadly.__qualname__ = "count_objects"
+    post_train(small_config(output, reward=deadly), prior=tiny_prior())
 
 
 @pytest.mark.slow
 def test_killed_run_resumes_bit_for_bit(tmp_path: Path) -> None:
-    script = KILLED.format(root=str(Path(__file__).parents[2]), output=str(tmp_path / "killed"))
-    assert subprocess.run([sys.executable, "-c", script]).returncode == -signal.SIGKILL
+    process = forked(killed_in_iteration_four, tmp_path / "killed")
+    process.join(120)
+    assert process.exitcode == -signal.SIGKILL
     assert torch.load(tmp_path / "killed" / "checkpoint.pt", weights_only=True)["iteration"] == 2
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # sums over threads are not associative

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import csv
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
 from agents.cli import main
 from agents.configuration.tree import changed
@@ -265,17 +263,18 @@ def test_a_grammar_without_end_trains_a_prior_that_reads_prompts(tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_two_processes_take_the_steps_of_one_with_twice_the_parts(tmp_path: Path) -> None:
+def test_two_processes_take_the_steps_of_one_with_twice_the_parts(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     generate("dimsum_table", 16, tmp_path / "data", workers=0, verify=False, progress=False)
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
-    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
     keys = ["iterations=4", "batch_size=8", "network.hidden=16", "network.depth=1", "network.heads=2", "seed=3"]
     keys += ["optimizer.warmup=2", "logger.log_every=1"]
     data = [f"data={tmp_path / 'data'}", f"heldout={tmp_path / 'data'}"]
-    command = [*launcher, "-m", "agents.cli", "pretrain", *data, *keys, f"output={tmp_path / 'two'}"]
-    done = subprocess.run(command, env=environment, capture_output=True, timeout=240, text=True)
-    assert done.returncode == 0, done.stderr[-3000:]
-    assert done.stdout.count("held-out loss") == 1  # the first process alone speaks
+    place = {"rdzv_backend": "c10d", "rdzv_endpoint": "localhost:0", "run_id": "two"}
+    launch = elastic_launch(LaunchConfig(1, 1, 2, start_method="fork", **place), main)  # as torchrun does
+    done = launch(["pretrain", *data, *keys, f"output={tmp_path / 'two'}"])
+    assert done == {0: 0, 1: 0}
+    assert capfd.readouterr().out.count("held-out loss") == 1  # the first process alone speaks
     assert main(["pretrain", *data, *keys, "optimizer.accumulate=2", f"output={tmp_path / 'one'}"]) == 0
     for name in ("two", "one"):
         assert {"config.yaml", "metrics.json", "prior"} <= {path.name for path in (tmp_path / name).iterdir()}
@@ -299,9 +298,9 @@ def test_one_prior_is_trained_on_several_scene_types(tmp_path: Path) -> None:
     )  # fmt: skip
     prior, data, heldout = prepare(config)
     assert prior.scene_type.name == "dimsum_table+pantry_shelf"
-    scenes, prompts = data.draw(400, torch.Generator().manual_seed(0), prompts=True)
+    scenes, prompts = data.draw(150, torch.Generator().manual_seed(0), prompts=True)
     tables = prior.decode(scenes).categories == prior.scene_type.assets.index("cafe_table")
-    assert float(tables.any(dim=1).float().mean()) == pytest.approx(0.5, abs=0.08)
-    assert len(prompts) == 400
+    assert float(tables.any(dim=1).float().mean()) == pytest.approx(0.5, abs=0.12)
+    assert len(prompts) == 150
     trained = Pretrainer(config, data, heldout if len(heldout) else scenes[:4], prior).run()
     assert trained.sample(2, prompt="A scene with 9 objects.", num_steps=2).tensor.shape[1] == 61

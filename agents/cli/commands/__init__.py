@@ -1,8 +1,8 @@
 """The commands of ``scene-envs``, one module each, imported when the command is called.
 
-A command module has ``config()``, which returns its dataclass of keys with a sentence per field under
-``Attributes:``, and ``run(settings, run)``, which does the work. A module with ``WRITES = False`` has no
-run folder.
+A command module has ``run(settings, run)``, which does the work. The keys of the command are the dataclass that
+``settings`` is annotated with, a sentence per field under ``Attributes:``. A module with ``WRITES = False`` has no run
+folder.
 """
 
 COMMANDS = {

@@ -27,11 +27,6 @@ class CheckRewardConfig:
     reward_timeout: float = 60.0
 
 
-def config() -> type[CheckRewardConfig]:
-    """The keys of this command."""
-    return CheckRewardConfig
-
-
 def run(settings: CheckRewardConfig) -> None:
     """Print what was checked; raises RewardError with every broken clause."""
     from rewards import check_reward, reward_name

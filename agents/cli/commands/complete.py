@@ -22,11 +22,6 @@ class CompleteConfig(InpaintingConfig):
     slots: int | None = None
 
 
-def config() -> type[CompleteConfig]:
-    """The keys of this command."""
-    return CompleteConfig
-
-
 def run(settings: CompleteConfig, run: Run) -> None:
     """Fill the empty slots."""
     prior, batch = load_prior_and_scenes("complete", settings)

@@ -24,11 +24,6 @@ class DemoConfig:
     workers: int = 2
 
 
-def config() -> type[DemoConfig]:
-    """The keys of this command."""
-    return DemoConfig
-
-
 def run(settings: DemoConfig, run: Run) -> None:
     """Post-train twice, compare, report."""
     from agents.post_training.comparison import number_rows

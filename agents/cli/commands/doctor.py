@@ -10,11 +10,6 @@ if TYPE_CHECKING:
     from agents.cli.run_folder import Run
 
 
-def config() -> type[PostTrainConfig]:
-    """The keys of this command: those of post-train."""
-    return PostTrainConfig
-
-
 def run(settings: PostTrainConfig, run: Run) -> None:
     """Examine the run that ``post-train`` would make of these settings."""
     from rich.console import Console

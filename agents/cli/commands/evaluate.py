@@ -68,11 +68,6 @@ class EvaluateConfig:
     output: str = ""
 
 
-def config() -> type[EvaluateConfig]:
-    """The keys of this command."""
-    return EvaluateConfig
-
-
 def run(settings: EvaluateConfig, run: Run) -> None:
     """Sample, measure group by group, tabulate."""
     from agents.evaluation.measures import EvaluationInputs, choose_measures, compute_measure

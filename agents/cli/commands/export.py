@@ -50,11 +50,6 @@ class ExportConfig:
     output: str = ""
 
 
-def config() -> type[ExportConfig]:
-    """The keys of this command."""
-    return ExportConfig
-
-
 def run(settings: ExportConfig, run: Run) -> None:
     """Read or draw the scenes and write them."""
     from scene_envs.export.formats import resolve_formats

@@ -40,11 +40,6 @@ class GenerateConfig:
     output: str = ""
 
 
-def config() -> type[GenerateConfig]:
-    """The keys of this command."""
-    return GenerateConfig
-
-
 def run(settings: GenerateConfig, run: Run) -> None:
     """Write the dataset into ``output``."""
     from scene_envs.datasets import generate

@@ -42,11 +42,6 @@ class ImportCheckpointConfig:
     output: str = ""
 
 
-def config() -> type[ImportCheckpointConfig]:
-    """The keys of this command."""
-    return ImportCheckpointConfig
-
-
 def run(settings: ImportCheckpointConfig, run: Run) -> None:
     """Read, save, try."""
     from agents.priors.checkpoint_import import import_checkpoint

@@ -32,11 +32,6 @@ class PackagePriorConfig:
     limits: str = ""
 
 
-def config() -> type[PackagePriorConfig]:
-    """The keys of this command."""
-    return PackagePriorConfig
-
-
 def run(settings: PackagePriorConfig) -> None:
     """Write the folder; it is the prior itself, so that no log goes into it."""
     from agents.priors.card import PriorFacts, package_prior

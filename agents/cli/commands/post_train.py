@@ -11,11 +11,6 @@ if TYPE_CHECKING:
     from agents.cli.run_folder import Run
 
 
-def config() -> type[PostTrainConfig]:
-    """The keys of this command."""
-    return PostTrainConfig
-
-
 def run(settings: PostTrainConfig, run: Run) -> None:
     """Post-train and report; the trainer and the report write the metrics."""
     from agents.post_training import post_train, post_train_and_compare

@@ -10,11 +10,6 @@ if TYPE_CHECKING:
     from agents.cli.run_folder import Run
 
 
-def config() -> type[PretrainConfig]:
-    """The keys of this command."""
-    return PretrainConfig
-
-
 def run(settings: PretrainConfig, run: Run) -> None:
     """Train the prior; the trainer writes its own metrics."""
     from agents.pretraining.trainer import pretrain

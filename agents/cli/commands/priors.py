@@ -19,11 +19,6 @@ class PriorsConfig:
     prior: str = ""
 
 
-def config() -> type[PriorsConfig]:
-    """The keys of this command."""
-    return PriorsConfig
-
-
 def run(settings: PriorsConfig) -> None:
     """Print every shipped prior with its size and its figures, or one card."""
     from agents.priors.card import README, PriorFacts

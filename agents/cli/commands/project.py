@@ -31,11 +31,6 @@ class ProjectConfig:
     output: str = ""
 
 
-def config() -> type[ProjectConfig]:
-    """The keys of this command."""
-    return ProjectConfig
-
-
 def run(settings: ProjectConfig, run: Run) -> None:
     """Project, settle, count what is ready."""
     from scene_envs.errors import InvalidInputError

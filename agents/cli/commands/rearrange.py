@@ -10,11 +10,6 @@ if TYPE_CHECKING:
     from agents.cli.run_folder import Run
 
 
-def config() -> type[InpaintingConfig]:
-    """The keys of this command."""
-    return InpaintingConfig
-
-
 def run(settings: InpaintingConfig, run: Run) -> None:
     """New poses for the free objects; what is welded stays."""
     prior, batch = load_prior_and_scenes("rearrange", settings)

@@ -12,11 +12,6 @@ class RewardsConfig:
     """No keys."""
 
 
-def config() -> type[RewardsConfig]:
-    """This command has no keys."""
-    return RewardsConfig
-
-
 def run(settings: RewardsConfig) -> None:
     """Print every reward with its settings and where it comes from."""
     from rewards import list_rewards, reward_info

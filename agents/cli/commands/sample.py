@@ -60,11 +60,6 @@ class SampleConfig:
     output: str = ""
 
 
-def config() -> type[SampleConfig]:
-    """The keys of this command."""
-    return SampleConfig
-
-
 def run(settings: SampleConfig, run: Run) -> None:
     """Draw, score, save and picture the scenes."""
     from agents.priors.base import ScenePrior

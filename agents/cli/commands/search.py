@@ -23,7 +23,7 @@ class SearchKeys(SearchConfig):
         reward_timeout: seconds that an objective from outside this package, which runs in a process of its own, may
             take for a batch; then its scenes are invalid.
         reward_memory: GiB that such an objective may allocate.
-        output: folder for best.safetensors, before.png, after.png and curve.png; the same command goes on there.
+        output: folder for best.safetensors, tree.html, tree.json and pictures; the same command goes on there.
     """
 
     prior: str = "dimsum_table"
@@ -31,11 +31,6 @@ class SearchKeys(SearchConfig):
     reward_timeout: float = 60.0
     reward_memory: float = 1.0
     output: str = ""
-
-
-def config() -> type[SearchKeys]:
-    """The keys of this command."""
-    return SearchKeys
 
 
 def run(settings: SearchKeys, run: Run) -> None:
@@ -58,7 +53,8 @@ def run(settings: SearchKeys, run: Run) -> None:
         def show(planner: str, done: int, budget: int, best: float) -> None:
             if planner not in tasks:
                 tasks[planner] = bar.add_task(planner, total=budget)
-            bar.update(tasks[planner], completed=done, description=f"{planner}, best {best:.3f}")
+            nfe = f"{done * search.nfe_per_scene} NFE"
+            bar.update(tasks[planner], completed=done, description=f"{planner}, best {best:.3f}, {nfe}")
 
         try:
             outcome = run_search(settings.prior, objective, config=search, output=settings.output, progress=show)

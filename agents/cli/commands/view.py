@@ -47,11 +47,6 @@ class ViewConfig:
     output: str = ""
 
 
-def config() -> type[ViewConfig]:
-    """The keys of this command."""
-    return ViewConfig
-
-
 def run(settings: ViewConfig, run: Run) -> None:
     """Write the page, and say where it is."""
     from agents.cli.commands.scenes import draw_scenes

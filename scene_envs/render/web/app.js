@@ -215,6 +215,18 @@ function readAddress() {
   if (asked.has("select")) select(Math.round(number("select", -1)));
 }
 
+// A small picture of a scene as ImageData, with some slots marked; nothing without WebGL.
+function picture(index, width, height, marked = []) {
+  if (!renderer) return null;
+  const chosen = 65535; // a slot that no scene has
+  const objects = scenes[index].map((object) => (marked.includes(object.slot) ? { ...object, slot: chosen } : object));
+  renderer.setObjects(objects, new Set());
+  const plain = { ...look(), colors: "natural", shape: "visual", hovered: -1, selected: marked.length ? chosen : -1 };
+  const image = renderer.snapshot(homeView(index, width / height), plain, width, height);
+  renderer.setObjects(scenes[state.scene], state.hidden);
+  return image;
+}
+
 // -- scenes -------------------------------------------------------------------------------------------------------
 
 function makeStrip() {
@@ -224,12 +236,7 @@ function makeStrip() {
   const due = [];
   const paint = () => {
     const tile = due.shift();
-    const index = Number(tile.dataset.scene);
-    renderer.setObjects(scenes[index], new Set());
-    const view = homeView(index, tile.width / tile.height);
-    const plain = { ...look(), colors: "natural", shape: "visual", hovered: -1, selected: -1 };
-    tile.getContext("2d").putImageData(renderer.snapshot(view, plain, tile.width, tile.height), 0, 0);
-    renderer.setObjects(scenes[state.scene], state.hidden);
+    tile.getContext("2d").putImageData(picture(Number(tile.dataset.scene), tile.width, tile.height), 0, 0);
     document.body.dataset.thumbnails = String(Number(document.body.dataset.thumbnails || 0) + 1);
     if (due.length) setTimeout(paint, 10);
     else redraw();
@@ -293,10 +300,11 @@ Object.assign(document.body.dataset, { scenes: scenes.length });
 if (renderer) redraw();
 else showText();
 
-// For scripts: the state, drawing at once, and the slots seen in the canvas (row by row from below).
+// For scripts: the state, drawing at once, small pictures, and the slots seen in the canvas (row by row from below).
 window.sceneViewer = {
   state,
   showScene,
+  picture,
   draw,
   camera: cameraNow,
   size: () => [canvas.width, canvas.height],

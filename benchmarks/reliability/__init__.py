@@ -1,0 +1,1 @@
+"""Reliability of commands and files: kills, fuzzed input, hostile rewards, full disks, two writers."""
