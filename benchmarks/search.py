@@ -145,7 +145,7 @@ class Trivial:
         """Any number of children."""
         return range(1_000_000)
 
-    def expand_batch(self, pairs: Sequence[tuple[tuple[int, ...], int]]) -> list[tuple[int, ...]]:
+    def expand_batch(self, pairs: Sequence[tuple[tuple[int, ...], int]], steering: Any = None) -> list[tuple[int, ...]]:
         """The longer paths; no longer than 100."""
         return [(*state, action) if len(state) < 100 else (*state[:-1], action) for state, action in pairs]
 

@@ -24,8 +24,17 @@ class ReverseStep(Protocol):
         ...
 
     @property
+    def denoised(self) -> Tensor | None:
+        """(B, N, D) the denoiser's estimate of x_0, where it is known."""
+        ...
+
+    @property
     def entries(self) -> int:
         """Number of random variables of the step of each scene."""
+        ...
+
+    def take(self, rows: Tensor) -> ReverseStep:
+        """The step of scenes ``rows`` (K,), which may come more than once."""
         ...
 
     def from_noise(self, noise: Tensor) -> Tensor:
@@ -65,6 +74,7 @@ class GaussianStep(NamedTuple):
     Attributes:
         mean: (B, N, D).
         std: (N, D); 0 marks a certain entry.
+        denoised: (B, N, D) the denoiser's estimate of x_0, where it is known.
 
     >>> step = GaussianStep(torch.zeros(1, 1, 2), torch.tensor([[1.0, 0.0]]))
     >>> step.from_noise(torch.ones(1, 1, 2)), step.entries
@@ -73,6 +83,11 @@ class GaussianStep(NamedTuple):
 
     mean: Tensor
     std: Tensor
+    denoised: Tensor | None = None
+
+    def take(self, rows: Tensor) -> GaussianStep:
+        """The step of scenes ``rows`` (K,), which may come more than once."""
+        return self._replace(mean=self.mean[rows], denoised=None)
 
     @property
     def entries(self) -> int:
@@ -100,6 +115,7 @@ class MixedStep(NamedTuple):
         random: (N,) bool, slots whose state is drawn; in the others the likeliest one is taken.
         masked: (B, N) bool, slots of which as many as expected are unmasked together
             (:mod:`agents.diffusion.unmasking`); None unmasks each by its own chance.
+        denoised: (B, N, P + K) the denoiser's estimate of x_0, categories by arg-max, where it is known.
 
     >>> probs = torch.tensor([[[0.25, 0.75, 0.0]]])
     >>> step = MixedStep(torch.zeros(1, 1, 1), torch.ones(1, 1), probs, torch.tensor([True]))
@@ -112,6 +128,12 @@ class MixedStep(NamedTuple):
     probs: Tensor
     random: Tensor
     masked: Tensor | None = None
+    denoised: Tensor | None = None
+
+    def take(self, rows: Tensor) -> MixedStep:
+        """The step of scenes ``rows`` (K,), which may come more than once."""
+        masked = None if self.masked is None else self.masked[rows]
+        return self._replace(mean=self.mean[rows], probs=self.probs[rows], masked=masked, denoised=None)
 
     @property
     def std(self) -> Tensor:

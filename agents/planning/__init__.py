@@ -8,6 +8,8 @@ if TYPE_CHECKING:
     from agents.planning.beam import BeamPlanner
     from agents.planning.best_of import BestOfPlanner
     from agents.planning.config import SearchConfig
+    from agents.planning.evolution import EvolutionPlanner
+    from agents.planning.feynman_kac import FeynmanKacPlanner
     from agents.planning.greedy import GreedyPlanner
     from agents.planning.journal import Journal
     from agents.planning.ledger import Ledger, PlanResult, Searchable, SearchStoppedError
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
 __all__ = [
     "BeamPlanner",
     "BestOfPlanner",
+    "EvolutionPlanner",
+    "FeynmanKacPlanner",
     "GreedyPlanner",
     "Journal",
     "Ledger",
@@ -49,6 +53,8 @@ __getattr__ = lazy_names(
         "agents.planning.beam": ("BeamPlanner",),
         "agents.planning.best_of": ("BestOfPlanner",),
         "agents.planning.config": ("SearchConfig",),
+        "agents.planning.evolution": ("EvolutionPlanner",),
+        "agents.planning.feynman_kac": ("FeynmanKacPlanner",),
         "agents.planning.greedy": ("GreedyPlanner",),
         "agents.planning.journal": ("Journal",),
         "agents.planning.ledger": ("Ledger", "PlanResult", "SearchStoppedError", "Searchable"),

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from agents.planning.ledger import Candidate, Ledger, PlanResult, Progress, Searchable
+from agents.planning.ledger import Ledger, Member, PlanResult, Progress, Searchable, best_different
 from agents.planning.registry import PlannerSettings, check_at_least, register_planner
 
 
@@ -38,20 +37,10 @@ class BeamPlanner(PlannerSettings):
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the current state."""
         ledger, count = Ledger(problem, budget, progress), self.children or 1
-        beam: list[tuple[Candidate, Sequence[int]]] = [(ledger.root, ledger.actions(ledger.root))]
+        beam: list[Member] = [(ledger.root, ledger.actions(ledger.root))]
         while ledger.left and beam:
             children = ledger.expand([(state, action) for state, actions in beam for action in actions[:count]])
             pool = [(child, ledger.actions(child)) for child in reversed(children) if child.valid]
             pool += [(state, actions[count:]) for state, actions in beam if state.valid or not pool]
-            beam = self._best(pool)
+            beam = best_different(pool, self.width)
         return ledger.result()
-
-    def _best(self, pool: list[tuple[Candidate, Sequence[int]]]) -> list[tuple[Candidate, Sequence[int]]]:
-        """The best different states of ``pool`` that have actions left; the first among equals."""
-        kept: list[tuple[Candidate, Sequence[int]]] = []
-        seen = set()
-        for state, actions in sorted(pool, key=lambda entry: -entry[0].value if entry[0].valid else 0.0):
-            if actions and state.fingerprint not in seen and len(kept) < self.width:
-                seen.add(state.fingerprint)
-                kept.append((state, actions))
-        return kept

@@ -23,8 +23,8 @@ class SearchConfig:
         max_nfe: denoiser evaluations of each search, where that is less than the budget's; null for no such limit.
         max_seconds: time after which the search ends with the best so far; null for no limit. The baseline comes
             after it.
-        count: searches side by side, each with a seed of its own, in common batches of the denoiser; each gives one
-            scene.
+        count: searches, each with a seed of its own; each gives one scene.
+        side_by_side: searches that run at once, in common batches of the denoiser; others follow when these are done.
         baseline: draw as many independent samples as well, and compare with their best.
         branching: inpaintings per state; the first ``branching`` scenes are fresh samples of the prior.
         max_depth: inpaintings in a row, the fresh sample included.
@@ -47,6 +47,7 @@ class SearchConfig:
     max_nfe: int | None = None
     max_seconds: float | None = None
     count: int = 1
+    side_by_side: int = 16
     baseline: bool = True
     branching: int = 4
     max_depth: int = 1000
@@ -72,11 +73,19 @@ class SearchConfig:
         """Scenes that each search may generate."""
         return self.budget if self.max_nfe is None else min(self.budget, self.max_nfe // self.nfe_per_scene)
 
+    @property
+    def parts(self) -> list[range]:
+        """The searches that run at once, by their numbers."""
+        starts = range(0, self.count, self.side_by_side)
+        return [range(start, min(start + self.side_by_side, self.count)) for start in starts]
+
     def __post_init__(self) -> None:
         if self.branching < 1:
             raise InvalidInputError(f"branching={self.branching}: a state needs at least one inpainting")
         if self.count < 1:
             raise InvalidInputError(f"count={self.count}: give the number of scenes to find, at least 1")
+        if self.side_by_side < 1:
+            raise InvalidInputError(f"side_by_side={self.side_by_side}: at least one search runs at a time")
         if self.num_steps < 1:
             raise InvalidInputError(f"num_steps={self.num_steps} must be a whole number of at least 1")
         if self.max_seconds is not None and not self.max_seconds > 0:

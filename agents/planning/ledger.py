@@ -68,11 +68,16 @@ class PlanResult:
 
     @property
     def curve(self) -> list[float]:
-        """Best objective after each expansion; failed ones leave it as it was."""
+        """Best objective after each expansion; failed ones leave it as it was.
+
+        A better state that cost no expansion counts with the last one.
+        """
         best, curve = -math.inf, []
         for value in self.values:
             best = max(best, value) if math.isfinite(value) else best
             curve.append(best)
+        if curve and self.best_value > curve[-1]:
+            curve[-1] = self.best_value
         return curve
 
 
@@ -99,6 +104,21 @@ class Candidate:
     def fingerprint(self) -> Any:
         """Equal for equal scenes; the path where the problem does not say."""
         return getattr(self.state, "fingerprint", self.path)
+
+
+Member = tuple[Candidate, Sequence[int]]
+"""A candidate and the actions it has left."""
+
+
+def best_different(pool: Sequence[Member], count: int) -> list[Member]:
+    """The ``count`` best different scenes of ``pool`` that have actions left; the first among equals."""
+    kept: list[Member] = []
+    seen = set()
+    for state, actions in sorted(pool, key=lambda entry: -entry[0].value if entry[0].valid else 0.0):
+        if actions and state.fingerprint not in seen and len(kept) < count:
+            seen.add(state.fingerprint)
+            kept.append((state, actions))
+    return kept
 
 
 class Ledger:
@@ -150,11 +170,15 @@ class Ledger:
         ]
         for child in children:
             self.values.append(child.value)
-            if child.valid and (not self.best.valid or _rank(child) < _rank(self.best)):
-                self.best = child
+            self.keep(child)
         if self.progress is not None:
             self.progress(len(self.values), self.best.value if self.best.valid else 0.0)
         return children
+
+    def keep(self, candidate: Candidate) -> None:
+        """Make ``candidate`` the best so far where it is; for a state that cost no expansion."""
+        if candidate.valid and (not self.best.valid or _rank(candidate) < _rank(self.best)):
+            self.best = candidate
 
     def result(self, tree: Tree | None = None) -> PlanResult:
         """The plan: the best state, the shallowest and then the first path among equals."""

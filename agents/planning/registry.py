@@ -39,7 +39,9 @@ class PlannerSettings(ABC):
 _PLANNERS: Registry[type[PlannerSettings]] = Registry(
     "planner",
     ENTRY_POINT_GROUP,
-    modules=[f"agents.planning.{name}" for name in ("beam", "best_of", "greedy", "mcts", "uct")],
+    modules=[
+        f"agents.planning.{name}" for name in ("beam", "best_of", "evolution", "feynman_kac", "greedy", "mcts", "uct")
+    ],
 )
 Settings = TypeVar("Settings", bound=type[PlannerSettings])
 

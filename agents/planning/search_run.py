@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from agents.planning.config import SearchConfig
 from agents.planning.journal import Journal
 from agents.planning.ledger import PlanResult
 from agents.planning.search_report import draw_curve, draw_scene
-from agents.planning.session import Lane, Session
+from agents.planning.session import Session
 from agents.planning.tree_file import SearchRecord
 from agents.planning.tree_page import shown_nodes, write_tree_page
 from scene_envs.envs import SearchEnv, SearchState
@@ -44,10 +44,11 @@ class SearchOutcome:
 
     Attributes:
         search: the plan of the best search.
-        searches: the plans of all ``count`` searches.
+        searches: the plans of all ``count`` searches that found a scene, the best first; without their trees where
+            there were more than ``side_by_side``.
         best_of: best of as many independent samples, the baseline at equal NFE; None without one.
         first: the best of the first ``branching`` samples of the best search, a batch of one.
-        best: the best scene of every search, a batch of ``count``; the best search first.
+        best: the best scene of each of ``searches``.
         metrics: what ``metrics.json`` holds.
     """
 
@@ -73,7 +74,8 @@ def run_search(
     The root is the scene with fixed welded objects alone, so its children are fresh samples. From there the planner
     regenerates what the objective blames (Pfaff et al. 2025, inference-time search). The same seed and settings give
     the same scenes. An interrupt (Ctrl-C, SIGTERM) ends the search with the best so far, as does ``max_seconds``. With
-    an output folder, the same call goes on where an earlier one was killed or ended; a larger budget may be given.
+    an output folder, the same call goes on where an earlier one was killed or ended; a larger budget may be given. Of
+    more than ``side_by_side`` searches the scenes that are finished are in the folder at any time.
 
     Args:
         prior: a prior, or the name or path of one.
@@ -114,34 +116,56 @@ def _search(
     started = time.perf_counter()
     planner, scenes = config.planner.make(config.branching), config.scenes
     actions = max(scenes, config.branching) if config.planner.widens else config.branching
-    env, session, searches = run.plan(planner, actions, scenes, config.count, "search", progress)
-    searched = time.perf_counter()
-    spent, best_of = sum(len(plan.values) for plan in searches), None
-    if config.baseline and spent and session.stopped in ("", "time"):
+    searches: list[PlanResult] = []
+    firsts: dict[int, SearchState] = {}
+    spent, stopped, parts = 0, "", config.parts
+    for part in parts:
+        left = math.inf if config.max_seconds is None else config.max_seconds - (time.perf_counter() - started)
+        if left <= 0 and spent:
+            stopped = "time"
+            break
+        name = "search" if len(parts) == 1 else f"search_{part.start:06}"
+        env, session, plans = run.plan(planner, actions, scenes, part, name, progress, max(left, 1e-9))
+        spent, stopped = spent + sum(len(plan.values) for plan in plans), session.stopped
+        searches += [plan if len(parts) == 1 else replace(plan, tree=None) for plan in plans if plan.best_path]
+        searches.sort(key=lambda plan: -plan.best_value)
+        firsts |= {lane.root.seed: _best_first(lane.first[: config.branching]) for lane in session.lanes if lane.first}
+        if folder is not None and len(parts) > 1 and searches:
+            _scenes(env, searches).save(folder / "best.safetensors")
+        if stopped:
+            break
+    searched, best_of = time.perf_counter(), None
+    if config.baseline and spent and stopped in ("", "time"):
         # As many actions as scenes: the same seeds by path, so the first scenes are those of the first search.
-        _, _, (best_of,) = run.plan(BestOfPlanner(), spent, spent, 1, "best of N", progress)
+        _, _, (best_of,) = run.plan(BestOfPlanner(), spent, spent, range(1), "best of N", progress)
     seconds = {"search": searched - started, "best_of": time.perf_counter() - searched}
-    searches = sorted(searches, key=lambda plan: -plan.best_value if plan.best_path else math.inf)
-    best = searches[0]
-    if not best.best_path:
+    root = session.lanes[0].root
+    if not searches and root.value >= 1:
+        raise InvalidInputError(
+            f"the objective {objective!r} is {root.objective:.4g} for the empty scene already, and the search ends at "
+            f"objective_scale={env.problem.scale:.4g}; give a larger objective_scale"
+        )
+    if not searches:
         raise SceneEnvsError(
             f"the search was interrupted before its first {config.branching} scenes were there; call it again"
-            if session.stopped and not spent
+            if stopped and not spent
             else f"the objective {objective!r} could not score any of the first {config.branching} samples of the "
             "prior; the log above says why"
         )
-    first = _best_first(session.lanes, best.best_state.seed, config.branching)
+    best = searches[0]
+    first = firsts[best.best_state.seed]
     outcome = SearchOutcome(
         search=best,
         searches=searches,
         best_of=best_of,
         first=env.scene(first),
-        best=SceneBatch.concatenate([env.scene(plan.best_state) for plan in searches]),
-        metrics=_metrics(objective, env.problem.scale, config, searches, best_of, first, seconds, session.stopped),
+        best=_scenes(env, searches),
+        metrics=_metrics(objective, env.problem.scale, config, searches, best_of, first, seconds, stopped, spent),
     )
     if folder is not None:
         _write(outcome, config, first, folder)
-        _write_tree(outcome, env, session, folder)
+        if len(parts) == 1:
+            _write_tree(outcome, env, session, folder)
         plain = {key: value for key, value in named.items() if isinstance(value, _PLAIN)}
         write_text(folder / "config.yaml", config_text(plain))
     return outcome
@@ -158,9 +182,16 @@ class _Run:
     folder: Path | None
 
     def plan(
-        self, planner: Any, actions: int, budget: int, count: int, name: str, progress: Progress | None
+        self,
+        planner: Any,
+        actions: int,
+        budget: int,
+        part: range,
+        name: str,
+        progress: Progress | None,
+        max_seconds: float = math.inf,
     ) -> tuple[SearchEnv, Session, list[PlanResult]]:
-        """``count`` plans of ``budget`` scenes each, in an environment of ``actions`` per state."""
+        """Plans of ``budget`` scenes each, one per search of ``part``, in an environment of ``actions`` per state."""
         config = self.config
         env = SearchEnv(
             scene=self.prior.scene_type,
@@ -179,13 +210,14 @@ class _Run:
         journal = None
         if self.folder is not None:
             journal = Journal(self.folder / f"{name.replace(' ', '_')}.journal", self.named)
-        limit = config.max_seconds if name == "search" else None
-        session = Session(env, max_seconds=limit, journal=journal)
-        told = None if progress is None else lambda done, best: progress(name, done, count * budget, best)
+        session = Session(env, max_seconds=max_seconds, journal=journal)
+        title, total = name.split("_")[0], budget * (config.count if name.startswith("search") else 1)
+        before = part.start * budget
+        told = None if progress is None else lambda done, best: progress(title, before + done, total, best)
         try:
             empty = SceneBatch.empty(self.prior.scene_type, 1, env.problem.slots)
             roots = []
-            for search in range(count):
+            for search in part:
                 env.reset(seed=config.seed + search, options={"scene": empty})
                 roots.append(env.clone_state())
             return env, session, session.run(planner, roots, budget, told)
@@ -193,9 +225,13 @@ class _Run:
             env.close()
 
 
-def _best_first(lanes: Sequence[Lane], seed: int, branching: int) -> SearchState:
-    """The best of the first ``branching`` children of the root of ``seed``."""
-    states = next(lane.first for lane in lanes if lane.root.seed == seed)[:branching]
+def _scenes(env: SearchEnv, plans: Sequence[PlanResult]) -> SceneBatch:
+    """The best scenes of plans."""
+    return SceneBatch.concatenate([env.scene(plan.best_state) for plan in plans])
+
+
+def _best_first(states: Sequence[SearchState]) -> SearchState:
+    """The best of the first children of a root."""
     return max(states, key=lambda state: state.value if state.valid else -1.0)
 
 
@@ -208,6 +244,7 @@ def _metrics(
     first: SearchState,
     seconds: dict[str, float],
     stopped: str,
+    spent: int,
 ) -> dict[str, Any]:
     search = searches[0]
     metrics = {
@@ -216,7 +253,7 @@ def _metrics(
         "saturated": search.best_state.objective > scale,
         "planner": config.planner.name,
         "stopped": stopped or None,
-        "nfe": sum(len(plan.values) for plan in searches) * config.nfe_per_scene,
+        "nfe": spent * config.nfe_per_scene,
         "first_samples": {"value": first.value, "objective": first.objective},
         "search": _of_plan(search),
         "seconds": {name: round(value, 2) for name, value in seconds.items()},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import queue
 import threading
 import time
@@ -14,7 +15,9 @@ from agents.utils.interrupts import Terminated, terminable
 from scene_envs.errors import InvalidInputError
 
 Pairs = Sequence[tuple[Any, int]]
-Ask = Callable[[Pairs], Sequence[Any]]
+Asked = tuple[Pairs, Any]
+"""Pairs, and how they are steered; None for not at all."""
+Ask = Callable[[Asked], Sequence[Any]]
 
 
 class Lane:
@@ -50,11 +53,11 @@ class Lane:
         """The objective of ``state``, in [0, 1]."""
         return self.problem.evaluate(state)
 
-    def expand_batch(self, pairs: Pairs) -> list[Any]:
+    def expand_batch(self, pairs: Pairs, steering: Any = None) -> list[Any]:
         """The child of every pair; raises SearchStoppedError when the budget is spent or the session ends."""
         if len(self.values) + len(pairs) > self.budget:
             raise SearchStoppedError(f"the budget of {self.budget} expansions is spent")
-        states = list(self.ask(pairs))
+        states = list(self.ask((pairs, steering)))
         for (parent, _), state in zip(pairs, states, strict=True):
             if parent is self.root:
                 self.first.append(state)
@@ -116,18 +119,22 @@ class Session:
         lanes = self.lanes = [Lane(self.problem, root, budget, self._expand) for root in roots]
         told = None if progress is None else lambda *_: progress(*_overall(lanes))
         with terminable():
-            if len(lanes) == 1:
+            if len(lanes) > 1:
+                return self._run_together(planner, lanes, told)
+            try:
                 return [_plan(planner, lanes[0], told)]
-            return self._run_together(planner, lanes, told)
+            except KeyboardInterrupt as interrupt:  # between two rounds
+                self.stopped = _reason(interrupt)
+                return [lanes[0].result()]
 
     def _run_together(self, planner: Any, lanes: list[Lane], told: Progress | None) -> list[PlanResult]:
         """Plans in threads that wait for each other: one asks or ends before any other goes on, in their order."""
-        asked: queue.Queue[tuple[int, Pairs | PlanResult | BaseException]] = queue.Queue()
+        heard: queue.Queue[Asked | PlanResult | BaseException] = queue.Queue()
         answers: list[queue.Queue[Sequence[Any] | None]] = [queue.Queue() for _ in lanes]
 
         def asks(index: int) -> Ask:
-            def ask(pairs: Pairs) -> Sequence[Any]:
-                asked.put((index, pairs))
+            def ask(asked: Asked) -> Sequence[Any]:
+                heard.put(asked)
                 answer = answers[index].get()
                 if answer is None:
                     raise SearchStoppedError("the search was stopped")
@@ -137,52 +144,59 @@ class Session:
 
         def work(index: int) -> None:
             try:
-                asked.put((index, _plan(planner, lanes[index], None)))
+                heard.put(_plan(planner, lanes[index], None))
             except BaseException as error:
-                asked.put((index, error))
+                heard.put(error)
+
+        results: dict[int, PlanResult] = {}
+        failure: BaseException | None = None
+        waiting: dict[int, Asked] = {}
+
+        def hear(index: int) -> None:
+            """Wait until the plan that goes on asks or ends."""
+            nonlocal failure
+            what: Any = None
+            while what is None:
+                try:
+                    what = heard.get()
+                except KeyboardInterrupt as interrupt:
+                    self.stopped = _reason(interrupt)
+            if isinstance(what, PlanResult):
+                results[index] = what
+            elif isinstance(what, BaseException):
+                failure = failure or what
+            else:
+                waiting[index] = what
 
         for index, lane in enumerate(lanes):
             lane.ask = asks(index)
             threading.Thread(target=work, args=(index,), daemon=True).start()
-        results: list[PlanResult | None] = [None] * len(lanes)
-        running, failure = set(range(len(lanes))), None
-        waiting: dict[int, Pairs] = {}
-        while running:
+            hear(index)
+        while waiting:
+            asked, waiting = waiting, {}
+            states: list[Any] = []
             try:
-                while len(waiting) < len(running):
-                    index, what = asked.get()
-                    if isinstance(what, PlanResult | BaseException):
-                        running.discard(index)
-                    if isinstance(what, PlanResult):
-                        results[index] = what
-                    elif isinstance(what, BaseException):
-                        failure = failure or what
-                    else:
-                        waiting[index] = what
-            except KeyboardInterrupt as interrupt:
-                self.stopped = _reason(interrupt)
-                continue
-            states: Sequence[Any] | None = None
-            order = sorted(waiting)
-            try:
-                if order and failure is None:
-                    states = self._expand([pair for index in order for pair in waiting[index]])
+                for steering, part in itertools.groupby(asked.values(), key=lambda one: one[1]):
+                    if failure is None:
+                        states += self._expand(([pair for pairs, _ in part for pair in pairs], steering))
             except SearchStoppedError:
                 pass
             except Exception as error:  # ends all plans, and is raised when they are over
                 failure = error
-            for index in order:
-                pairs = waiting.pop(index)
-                answers[index].put(None if states is None else states[: len(pairs)])
-                states = None if states is None else states[len(pairs) :]
-            if told is not None and states is not None:
+            for index, (pairs, _) in asked.items():
+                enough = failure is None and len(states) >= len(pairs)
+                answers[index].put(states[: len(pairs)] if enough else None)
+                states = states[len(pairs) :] if enough else []
+                hear(index)
+            if told is not None:
                 told(0, 0.0)
         if failure is not None:
             raise failure
-        return [result for result in results if result is not None]
+        return [results[index] for index in sorted(results)]
 
-    def _expand(self, pairs: Pairs) -> Sequence[Any]:
+    def _expand(self, asked: Asked) -> Sequence[Any]:
         """The children of one joint round: from the journal, or made now and written there."""
+        pairs, steering = asked
         if self.stopped:
             raise SearchStoppedError(f"the search was stopped: {self.stopped}")
         known = [] if self.journal is None else self.journal.take(pairs)
@@ -194,7 +208,8 @@ class Session:
             self.stopped = "time"
             raise SearchStoppedError(f"max_seconds={self.max_seconds} are over")
         try:
-            states = self.problem.expand_batch(pairs[len(known) :])
+            how = () if steering is None else (steering,)
+            states = self.problem.expand_batch(pairs[len(known) :], *how)
             if self.journal is not None:
                 self.journal.add(states)
         except KeyboardInterrupt as interrupt:

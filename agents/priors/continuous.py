@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from agents.diffusion import GaussianProcess, GaussianStep, Preconditioning, ResidualVariance, StepTable
+from agents.diffusion import GaussianProcess, GaussianStep, Preconditioning, ResidualVariance, ReverseStep, StepTable
 from agents.diffusion.gaussian import timestep_weights
 from agents.diffusion.schedules import make_schedule
 from agents.diffusion.weighting import check_weighting, loss_weights, timestep_distribution
@@ -20,7 +20,7 @@ from agents.networks.text import Text
 from agents.priors.base import ScenePrior
 from agents.priors.config import PriorConfig, current_names
 from agents.priors.forward import DenoiserOutput, NoisedScenes
-from agents.priors.inpainting import draw_noise
+from agents.priors.inpainting import Hook, draw_noise
 from agents.priors.prompt_validation import no_text
 from agents.priors.rotation_codes import SceneCode
 from scene_envs.errors import InvalidInputError, unknown_name
@@ -146,13 +146,16 @@ class ContinuousPrior(ScenePrior):
 
     def transition(self, x_t: Tensor, step: int, table: StepTableLike, *, eta: float = 1.0) -> GaussianStep:
         """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters."""
-        return GaussianStep(*self.posterior(x_t, step, table, eta))
+        return self._reverse(x_t, step, table, eta)
 
     def posterior(self, x_t: Tensor, step: int, table: StepTableLike, eta: float = 1.0) -> tuple[Tensor, Tensor]:
         """Mean (B, N, D) and std (N, D) of x_{t-1} given x_t; differentiable in the network's parameters.
 
         The std is 0 on known entries, and everywhere at the last step, which is deterministic, or where ``eta`` is 0.
         """
+        return self._reverse(x_t, step, table, eta)[:2]
+
+    def _reverse(self, x_t: Tensor, step: int, table: StepTableLike, eta: float) -> GaussianStep:
         t, previous = int(table.timesteps[step]), int(table.previous[step])
         self.process.check_stride(t, previous)
         x0 = self.denoiser(x_t, torch.full((x_t.shape[0],), t, device=x_t.device))
@@ -161,7 +164,7 @@ class ContinuousPrior(ScenePrior):
         residual = None if self.residual is None else self.residual.at(t)
         mean, std = self.process.posterior(x_t, x0, t, previous, residual, eta)
         std_map = std * (~self.known(x_t.shape[1])).to(x_t.dtype)
-        return self.clamp(mean), std_map
+        return GaussianStep(self.clamp(mean), std_map, x0.detach())
 
     def regenerate(
         self,
@@ -172,26 +175,37 @@ class ContinuousPrior(ScenePrior):
         resample: int,
         prompts: Sequence[str] | None = None,
         guidance: float = 0.0,
+        hook: Hook | None = None,
     ) -> Tensor:
         """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; used by :meth:`inpaint`."""
         x0 = self.encode(batch)
         widths = torch.tensor([self.code.pose_width, x0.shape[-1] - self.code.pose_width], device=mask.device)
         keep = ~mask.repeat_interleave(widths, dim=-1)
-        return self._chain_with_noised(x0, keep, table, generators, resample)
+        return self._chain_with_noised(x0, keep, table, generators, resample, hook)
 
     def _chain_with_noised(
-        self, x0: Tensor, keep: Tensor, table: StepTable, generators: Sequence[Generator], resample: int
+        self,
+        x0: Tensor,
+        keep: Tensor,
+        table: StepTable,
+        generators: Sequence[Generator],
+        resample: int,
+        hook: Hook | None,
     ) -> Tensor:
         """x_0 from a chain in which entries ``keep`` (B, N, D) of ``x0`` are put in with each level's noise."""
         x = self.clamp(draw_noise(x0, generators))
         for step in range(len(table)):
             level, after = table.timesteps[step], int(table.previous[step])
-            for again in range(resample if after > 0 else 1):
+            rounds = resample if after > 0 else 1
+            for again in range(rounds):
                 if again:
                     x = self.process.renoise(x, after, int(level), draw_noise(x0, generators))
                 noised = self.process.add_noise(x0, level, draw_noise(x0, generators))
                 x = self.clamp(torch.where(keep, noised, x))
-                x = self.transition(x, step, table).from_noise(draw_noise(x0, generators))
+                reverse: ReverseStep = self.transition(x, step, table)
+                if hook is not None and again == rounds - 1:
+                    reverse = hook(step, reverse)
+                x = reverse.from_noise(draw_noise(x0, generators))
         return torch.where(keep, x0, x)
 
     def noised_loss(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:

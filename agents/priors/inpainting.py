@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Generator, Tensor
 
+from agents.diffusion.reverse_steps import ReverseStep
 from agents.diffusion.step_tables import StepTable
 from agents.priors.prompt_validation import check_prompts
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import CATEGORY, POSE, SceneBatch
 from scene_envs.scene_types import SceneType
+
+Hook = Callable[[int, ReverseStep], ReverseStep]
+"""``(step, reverse) -> reverse``: called at every step of a chain before x_{t-1} is drawn; may take other rows."""
+Watch = Callable[[int, int, Callable[[], SceneBatch]], Tensor | None]
+"""``(step, steps, denoised) -> rows``: what happens to scenes while they are denoised.
+
+``denoised()`` gives the B scenes as the network sees them at this step. ``rows`` (B,) are the scenes that go on in the
+place of each, such as ``[0, 0, 2]``; None for all as they are.
+"""
 
 
 class Inpainting(ABC):
@@ -52,6 +62,7 @@ class Inpainting(ABC):
         resample: int,
         prompts: Sequence[str] | None = None,
         guidance: float = 0.0,
+        hook: Hook | None = None,
     ) -> Tensor:
         """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; used by :meth:`inpaint`."""
 
@@ -67,6 +78,7 @@ class Inpainting(ABC):
         generators: Sequence[Generator] | None = None,
         seed: int = 0,
         resample: int = 1,
+        watch: Watch | None = None,
     ) -> SceneBatch:
         """Regenerate what is masked, given the rest.
 
@@ -80,6 +92,8 @@ class Inpainting(ABC):
             generators: one per scene, so that a scene's result does not depend on its neighbours' noise.
             seed: used to make the generators when none are given.
             resample: how often each step is taken, going back in between (Lugmayr et al. 2022, Algorithm 1); 1 is once.
+            watch: told of every step, and says which scenes go on; a scene may give way only to one of the same
+                ``batch`` and ``mask``.
 
         Returns:
             Scenes on the device of ``batch``, whose unmasked entries are bit-identical to its own. Where the category
@@ -98,8 +112,19 @@ class Inpainting(ABC):
         if generators is None:
             generators = [Generator().manual_seed(seed + i) for i in range(len(batch))]
         device, table = self.device, self.step_table(num_steps)
-        x = self.regenerate(batch.to(device), both.to(device), table, generators, resample, prompts, guidance)
+        hook = None if watch is None else self._hook(watch, batch, both, len(table))
+        x = self.regenerate(batch.to(device), both.to(device), table, generators, resample, prompts, guidance, hook)
         return merge(batch, self.decode(x).to(batch.tensor.device), both)
+
+    def _hook(self, watch: Watch, batch: SceneBatch, both: Tensor, steps: int) -> Hook:
+        def hook(step: int, reverse: ReverseStep) -> ReverseStep:
+            estimate = reverse.denoised
+            if estimate is None:
+                return reverse
+            rows = watch(step, steps, lambda: merge(batch, self.decode(estimate).to(batch.tensor.device), both))
+            return reverse if rows is None else reverse.take(rows.to(self.device))
+
+        return hook
 
     def complete(
         self,

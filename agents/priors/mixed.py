@@ -24,7 +24,7 @@ from agents.diffusion import (
 )
 from agents.diffusion.categorical import make_categorical_schedule
 from agents.diffusion.gaussian import timestep_weights
-from agents.diffusion.reverse_steps import state_of
+from agents.diffusion.reverse_steps import ReverseStep, state_of
 from agents.diffusion.schedules import make_schedule
 from agents.diffusion.unmasking import UNMASKINGS
 from agents.diffusion.weighting import check_weighting
@@ -33,7 +33,7 @@ from agents.networks.registry import build_network, config_from_state, config_st
 from agents.networks.text import Text
 from agents.networks.text_encoders import text_config_from_state, text_encoder
 from agents.priors.config import MixedPriorConfig, current_names
-from agents.priors.inpainting import draw_noise
+from agents.priors.inpainting import Hook, draw_noise
 from agents.priors.mixed_training import TrainableMixedPrior
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
@@ -262,7 +262,11 @@ class MixedPrior(TrainableMixedPrior):
             certain = F.one_hot(self._fixed[:fixed, POSE_FEATURES:].argmax(dim=-1), self.num_categories + 1).to(probs)
             probs = torch.cat([certain.expand(len(probs), -1, -1), probs[:, fixed:]], dim=1)
         masked = (state == self.num_categories) & random if self._together else None
-        return MixedStep(clamped[..., :POSE_FEATURES], std * (~known).to(mean.dtype), probs, random, masked)
+        category = logits.argmax(dim=-1)
+        if self.categories.only_absorbs:
+            category = torch.where(state < self.num_categories, state, category)
+        estimate = torch.cat([pose, F.one_hot(category, self.num_categories).to(pose)], dim=-1).detach()
+        return MixedStep(clamped[..., :POSE_FEATURES], std * (~known).to(mean.dtype), probs, random, masked, estimate)
 
     def _barred(self, state: Tensor) -> Tensor:
         """(B, N, K) bool: categories of x_0 with probability 0, given states (B, N) of x_t.
@@ -278,7 +282,7 @@ class MixedPrior(TrainableMixedPrior):
 
     def regenerate(
         self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int,
-        prompts: Sequence[str] | None = None, guidance: float = 0.0,
+        prompts: Sequence[str] | None = None, guidance: float = 0.0, hook: Hook | None = None,
     ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; the rest is seen as it is."""
         text = None if prompts is None else self.encode_prompts(prompts)
@@ -286,13 +290,13 @@ class MixedPrior(TrainableMixedPrior):
         noise = draw_noise(observed.x, generators)
         probs = self.categories.prior().to(noise).expand(*noise.shape[:2], -1)
         start = self.clamp(self._with_states(noise[..., :POSE_FEATURES], probs, noise))
-        return self.run_chain(start, table, generators, observed, text, guidance, resample)
+        return self.run_chain(start, table, generators, observed, text, guidance, resample, hook=hook)
 
     @torch.no_grad()
     def run_chain(
         self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None,
         observed: Observed | None = None, text: Text | None = None, guidance: float = 0.0, resample: int = 1,
-        eta: float = 1.0,
+        eta: float = 1.0, hook: Hook | None = None,
     ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D) from x_T, with observed entries kept.
 
@@ -303,18 +307,22 @@ class MixedPrior(TrainableMixedPrior):
             observed: entries that carry no noise.
             text, guidance, eta: as in :meth:`transition`.
             resample: how often each step is taken, going back in between.
+            hook: called at the last taking of every step.
         """
         free = self.unconditional(len(x)) if text is None or guidance else None
         x = x if observed is None else observed.write(x)
         for step in range(len(table)):
             level, after = int(table.timesteps[step]), int(table.previous[step])
-            for again in range(resample if after > 0 else 1):
+            rounds = resample if after > 0 else 1
+            for again in range(rounds):
                 if again:
                     x = self._renoise(x, after, level, draw_noise(x, noises))
                     x = x if observed is None else observed.write(x)
-                reverse = self.transition(
+                reverse: ReverseStep = self.transition(
                     x, step, table, observed=observed, text=text, guidance=guidance, free=free, eta=eta
                 )
+                if hook is not None and again == rounds - 1:
+                    reverse = hook(step, reverse)
                 x = reverse.from_noise(draw_noise(x, noises))
                 x = x if observed is None else observed.write(x)
         return x

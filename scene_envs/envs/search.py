@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +24,12 @@ from scene_envs.scene import SceneBatch
 _LOGGER = logging.getLogger(__name__)
 _SAME = 1e-4
 """Scenes are the same when their objects agree to this, m."""
+
+Steering = Callable[[Sequence[tuple["SearchState", int]], Callable[[SceneBatch], Tensor]], Any]
+"""``(pairs, values) -> watch``: makes what watches the denoising of an expansion, as a prior's ``inpaint`` takes it.
+
+``values`` gives Φ (B,) of scenes that are being denoised, 0 where the objective cannot score one.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,8 +168,12 @@ class SearchProblem:
             )
         return self._score(scene, [(seed, (), 0.0)])[0]
 
-    def expand_batch(self, pairs: Sequence[tuple[SearchState, int]]) -> list[SearchState]:
+    def expand_batch(
+        self, pairs: Sequence[tuple[SearchState, int]], steering: Steering | None = None
+    ) -> list[SearchState]:
         """The children of (state, action) pairs, generated as one batch and scored as one batch.
+
+        With ``steering`` the children of one parent depend on each other.
 
         Raises:
             InvalidInputError: an action is not legal in its state.
@@ -176,7 +186,8 @@ class SearchProblem:
         parents = SceneBatch(torch.stack([state.scene for state, _ in pairs]), self.scene_type)
         masks = torch.stack([self.mask_of(state, action) for state, action in pairs])
         noises = [NodeRandomness.at(state.seed, path).noise for (state, _), path in zip(pairs, paths, strict=True)]
-        children = self._inpaint(parents, masks, noises)
+        watch = None if steering is None else steering(pairs, self._values)
+        children = self._inpaint(parents, masks, noises, watch)
         origins = [(state.seed, path, state.value) for (state, _), path in zip(pairs, paths, strict=True)]
         return self._score(children, origins)
 
@@ -198,11 +209,13 @@ class SearchProblem:
 
     def without_masked(self, state: SearchState) -> SearchState:
         """The same node with the objects that are still masked removed: what a search may return in the end."""
-        parts = torch.where(
-            state.mask[:, None], SceneBatch.empty(self.scene_type, 1, self.slots).tensor[0], state.scene
-        )
-        scene = SceneBatch(parts.unsqueeze(0), self.scene_type)
-        return self._score(scene, [(state.seed, state.path, state.value)])[0]
+        empty = SceneBatch.empty(self.scene_type, 1, self.slots).tensor[0]
+        return self.with_scene(state, torch.where(state.mask[:, None], empty, state.scene))
+
+    def with_scene(self, state: SearchState, scene: Tensor) -> SearchState:
+        """The node of ``state`` with another ``scene`` (N, D), scored, and with its mask; nothing is denoised."""
+        batch = SceneBatch(scene.unsqueeze(0), self.scene_type)
+        return self._score(batch, [(state.seed, state.path, state.value)])[0]
 
     def _open_actions(self, state: SearchState) -> Sequence[int]:
         """Actions that regenerate something in ``state``, in the order in which planners try them."""
@@ -231,16 +244,23 @@ class SearchProblem:
         """Denoiser evaluations per generated scene."""
         return self.num_steps * (2 if self.prompting.guidance else 1)
 
-    def _inpaint(self, batch: SceneBatch, masks: Tensor, noises: list[torch.Generator]) -> SceneBatch:
+    def _inpaint(
+        self, batch: SceneBatch, masks: Tensor, noises: list[torch.Generator], watch: Any = None
+    ) -> SceneBatch:
         guidance, reader = self.prompting.guidance, self.prompting.reader
         self.evaluations += self.nfe_per_scene * len(batch)
         batch, masks = batch.to(self.device), masks.to(self.device)
+        how: dict[str, Any] = {"num_steps": self.num_steps, "generators": noises}
+        if watch is not None:
+            how["watch"] = watch
         if reader is None or self.prompt is None:
-            return self.prior.inpaint(batch, masks, num_steps=self.num_steps, generators=noises).to("cpu")
-        made = reader.inpaint(
-            batch, masks, num_steps=self.num_steps, generators=noises, prompt=self.prompt, guidance=guidance
-        )
-        return made.to("cpu")
+            return self.prior.inpaint(batch, masks, **how).to("cpu")
+        return reader.inpaint(batch, masks, prompt=self.prompt, guidance=guidance, **how).to("cpu")
+
+    def _values(self, batch: SceneBatch) -> Tensor:
+        """(B,) Φ of scenes; 0 where the objective cannot score one."""
+        score = self.scorer(batch.to("cpu"), None if self.prompt is None else [self.prompt] * len(batch))
+        return torch.where(score.valid, score.value / self.scale, torch.zeros(())).clamp(0.0, 1.0)
 
     def _score(self, batch: SceneBatch, origins: Sequence[tuple[int, tuple[int, ...], float]]) -> list[SearchState]:
         """States of ``batch``, given each one's (seed, path, value of the parent)."""

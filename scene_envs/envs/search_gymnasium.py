@@ -8,9 +8,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from torch import Tensor
 
 from scene_envs.envs.errors import ResetNeededError
-from scene_envs.envs.search import SearchProblem, SearchState
+from scene_envs.envs.search import SearchProblem, SearchState, Steering
 from scene_envs.envs.settings import SearchSettings, takes
 from scene_envs.envs.spaces import STATE_BOUND, check_render_mode, occupied, picture, scene_box
 from scene_envs.envs.specs import SpecMixin
@@ -223,9 +224,14 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         """The child of ``state`` under ``action``; the current state stays."""
         return self.expand_batch([(state, action)])[0]
 
-    def expand_batch(self, pairs: Sequence[tuple[SearchState, int]]) -> list[SearchState]:
-        """The children of (state, action) pairs, denoised as one batch; the current state stays."""
-        children = self.problem.expand_batch(pairs)
+    def expand_batch(
+        self, pairs: Sequence[tuple[SearchState, int]], steering: Steering | None = None
+    ) -> list[SearchState]:
+        """The children of (state, action) pairs, denoised as one batch; the current state stays.
+
+        ``steering`` makes what watches the denoising, as :class:`agents.planning.Particles`.
+        """
+        children = self.problem.expand_batch(pairs, steering)
         self._remember(children)
         return children
 
@@ -242,6 +248,10 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     def without_masked(self, state: SearchState) -> SearchState:
         """``state`` with the objects that are still masked removed; the current state stays."""
         return self.problem.without_masked(state)
+
+    def with_scene(self, state: SearchState, scene: Tensor) -> SearchState:
+        """``state`` with another ``scene`` (N, D), scored, and with its mask; nothing is denoised."""
+        return self.problem.with_scene(state, scene)
 
     def scene(self, state: SearchState | None = None) -> SceneBatch:
         """The scene of ``state`` (default: the current one), as a batch of one."""

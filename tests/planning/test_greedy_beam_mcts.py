@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from agents.planning import BeamPlanner, GreedyPlanner, MCTSPlanner, UCTPlanner
+from agents.planning import BeamPlanner, EvolutionPlanner, GreedyPlanner, MCTSPlanner, UCTPlanner
 from tests.helpers.toy_tree import Path, ToyTree, matches, scrambled
 
 PLANNERS = [
     BeamPlanner(children=3),
+    EvolutionPlanner(children=3, population=3),
     GreedyPlanner(children=3),
     MCTSPlanner(children=3),
     UCTPlanner(parallel=3, children=3),
@@ -137,13 +138,11 @@ def test_mcts_expands_all_children_of_the_leaf_of_the_highest_bound() -> None:
 
 def test_mcts_backs_up_one_random_child_and_tries_its_siblings_next() -> None:
     problem = ToyTree(scrambled, branching=3, depth=9)
-    values = MCTSPlanner(children=3).plan(problem, budget=9).values
+    planner = MCTSPlanner(children=3, rollout="random", exploration=1.0)
+    values = planner.plan(problem, budget=9).values
     grown = [path for path in problem.all_paths()[:12] if scrambled(path) in values and len(path) == 2]
     assert len({path[0] for path in grown}) == 2  # both siblings without a visit come before any other leaf
-    assert (
-        MCTSPlanner(children=3, seed=1).plan(problem, budget=30).values
-        != MCTSPlanner(children=3).plan(problem, budget=30).values
-    )
+    assert replace(planner, seed=1).plan(problem, budget=30).values != planner.plan(problem, budget=30).values
 
 
 @dataclass(frozen=True)
@@ -176,7 +175,7 @@ class MaskedTree:
 
 
 def test_mcts_stops_where_nothing_is_masked_and_removes_what_is() -> None:
-    result = MCTSPlanner(children=3, exploration=0.0).plan(MaskedTree(), budget=1000)
+    result = MCTSPlanner(children=3, exploration=1.0).plan(MaskedTree(), budget=1000)
     assert len(result.values) < 1000
     assert not bool(result.best_state.mask.any())
     assert result.best_value == pytest.approx(0.35)

@@ -10,10 +10,11 @@ import pytest
 import torch
 import yaml
 
+from agents.cli import main
 from agents.planning import SearchOutcome, UCTPlanner, run_search
 from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
-from rewards import RewardContext, RewardOutput
+from rewards import RewardContext, RewardOutput, register_reward
 from scene_envs.envs import SearchEnv
 from scene_envs.errors import InvalidInputError, SceneEnvsError
 from scene_envs.scene import SceneBatch
@@ -128,6 +129,37 @@ def test_an_objective_that_never_scores_is_an_error(run: Run) -> None:
 
     with pytest.raises(SceneEnvsError, match="could not score any of the first 3 samples"):
         run_search(run.prior, broken, **SETTINGS)
+
+
+def test_an_objective_beyond_its_scale_is_reported_with_its_raw_value(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    @register_reward("far_beyond")
+    def far_beyond(batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        return RewardOutput(torch.where(batch.is_free.any(-1), 50.0 + batch.is_free.sum(-1), 0.0))
+
+    output = tmp_path / "run"
+    words = ["search", f"prior={run.prior.save(tmp_path / 'prior')}", "objective=far_beyond", "baseline=false"]
+    words += ["budget=9", "branching=3", "num_steps=2"]
+    assert main([*words, f"output={output}"]) == 0
+    metrics = json.loads((output / "metrics.json").read_text())
+    found = int(SceneBatch.load(output / "best.safetensors").is_free.sum())
+    assert metrics["saturated"]
+    assert (metrics["search"]["value"], metrics["search"]["objective"]) == (1.0, 50 + found)
+    assert "that is beyond objective_scale=33" in capsys.readouterr().out
+    assert main([*words, "objective_scale=100", f"output={tmp_path / 'more'}"]) == 0
+    metrics = json.loads((tmp_path / "more" / "metrics.json").read_text())
+    assert not metrics["saturated"]
+    assert metrics["search"]["expansions"] == 9
+    assert "that is beyond" not in capsys.readouterr().out
+
+
+def test_an_objective_that_is_beyond_its_scale_without_objects_says_so(run: Run) -> None:
+    def beyond(batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        return RewardOutput(torch.full((len(batch),), 50.0))
+
+    with pytest.raises(InvalidInputError, match=r"is 50 for the empty scene already, .* at objective_scale=33"):
+        run_search(run.prior, beyond, **SETTINGS)
 
 
 @pytest.mark.parametrize(

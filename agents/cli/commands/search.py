@@ -68,8 +68,14 @@ def run(settings: SearchKeys, run: Run) -> None:
         f"{best_of}{first:.4g} by the best of the first {search.branching}"
     )
     if len(outcome.searches) > 1:
-        objectives = ", ".join(f"{plan.best_state.objective:.4g}" for plan in outcome.searches)
-        run.say(f"best scene of each search: {objectives}")
+        found = [plan.best_state.objective for plan in outcome.searches]
+        each = ", ".join(f"{objective:.4g}" for objective in found[:16])
+        run.say(f"best scenes of {len(found)} searches: {each}" + (f", ..., {found[-1]:.4g}" if found[16:] else ""))
+    if metrics["saturated"]:
+        run.say(
+            f"that is beyond objective_scale={metrics['objective_scale']:.4g}, where the search takes a scene for "
+            "perfect and ends; raise objective_scale to search on"
+        )
     if metrics["stopped"] == "time":
         run.say(f"ended after max_seconds={search.max_seconds:g}; the same command with more time goes on")
     run.say(f"written to {run.directory}")

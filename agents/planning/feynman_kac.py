@@ -1,0 +1,150 @@
+"""Feynman-Kac steering: scenes that are denoised side by side, resampled by the objective of what they will be."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from agents.planning.greedy import GreedyPlanner
+from agents.planning.ledger import PlanResult, Progress, Searchable
+from agents.planning.registry import PlannerSettings, check_at_least, register_planner
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import SceneBatch
+
+
+def systematic(weights: np.ndarray, uniform: float) -> np.ndarray:
+    """(K,) which particle goes on in each place: systematic resampling (Carpenter et al. 1999).
+
+    Particle i with share w_i of the weights (K,) goes on in K w_i places on average over ``uniform`` in [0, 1), and
+    always in a whole number of places next to that. One that goes on keeps its own place.
+
+    >>> systematic(np.array([0.5, 0.0, 0.5, 0.0]), 0.5).tolist()
+    [0, 0, 2, 2]
+    """
+    count = len(weights)
+    edges = np.cumsum(weights)
+    drawn = np.searchsorted(edges / edges[-1], (np.arange(count) + uniform) / count, side="right").clip(max=count - 1)
+    rows = np.full(count, -1)
+    survivors, repeats = np.unique(drawn, return_counts=True)
+    rows[survivors] = survivors
+    rows[rows < 0] = np.repeat(survivors, repeats - 1)
+    return rows
+
+
+class Particles:
+    """Groups of particles: the children of one parent that are denoised in one batch.
+
+    At ``resamplings`` steps a group is resampled by exp(strength * (value - value at the last resampling)), so that the
+    weight of a whole path is exp(strength * value) of its last one (Singhal et al. 2025, difference potential).
+
+    Args:
+        parents: (B,) parent of each particle, any hashable.
+        rngs: a generator per parent.
+        values: Φ (B,) of denoised scenes.
+        resamplings: how often.
+        begin: share of the steps that come before.
+        strength: of the weights.
+    """
+
+    def __init__(
+        self,
+        parents: Sequence[Any],
+        rngs: dict[Any, np.random.Generator],
+        values: Callable[[SceneBatch], Tensor],
+        resamplings: int,
+        begin: float,
+        strength: float,
+    ) -> None:
+        self.groups = {parent: np.flatnonzero([parent == other for other in parents]) for parent in rngs}
+        self.rngs, self.values = rngs, values
+        self.resamplings, self.begin, self.strength = resamplings, begin, strength
+        self.before = np.zeros(len(parents))
+
+    def __call__(self, step: int, steps: int, denoised: Callable[[], SceneBatch]) -> Tensor | None:
+        """(B,) the particles that go on, or None at a step without resampling."""
+        if step not in self.at(steps):
+            return None
+        now = self.values(denoised()).double().numpy()
+        rows = np.arange(len(now))
+        for parent, group in self.groups.items():
+            log_weights = self.strength * (now[group] - self.before[group])
+            rows[group] = group[systematic(np.exp(log_weights - log_weights.max()), self.rngs[parent].random())]
+        self.before = now[rows]
+        return torch.from_numpy(rows)
+
+    def at(self, steps: int) -> list[int]:
+        """Steps at which particles are resampled: evenly spaced from ``begin`` on, without the last."""
+        first = int(self.begin * steps)
+        return sorted({first + (i * (steps - 1 - first)) // self.resamplings for i in range(self.resamplings)})
+
+
+@register_planner("feynman_kac")
+@dataclass(frozen=True)
+class FeynmanKacPlanner(PlannerSettings):
+    """Feynman-Kac steering of every inpainting (Singhal et al. 2025), in rounds of iterated repair.
+
+    A round denoises ``particles`` inpaintings of the current state side by side. On the way the objective scores what
+    the network expects each to become, and particles that promise more take the places of others. What comes out is
+    kept as in :class:`~agents.planning.GreedyPlanner`. Resampling costs evaluations of the objective, none of the
+    denoiser.
+
+    Attributes:
+        particles: inpaintings per round, one batch of the denoiser.
+        resamplings: how often they are resampled.
+        begin: share of the denoising steps before the first resampling.
+        strength: weight of a particle is exp(strength * Φ); 0 leaves all particles alone.
+    """
+
+    name: str = "feynman_kac"
+    widens = True
+    particles: int = 8
+    resamplings: int = 2
+    begin: float = 0.7
+    strength: float = 50.0
+
+    def __post_init__(self) -> None:
+        check_at_least(self, 1, "particles", "resamplings")
+        check_at_least(self, 0, "begin", "strength")
+        if self.begin >= 1:
+            raise InvalidInputError(f"planner {self.name}: begin={self.begin} is a share of the steps, below 1")
+
+    def make(self, branching: int) -> FeynmanKacPlanner:
+        """The planner."""
+        return self
+
+    def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
+        """Spend up to ``budget`` expansions below the current state.
+
+        Raises:
+            InvalidInputError: the expansions of ``problem`` cannot be steered.
+        """
+        if "steering" not in inspect.signature(problem.expand_batch).parameters:
+            takes = f"expand_batch of {type(problem).__name__} takes no steering="
+            raise InvalidInputError(f"planner {self.name} steers the denoising, and {takes}; choose another planner")
+        return GreedyPlanner(children=self.particles).plan(_Steered(problem, self._steer), budget, progress)
+
+    def _steer(self, pairs: Sequence[tuple[Any, int]], values: Callable[[SceneBatch], Tensor]) -> Particles:
+        parents, rngs = [(state.seed, state.path) for state, _ in pairs], {}
+        for (seed, path), (_, action) in zip(parents, pairs, strict=True):
+            if (seed, path) not in rngs:  # 0 and 1 are the noise and the mask of the child
+                source = np.random.SeedSequence(entropy=seed, spawn_key=(*path, action, 2))
+                rngs[seed, path] = np.random.default_rng(source)
+        return Particles(parents, rngs, values, self.resamplings, self.begin, self.strength)
+
+
+class _Steered:
+    """A problem whose expansions are steered."""
+
+    def __init__(self, problem: Any, steering: Any) -> None:
+        self.problem = problem
+        self.expand_batch = partial(problem.expand_batch, steering=steering)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.problem, name)
