@@ -38,7 +38,10 @@ from agents.utils.process_group import ProcessGroup, launched_processes
 from rewards import reward_name
 from scene_envs.errors import TrainingError
 from scene_envs.folders import claimed
+from scene_envs.scene import SceneBatch
 
+_PROBED = 2
+"""Real scenes that a reward has to score before a run begins."""
 _MOST_ROLLBACKS = 3
 """Returns to the best checkpoint after which a run ends."""
 
@@ -183,6 +186,8 @@ class PostTrainer:
                 check_object_count([text for i in large for text in prompts(i)], self.prior.scene_type, slots)
         x0 = self.prior.encode(batch.to(config.device))
         self.scenes = SceneBank.split(x0, config.guard.scenes, prompts)
+        if config.prompt is None and not reuse_scenes:
+            self._probe(batch[:_PROBED])
         self.guard = make_guard(config, self.learner, self.scenes)
         self.learner.deal_prompts(self.scenes)
 
@@ -237,14 +242,24 @@ class PostTrainer:
             self.rollbacks += 1
             self.learner.return_to(self.files.best(self.prior))
 
+    def _probe(self, scenes: SceneBatch) -> None:
+        """End a run whose reward scores no real scene, before anything is sampled."""
+        if not bool(self.learner.scorer(scenes, None).valid.any()):
+            raise self._nothing_scored(f"none of {len(scenes)} real scenes, so that nothing was sampled")
+
     def _count_invalid(self) -> None:
         self.invalid_streak += 1
-        if self.invalid_streak < self.config.guard.max_invalid:
-            return
-        raise TrainingError(
-            f"the reward {self.config.plain()['reward']!r} scored no scene in {self.invalid_streak} batches in a row, "
-            f"the last at iteration {self.iteration + 1}; the warnings above say why, and `scene-envs check-reward` "
-            "tries a reward on its own"
+        if self.iteration == 0:
+            raise self._nothing_scored("no scene of the first batch")
+        if self.invalid_streak >= self.config.guard.max_invalid:
+            raise self._nothing_scored(
+                f"no scene in {self.invalid_streak} batches in a row, the last at iteration {self.iteration + 1}"
+            )
+
+    def _nothing_scored(self, what: str) -> TrainingError:
+        return TrainingError(
+            f"the reward {self.config.plain()['reward']!r} scored {what}; the warnings above say why, and "
+            "`scene-envs check-reward` tries a reward on its own"
         )
 
     def _not_finite(self, figures: dict[str, float]) -> TrainingError:

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from agents.configuration.tree import changed
 from agents.post_training import PostTrainer, post_train
 from agents.post_training import learner as learner_module
 from agents.priors.base import ScenePrior
@@ -209,21 +210,43 @@ def test_broken_weights_are_said_to_be_broken(tmp_path: Path) -> None:
         post_train(small_config(tmp_path), prior=prior)
 
 
-def test_raising_reward_stops_after_some_batches(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("scored", "message"),
+    [(0, "none of 2 real scenes, so that nothing was sampled"), (2, "no scene of the first batch")],
+)
+def test_a_reward_that_scores_nothing_ends_the_run_at_once(tmp_path: Path, scored: int, message: str) -> None:
     def raises(batch: SceneBatch, context: RewardContext) -> RewardOutput:
-        raise ZeroDivisionError("no")
+        if len(batch) > scored:
+            raise ZeroDivisionError("no")
+        return count_objects(batch, context)
 
-    with pytest.raises(TrainingError, match=r"scored no scene in 2 batches"):
-        post_train(small_config(tmp_path, reward=raises, max_invalid=2), prior=tiny_prior())
-    assert len(ScenePrior.load(tmp_path).sample(1, num_steps=2)) == 1
+    with pytest.raises(TrainingError, match=message):
+        post_train(small_config(tmp_path, reward=raises, max_invalid=5, **{"guard.samples": 0}), prior=tiny_prior())
 
 
-def test_batches_without_valid_reward_change_nothing(tmp_path: Path) -> None:
-    config = small_config(tmp_path, reward=not_a_number, iterations=2, max_invalid=5)
-    result = post_train(config, prior=tiny_prior())
-    assert [row["valid_fraction"] for row in result.history] == [0.0, 0.0]
-    base = tiny_prior().state_dict()
-    assert all(torch.equal(base[name], tensor) for name, tensor in weights(tmp_path).items())
+def test_prompt_match_without_a_prompt_ends_before_anything_is_sampled(tmp_path: Path) -> None:
+    with pytest.raises(TrainingError, match="'prompt_match' scored none of 2 real scenes"):
+        post_train(small_config(tmp_path, reward="prompt_match"), prior=tiny_prior())
+
+
+def test_batches_without_valid_reward_change_nothing_and_end_a_run_after_some(tmp_path: Path) -> None:
+    calls = []
+
+    def fails(batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        calls.extend([1] if len(batch) == 6 else [])  # batches, not the real scenes
+        return (count_objects if len(calls) <= 1 else not_a_number)(batch, context)
+
+    config = small_config(tmp_path, reward=fails, iterations=3, max_invalid=2, **{"guard.samples": 0})
+    with pytest.raises(TrainingError, match="scored no scene in 2 batches in a row, the last at iteration 3"):
+        post_train(config, prior=tiny_prior())
+    calls.clear()
+    once = post_train(changed(config, {"output": str(tmp_path / "once"), "iterations": 1}), prior=tiny_prior())
+    calls.clear()
+    twice = post_train(changed(config, {"output": str(tmp_path / "twice"), "iterations": 2}), prior=tiny_prior())
+    assert [row["valid_fraction"] for row in twice.history] == [1.0, 0.0]
+    assert once.history[0]["reward"] == twice.history[0]["reward"]
+    for name, tensor in weights(tmp_path / "once").items():
+        assert torch.equal(tensor, weights(tmp_path / "twice")[name])
 
 
 def test_some_invalid_scenes_leave_the_statistics(tmp_path: Path) -> None:
