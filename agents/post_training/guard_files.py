@@ -42,12 +42,16 @@ class GuardFiles:
     """What the guard keeps in a run's folder; the first process alone writes.
 
     Args:
-        directory: the folder.
-        reward: of the run, as its configuration has it.
+        config: of the run.
     """
 
-    def __init__(self, directory: Path, reward: Any) -> None:
-        self.directory, self.reward = directory, reward
+    def __init__(self, config: PostTrainConfig) -> None:
+        self.directory = config.directory
+        self._facts: dict[str, Any] = {
+            "algorithm": config.algorithm.name,
+            "base": Path(config.prior).name,
+            "reward": config.plain()["reward"],
+        }
         self._processes = ProcessGroup.current()
 
     def keep(self, prior: ScenePrior, guard: Guard, iteration: int) -> None:
@@ -55,7 +59,7 @@ class GuardFiles:
         prior.card = {
             **prior.card,
             "post_training": {
-                "reward": self.reward,
+                **self._facts,
                 "iteration": iteration,
                 "mean_reward": guard.best_reward if iteration else None,
                 "guard_ratio": guard.ratio,

@@ -116,7 +116,7 @@ class PostTrainer:
         self.config = config
         self.directory = config.directory
         self.processes = ProcessGroup.current()
-        self.files = GuardFiles(self.directory, config.plain()["reward"])
+        self.files = GuardFiles(config)
         self.learner = Learner(config, ScenePrior.load(config.prior if prior is None else prior))
         self.prior = self.learner.prior
         self.iteration = 0

@@ -193,6 +193,7 @@ def card_page(name: str, prior: ScenePrior, facts: PriorFacts) -> str:
         "prompts": facts.text or "none",
         "data": _data(card),
         "training": _training(card),
+        "post-training": _post_training(card),
         "licence of the data": str(card.get("license") or "not stated"),
     }
     table = "\n".join(["| | |", "|---|---|", *(f"| {key} | {text} |" for key, text in rows.items() if text)])
@@ -265,6 +266,18 @@ def _training(card: Mapping[str, Any]) -> str:
         f"imported from {card['imported_from']}" if "imported_from" in card else "",
     ]
     return ", ".join(part.rstrip(".") for part in parts if part)
+
+
+def _post_training(card: Mapping[str, Any]) -> str:
+    run = card.get("post_training") or {}
+    if not run.get("iteration"):
+        return ""
+    algorithm = f" of {run['algorithm'].upper().replace('_', '-')}" if "algorithm" in run else ""
+    base = f" from `{run['base']}`" if "base" in run else ""
+    return (
+        f"{run['iteration']} iterations{algorithm} toward `{run['reward']}`{base}, held-out loss "
+        f"{run['guard_ratio']:.3f} times the base prior's"
+    )
 
 
 def _training_of(source: Path) -> dict[str, Any]:
