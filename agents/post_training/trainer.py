@@ -244,7 +244,7 @@ class PostTrainer:
 
     def _probe(self, scenes: SceneBatch) -> None:
         """End a run whose reward scores no real scene, before anything is sampled."""
-        if not bool(self.learner.scorer(scenes, None).valid.any()):
+        if not self.processes.any(bool(self.learner.scorer(scenes, None).valid.any())):
             raise self._nothing_scored(f"none of {len(scenes)} real scenes, so that nothing was sampled")
 
     def _count_invalid(self) -> None:

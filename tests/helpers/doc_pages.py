@@ -30,9 +30,6 @@ SMALLER: dict[str, dict[str, str]] = {
         "10_000,": "12,",
         "workers=4)": "workers=0, progress=False)",
         "1_000_000": "2",
-        "stream.take(64)": "stream.take(4)",
-        "batch_size=64": "batch_size=4",
-        "scenes.scene_type, scenes.batch(), scenes.prompts": "break",
     },
     "docs/envs/README.md": {
         'DenoisingTorchRLEnv(32, reward="object_count", num_steps=50)': (
