@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+from filelock import FileLock
 
 from agents.cli.parser import main
 from agents.post_training import PostTrainer, post_train
@@ -93,10 +94,14 @@ def difference(one: Any, other: Any) -> float:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Every case on two processes, and on one that takes half of the batch at a time."""
-    path = tmp_path_factory.mktemp("runs")
-    failing = small_config(path / "failing", reward=fails_elsewhere, iterations=2), "continuous", torch.float32
-    assert in_processes(train, [*runs(path / "two", chunk=None), failing]) == [0, 0]
-    train(runs(path / "one", chunk=3))
+    path = tmp_path_factory.getbasetemp()
+    path = (path.parent if "PYTEST_XDIST_WORKER" in os.environ else path) / "processes"  # one for all workers
+    with FileLock(f"{path}.lock"):
+        if not (path / "done").exists():
+            failing = small_config(path / "failing", reward=fails_elsewhere, iterations=2), "continuous", torch.float32
+            assert in_processes(train, [*runs(path / "two", chunk=None), failing]) == [0, 0]
+            train(runs(path / "one", chunk=3))
+            (path / "done").touch()
     return path
 
 
