@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.reproducibility import comparisons, crowded, same, settled
+from benchmarks.reproducibility import NOISE, comparisons, crowded, same, settled
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import PhysicsPool, feasibility, settle
 from scene_envs.scene import SceneBatch
+from scene_envs.scene_types.built_in import BUILT_IN
 
 pytestmark = pytest.mark.slow
 
@@ -25,18 +26,12 @@ def pool() -> Iterator[PhysicsPool]:
         yield pool
 
 
-@pytest.mark.parametrize(
-    ("name", "noise"),
-    [("dimsum_table", (0.004, 0.03)), ("pantry_shelf", (0.004, 0.03)), ("restaurant_low_clutter", (0.015,))],
-)
-def test_no_history_changes_a_result(name: str, noise: tuple[float, ...], pool: PhysicsPool) -> None:
-    """Each function of each scene alone, after others in a random order, and in workers with histories of their own.
-
-    ``benchmarks/reproducibility.py`` does the same for all types and levels of noise.
-    """
-    agree = comparisons(crowded(name, noise), pool, seed=3)
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_no_history_changes_a_result(name: str, pool: PhysicsPool) -> None:
+    """Each function of each scene alone, after others in a random order, and in workers with histories of their own."""
+    agree = comparisons(crowded(name), pool, seed=3)
     assert [key for key, good in agree.items() if not good] == []
-    assert len(agree) == 4 * (len(noise) + 1)
+    assert len(agree) == 4 * (len(NOISE) + 1)
 
 
 def test_a_fresh_process_gives_the_same(tmp_path: Path) -> None:
