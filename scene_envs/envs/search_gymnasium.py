@@ -51,6 +51,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     | `regenerate` | `MultiBinary(N)` | slots that the next action regenerates |
     | `depth` | `Box(0, max_depth, (1,), int64)` | actions taken |
     | `value` | `Box(0, 1, (1,), float32)` | Φ of the scene |
+    | `prompt` | `Box(0, V-1, (L,), int64)` | tokens of the prompt, 0 being padding; only if `prompt=` is given |
 
     `info` holds the same numbers at every reset and step: `depth`, `value` (Φ), `objective` (raw), `reward_valid`
     (0 or 1), `objects` (slots that are not empty, welded ones included), `regenerate` (slots in the mask),
@@ -129,6 +130,11 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
                 "value": spaces.Box(0.0, 1.0, (1,), np.float32),
             }
         )
+        self._tokens: np.ndarray | None = None
+        if problem.prompt is not None and problem.prompting.space is not None:
+            length, words = problem.prompting.space
+            self.observation_space["prompt"] = spaces.Box(0, words - 1, (length,), np.int64)
+            self._tokens = problem.prompting.read([problem.prompt])[0].numpy()
         self.action_space = spaces.Discrete(problem.num_actions)
         self._state: SearchState | None = None
         self._best: SearchState | None = None
@@ -292,6 +298,8 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
             "depth": np.array([state.depth], np.int64),
             "value": np.array([state.value], np.float32),
         }
+        if self._tokens is not None:
+            observation["prompt"] = self._tokens.copy()
         info = {
             "depth": state.depth,
             "value": state.value,

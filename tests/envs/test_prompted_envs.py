@@ -188,6 +188,15 @@ def test_search_inpaints_under_the_prompt(reader):
     assert (first.evaluations, guided.evaluations) == (6, 4)  # two roots and a child; one root with both branches
 
 
+def test_search_shows_its_prompt(reader):
+    kwargs = {"prior": reader, "objective": "prompt_match", "num_steps": 2, "max_depth": 2, "objective_scale": 1.0}
+    env = gym.make(SEARCH, prompt=PROMPTS[0], **kwargs)
+    observation, _ = env.reset(seed=0)
+    assert observation["prompt"].tolist() == reader.read_prompts([PROMPTS[0]], 34)[0].tolist()
+    check_env(env.unwrapped, skip_render_check=True)
+    assert "prompt" not in gym.make(SEARCH, prior=reader, num_steps=2).observation_space.spaces
+
+
 def test_search_refuses_what_it_cannot_follow(reader, prior):
     with pytest.raises(InvalidInputError, match="trained without text"):
         gym.make(SEARCH, prior=prior, prompt=PROMPTS[0])
