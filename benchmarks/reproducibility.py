@@ -1,6 +1,6 @@
 """Whether physics gives the same bits whatever ran before, in whichever process, with however many workers.
 
-    python -m benchmarks.reproducibility [TYPE ...] [--noise 0.004 0.015 0.03] [--seed 5]
+    python benchmarks/reproducibility.py [TYPE ...] [--noise 0.004 0.015 0.03] [--seed 5]
 
 Scenes are the fullest of six draws of each grammar, a scene for each level of noise (m along every axis). `settle`,
 `project`, `feasibility` and `make_ready` take them as one batch; then one by one, in a random order of scenes and
