@@ -145,6 +145,11 @@ class ScenePrior(Inpainting, nn.Module, ABC):
             CorruptFileError: its files are not those of a prior, or do not fit each other.
         """
         if isinstance(name, ScenePrior):
+            if adapter:
+                raise InvalidInputError(
+                    f"adapter={adapter!r} is added to a prior that is loaded by name; give its name or folder, not the "
+                    "prior itself"
+                )
             return name
         name, named = split_name(name)
         terms = [term for spec in (named, adapter) if spec for term in parse_adapters(spec)]

@@ -118,6 +118,12 @@ def test_an_adapter_of_another_prior_is_refused_and_both_are_named(tmp_path: Pat
         ScenePrior.load(folder, adapter=tmp_path)
 
 
+def test_an_adapter_beside_a_prior_in_memory_is_not_dropped(base: ScenePrior) -> None:
+    assert ScenePrior.load(base) is base
+    with pytest.raises(InvalidInputError, match="give its name or folder, not the prior itself"):
+        ScenePrior.load(base, adapter="runs/feasible")
+
+
 def test_bad_files_and_sums_are_refused(tmp_path: Path) -> None:
     base = tiny_prior()
     folder = base.save(tmp_path / "base")
