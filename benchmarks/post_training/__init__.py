@@ -1,0 +1,1 @@
+"""Tables of post-training: training runs, measured samples, and what they cost."""

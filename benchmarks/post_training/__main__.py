@@ -1,0 +1,94 @@
+"""``python -m benchmarks.post_training table=NAME key=value …``: train rows, measure their samples, print a table."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatch
+from typing import TYPE_CHECKING
+
+from agents.cli.parser import main_of
+from scene_envs.errors import InvalidInputError, unknown_name
+
+if TYPE_CHECKING:
+    from agents.cli.run_folder import Run
+
+
+@dataclass
+class PostTrainingTables:
+    """A table of post-training: its runs, their samples and those of the base priors.
+
+    Attributes:
+        table: stability, placement, counts, prompts, realism or frontier.
+        rows: patterns of row names that are run and shown, such as [dimsum_table-nft-*]; empty for all.
+        iterations: of every run; null takes the table's.
+        count: samples that are measured of each prior.
+        keys: further keys of post-train for every run, such as ["batch_size=8"].
+        train: whether runs are begun; false tabulates what the folder has.
+        output: folder of the runs, the figures and table.md; a second call goes on there.
+    """
+
+    table: str = "stability"
+    rows: list[str] = field(default_factory=list)
+    iterations: int | None = None
+    count: int = 400
+    keys: list[str] = field(default_factory=list)
+    train: bool = True
+    output: str = ""
+
+
+def run(settings: PostTrainingTables, run: Run) -> None:
+    """Train and measure what is missing, and write the table after every row."""
+    from benchmarks.post_training.rows import TABLES, Row
+    from benchmarks.post_training.runs import kept_loss, measure, train, training_figures
+    from benchmarks.post_training.tables import markdown
+    from scene_envs.files import write_text
+
+    if settings.table not in TABLES:
+        raise unknown_name("table", settings.table, sorted(TABLES))
+    table = TABLES[settings.table]
+    patterns = settings.rows or ["*"]
+    rows = [row for row in table.rows if any(fnmatch(row.name, pattern) for pattern in patterns)]
+    if not rows:
+        names = ", ".join(row.name for row in table.rows)
+        raise InvalidInputError(f"no row matches rows={settings.rows}; the rows are {names}")
+    lines: list[tuple[str, dict[str, float]]] = []
+
+    def figures_of(row: Row) -> dict[str, float]:
+        iterations = settings.iterations or row.iterations
+        folder = run.directory / row.name
+        if settings.train:
+            run.say(f"{row.name}: {iterations} iterations")
+            train(row, run.directory, iterations, settings.keys)
+        if not (folder / "log.csv").exists():
+            return {}
+        figures = training_figures(folder)
+        figures["seconds_per_iteration"] = figures["seconds"] / figures["iterations"]
+        if table.measures and (folder / "metrics.json").exists():
+            prior = str(folder)
+            figures |= measure(
+                prior, run.directory / f"{row.name}-figures", table.measures, settings.count, row.guidance
+            )
+            figures |= kept_loss(folder)
+        return figures
+
+    measured: set[str] = set()
+    for row in rows:
+        if table.measures and row.prior not in measured:
+            measured.add(row.prior)
+            base = run.directory / f"{row.prior}-figures"
+            lines.append((row.prior, measure(row.prior, base, table.measures, settings.count, row.guidance)))
+        lines.append((row.name, figures_of(row)))
+        text = markdown(table.title, ("iterations", *table.columns, "seconds"), lines)
+        write_text(run.directory / "table.md", text)
+    run.say(text)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the program and return its exit status."""
+    return main_of("post_training", "tables of post-training", sys.modules[__name__], argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,148 @@
+"""Runs of the tables of post-training: which prior, which keys of ``post-train``, how long."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+SCENES = 48
+"""Scenes of an iteration, the default of ``post-train``."""
+
+TYPES = (
+    "dimsum_table", "living_room_shelf", "pantry_shelf", "breakfast_table_low_clutter", "breakfast_table_high_clutter",
+    "restaurant_low_clutter", "restaurant_high_clutter",
+)  # fmt: skip
+FORWARD, CHAIN, BASELINE = "nft", "ddpo_sf", "reward_weighted"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One training run and its measured samples.
+
+    Attributes:
+        name: its folder, and the first column.
+        prior: shipped prior that it starts from, and is compared with.
+        keys: of ``post-train``, as on the command line.
+        iterations: of training.
+        slots: sampled slots, None for the trained number.
+        guidance: weight of guidance of the samples with prompts.
+    """
+
+    name: str
+    prior: str
+    keys: tuple[str, ...]
+    iterations: int
+    slots: int | None = None
+    guidance: float = 0.0
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows that stand side by side.
+
+    Attributes:
+        title: heading.
+        rows: one for each run.
+        measures: groups of ``evaluate`` that the samples get; empty for tables of the training alone.
+        columns: figures shown, by the names of ``COLUMNS``.
+    """
+
+    title: str
+    rows: tuple[Row, ...]
+    measures: tuple[str, ...]
+    columns: tuple[str, ...]
+
+
+def _stability() -> tuple[Row, ...]:
+    """300 iterations of each algorithm on Dimsum with three seeds, of the forward process on two more types."""
+    dimsum = [
+        Row(f"dimsum_table-{name}-{seed}", "dimsum_table", _keys(name, "feasible_share", seed), 300)
+        for name in (FORWARD, "awm", CHAIN)
+        for seed in range(3)
+    ]
+    others = [
+        Row(f"{prior}-{FORWARD}-0", prior, _keys(FORWARD, "feasible_share", 0), 300)
+        for prior in ("living_room_shelf", "restaurant_low_clutter")
+    ]
+    return (*dimsum, *others)
+
+
+def _placement() -> tuple[Row, ...]:
+    """Three algorithms at equal sampled scenes, three seeds on Dimsum and one on the other types."""
+    return tuple(
+        Row(f"{prior}-{name}-{seed}", prior, _keys(name, "feasible_share", seed), 300)
+        for prior in TYPES
+        for name in (FORWARD, CHAIN, BASELINE)
+        for seed in range(3 if prior == "dimsum_table" else 1)
+    )
+
+
+def _counts() -> tuple[Row, ...]:
+    """The paper's figure: the number of objects on Living Room Shelf with 20 extra slots, and on Dimsum."""
+    hold = "hold=guard:1.05"
+    return (
+        Row("living_room_shelf-count-0", "living_room_shelf",
+            (*_keys(CHAIN, "object_count", 0), "slots=43", hold), 80, slots=43),
+        Row("dimsum_table_continuous-count-0", "dimsum_table_continuous",
+            (*_keys(CHAIN, "object_count", 0), hold), 80),
+        Row("dimsum_table-count-0", "dimsum_table", (*_keys(CHAIN, "object_count", 0), hold), 80),
+    )  # fmt: skip
+
+
+def _prompts() -> tuple[Row, ...]:
+    """Prompts as reward, alone and gated with feasibility."""
+    gated = "reward={name: product, rewards: [prompt_match, feasible_share]}"
+    rows = []
+    for prior in ("dimsum_table", "restaurant_low_clutter"):
+        for label, reward in (
+            ("match", "reward=prompt_match"),
+            ("gated", gated),
+            ("feasible", "reward=feasible_share"),
+        ):
+            keys = (f"algorithm={FORWARD}", reward, "prompt=grammar", "seed=0")
+            rows.append(Row(f"{prior}-{label}-0", prior, keys, 100))
+    return tuple(rows)
+
+
+def _realism() -> tuple[Row, ...]:
+    """An online discriminator as reward, alone and gated with feasibility."""
+    gated = "reward={name: gate, reward: realism, condition: feasible_share, threshold: 0.8, otherwise: -5.0}"
+    return tuple(
+        Row(f"{prior}-{label}-0", prior, (f"algorithm={FORWARD}", reward, "seed=0"), 100)
+        for prior in ("breakfast_table_high_clutter", "restaurant_low_clutter")
+        for label, reward in (("realism", "reward=realism"), ("gated", gated))
+    )
+
+
+def _frontier() -> tuple[Row, ...]:
+    """Reward against realism: weights of the regularisation and of the KL term."""
+    swept = [("regularisation.weight", weight) for weight in (0.05, 0.2, 1.0, 5.0)]
+    swept += [("regularisation.kl", weight) for weight in (0.01, 0.1, 1.0)]
+    return tuple(
+        Row(f"dimsum_table-{name}-{key.split('.')[1]}-{weight:g}", "dimsum_table",
+            (*_keys(name, "feasible_objects", 0), f"{key}={weight:g}"), 60)
+        for name in (FORWARD, "awm", CHAIN)
+        for key, weight in swept
+    )  # fmt: skip
+
+
+def _keys(algorithm: str, reward: str, seed: int) -> tuple[str, ...]:
+    return f"algorithm={algorithm}", f"reward={reward}", f"seed={seed}"
+
+
+_LAYOUT = ("free", "share", "collision", "loss", "count_wasserstein", "category_kl", "classifier")
+_MEASURES = ("layout", "physics", "classifier")
+_WITH_PROMPTS = ("layout", "physics", "prompts", "classifier")
+
+TABLES: dict[str, Table] = {
+    "stability": Table("300 iterations at the defaults", _stability(), (), ("first", "best", "last", "fall")),
+    "placement": Table("Feasible share, equal sampled scenes", _placement(), _WITH_PROMPTS,
+                       (*_LAYOUT, "prompt_counts", "prompt_names", "prompt_relations")),
+    "counts": Table("Object counts past the data", _counts(), ("layout", "physics"),
+                    ("free", "feasible", "share", "loss", "count_wasserstein", "category_kl")),
+    "prompts": Table("Following prompts", _prompts(), _WITH_PROMPTS,
+                     ("free", "share", "prompt_counts", "prompt_names", "prompt_relations", "loss", "classifier")),
+    "realism": Table("Realism as reward", _realism(), _MEASURES, _LAYOUT),
+    "frontier": Table("Reward against realism", _frontier(), _MEASURES,
+                      ("feasible", "share", "free", "loss", "classifier")),
+}  # fmt: skip
+"""Tables by the word that asks for them."""
