@@ -40,20 +40,4 @@ __all__ = [
     "settle",
 ]
 
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "scene_envs.physics.api": ["equilibrium", "feasibility", "penetration", "project", "settle"],
-        "scene_envs.physics.pool": ["PhysicsPool"],
-        "scene_envs.physics.readiness": ["make_ready"],
-        "scene_envs.physics.results": [
-            "EquilibriumResult",
-            "FeasibilityResult",
-            "ObjectPair",
-            "PenetrationResult",
-            "ProjectionResult",
-            "ReadyResult",
-            "SettleResult",
-        ],
-    },
-)
+__getattr__ = lazy_names(__name__, __file__)
