@@ -34,16 +34,7 @@ __all__ = [
     "run_search",
 ]
 
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "agents.evaluation": ["evaluate"],
-        "agents.planning": ["SearchConfig", "SearchOutcome", "run_search"],
-        "agents.post_training": ["PostTrainConfig", "PostTrainResult", "post_train"],
-        "agents.pretraining": ["PretrainConfig", "pretrain"],
-        "agents.priors": ["ScenePrior", "list_priors"],
-    },
-)
+__getattr__ = lazy_names(__name__, __file__)
 
 
 def __dir__() -> list[str]:

@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from rewards.base import RewardContext, RewardOutput
-from rewards.registry import as_output, is_own, resolve_reward, reward_name
+from rewards.function_reward import as_output
+from rewards.registry import is_own, resolve_reward, reward_name
 from rewards.seeding import seeded_generators
 from scene_envs.errors import RewardError
 from scene_envs.protocols import SceneScorer

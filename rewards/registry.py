@@ -10,14 +10,11 @@ from importlib.metadata import EntryPoint
 from types import ModuleType
 from typing import Any, TypeVar
 
-import torch
-from torch import Tensor
-
-from rewards.base import Reward, RewardContext, RewardOutput
+from rewards.base import Reward
+from rewards.function_reward import FunctionReward
 from rewards.local_files import is_local, load_local
 from scene_envs.errors import InvalidInputError, RewardError
 from scene_envs.registry import Registry
-from scene_envs.scene import SceneBatch
 
 ENTRY_POINT_GROUP = "scene_envs.rewards"
 """Packages offer rewards under this entry-point group; the entry's name is the reward's name."""
@@ -43,40 +40,6 @@ class RewardInfo:
     summary: str
     parameters: tuple[str, ...]
     source: str
-
-
-class FunctionReward:
-    """A bare function as a reward.
-
-    Args:
-        function: takes ``(batch)`` or ``(batch, context)``, then keyword settings; returns (B,) numbers or a
-            :class:`RewardOutput`.
-        name: its name in logs; the function's own by default.
-        **settings: keyword arguments passed on at every call.
-
-    >>> FunctionReward(lambda batch: batch.counts, name="count")(SceneBatch.empty("dimsum_table", 2), RewardContext())
-    RewardOutput(value=tensor([1., 1.]), per_object=None, terms={}, valid=None, object_flags={}, problem='')
-    """
-
-    def __init__(self, function: Callable[..., Any], name: str | None = None, **settings: Any) -> None:
-        self.function = function
-        self.name = str(name or getattr(function, "__name__", type(function).__name__))
-        self.settings = settings
-        self._takes_context = _accepts(function, 2, settings, self.name)
-
-    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
-        arguments = (batch, context) if self._takes_context else (batch,)
-        return as_output(self.function(*arguments, **self.settings))
-
-    def __repr__(self) -> str:
-        return f"FunctionReward({self.name!r})"
-
-
-def as_output(result: Any) -> Any:
-    """A bare tensor as a RewardOutput, whole numbers as floats; anything else as it is."""
-    if not isinstance(result, Tensor):
-        return result
-    return RewardOutput(result if result.is_floating_point() else result.to(torch.float32))
 
 
 def register_reward(name: str) -> Callable[[Maker], Maker]:
@@ -312,21 +275,3 @@ def _origin(maker: Any) -> str:
 def _is_reward_object(reward: Any) -> bool:
     """Whether it is an object of a class that defines ``__call__`` in Python (not a partial or a builtin)."""
     return inspect.isfunction(getattr(type(reward), "__call__", None))  # noqa: B004
-
-
-def _accepts(function: Callable[..., Any], count: int, settings: Mapping[str, Any], name: str) -> bool:
-    """Whether ``function`` takes ``count`` positional arguments beside ``settings``; one fewer must do otherwise."""
-    try:
-        signature = inspect.signature(function)
-    except (TypeError, ValueError):
-        return True
-    for number in (count, count - 1):
-        try:
-            signature.bind(*[None] * number, **settings)
-        except TypeError:
-            continue
-        return number == count
-    raise InvalidInputError(
-        f"reward {name!r} has the signature {signature} and was given the settings {sorted(settings)}; "
-        "it must take (batch) or (batch, context), and its settings as keywords"
-    )

@@ -85,37 +85,6 @@ __all__ = [
     "write_viewer",
 ]
 
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "scene_envs.assets": ["list_assets", "load_library"],
-        "scene_envs.datasets": ["SceneDataset", "describe", "generate", "parse_prompt"],
-        "scene_envs.envs": [
-            "DenoisingEnv",
-            "DenoisingTorchRLEnv",
-            "DenoisingVectorEnv",
-            "SearchEnv",
-            "check_branchable",
-            "list_masks",
-            "register_mask",
-        ],
-        "scene_envs.errors": ["InvalidInputError", "SceneEnvsError", "UnknownNameError"],
-        "scene_envs.export": ["list_formats", "register_format"],
-        "scene_envs.grammars": ["Grammar", "get_grammar", "list_grammars", "register_grammar"],
-        "scene_envs.normalizer": ["Normalizer"],
-        "scene_envs.physics": ["PhysicsPool", "feasibility", "make_ready", "penetration", "project", "settle"],
-        "scene_envs.render": ["write_viewer"],
-        "scene_envs.scene": ["SceneBatch"],
-        "scene_envs.scene_types": [
-            "Camera",
-            "FixedObject",
-            "SceneType",
-            "get_scene_type",
-            "list_scene_types",
-            "register_scene_type",
-            "union_scene_type",
-        ],
-    },
-)
+__getattr__ = lazy_names(__name__, __file__)
 
 register_envs()

@@ -2,23 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import ast
+from collections.abc import Callable
+from functools import cache
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 
-def lazy_names(package: str, homes: Mapping[str, Sequence[str]]) -> Callable[[str], Any]:
-    """A module's ``__getattr__`` (PEP 562) that imports public names from their homes.
+def lazy_names(package: str, file: str) -> Callable[[str], Any]:
+    """A module's ``__getattr__`` (PEP 562) that imports what the module imports under ``if TYPE_CHECKING:``.
+
+    Type checkers and readers see plain imports, which are the only list of names and of the modules that define them.
 
     Args:
-        package: the module's ``__name__``, for the error message.
-        homes: the public names that each module defines, by the module's name.
+        package: the module's ``__name__``.
+        file: its ``__file__``, whose source is read when the first name is asked for.
     """
-    module_of = {name: module for module, names in homes.items() for name in names}
+
+    @cache
+    def homes() -> dict[str, str]:
+        tree = ast.parse(Path(file).read_text(encoding="utf-8"))
+        guarded = [node for guard in tree.body if isinstance(guard, ast.If) for node in guard.body]
+        imports = [node for node in guarded if isinstance(node, ast.ImportFrom)]
+        return {alias.name: str(node.module) for node in imports for alias in node.names}
 
     def load(name: str) -> Any:
-        if name not in module_of:
+        if name.startswith("__") or name not in homes():
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(import_module(module_of[name]), name)
+        return getattr(import_module(homes()[name]), name)
 
     return load

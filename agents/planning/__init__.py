@@ -47,23 +47,4 @@ __all__ = [
     "run_search",
 ]
 
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "agents.planning.beam": ("BeamPlanner",),
-        "agents.planning.best_of": ("BestOfPlanner",),
-        "agents.planning.config": ("SearchConfig",),
-        "agents.planning.evolution": ("EvolutionPlanner",),
-        "agents.planning.feynman_kac": ("FeynmanKacPlanner",),
-        "agents.planning.greedy": ("GreedyPlanner",),
-        "agents.planning.journal": ("Journal",),
-        "agents.planning.ledger": ("Ledger", "PlanResult", "SearchStoppedError", "Searchable"),
-        "agents.planning.mcts": ("MCTSPlanner",),
-        "agents.planning.registry": ("PlannerSettings", "list_planners", "register_planner"),
-        "agents.planning.search_run": ("SearchOutcome", "run_search"),
-        "agents.planning.session": ("Session",),
-        "agents.planning.tree": ("Node", "Tree"),
-        "agents.planning.tree_file": ("SearchRecord", "TreeNode"),
-        "agents.planning.uct": ("UCTPlanner",),
-    },
-)
+__getattr__ = lazy_names(__name__, __file__)

@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from agents.post_training.comparison_run import post_train_and_compare
     from agents.post_training.config import PostTrainConfig
     from agents.post_training.ddpo import DDPO
-    from agents.post_training.forward_losses import AWMLoss, ForwardProcessLoss, NFTLoss, RewardWeightedLoss
+    from agents.post_training.forward_losses import AWMLoss, NFTLoss, RewardWeightedLoss
     from agents.post_training.forward_process import ForwardProcess
+    from agents.post_training.forward_process_loss import ForwardProcessLoss
     from agents.post_training.guard import Guard
     from agents.post_training.losses import DDPOSFLoss
     from agents.post_training.policy import DenoisingPolicy
@@ -46,30 +47,4 @@ __all__ = [
     "register_algorithm",
 ]
 
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "agents.post_training.advantages": ("compute_advantages",),
-        "agents.post_training.algorithms": (
-            "AlgorithmSettings",
-            "DDPOSFSettings",
-            "list_algorithms",
-            "register_algorithm",
-        ),
-        "agents.post_training.base": ("Algorithm",),
-        "agents.post_training.comparison_run": ("post_train_and_compare",),
-        "agents.post_training.config": ("PostTrainConfig",),
-        "agents.post_training.ddpo": ("DDPO",),
-        "agents.post_training.forward_losses": (
-            "AWMLoss",
-            "ForwardProcessLoss",
-            "NFTLoss",
-            "RewardWeightedLoss",
-        ),
-        "agents.post_training.forward_process": ("ForwardProcess",),
-        "agents.post_training.guard": ("Guard",),
-        "agents.post_training.losses": ("DDPOSFLoss",),
-        "agents.post_training.policy": ("DenoisingPolicy",),
-        "agents.post_training.trainer": ("PostTrainer", "PostTrainResult", "post_train"),
-    },
-)
+__getattr__ = lazy_names(__name__, __file__)

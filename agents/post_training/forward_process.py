@@ -16,7 +16,8 @@ from agents.post_training.advantages import compute_advantages, sibling_advantag
 from agents.post_training.algorithms import AWMSettings, ForwardProcessSettings, NFTSettings, RewardWeightedSettings
 from agents.post_training.base import Algorithm
 from agents.post_training.expectation import Expectation
-from agents.post_training.forward_losses import AWMLoss, ForwardProcessLoss, NFTLoss, RewardWeightedLoss
+from agents.post_training.forward_losses import AWMLoss, NFTLoss, RewardWeightedLoss
+from agents.post_training.forward_process_loss import ForwardProcessLoss
 from agents.post_training.gradients import GradientSum, credited_reward
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.prompts import prompt_groups

@@ -10,7 +10,4 @@ if TYPE_CHECKING:
 
 __all__ = ["PretrainConfig", "Pretrainer", "pretrain"]
 
-__getattr__ = lazy_names(
-    __name__,
-    {"agents.pretraining.config": ("PretrainConfig",), "agents.pretraining.trainer": ("Pretrainer", "pretrain")},
-)
+__getattr__ = lazy_names(__name__, __file__)

@@ -1,4 +1,4 @@
-"""Rows of a training run: to the log, to a CSV file, and to a logger."""
+"""What a training run shows: rows in the log, in a CSV file and in a logger, and pictures of samples."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from agents.priors.base import ScenePrior
 from agents.utils.loggers import RunLogger
+from scene_envs.errors import MissingDependencyError
 from scene_envs.files import write_text
 
 logger = logging.getLogger(__name__)
@@ -68,3 +70,17 @@ class TrainingLog:
 def _is_whole(row: Mapping[str, Any]) -> bool:
     """Whether a row of the file has all its numbers; the last of a killed run may not."""
     return str(row.get("step") or "").isdigit() and all(row.get(name) is not None for name in FIELDS)
+
+
+def draw_samples(prior: ScenePrior, directory: Path, step: int, seed: int) -> None:
+    """A gallery of samples of a prior, ``samples-STEP.png`` in ``directory``; left out without PyBullet."""
+    from scene_envs.render import gallery, render
+
+    batch = prior.sample(8, num_steps=50, seed=seed).to("cpu")
+    captions = [f"{int(count)} objects" for count in batch.counts]
+    try:
+        images = render(batch, width=400, height=300)
+    except MissingDependencyError as error:
+        logger.warning("no pictures of samples: %s", error)
+        return
+    gallery(list(images), columns=4, captions=captions).save(directory / f"samples-{step:07d}.png")

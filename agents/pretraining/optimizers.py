@@ -1,4 +1,4 @@
-"""Optimisers of a pretraining run: AdamW, and Muon for the matrices inside transformer blocks."""
+"""Learning rate and optimisers of a pretraining run: AdamW, and Muon for the matrices inside transformer blocks."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from agents.pretraining.config import PretrainConfig
 from scene_envs.errors import unknown_name
 
 OPTIMIZERS = ("adamw", "muon")
@@ -18,6 +19,17 @@ _BETAS, _EPS = (0.9, 0.99), 1e-8
 _MOMENTUM = 0.95
 _COEFFICIENTS = (3.4445, -4.7750, 2.0315)
 """Of the quintic Newton-Schulz iteration (Jordan et al. 2024)."""
+
+
+def learning_rate_at(step: int, config: PretrainConfig) -> float:
+    """Linear warm-up, the peak, and in the last ``decay_share`` of the steps a cosine to ``final_lr``."""
+    optimizer = config.optimizer
+    if step < optimizer.warmup:
+        return optimizer.lr * (step + 1) / optimizer.warmup
+    start = max(optimizer.warmup, config.iterations * (1.0 - optimizer.decay_share))
+    progress = (step - start) / max(1.0, config.iterations - start)
+    cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, max(0.0, progress))))
+    return optimizer.lr * (optimizer.final_lr + (1 - optimizer.final_lr) * cosine)
 
 
 def build_optimizer(

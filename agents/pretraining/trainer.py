@@ -18,8 +18,8 @@ from torch.optim.lr_scheduler import LambdaLR
 from agents.configuration.tree import config_text, dotted
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.data import TrainingData
-from agents.pretraining.log import TrainingLog
-from agents.pretraining.optimizers import build_optimizer
+from agents.pretraining.log import TrainingLog, draw_samples
+from agents.pretraining.optimizers import build_optimizer, learning_rate_at
 from agents.pretraining.setup import prepare
 from agents.pretraining.text_warmup import warm_up_text
 from agents.priors.base import ScenePrior
@@ -29,7 +29,7 @@ from agents.utils.loggers import make_logger
 from agents.utils.process_group import ProcessGroup, is_first_process
 from agents.utils.seeds import derived_generator
 from agents.utils.weight_average import AveragedWeights, WeightAverage
-from scene_envs.errors import InvalidInputError, MissingDependencyError, TrainingError
+from scene_envs.errors import InvalidInputError, TrainingError
 from scene_envs.files import write_json, write_text
 from scene_envs.folders import claimed
 
@@ -38,17 +38,6 @@ logger = logging.getLogger(__name__)
 _MAY_DIFFER = ("iterations", "output", "logger", "device", "recipe")
 """Keys that may change between a run and its continuation."""
 _PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
-
-
-def learning_rate_at(step: int, config: PretrainConfig) -> float:
-    """Linear warm-up, the peak, and in the last ``decay_share`` of the steps a cosine to ``final_lr``."""
-    optimizer = config.optimizer
-    if step < optimizer.warmup:
-        return optimizer.lr * (step + 1) / optimizer.warmup
-    start = max(optimizer.warmup, config.iterations * (1.0 - optimizer.decay_share))
-    progress = (step - start) / max(1.0, config.iterations - start)
-    cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, max(0.0, progress))))
-    return optimizer.lr * (optimizer.final_lr + (1 - optimizer.final_lr) * cosine)
 
 
 @torch.no_grad()
@@ -153,8 +142,11 @@ class Pretrainer:
                 row |= {"learning_rate": learning_rate_at(self.step - 1, config), "seconds": round(self.seconds, 1)}
                 running.clear()
                 yield row
-            if config.logger.pictures_every and self.step % config.logger.pictures_every == 0:
-                self._draw_samples()
+            pictures = config.logger.pictures_every
+            if pictures and self.step % pictures == 0 and self.processes.is_first:
+                with self._averaged():
+                    draw_samples(self.prior.eval(), self.directory, self.step, config.seed)
+                self.prior.train()
             if self.step % config.logger.checkpoint_every == 0 or last or end.pending:
                 self._save()
             end()
@@ -211,23 +203,6 @@ class Pretrainer:
 
     def _averaged(self) -> AveragedWeights[nn.Module]:
         return AveragedWeights(self.network, self.average)
-
-    def _draw_samples(self) -> None:
-        """A gallery of samples of the averaged prior, ``samples-STEP.png``; left out without PyBullet."""
-        if not self.processes.is_first:
-            return
-        from scene_envs.render import gallery, render
-
-        with self._averaged():
-            batch = self.prior.eval().sample(8, num_steps=50, seed=self.config.seed).to("cpu")
-        self.prior.train()
-        captions = [f"{int(count)} objects" for count in batch.counts]
-        try:
-            images = render(batch, width=400, height=300)
-        except MissingDependencyError as error:
-            logger.warning("no pictures of samples: %s", error)
-            return
-        gallery(list(images), columns=4, captions=captions).save(self.directory / f"samples-{self.step:07d}.png")
 
     # -- files ----------------------------------------------------------------------------------
 

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Generator, Tensor, nn
 
-from agents.configuration.prior_names import split_name
 from agents.diffusion import (
     GaussianProcess,
     Preconditioning,
@@ -21,25 +17,21 @@ from agents.diffusion import (
     StepTable,
 )
 from agents.networks.count_conditioning import CountConditioning
-from agents.networks.low_rank import merged_weights
 from agents.networks.mixed_denoiser import Observed
 from agents.networks.text import Text
-from agents.priors.adapters import AdapterFacts, AdapterSpec, merge_adapters, parse_adapters
+from agents.priors.adapters import AdapterFacts
 from agents.priors.forward import DenoiserOutput, NoisedScenes
 from agents.priors.inpainting import Inpainting
+from agents.priors.loading import Loadable
 from agents.priors.prompt_validation import check_prompts, no_text
-from agents.priors.storage import StoredPrior, explained, read_stored, write_stored
-from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.errors import InvalidInputError
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
 from scene_envs.scene import POSE_FEATURES, TRANSLATION, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
-_CLASSES: dict[str, type[ScenePrior]] = {}
-"""Classes of priors by the name of their process."""
 
-
-class ScenePrior(Inpainting, nn.Module, ABC):
+class ScenePrior(Loadable, Inpainting, nn.Module, ABC):
     """A trained denoiser with its schedule, layout and normalizer. Tensors x are normalised scenes (B, N, D).
 
     Fixed welded objects and constant features are *known*: clamped to their values while sampling and left
@@ -52,8 +44,6 @@ class ScenePrior(Inpainting, nn.Module, ABC):
     SceneBatch('dimsum_table', (2, 34, 20))
     """
 
-    process_name = ""
-    """Name of the process in configuration files; a subclass that sets it can be loaded by :meth:`load`."""
     denoiser: Any
     """The network inside its process, a module with ``.network``."""
     process: GaussianProcess
@@ -61,11 +51,6 @@ class ScenePrior(Inpainting, nn.Module, ABC):
     _timestep_weights: Tensor
     adapter: AdapterFacts | None = None
     """Facts about the low-rank updates in training; None for a prior without."""
-
-    def __init_subclass__(cls, **settings: Any) -> None:
-        super().__init_subclass__(**settings)
-        if cls.process_name:
-            _CLASSES[cls.process_name] = cls
 
     def _keep(
         self,
@@ -85,10 +70,6 @@ class ScenePrior(Inpainting, nn.Module, ABC):
         self._fixed: Tensor
         fixed = SceneBatch.empty(self.scene_type, 1, len(self.scene_type.fixed) or 1)
         self.register_buffer("_fixed", self.normalised(fixed)[0], persistent=False)
-
-    def config_state(self) -> dict[str, Any]:
-        """The ``prior`` entry of the configuration file."""
-        return asdict(self.config)
 
     @property
     def device(self) -> torch.device:
@@ -115,81 +96,6 @@ class ScenePrior(Inpainting, nn.Module, ABC):
     def count_conditioning(self) -> CountConditioning | None:
         """The part of the network that is told how many objects a prompt asks for; None where there is none."""
         return None
-
-    # -- files ----------------------------------------------------------------------------------
-
-    @classmethod
-    @abstractmethod
-    def from_state(
-        cls,
-        fields: dict[str, Any],
-        normalizer: Normalizer,
-        preconditioning: Preconditioning,
-        card: dict[str, Any] | None,
-        residual: ResidualVariance | None,
-    ) -> ScenePrior:
-        """From the ``prior`` entry of a configuration file."""
-
-    @classmethod
-    def load(cls, name: str | os.PathLike[str] | ScenePrior, adapter: AdapterSpec | None = None) -> ScenePrior:
-        """A shipped prior by name, or one from a prior or run directory; in evaluation mode.
-
-        Args:
-            name: of the prior; ``NAME with ADAPTER`` names its adapters as well.
-            adapter: low-rank updates that are added to its weights: the file or the run folder of one, several joined
-                by ``+`` or in a list, each with a factor before ``*`` if need be.
-
-        Raises:
-            UnknownNameError: no shipped prior has that name.
-            InvalidInputError: an adapter is missing, or was trained on another prior.
-            CorruptFileError: its files are not those of a prior, or do not fit each other.
-        """
-        if isinstance(name, ScenePrior):
-            if adapter:
-                raise InvalidInputError(
-                    f"adapter={adapter!r} is added to a prior that is loaded by name; give its name or folder, not the "
-                    "prior itself"
-                )
-            return name
-        name, named = split_name(name)
-        terms = [term for spec in (named, adapter) if spec for term in parse_adapters(spec)]
-        stored = read_stored(name)
-        with explained(name):
-            kind = prior_class(stored.process)
-            prior = kind.from_state(
-                stored.fields, stored.normalizer, stored.preconditioning, stored.card, stored.residual
-            )
-            prior.load_weights(stored.tensors)
-        if terms:
-            merge_adapters(prior, str(name), terms)
-        return prior.eval()
-
-    def save(self, directory: str | os.PathLike[str], precision: str = "float32") -> Path:
-        """Write ``config.json`` and ``model.safetensors`` into ``directory``.
-
-        Args:
-            directory: folder, made if need be.
-            precision: of the weights in the file, ``"float32"`` or ``"float16"``; loaded weights are float32 again.
-        """
-        stored = StoredPrior(
-            self.process_name,
-            self.config_state(),
-            self.scene_type,
-            self.normalizer,
-            self.preconditioning,
-            self.card,
-            self.residual,
-            self.weights(),
-        )
-        return write_stored(directory, stored, precision)
-
-    def weights(self) -> dict[str, Tensor]:
-        """Trained tensors by name, as a prior's file holds them."""
-        return merged_weights(self.denoiser.network)
-
-    def load_weights(self, tensors: dict[str, Tensor]) -> None:
-        """Inverse of :meth:`weights`; raises RuntimeError when names or shapes differ."""
-        self.denoiser.network.load_state_dict(tensors)
 
     # -- the reverse chain ----------------------------------------------------------------------
 
@@ -407,10 +313,3 @@ def _chunk_sizes(total: int, size: int) -> Iterator[int]:
     while total > 0:
         yield min(size, total)
         total -= size
-
-
-def prior_class(process: str) -> type[ScenePrior]:
-    """The class of priors of a process, ``"continuous"`` or ``"mixed"`` or that of a class of your own."""
-    if process not in _CLASSES:
-        raise unknown_name("process", process, _CLASSES)
-    return _CLASSES[process]

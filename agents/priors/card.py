@@ -1,4 +1,4 @@
-"""Model cards of priors: a line in a listing, and a page in a folder to publish."""
+"""Priors as folders to give away, and their model cards."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import json
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.priors.files import WEIGHTS_NAME, count_parameters, find_prior, read_config, write_config
+from agents.priors.facts import PriorFacts
+from agents.priors.files import read_config, write_config
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.files import write_text
 
@@ -20,97 +21,7 @@ if TYPE_CHECKING:
 README = "README.md"
 OWN_LICENSE = "MIT, as this package, whose grammars and assets made the scenes."
 """Of the data of priors that were trained on what ``scene-envs generate`` makes."""
-HEADLINES = {
-    "feasible_fraction": "free objects feasible as sampled",
-    "ready_fraction": "after projection and settling",
-    "classifier_accuracy": "told from real scenes by a classifier",
-    "prompt_following": "prompts followed",
-    "novelty": "novelty",
-}
-"""The figures of :mod:`agents.evaluation` that a listing shows, and what it calls them."""
 _OPTIMIZERS = {"adamw": "AdamW", "muon": "Muon and AdamW"}
-_RATIOS = ("novelty",)
-_FLOOR = "floor_"
-
-
-@dataclass(frozen=True)
-class PriorFacts:
-    """Facts about a prior from its files.
-
-    Attributes:
-        name: as it was asked for.
-        scene_type: its scene type.
-        process: ``"continuous"`` or ``"mixed"``.
-        slots: that it was trained on.
-        text: what reads its prompts; empty for a prior without text.
-        parameters: trained numbers in its file.
-        megabytes: size of its weights on disk, MB.
-        card: facts about its training and, under ``measures``, its figures.
-    """
-
-    name: str
-    scene_type: str
-    process: str
-    slots: int
-    text: str
-    parameters: int
-    megabytes: float
-    card: Mapping[str, Any]
-
-    @classmethod
-    def of(cls, name: str | os.PathLike[str]) -> PriorFacts:
-        """The facts of a shipped prior, or of one in a prior or run directory; weights are not read.
-
-        Raises:
-            UnknownNameError, InvalidInputError, CorruptFileError: as :func:`agents.priors.files.read_prior`.
-        """
-        folder, state = find_prior(name), read_config(name)
-        try:
-            made = state["prior"]
-            return cls(
-                name=str(name),
-                scene_type=made["scene_type"],
-                process=state.get("process", "continuous"),
-                slots=made["slots"],
-                text=_reader(made.get("text")),
-                parameters=count_parameters(name),
-                megabytes=(folder / WEIGHTS_NAME).stat().st_size / 1e6,
-                card=state.get("card") or {},
-            )
-        except (KeyError, TypeError, AttributeError) as error:
-            raise CorruptFileError(
-                f"the configuration of the prior {str(name)!r} is not one of ours: {error}"
-            ) from error
-
-    @property
-    def measures(self) -> dict[str, float]:
-        """The figures of its samples; empty when it was never measured."""
-        return dict(self.card.get("measures") or {})
-
-    def lines(self) -> list[str]:
-        """A few lines for a listing."""
-        prompts = f"reads prompts with {self.text}" if self.text else "reads no prompts"
-        head = f"{self.name}: scenes of {self.scene_type}, {self.slots} slots, {self.process} process, {prompts}"
-        rows = [f"{self.parameters / 1e6:.1f} M parameters, {self.megabytes:.1f} MB"]
-        shown = headlines(self.measures)
-        width = max((len(label) for label, _, _ in shown), default=0)
-        rows += [
-            f"{label:{width}}  {value:>6}{f'  (real scenes {real})' if real else ''}" for label, value, real in shown
-        ]
-        return [head, *(f"    {row}" for row in (rows if shown else [*rows, "not measured"]))]
-
-
-def headlines(measures: Mapping[str, float]) -> list[tuple[str, str, str]]:
-    """(label, samples, real scenes) of the figures that a listing shows; what was not measured is left out.
-
-    >>> headlines({"feasible_fraction": 0.81, "floor_feasible_fraction": 0.99, "novelty": 0.954})
-    [('free objects feasible as sampled', '81 %', '99 %'), ('novelty', '0.95', '')]
-    """
-    rows = []
-    for name, label in HEADLINES.items():
-        if name in measures:
-            rows.append((label, _figure(name, measures[name]), _figure(name, measures.get(_FLOOR + name))))
-    return rows
 
 
 def package_prior(
@@ -318,19 +229,5 @@ def _read_json(file: Path) -> dict[str, Any]:
     return content
 
 
-def _reader(text: Mapping[str, Any] | None) -> str:
-    if text is None:
-        return ""
-    if text.get("kind") == "bert":
-        return f"BERT ({os.path.basename(text['model'])})"
-    return f"a vocabulary of {len(text['words'])} words"
-
-
 def _license(card: Mapping[str, Any]) -> str:
     return str(card.get("license") or ("" if "imported_from" in card else OWN_LICENSE))
-
-
-def _figure(name: str, value: float | None) -> str:
-    if value is None:
-        return ""
-    return f"{value:.2f}" if name in _RATIOS else f"{100 * value:.3g} %"

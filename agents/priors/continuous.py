@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -15,7 +14,7 @@ from agents.diffusion.schedules import make_schedule
 from agents.diffusion.weighting import check_weighting, loss_weights, timestep_distribution
 from agents.networks.denoiser import Denoiser
 from agents.networks.mixed_denoiser import Observed
-from agents.networks.registry import build_network, config_from_state, config_state
+from agents.networks.registry import build_network, config_from_state
 from agents.networks.text import Text
 from agents.priors.base import ScenePrior
 from agents.priors.config import PriorConfig, current_names
@@ -106,10 +105,6 @@ class ContinuousPrior(ScenePrior):
         """From the ``prior`` entry of a configuration file."""
         fields = {**current_names(fields), "network": config_from_state(fields["network"], "continuous")}
         return cls(PriorConfig(**fields), normalizer, preconditioning, card, residual)
-
-    def config_state(self) -> dict[str, Any]:
-        """The ``prior`` entry of the configuration file."""
-        return {**asdict(self.config), "network": config_state(self.config.network)}
 
     # -- scenes and numbers ---------------------------------------------------------------------
 

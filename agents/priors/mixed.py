@@ -7,7 +7,6 @@ While a category is masked its K entries are zeros. (Pfaff et al., CoRL 2025; Hu
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -29,7 +28,7 @@ from agents.diffusion.schedules import make_schedule
 from agents.diffusion.unmasking import UNMASKINGS
 from agents.diffusion.weighting import check_weighting
 from agents.networks.mixed_denoiser import MixedDenoiser, Observed
-from agents.networks.registry import build_network, config_from_state, config_state
+from agents.networks.registry import build_network, config_from_state
 from agents.networks.text import Text
 from agents.networks.text_encoders import text_config_from_state, text_encoder
 from agents.priors.config import MixedPriorConfig, current_names
@@ -115,10 +114,6 @@ class MixedPrior(TrainableMixedPrior):
         fields = {**current_names(fields), "network": config_from_state(fields["network"], "mixed"), "text": text}
         return cls(MixedPriorConfig(**fields), normalizer, preconditioning, card, residual)
 
-    def config_state(self) -> dict[str, Any]:
-        """The ``prior`` entry of the configuration file."""
-        return {**asdict(self.mixed), "network": config_state(self.mixed.network)}
-
     def weights(self) -> dict[str, Tensor]:
         """Tensors of the network, and those of the text encoder under ``text_encoder.``."""
         tensors = super().weights()
@@ -134,76 +129,6 @@ class MixedPrior(TrainableMixedPrior):
         )
         if self.denoiser.text_encoder is not None:
             self.denoiser.text_encoder.load_state_dict(text)
-
-    # -- what the network is told ---------------------------------------------------------------
-
-    def observed_entries(self, x: Tensor, observed: Observed | None = None) -> Observed | None:
-        """Observed entries of scenes ``x`` (B, N, D) for the network: ``observed``, or else the fixed objects.
-
-        A prior trained with observed entries has always been told of its fixed objects; one trained without is not.
-        """
-        if observed is not None or self.mixed.observed_share <= 0:
-            return observed
-        fixed = torch.zeros(x.shape[:2], dtype=torch.bool, device=x.device)
-        fixed[:, : len(self.scene_type.fixed)] = True
-        return Observed(x, fixed, fixed)
-
-    # -- scenes and states ----------------------------------------------------------------------
-
-    @property
-    def num_categories(self) -> int:
-        """K = C + 1."""
-        return self.mixed.network.categories
-
-    def known(self, slots: int) -> Tensor:
-        """(slots, D) bool: entries that are clamped (fixed welded slots, constant pose features)."""
-        constant = self.normalizer.is_constant.to(self._fixed.device).clone()
-        constant[POSE_FEATURES:] = False
-        known = constant.expand(slots, -1).clone()
-        known[: len(self.scene_type.fixed)] = True
-        return known
-
-    def clamp(self, x: Tensor) -> Tensor:
-        """``x`` (B, N, D) with its known entries set to their values."""
-        count = len(self.scene_type.fixed)
-        constant = self.normalizer.is_constant[:POSE_FEATURES].to(x.device)
-        x = torch.cat(
-            [
-                torch.where(constant, torch.zeros_like(x[..., :POSE_FEATURES]), x[..., :POSE_FEATURES]),
-                x[..., POSE_FEATURES:],
-            ],
-            dim=-1,
-        )
-        if count:
-            x = torch.cat([self._fixed[:count].to(x).expand(x.shape[0], -1, -1), x[:, count:]], dim=1)
-        return x
-
-    def normalised(self, batch: SceneBatch) -> Tensor:
-        """(B, N, D): normalised pose, one-hot category as it is.
-
-        The pose of an empty slot means nothing; it takes the mean of poses, where it asks nothing of the network.
-        """
-        pose = batch.to_tensor(normalised=self.normalizer)[..., :POSE_FEATURES]
-        pose = torch.where(batch.is_empty[..., None], self.preconditioning.mean.to(pose), pose)
-        return torch.cat([pose, batch.tensor[..., POSE_FEATURES:]], dim=-1)
-
-    def initial(self, count: int, slots: int, generator: Generator | None = None) -> Tensor:
-        """x_T (count, slots, D): normal poses, categories from the end of their chain, known entries clamped."""
-        noise = torch.randn(count, slots, self.scene_type.features, generator=generator, device=self._fixed.device)
-        probs = self.categories.prior().to(noise).expand(count, slots, -1)
-        return self.clamp(self._with_states(noise[..., :POSE_FEATURES], probs, noise))
-
-    def add_noise(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
-        """A sample of q(x_t | x_0) from standard normal noise (B, N, D)."""
-        pose = self.process.add_noise(x0[..., :POSE_FEATURES], t, noise[..., :POSE_FEATURES])
-        category = x0[..., POSE_FEATURES:].argmax(dim=-1)
-        return self.clamp(self._with_states(pose, self.categories.marginal(category, t.expand(len(x0))), noise))
-
-    @staticmethod
-    def _with_states(pose: Tensor, probs: Tensor, noise: Tensor) -> Tensor:
-        """``pose`` (B, N, 12) beside states drawn from ``probs`` (B, N, K + 1) by ``noise`` (B, N, D)."""
-        random = torch.ones(pose.shape[1], dtype=torch.bool, device=pose.device)
-        return MixedStep(pose, torch.zeros_like(pose[0]), probs, random).from_noise(noise)
 
     # -- the reverse chain ----------------------------------------------------------------------
 
@@ -250,7 +175,7 @@ class MixedPrior(TrainableMixedPrior):
         mean, std = self.process.posterior(x_t[..., :POSE_FEATURES], pose, t, previous, residual, eta)
         states = x_t[..., POSE_FEATURES:]
         state = state_of(states)
-        logits = logits.masked_fill(self._barred(state), -torch.inf)
+        logits = logits.masked_fill(self.barred_categories(state), -torch.inf)
         probs = self.categories.posterior(state, logits.softmax(dim=-1), t, previous)
         slots, fixed = x_t.shape[1], len(self.scene_type.fixed)
         random = torch.full((slots,), previous > 0, device=x_t.device)
@@ -268,18 +193,6 @@ class MixedPrior(TrainableMixedPrior):
         estimate = torch.cat([pose, F.one_hot(category, self.num_categories).to(pose)], dim=-1).detach()
         return MixedStep(clamped[..., :POSE_FEATURES], std * (~known).to(mean.dtype), probs, random, masked, estimate)
 
-    def _barred(self, state: Tensor) -> Tensor:
-        """(B, N, K) bool: categories of x_0 with probability 0, given states (B, N) of x_t.
-
-        These are the categories of fixed objects, in all slots but theirs. A slot that holds one as an observed entry
-        keeps it where the chain only absorbs.
-        """
-        barred = torch.zeros(*state.shape, self.num_categories, dtype=torch.bool, device=state.device)
-        barred[:, len(self.scene_type.fixed) :, list(self.scene_type.fixed_categories)] = True
-        if self.categories.only_absorbs:
-            barred &= F.one_hot(state, self.num_categories + 1)[..., :-1] == 0
-        return barred
-
     def regenerate(
         self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int,
         prompts: Sequence[str] | None = None, guidance: float = 0.0, hook: Hook | None = None,
@@ -289,7 +202,7 @@ class MixedPrior(TrainableMixedPrior):
         observed = Observed(self.encode(batch), ~mask[..., 0], ~mask[..., 1])
         noise = draw_noise(observed.x, generators)
         probs = self.categories.prior().to(noise).expand(*noise.shape[:2], -1)
-        start = self.clamp(self._with_states(noise[..., :POSE_FEATURES], probs, noise))
+        start = self.clamp(self.with_states(noise[..., :POSE_FEATURES], probs, noise))
         return self.run_chain(start, table, generators, observed, text, guidance, resample, hook=hook)
 
     @torch.no_grad()
@@ -331,7 +244,7 @@ class MixedPrior(TrainableMixedPrior):
         """A sample of q(x_t | x_s), s < t."""
         pose = self.process.renoise(x_s[..., :POSE_FEATURES], s, t, noise[..., :POSE_FEATURES])
         rows = self.categories.transition(s, t).to(x_s)[state_of(x_s[..., POSE_FEATURES:])]
-        return self.clamp(self._with_states(pose, rows, noise))
+        return self.clamp(self.with_states(pose, rows, noise))
 
     @torch.no_grad()
     def _sample_chunk(

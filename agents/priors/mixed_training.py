@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
-
 import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
-from agents.diffusion import CategoricalProcess, ResidualVariance, StepTable
+from agents.diffusion import ResidualVariance, StepTable
 from agents.diffusion.reverse_steps import state_of
 from agents.diffusion.weighting import loss_weights
-from agents.networks.mixed_denoiser import MixedDenoiser, Observed
+from agents.networks.mixed_denoiser import Observed
 from agents.networks.text import Text
-from agents.priors.base import ScenePrior
-from agents.priors.config import MixedPriorConfig
 from agents.priors.forward import DenoiserOutput, NoisedScenes
-from agents.priors.text import PromptReader
+from agents.priors.mixed_states import MixedStates
 from scene_envs.scene import POSE_FEATURES
 
 _EMPTY_WEIGHT = 0.1
@@ -29,26 +25,8 @@ _AT_ONCE = 32
 """Scenes whose residual is measured at once: features of all pairs of slots of 512 rooms would be gigabytes."""
 
 
-class TrainableMixedPrior(PromptReader, ScenePrior):
+class TrainableMixedPrior(MixedStates):
     """The part of :class:`~agents.priors.mixed.MixedPrior` that is needed to train it."""
-
-    mixed: MixedPriorConfig
-    denoiser: MixedDenoiser
-    categories: CategoricalProcess
-    """The process of the categories."""
-
-    @property
-    @abstractmethod
-    def num_categories(self) -> int:
-        """K = C + 1."""
-
-    @abstractmethod
-    def observed_entries(self, x: Tensor, observed: Observed | None = None) -> Observed | None:
-        """Observed entries of scenes ``x`` (B, N, D) for the network."""
-
-    @abstractmethod
-    def add_noise(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
-        """A sample of q(x_t | x_0) from standard normal noise (B, N, D)."""
 
     def noised_loss(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
         """(B,) mean squares of the pose output plus ``category_weight`` times the category loss, where unobserved."""

@@ -46,21 +46,4 @@ __all__ = [
     "register_mask",
 ]
 
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "scene_envs.envs.branchable": ["NotBranchableError", "check_branchable"],
-        "scene_envs.envs.denoising": ["DenoisingCore"],
-        "scene_envs.envs.denoising_gymnasium": ["DenoisingEnv"],
-        "scene_envs.envs.denoising_torchrl": ["DenoisingTorchRLEnv"],
-        "scene_envs.envs.denoising_vector": ["DenoisingVectorEnv"],
-        "scene_envs.envs.errors": ["ResetNeededError"],
-        "scene_envs.envs.masks": ["MaskGenerator", "list_masks", "register_mask"],
-        "scene_envs.envs.scoring": ["Score"],
-        "scene_envs.envs.search": ["SearchProblem", "SearchState"],
-        "scene_envs.envs.search_gymnasium": ["SearchEnv"],
-        "scene_envs.envs.search_masks": ["MaskChoiceProblem", "MaskChoiceState"],
-        "scene_envs.envs.search_masks_gymnasium": ["SearchMaskEnv"],
-        "scene_envs.envs.trajectories": ["StepResult", "Trajectories"],
-    },
-)
+__getattr__ = lazy_names(__name__, __file__)

@@ -5,12 +5,14 @@ Names load on first use, so that worker processes start without torch.
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from scene_envs.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from scene_envs.physics.api import equilibrium, feasibility, make_ready, penetration, project, settle
+    from scene_envs.physics.api import equilibrium, feasibility, penetration, project, settle
     from scene_envs.physics.pool import PhysicsPool
+    from scene_envs.physics.readiness import make_ready
     from scene_envs.physics.results import (
         EquilibriumResult,
         FeasibilityResult,
@@ -20,8 +22,6 @@ if TYPE_CHECKING:
         ReadyResult,
         SettleResult,
     )
-
-_API = ("equilibrium", "feasibility", "make_ready", "penetration", "project", "settle")
 
 __all__ = [
     "EquilibriumResult",
@@ -40,9 +40,4 @@ __all__ = [
     "settle",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module 'scene_envs.physics' has no attribute {name!r}")
-    module = "api" if name in _API else "pool" if name == "PhysicsPool" else "results"
-    return getattr(import_module(f"scene_envs.physics.{module}"), name)
+__getattr__ = lazy_names(__name__, __file__)

@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
-
 import torch
-from torch import Tensor
 
 from scene_envs.errors import InvalidInputError
-from scene_envs.physics.batches import poses_after, run_kernel, spent, stack, valid_rows
-from scene_envs.physics.motion import CONVERGED, ITERATIONS
+from scene_envs.physics.batches import poses_after, run_kernel, stack, valid_rows
+from scene_envs.physics.motion import ITERATIONS
 from scene_envs.physics.pool import PhysicsPool
 from scene_envs.physics.results import (
     EquilibriumResult,
@@ -20,32 +14,9 @@ from scene_envs.physics.results import (
     ObjectPair,
     PenetrationResult,
     ProjectionResult,
-    ReadyResult,
     SettleResult,
 )
 from scene_envs.scene import SceneBatch
-
-_READY_DEPTH = 1e-4
-"""How deep a ready object may overlap another one (m)."""
-_LEAN = 0.12
-"""Angle (rad) by which gravity may lean before a ready object gives way: what leans and only just holds in one
-simulator creeps in the next."""
-_STAYS: dict[str, Any] = {"max_displacement": 1e-3, "max_rotation": 1e-2}
-_HOLDS: dict[str, Any] = {"max_displacement": 2e-3, "max_rotation": 2e-2, "duration": 0.5}
-_LASTING: tuple[dict[str, Any], ...] = ({"duration": 2.0} | _STAYS, {"duration": 2.0} | _STAYS)
-"""Time (s) and limits of motion (m, rad) of what is ready: once, and again where something was struck."""
-_UPRIGHT: tuple[dict[str, Any], ...] = ({"duration": 0.1} | _STAYS, {"duration": 0.5} | _STAYS)
-"""The shorter trials by which every round is judged first: they find most of what moves, at less cost."""
-_LEANING: tuple[dict[str, Any], ...] = tuple(
-    {"tilt": (x * _LEAN / math.sqrt(2), y * _LEAN / math.sqrt(2))} | _HOLDS for x in (-1, 1) for y in (-1, 1)
-)
-"""The same and directions of gravity: in a round for scenes that stay upright, in the end for the others."""
-_PATIENCE = 2
-"""Rounds without more ready objects after which a scene is left as it is."""
-_ROUNDS_SHARE = 0.5
-"""Share of a scene's work that the rounds may do; the rest is for the trials at the end."""
-_UNMOVED = 1e-4
-"""Motion (m) below which an object is believed not to depend on others that move."""
 
 
 def feasibility(
@@ -174,170 +145,3 @@ def project(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> Projection
         heap=stack(rows, batch, "heap", torch.bool, shape=()),
         valid=valid_rows(rows),
     )
-
-
-def make_ready(
-    batch: SceneBatch, *, duration: float = 1.5, rounds: int = 5, pool: PhysicsPool | None = None
-) -> ReadyResult:
-    """Project, settle, then count the simulation-ready objects.
-
-    A free object is ready when it is inside the workspace, overlaps nothing deeper than 0.1 mm, and stays within 1 mm
-    and 0.01 rad of where it is for 2 s of simulation, also without the objects that are not ready. In the end it has to
-    stay within 2 mm and 0.02 rad for half a second when gravity leans by 0.12 rad, in each of four directions: a stack
-    that leans and only just holds is not ready. Objects whose rest has a closed form need no simulation.
-
-    Scenes with objects in the workspace that are not ready go through projection and settling again, with more solver
-    iterations, up to ``rounds`` times in all, until two in a row have made no more of them ready. The round with most
-    ready objects is kept, the earliest of equal ones. A heap, whose objects are so deep in each other that projection
-    has to spread them, is invalid. All rounds of a scene together do half of the work that :func:`settle` may do, and
-    the last trials the rest; where it does not suffice, the scene is the best of the rounds that ended, what was not
-    judged is not ready, and ``finished`` is False.
-
-    Args:
-        batch: B scenes of N slots.
-        duration: longest time to settle in each round, s.
-        rounds: most rounds per scene, at least 1.
-        pool: worker processes; None computes in this process.
-
-    Raises InvalidInputError, also for ``rounds`` below 1, and MissingDependencyError as :func:`feasibility` does.
-    """
-    if rounds < 1:
-        raise InvalidInputError(f"rounds={rounds} must be at least 1: each projects and settles once")
-    units = stack(run_kernel("units", batch, {}, pool), batch, "units", torch.float64, shape=())
-    reserve = (1.0 - _ROUNDS_SHARE) * units
-    units = units - reserve
-    best = last = _make_ready_once(batch, duration, ITERATIONS, units, pool)
-    tensor, ready, counts = best.batch.tensor.clone(), best.ready.clone(), best.counts.clone()
-    lasting = best.lasting.clone()
-    scenes = torch.arange(len(batch))  # that went through the last round
-    without_gain = torch.zeros(len(batch), dtype=torch.int64)  # rounds in a row
-    for _ in range(rounds - 1):
-        unready = last.batch.is_free & last.batch.in_workspace & ~last.ready
-        again = last.finished & (without_gain[scenes] < _PATIENCE) & unready.any(dim=-1)
-        if not again.any():
-            break
-        scenes = scenes[again]
-        left = units[scenes]
-        last = _make_ready_once(last.batch[again.nonzero()[:, 0]], duration, CONVERGED, left, pool)
-        units[scenes] = left
-        better = last.counts > counts[scenes]
-        without_gain[scenes] = (without_gain[scenes] + 1) * ~better
-        improved = scenes[better]
-        tensor[improved], ready[improved] = last.batch.tensor[better], last.ready[better]
-        counts[improved], lasting[improved] = last.counts[better], last.lasting[better]
-    final = SceneBatch(tensor, best.batch.scene_type)
-    finished = best.valid & (units > 0)
-    due = (~lasting).nonzero()[:, 0]
-    left = (units + reserve)[due]
-    ready[due] = _strike(final[due], ready[due], _LEANING, left, pool)
-    ready[due] = _strike_until_still(final[due], ready[due], left, pool)
-    finished[due] &= left > 0
-    return ReadyResult(final, ready, ready.sum(dim=-1), finished, best.valid)
-
-
-def _keep(batch: SceneBatch, kept: Tensor) -> SceneBatch:
-    """The scenes with all free objects but ``kept`` (B, N) removed."""
-    categories = batch.categories.masked_fill(batch.is_free & ~kept, batch.scene_type.num_assets)
-    return SceneBatch.from_parts(batch.translations, batch.rotations, categories, batch.scene_type)
-
-
-@dataclass(frozen=True, eq=False)
-class _Round:
-    """Scenes after one round of :func:`make_ready`.
-
-    Attributes:
-        batch: the settled scenes.
-        ready: (B, N) free objects that passed the trials of a round.
-        valid: (B,) whether projection and settling gave an answer.
-        finished: (B,) whether the work did not end early.
-        lasting: (B,) whether all that is ready stayed for the whole time.
-    """
-
-    batch: SceneBatch
-    ready: Tensor
-    valid: Tensor
-    finished: Tensor
-    lasting: Tensor
-
-    @property
-    def counts(self) -> Tensor:
-        """(B,) ready objects."""
-        return self.ready.sum(dim=-1)
-
-
-def _make_ready_once(
-    batch: SceneBatch, duration: float, iterations: int, units: Tensor, pool: PhysicsPool | None
-) -> _Round:
-    """One round of :func:`make_ready`; takes the work done off ``units`` (B,), in place."""
-    projected = project(batch, pool=pool)
-    rows = (projected.valid & ~projected.heap).nonzero()[:, 0]
-    options = {"duration": duration, "iterations": iterations}
-    settling = run_kernel("settle", projected.batch[rows], options, pool, units[rows])
-    settled, settled_valid = poses_after(settling, projected.batch[rows])[0], valid_rows(settling)
-    left = units[rows] - spent(settling)
-    tensor, ready = projected.batch.tensor.clone(), torch.zeros_like(projected.batch.is_empty)
-    valid, lasting = torch.zeros(len(batch), dtype=torch.bool), torch.zeros(len(batch), dtype=torch.bool)
-    still, lasting[rows] = _judge_round(settled, left, pool)
-    tensor[rows], ready[rows] = settled.tensor, still & settled_valid[:, None]
-    units[rows], valid[rows] = left, settled_valid
-    return _Round(SceneBatch(tensor, batch.scene_type), ready, valid, valid & (units > 0), lasting)
-
-
-def _judge_round(batch: SceneBatch, units: Tensor, pool: PhysicsPool | None) -> tuple[Tensor, Tensor]:
-    """(B, N) free objects that stay in the trials of a round, and (B,) whether no trial at all found one that moves.
-
-    Only scenes of which everything in the workspace stays in the short trials go through the others, leaning gravity
-    first and then the longest: scenes that fail have another round. Takes the work done off ``units`` (B,), in place.
-    """
-    candidates = batch.is_free & batch.in_workspace
-    ready = _strike(batch, candidates & (units > 0)[:, None], _UPRIGHT, units, pool)
-    complete = ((ready == candidates).all(dim=-1) & (units > 0)).nonzero()[:, 0]
-    lasting = torch.zeros(len(batch), dtype=torch.bool)
-    for trials in (_LEANING, _LASTING[:1]):
-        left = units[complete]
-        stays = _strike(batch[complete], ready[complete], trials, left, pool)
-        unmoved = (stays == ready[complete]).all(dim=-1)
-        ready[complete], units[complete] = stays, left
-        complete = complete[unmoved]
-    lasting[complete] = True
-    return ready, lasting
-
-
-def _strike(
-    batch: SceneBatch, ready: Tensor, trials: Sequence[dict[str, Any]], units: Tensor, pool: PhysicsPool | None
-) -> Tensor:
-    """``ready`` (B, N) without the objects that move in one of the trials, each without those struck before."""
-    ready = ready.clone()
-    scenes = ready.any(dim=-1).nonzero()[:, 0]
-    for trial in trials if len(scenes) else ():
-        ready[scenes] &= _judge(_keep(batch[scenes], ready[scenes]), scenes, trial, units, pool)[0]
-    return ready
-
-
-def _strike_until_still(batch: SceneBatch, ready: Tensor, units: Tensor, pool: PhysicsPool | None) -> Tensor:
-    """``ready`` (B, N) without the objects that move in the longest trial, repeated where it struck something.
-
-    Where it strikes something again, everything that moved is struck with it.
-    """
-    ready = ready.clone()
-    scenes = ready.any(dim=-1).nonzero()[:, 0]
-    still = ready[scenes]
-    for trial in _LASTING:
-        if not len(scenes):
-            break
-        feasible, displacement = _judge(_keep(batch[scenes], ready[scenes]), scenes, trial, units, pool)
-        struck = (ready[scenes] & ~feasible).any(dim=-1)
-        ready[scenes] &= feasible
-        scenes, still = scenes[struck], (displacement < _UNMOVED)[struck]
-    ready[scenes] &= still
-    return ready
-
-
-def _judge(
-    kept: SceneBatch, scenes: Tensor, trial: dict[str, Any], units: Tensor, pool: PhysicsPool | None
-) -> tuple[Tensor, Tensor]:
-    """Which objects (b, N) stay where they are, none where invalid, and their displacement (b, N) m."""
-    options = {"max_penetration": _READY_DEPTH} | trial
-    rows = run_kernel("feasibility", kept, options, pool, units[scenes])
-    units[scenes] -= spent(rows)
-    return stack(rows, kept, "feasible", torch.bool), stack(rows, kept, "displacement")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scene_envs.physics.collision import ObjectPairs
+from scene_envs.physics.pairs import ObjectPairs
 from scene_envs.physics.placement import Objects
 
 PER_SCENE, PER_OBJECT, PER_PAIR, MOST_PER_OBJECT = 1_000.0, 1_200.0, 500.0, 10_000.0

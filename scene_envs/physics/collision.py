@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from scene_envs.physics.geometry import LibraryGeometry
 from scene_envs.physics.narrowphase import PenetrationDepth
+from scene_envs.physics.pairs import Contacts, ObjectPairs
 from scene_envs.physics.placement import Objects, PlacedObjects, object_boxes, part_pairs, place
 from scene_envs.physics.separation import separations
 
@@ -26,111 +26,6 @@ NEAR_FIXED = 0.06
 """and up to this far (m) in height where one of the two is fixed: what falls onto it has a closed form."""
 _TOO_MANY = 20_000_000
 """Corner tests in the overlapping object pairs of one scene from which its depths are upper bounds."""
-
-
-@dataclass(frozen=True, eq=False)
-class Contacts:
-    """Near pairs of parts.
-
-    Attributes:
-        first: (Q,) object rows.
-        second: (Q,) object rows, larger than ``first``.
-        part_first: (Q,) part of the first object in the library.
-        part_second: (Q,) part of the second.
-        gap: (Q,) m along ``direction``; the true distance is at least this much.
-        direction: (Q, 3) unit vector in the world, from the first part to the second.
-    """
-
-    first: Index
-    second: Index
-    part_first: Index
-    part_second: Index
-    gap: Array
-    direction: Array
-
-    def among(self, number: Index) -> Contacts:
-        """The contacts of objects whose new ``number`` (n,) is not negative, renumbered."""
-        first, second = number[self.first], number[self.second]
-        return replace(self, first=first, second=second)[(first >= 0) & (second >= 0)]
-
-    def __getitem__(self, rows: Index | Mask) -> Contacts:
-        return Contacts(
-            self.first[rows],
-            self.second[rows],
-            self.part_first[rows],
-            self.part_second[rows],
-            self.gap[rows],
-            self.direction[rows],
-        )
-
-    def __add__(self, other: Contacts) -> Contacts:
-        return Contacts(
-            np.concatenate([self.first, other.first]),
-            np.concatenate([self.second, other.second]),
-            np.concatenate([self.part_first, other.part_first]),
-            np.concatenate([self.part_second, other.part_second]),
-            np.concatenate([self.gap, other.gap]),
-            np.concatenate([self.direction, other.direction]),
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class ObjectPairs:
-    """Pairs of objects whose boxes are near each other.
-
-    Attributes:
-        first: (P,) row of the object.
-        second: (P,) row of the other object, larger than ``first``.
-        gap: (P,) m, signed gap of the coarse parts along ``direction``.
-        direction: (P, 3) unit vector in the world, from the first object to the second.
-        depth: (P,) m, how deep the fine parts overlap; 0 when they do not.
-        total: (P,) m, the sum of the depths of all overlapping fine parts (only when asked for).
-        part_count: (P,) overlapping fine part pairs (only when asked for).
-        low: (n, 3) lowest corner of each object's box, m.
-        high: (n, 3) highest corner of each object's box, m.
-        contacts: near pairs of their coarse parts.
-        rough: (P,) bool; the depth is an upper bound, from face planes of the coarse parts, because exact depths of the
-            scene would take too long.
-    """
-
-    first: Index
-    second: Index
-    gap: Array
-    direction: Array
-    depth: Array
-    total: Array
-    part_count: Index
-    low: Array
-    high: Array
-    contacts: Contacts
-    rough: Mask
-
-    def among(self, rows: Index) -> ObjectPairs:
-        """The pairs of the objects ``rows`` (m,), ascending, renumbered to 0..m-1."""
-        number = np.full(len(self.low), -1, dtype=np.int64)
-        number[rows] = np.arange(len(rows))
-        first, second = number[self.first], number[self.second]
-        kept = (first >= 0) & (second >= 0)
-        return ObjectPairs(
-            first[kept],
-            second[kept],
-            self.gap[kept],
-            self.direction[kept],
-            self.depth[kept],
-            self.total[kept],
-            self.part_count[kept],
-            self.low[rows],
-            self.high[rows],
-            self.contacts.among(number),
-            self.rough[kept],
-        )
-
-    def deepest(self) -> Array:
-        """(n,) m, the deepest overlap of each object."""
-        depth = np.zeros(len(self.low))
-        np.maximum.at(depth, self.first, self.depth)
-        np.maximum.at(depth, self.second, self.depth)
-        return depth
 
 
 class Collider:

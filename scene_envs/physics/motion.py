@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_envs.physics.budget import Budget
-from scene_envs.physics.collision import Collider, ObjectPairs
+from scene_envs.physics.collision import Collider
 from scene_envs.physics.geometry import LibraryGeometry, library_geometry
+from scene_envs.physics.pairs import ObjectPairs
 from scene_envs.physics.placement import Objects, object_boxes, place
 from scene_envs.physics.rest import Rest, Statics
 from scene_envs.physics.support import Support, clusters, company
@@ -24,14 +25,10 @@ Mask = NDArray[np.bool_]
 
 _LOGGER = logging.getLogger(__name__)
 
-_SEGMENT = 0.25
-"""Seconds after which settling looks again at which shapes it needs, and whether anything still moves."""
 _FAR, _MARGIN = 2e-3, 1e-3
 """What moved further than this (m) may have met others, whose boxes are within that distance (m) of its way."""
 _MEETINGS = 4
 """How often to look again with what was met."""
-_STILL, _STILL_ANGLE = 5e-5, 5e-4
-"""An object that moved less than this (m, rad) in a segment has come to rest."""
 _TALL = 3
 """Objects on this many others are where the solver's own sinking becomes visible."""
 _HIGH = 7
@@ -278,50 +275,6 @@ def _merge(objects: Objects, pairs: ObjectPairs, group: Index, first: Index, sec
     # One cluster for all of them: they are few, and what was at rest is at rest again.
     group[due] = int(group.max()) + 1
     return due
-
-
-def settle_scene(
-    physics: Physics,
-    objects: Objects,
-    pairs: ObjectPairs,
-    duration: float,
-    iterations: int,
-    bottom: float,
-    budget: Budget,
-) -> tuple[Array, Array, bool]:
-    """Let one scene come to rest: rotation (n, 3, 3), translation (n, 3) m, and whether it stayed finite.
-
-    Args:
-        physics: of the scene's assets.
-        objects: of one scene.
-        pairs: their near pairs.
-        duration: s, the longest time to simulate.
-        iterations: of the solver per step.
-        bottom: height (m) below which objects are left where they are.
-        budget: units of simulation; when they are spent, objects stay where they have got to.
-    """
-    current = objects
-    calm = np.zeros(len(objects), dtype=bool)  # was simulated, and did not move
-    remaining = duration
-    while remaining > 1e-9 and not budget.is_spent:
-        span = min(_SEGMENT, remaining)
-        remaining -= span
-        rest = physics.rest(current, pairs, span)
-        active = ~(rest.still | current.fixed)
-        fallen = active & (current.translation[:, 2] < bottom)
-        done = fallen | active & ~company(current, pairs, active & ~calm & ~fallen)
-        rest = Rest(rest.still | done, rest.rise, rest.tilt)
-        if not (active & ~done).any() and (np.abs(rest.rise) < _STILL).all():
-            break
-        moved = advance(physics, current, pairs, rest, span, budget, settling=iterations)
-        if not moved.is_finite:
-            return objects.rotation, objects.translation, False
-        far = np.linalg.norm(moved.translation - current.translation, axis=1)
-        calm = (far < _STILL) & (moved.angle < _STILL_ANGLE)
-        current = replace(current, rotation=moved.rotation, translation=moved.translation)
-        if remaining > 1e-9 and not budget.is_spent:
-            pairs = physics.collider.pairs(current)
-    return current.rotation, current.translation, True
 
 
 def settings_for(height: int) -> SolverSettings:

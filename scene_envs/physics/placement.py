@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_envs.physics.geometry import LevelGeometry, LibraryGeometry
+from scene_envs.physics.rows import Rows
 from scene_envs.physics.separation import PlacedParts, rotate
 
 Array = NDArray[np.float64]
@@ -18,7 +19,7 @@ Level = Literal["fine", "coarse"]
 
 
 @dataclass(frozen=True, eq=False)
-class Objects:
+class Objects(Rows):
     """The non-empty slots of some scenes, flattened.
 
     Attributes:
@@ -39,16 +40,6 @@ class Objects:
 
     def __len__(self) -> int:
         return len(self.scene)
-
-    def __getitem__(self, rows: Index | Mask) -> Objects:
-        return Objects(
-            self.scene[rows],
-            self.slot[rows],
-            self.category[rows],
-            self.rotation[rows],
-            self.translation[rows],
-            self.fixed[rows],
-        )
 
 
 def flatten(

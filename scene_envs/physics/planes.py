@@ -12,6 +12,7 @@ from scipy.sparse import csr_array
 from scene_envs.physics.budget import Budget
 from scene_envs.physics.collision import Collider, scene_pairs
 from scene_envs.physics.placement import Objects, object_boxes, part_pairs, place
+from scene_envs.physics.rows import Rows
 from scene_envs.physics.separation import grouped_gaps
 from scene_envs.physics.support import components
 
@@ -40,7 +41,7 @@ _ROWS_SQUARED = 25.0
 
 
 @dataclass(frozen=True, eq=False)
-class Planes:
+class Planes(Rows):
     """Half-spaces: ``direction . (x_second - x_first) >= bound``; object -1 is the world's origin.
 
     Attributes:
@@ -54,14 +55,6 @@ class Planes:
     second: Index
     direction: Array
     bound: Array
-
-    def __add__(self, other: Planes) -> Planes:
-        return Planes(
-            np.concatenate([self.first, other.first]),
-            np.concatenate([self.second, other.second]),
-            np.concatenate([self.direction, other.direction]),
-            np.concatenate([self.bound, other.bound]),
-        )
 
 
 def near_pairs(collider: Collider, objects: Objects) -> tuple[Index, Index]:

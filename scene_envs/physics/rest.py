@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from scene_envs.physics import rigid
-from scene_envs.physics.collision import NEAR, Contacts, ObjectPairs, scene_pairs
+from scene_envs.physics.collision import NEAR, scene_pairs
 from scene_envs.physics.constants import GRAVITY
 from scene_envs.physics.geometry import AssetGeometry, LibraryGeometry
+from scene_envs.physics.pairs import Contacts, ObjectPairs
 from scene_envs.physics.parts import PartGeometry
 from scene_envs.physics.placement import Objects
+from scene_envs.physics.rows import Rows
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -39,7 +41,7 @@ _DEEPEST = 2e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Rest:
+class Rest(Rows):
     """Objects whose motion has a closed form.
 
     Attributes:
@@ -51,9 +53,6 @@ class Rest:
     still: Mask
     rise: Array
     tilt: Array
-
-    def __getitem__(self, rows: Index) -> Rest:
-        return Rest(self.still[rows], self.rise[rows], self.tilt[rows])
 
 
 @dataclass(frozen=True, eq=False)

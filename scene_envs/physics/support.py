@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from scene_envs.physics.collision import ObjectPairs
 from scene_envs.physics.contact_faces import ContactFace
 from scene_envs.physics.geometry import LibraryGeometry
+from scene_envs.physics.pairs import ObjectPairs
 from scene_envs.physics.placement import Objects
 
 Array = NDArray[np.float64]

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import FeasibilityResult, equilibrium, feasibility, make_ready, settle
-from scene_envs.physics.collision import ObjectPairs
 from scene_envs.physics.motion import Physics, physics_of
+from scene_envs.physics.pairs import ObjectPairs
 from scene_envs.physics.placement import Objects
 from scene_envs.physics.rest import Rest
 from scene_envs.physics.world import World

@@ -11,7 +11,8 @@ from scipy.optimize import brentq
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
-from agents.post_training.forward_losses import AWMLoss, ForwardProcessLoss, NFTLoss, RewardWeightedLoss
+from agents.post_training.forward_losses import AWMLoss, NFTLoss, RewardWeightedLoss
+from agents.post_training.forward_process_loss import ForwardProcessLoss
 from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError

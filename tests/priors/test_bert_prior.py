@@ -17,8 +17,9 @@ from agents.pretraining.config import PretrainConfig
 from agents.pretraining.initial_prior import build_prior
 from agents.pretraining.trainer import pretrain
 from agents.priors.base import ScenePrior
-from agents.priors.card import PriorFacts, package_prior
+from agents.priors.card import package_prior
 from agents.priors.checkpoint_import import import_checkpoint
+from agents.priors.facts import PriorFacts
 from agents.priors.mixed import MixedPrior
 from scene_envs.datasets import SceneDataset
 from scene_envs.datasets.prompts import describe_all

@@ -34,7 +34,8 @@ class PackagePriorConfig:
 
 def run(settings: PackagePriorConfig) -> None:
     """Write the folder; it is the prior itself, so that no log goes into it."""
-    from agents.priors.card import PriorFacts, package_prior
+    from agents.priors.card import package_prior
+    from agents.priors.facts import PriorFacts
     from scene_envs.errors import InvalidInputError
 
     if not settings.prior or not settings.output:

@@ -21,7 +21,8 @@ class PriorsConfig:
 
 def run(settings: PriorsConfig) -> None:
     """Print every shipped prior with its size and its figures, or one card."""
-    from agents.priors.card import README, PriorFacts
+    from agents.priors.card import README
+    from agents.priors.facts import PriorFacts
     from agents.priors.files import find_prior, list_priors
 
     if settings.prior:

@@ -1,0 +1,229 @@
+"""What the losses of forward-process reinforcement learning have in common, as a torchrl loss.
+
+They weight the pretraining loss of finished scenes by how good the scenes were. They need no log-probabilities, no
+stored trajectories and no particular sampler.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Generator, Tensor
+from torchrl.objectives import LossModule
+
+from agents.networks.text import Text
+from agents.post_training.expectation import Expectation
+from agents.priors.base import ScenePrior
+from agents.priors.forward import NoisedScenes
+from scene_envs.errors import InvalidInputError
+
+
+class ForwardProcessLoss(LossModule):
+    """A loss of finished scenes x_0 at random timesteps of the forward process.
+
+    Every scene is noised once per call. The trained denoiser says o, the sampling policy's denoiser says o_old, and a
+    subclass says what the loss of an entry is, given the advantage of its slot. Squared errors are weighted and reduced
+    as in pretraining: a mean over the entries of a scene, then over the valid scenes. Losses of categories are a mean
+    over the slots whose category is masked at that timestep, times the prior's ``category_weight``.
+
+    The error of a sample is its target minus the mean target of own samples at that noised scene. ``expectation``
+    learns this mean; without one o_old stands for it, and where all samples are bad its own error drives it off.
+
+    Poses take ``advantage``, categories ``category_advantage``; each is one number per scene or one per slot. In x_t
+    every slot sees the others, so an advantage per slot credits an object for its own pose alone.
+
+    Accepted keys (``set_keys``):
+        scene: (B, N, D) float, finished scenes x_0 as the prior encodes them. Default ``"scene"``.
+        advantage: (B,), (B, 1) or (B, N) float, for poses. Default ``"advantage"``.
+        category_advantage: the same for categories, optional; without it they have no credit. Default
+            ``"category_advantage"``.
+        timestep: (B,) or (B, 1) int64, optional; drawn as in pretraining without. Default ``"timestep"``.
+        valid: (B,) or (B, 1) bool, optional; False rows are left out of the mean. Default ``"valid"``.
+        text, text_mask: (B, L, W) tokens and (B, L) their mask, optional. Default ``"text"`` and ``"text_mask"``.
+
+    Args:
+        prior: what is trained.
+        sampler: what made the scenes, such as a slower copy of ``prior``; its weights get no gradient.
+        base: what training began with; needed for ``push_limit``.
+        expectation: of the targets over own samples, trained by ``loss_expectation``; None takes o_old for it.
+        push_limit: a bad pose pushes only while the squared error of o_old on it is at most this many times that of
+            the base prior; 0 for no limit.
+        generator: source of timesteps, noise and observed entries (CPU); None for torch's own.
+
+    Returns (``forward``): ``loss_objective`` (); ``loss_expectation`` (), its pretraining loss on the scenes, 0 without
+        one; and detached ``distance`` (), the root mean square of o - o_old, and ``limited`` (), the share of bad poses
+        that do not push any more.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        scene: NestedKey = "scene"
+        advantage: NestedKey = "advantage"
+        category_advantage: NestedKey = "category_advantage"
+        timestep: NestedKey = "timestep"
+        valid: NestedKey = "valid"
+        text: NestedKey = "text"
+        text_mask: NestedKey = "text_mask"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_objective", "loss_expectation", "distance", "limited"]  # noqa: RUF012  (torchrl reads lists)
+    prior: ScenePrior
+    generator: Generator | None
+
+    def __init__(
+        self,
+        prior: ScenePrior,
+        sampler: ScenePrior,
+        *,
+        base: ScenePrior | None = None,
+        push_limit: float = 0.0,
+        expectation: Expectation | None = None,
+        generator: Generator | None = None,
+    ) -> None:
+        super().__init__()
+        if push_limit < 0:
+            raise InvalidInputError(f"push_limit={push_limit} must not be negative; 0 is for no limit")
+        if push_limit and base is None:
+            raise InvalidInputError(f"push_limit={push_limit} compares with the base prior; give base=")
+        self.prior = prior
+        self.generator = generator
+        self.push_limit = push_limit
+        self.expectation = expectation
+        self._others = (sampler, base)  # in a tuple: not modules of the loss, whose parameters are the prior's
+
+    @property
+    def sampler(self) -> ScenePrior:
+        """What made the scenes."""
+        return self._others[0]
+
+    @property
+    def base(self) -> ScenePrior | None:
+        """What training began with."""
+        return self._others[1]
+
+    @property
+    def functional(self) -> bool:
+        """False: the prior's own parameters receive the gradient."""
+        return False
+
+    @property
+    def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
+        """Keys that must be present."""
+        return [self.tensor_keys.scene, self.tensor_keys.advantage]
+
+    def _forward_value_estimator_keys(self, **kwargs: object) -> None:
+        """These losses have no value estimator."""
+
+    @abstractmethod
+    def continuous_loss(self, output: Tensor, old: Tensor, target: Tensor, advantage: Tensor) -> Tensor:
+        """Losses of continuous entries; all arguments broadcast to (B, N, F).
+
+        Args:
+            output: o of the denoiser in training.
+            old: o_old of the sampling policy, a constant.
+            target: what a denoiser should have said of this noise.
+            advantage: of each entry's slot.
+        """
+
+    @abstractmethod
+    def category_loss(self, logits: Tensor, old: Tensor, category: Tensor, advantage: Tensor) -> Tensor:
+        """(B, N) losses of categories.
+
+        Args:
+            logits: (B, N, K) of the denoiser in training.
+            old: (B, N, K) of the sampling policy, constants.
+            category: (B, N) int64, the clean categories.
+            advantage: (B, 1) or (B, N).
+        """
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """The loss of a batch of finished scenes.
+
+        Raises:
+            InvalidInputError: an advantage has neither one value per scene nor one per slot.
+        """
+        flat = tensordict.reshape(-1)
+        timestep = flat.get(self.tensor_keys.timestep, None)
+        scene = flat.get(self.tensor_keys.scene).detach()
+        noised = self.prior.noised(scene, self.generator, None if timestep is None else timestep.reshape(-1))
+        return self.of_noised(noised, flat)
+
+    def of_noised(self, noised: NoisedScenes, flat: TensorDictBase) -> TensorDict:
+        """The loss of a batch of shape [B] whose scenes the prior has noised already."""
+        keys = self.tensor_keys
+        scene = flat.get(keys.scene)
+        advantage = self._advantage(flat, keys.advantage, scene)
+        credit = self._advantage(flat, keys.category_advantage, scene)
+        tokens, mask = flat.get(keys.text, None), flat.get(keys.text_mask, None)
+        text = None if tokens is None or mask is None else (tokens.detach(), mask)
+        valid = flat.get(keys.valid, None)
+        kept = torch.ones(len(scene), dtype=torch.bool, device=scene.device) if valid is None else valid.reshape(-1)
+        losses, expectation, distance, limited = self._losses(noised, text, advantage, credit)
+        count = kept.sum().clamp(min=1)
+        fields = {
+            "loss_objective": torch.where(kept, losses, 0.0).sum() / count,
+            "loss_expectation": torch.where(kept, expectation, 0.0).sum() / count,
+            "distance": (torch.where(kept, distance, 0.0).sum() / count).sqrt(),
+            "limited": limited,
+        }
+        return TensorDict(fields, [])
+
+    def _losses(
+        self, noised: NoisedScenes, text: Text | None, advantage: Tensor, credit: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """(B,) losses, (B,) those of the expectation, (B,) mean squares of o - o_old, and the limited share ()."""
+        output = self.prior.output(noised, text)
+        with torch.no_grad():
+            old = self.sampler.output(noised, text)
+            advantage, limited = self._limited(noised, text, advantage, old.continuous)
+        features, poses = output.continuous.shape[-1], self.prior.pose_width
+        of_entries = advantage[..., None].expand(-1, output.continuous.shape[1], features)
+        if features > poses:  # a continuous prior: categories are entries, too
+            of_entries = torch.cat(
+                [of_entries[..., :poses], credit[..., None].expand(*of_entries.shape[:2], features - poses)], dim=-1
+            )
+        weight = noised.weight / noised.weight.sum(dim=(1, 2), keepdim=True).clamp(min=1.0)
+        target, expectation = noised.target, weight.new_zeros(len(weight))
+        if self.expectation is not None:
+            expected = self.expectation(noised, text)
+            expectation = ((expected - target).square() * weight).sum(dim=(1, 2)) * noised.scale
+            target = old.continuous + target - expected.detach()
+        entries = self.continuous_loss(output.continuous, old.continuous, target, of_entries)
+        losses = (entries * weight).sum(dim=(1, 2)) * noised.scale
+        distance = ((output.continuous - old.continuous).detach().square() * weight).sum(dim=(1, 2))
+        if output.logits is not None and old.logits is not None and noised.drawn is not None:
+            slots = self.category_loss(output.logits, old.logits, noised.category, credit)
+            mean = (slots * noised.drawn).sum(dim=1) / noised.drawn.sum(dim=1).clamp(min=1.0)
+            losses = losses + self.prior.config.category_weight * mean
+        return losses, expectation, distance, limited
+
+    def _limited(
+        self, noised: NoisedScenes, text: Text | None, advantage: Tensor, old: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Advantages of poses, those of bad ones 0 beyond ``push_limit``, and the share () of the latter."""
+        if not self.push_limit or self.base is None:
+            return advantage, advantage.new_zeros(())
+        poses = self.prior.pose_width
+        weight = noised.weight[..., :poses]
+        first = self.base.output(noised, text).continuous
+        now, then = (((noised.target - said)[..., :poses].square() * weight).sum(dim=-1) for said in (old, first))
+        bad = (advantage < 0) & (weight.sum(dim=-1) > 0)
+        beyond = bad & (now > self.push_limit * then)
+        return torch.where(beyond, 0.0, advantage), beyond.sum() / bad.sum().clamp(min=1)
+
+    def _advantage(self, flat: TensorDictBase, key: NestedKey, scene: Tensor) -> Tensor:
+        """(B, 1) or (B, N); zeros where the key is missing."""
+        found = flat.get(key, None)
+        if found is None:
+            return scene.new_zeros(len(scene), 1)
+        found = found.detach().reshape(len(scene), -1)
+        if found.shape[1] not in (1, scene.shape[1]):
+            raise InvalidInputError(
+                f"{key!r} has {found.shape[1]} values per scene; give one, or one per slot ({scene.shape[1]})"
+            )
+        return found

@@ -1,0 +1,66 @@
+"""Bare functions as rewards: which arguments they take, and what they may return."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rewards.base import RewardContext, RewardOutput
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import SceneBatch
+
+
+class FunctionReward:
+    """A bare function as a reward.
+
+    Args:
+        function: takes ``(batch)`` or ``(batch, context)``, then keyword settings; returns (B,) numbers or a
+            :class:`RewardOutput`.
+        name: its name in logs; the function's own by default.
+        **settings: keyword arguments passed on at every call.
+
+    >>> FunctionReward(lambda batch: batch.counts, name="count")(SceneBatch.empty("dimsum_table", 2), RewardContext())
+    RewardOutput(value=tensor([1., 1.]), per_object=None, terms={}, valid=None, object_flags={}, problem='')
+    """
+
+    def __init__(self, function: Callable[..., Any], name: str | None = None, **settings: Any) -> None:
+        self.function = function
+        self.name = str(name or getattr(function, "__name__", type(function).__name__))
+        self.settings = settings
+        self._takes_context = _accepts(function, 2, settings, self.name)
+
+    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        arguments = (batch, context) if self._takes_context else (batch,)
+        return as_output(self.function(*arguments, **self.settings))
+
+    def __repr__(self) -> str:
+        return f"FunctionReward({self.name!r})"
+
+
+def as_output(result: Any) -> Any:
+    """A bare tensor as a RewardOutput, whole numbers as floats; anything else as it is."""
+    if not isinstance(result, Tensor):
+        return result
+    return RewardOutput(result if result.is_floating_point() else result.to(torch.float32))
+
+
+def _accepts(function: Callable[..., Any], count: int, settings: Mapping[str, Any], name: str) -> bool:
+    """Whether ``function`` takes ``count`` positional arguments beside ``settings``; one fewer must do otherwise."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return True
+    for number in (count, count - 1):
+        try:
+            signature.bind(*[None] * number, **settings)
+        except TypeError:
+            continue
+        return number == count
+    raise InvalidInputError(
+        f"reward {name!r} has the signature {signature} and was given the settings {sorted(settings)}; "
+        "it must take (batch) or (batch, context), and its settings as keywords"
+    )

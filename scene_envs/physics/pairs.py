@@ -1,0 +1,99 @@
+"""Near pairs of parts and of objects, as the collision finds them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_envs.physics.rows import Rows
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts(Rows):
+    """Near pairs of parts.
+
+    Attributes:
+        first: (Q,) object rows.
+        second: (Q,) object rows, larger than ``first``.
+        part_first: (Q,) part of the first object in the library.
+        part_second: (Q,) part of the second.
+        gap: (Q,) m along ``direction``; the true distance is at least this much.
+        direction: (Q, 3) unit vector in the world, from the first part to the second.
+    """
+
+    first: Index
+    second: Index
+    part_first: Index
+    part_second: Index
+    gap: Array
+    direction: Array
+
+    def among(self, number: Index) -> Contacts:
+        """The contacts of objects whose new ``number`` (n,) is not negative, renumbered."""
+        first, second = number[self.first], number[self.second]
+        return replace(self, first=first, second=second)[(first >= 0) & (second >= 0)]
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectPairs:
+    """Pairs of objects whose boxes are near each other.
+
+    Attributes:
+        first: (P,) row of the object.
+        second: (P,) row of the other object, larger than ``first``.
+        gap: (P,) m, signed gap of the coarse parts along ``direction``.
+        direction: (P, 3) unit vector in the world, from the first object to the second.
+        depth: (P,) m, how deep the fine parts overlap; 0 when they do not.
+        total: (P,) m, the sum of the depths of all overlapping fine parts (only when asked for).
+        part_count: (P,) overlapping fine part pairs (only when asked for).
+        low: (n, 3) lowest corner of each object's box, m.
+        high: (n, 3) highest corner of each object's box, m.
+        contacts: near pairs of their coarse parts.
+        rough: (P,) bool; the depth is an upper bound, from face planes of the coarse parts, because exact depths of the
+            scene would take too long.
+    """
+
+    first: Index
+    second: Index
+    gap: Array
+    direction: Array
+    depth: Array
+    total: Array
+    part_count: Index
+    low: Array
+    high: Array
+    contacts: Contacts
+    rough: Mask
+
+    def among(self, rows: Index) -> ObjectPairs:
+        """The pairs of the objects ``rows`` (m,), ascending, renumbered to 0..m-1."""
+        number = np.full(len(self.low), -1, dtype=np.int64)
+        number[rows] = np.arange(len(rows))
+        first, second = number[self.first], number[self.second]
+        kept = (first >= 0) & (second >= 0)
+        return ObjectPairs(
+            first[kept],
+            second[kept],
+            self.gap[kept],
+            self.direction[kept],
+            self.depth[kept],
+            self.total[kept],
+            self.part_count[kept],
+            self.low[rows],
+            self.high[rows],
+            self.contacts.among(number),
+            self.rough[kept],
+        )
+
+    def deepest(self) -> Array:
+        """(n,) m, the deepest overlap of each object."""
+        depth = np.zeros(len(self.low))
+        np.maximum.at(depth, self.first, self.depth)
+        np.maximum.at(depth, self.second, self.depth)
+        return depth
