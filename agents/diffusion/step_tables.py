@@ -63,6 +63,32 @@ class StepTable:
         return cls(t, torch.cat([t[1:], torch.zeros(1, dtype=torch.int64)]))
 
     @classmethod
+    def gradual(cls, masked: Tensor, slots: int, num_steps: int) -> StepTable:
+        """``num_steps`` steps of which the first half decide about one slot each; the rest is evenly spaced.
+
+        Slots that are unmasked in one step do not know of each other's categories. What the first of them hold says
+        what kind of scene it will be, so they are decided one after the other.
+
+        Args:
+            masked: (T + 1,) share of masked slots at each timestep, non-decreasing, as of an absorbing chain.
+            slots: N of a scene.
+            num_steps: S, from 1 to T.
+
+        >>> StepTable.gradual(torch.linspace(0, 1, 1001), 100, 12).timesteps.tolist()
+        [1000, 990, 980, 970, 960, 823, 686, 549, 412, 275, 138, 1]
+        """
+        num_timesteps = len(masked) - 1
+        even = cls.spaced(num_timesteps, num_steps)
+        shares = 1.0 - torch.arange(num_steps // 2 + 1, dtype=torch.float64) / slots
+        first = torch.searchsorted(masked.double().cpu(), shares.clamp(min=0.0))  # the earliest level with that share
+        first = first[(first >= even.timesteps[: len(first)])].unique().flip(0)
+        rest = num_steps - len(first)
+        if len(first) < 2 or rest < 1 or int(first[-1]) - 1 < rest:
+            return even
+        later = torch.linspace(int(first[-1]), 1, rest + 1, dtype=torch.float64).round().long()[1:]
+        return cls.from_timesteps([*first.tolist(), *later.tolist()], num_timesteps)
+
+    @classmethod
     def from_timesteps(cls, timesteps: Sequence[int], num_timesteps: int | None = None) -> StepTable:
         """From the timesteps alone, in decreasing order; the last step lands on 0.
 

@@ -11,14 +11,12 @@ from collections.abc import Iterator
 import torch
 from torch import Generator, Tensor
 
-from agents.diffusion.divergence import categorical_kl, step_kl
-from agents.diffusion.reverse_steps import state_of
+from agents.diffusion.divergence import step_kl
 from agents.networks.text import Text
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import Rollout
 from agents.priors.base import ScenePrior
 from agents.priors.forward import NoisedScenes
-from agents.priors.mixed_training import TrainableMixedPrior
 
 
 def chain_kl(
@@ -70,8 +68,7 @@ def forward_kl(
     size = chunk or count
     for start in range(0, count, size):
         rows = slice(start, start + size)
-        fixed = prior.observed_entries(x0[rows]) if isinstance(prior, TrainableMixedPrior) else None
-        noised = prior.noised(x0[rows], generator, timesteps[rows], fixed)
+        noised = prior.noised(x0[rows], generator, timesteps[rows], prior.observed_entries(x0[rows]))
         yield noised_kl(prior, base, noised, _rows(rollout.text, rows)).sum() * ((total - 1) / count)
 
 
@@ -92,16 +89,9 @@ def noised_kl(prior: ScenePrior, base: ScenePrior, noised: NoisedScenes, text: T
     random = (noised.weight > 0).float()
     square = (prior.denoised(noised, now) - before).square() * random
     total, entries = 0.5 * rise * square.sum(dim=(1, 2)), random.sum(dim=(1, 2))
-    if isinstance(prior, TrainableMixedPrior):
-        assert now.logits is not None
-        assert then.logits is not None
-        drawn = torch.ones_like(random[..., 0]) if noised.drawn is None else noised.drawn
-        state = state_of(noised.x_t[..., prior.pose_width :])
-        probs, others = (
-            prior.categories.posterior(state, logits.softmax(dim=-1), noised.t, noised.t - 1)
-            for logits in (now.logits, then.logits)
-        )
-        total = total + (categorical_kl(probs, others) * drawn).sum(dim=1)
+    of_categories = prior.category_kl(noised, now, then)
+    if of_categories is not None:
+        total = total + of_categories.sum(dim=1)
         entries = entries + (random.sum(dim=2) > 0).sum(dim=1)
     return total / entries.clamp(min=1.0)
 

@@ -293,6 +293,17 @@ class ScenePrior(Loadable, Inpainting, nn.Module, ABC):
         features = output.continuous.shape[-1]
         return self.process.x0_from_output(noised.x_t[..., :features], noised.t, output.continuous)
 
+    def observed_entries(self, x: Tensor, observed: Observed | None = None) -> Observed | None:
+        """What the network is told of scenes ``x`` (B, N, D) without noise, given ``observed``; None for nothing."""
+        return observed
+
+    def category_kl(self, noised: NoisedScenes, now: DenoiserOutput, then: DenoiserOutput) -> Tensor | None:
+        """(B, N) KL divergences of the categories' reverse steps t -> t - 1 by two outputs, nats.
+
+        ``None`` where categories are a part of the continuous output.
+        """
+        return None
+
     @property
     def pose_width(self) -> int:
         """Leading features of the continuous output that are poses; the others, if any, are categories."""

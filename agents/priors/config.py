@@ -85,6 +85,9 @@ class MixedPriorConfig:
         clip: bound on denoised poses while sampling, normalised units; 0 for none (1 is the paper's).
         unmasking: which masked slots a step of an absorbing kernel unmasks: ``"even"``, as near to the expected number
             as can be, or ``"independent"``, each by its own chance. Other kernels know the second alone.
+        union: what a scene of a union of scene types may hold: ``"one_type"``, the assets of one member, which is
+            settled by the first objects of the scene, or ``"any"`` assets. Needs an absorbing kernel; other scene
+            types have one member.
     """
 
     scene_type: str
@@ -109,6 +112,7 @@ class MixedPriorConfig:
     empty_slots: str = "attended"
     clip: float = 0.0
     unmasking: str = "even"
+    union: str = "one_type"
 
 
 def current_names(fields: Mapping[str, Any]) -> dict[str, Any]:

@@ -33,6 +33,7 @@ from agents.networks.text import Text
 from agents.networks.text_encoders import text_config_from_state, text_encoder
 from agents.priors.config import MixedPriorConfig, current_names
 from agents.priors.inpainting import Hook, draw_noise
+from agents.priors.mixed_states import UNIONS
 from agents.priors.mixed_training import TrainableMixedPrior
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
@@ -83,6 +84,8 @@ class MixedPrior(TrainableMixedPrior):
             raise unknown_name("category loss", config.category_loss, CATEGORY_LOSSES)
         if config.unmasking not in UNMASKINGS:
             raise unknown_name("unmasking", config.unmasking, UNMASKINGS)
+        if config.union not in UNIONS:
+            raise unknown_name("union", config.union, UNIONS)
         check_weighting(config.loss_weighting, config.prediction)
         if config.empty_slots == "dropped" and not getattr(config.network, "reads_slot_mask", False):
             raise InvalidInputError("empty_slots='dropped' needs network='flux'; others take empty_slots='attended'")

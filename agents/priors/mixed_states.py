@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
-from agents.diffusion import CategoricalProcess, MixedStep
+from agents.diffusion import CategoricalProcess, MixedStep, StepTable
 from agents.networks.mixed_denoiser import MixedDenoiser, Observed
 from agents.priors.base import ScenePrior
 from agents.priors.config import MixedPriorConfig
 from agents.priors.text import PromptReader
 from scene_envs.scene import POSE_FEATURES, SceneBatch
+from scene_envs.scene_types import members_of
+
+UNIONS = ("one_type", "any")
+"""What a scene of a union of scene types may hold."""
 
 
 class MixedStates(PromptReader, ScenePrior):
@@ -76,10 +82,41 @@ class MixedStates(PromptReader, ScenePrior):
         """(B, N, K) bool: categories of x_0 with probability 0, given states (B, N) of x_t.
 
         These are the categories of fixed objects, in all slots but theirs. A slot that holds one as an observed entry
-        keeps it where the chain only absorbs.
+        keeps it where the chain only absorbs. With ``union="one_type"`` they are also the assets that no member has
+        beside what the scene holds already.
         """
         barred = torch.zeros(*state.shape, self.num_categories, dtype=torch.bool, device=state.device)
         barred[:, len(self.scene_type.fixed) :, list(self.scene_type.fixed_categories)] = True
         if self.categories.only_absorbs:
-            barred &= F.one_hot(state, self.num_categories + 1)[..., :-1] == 0
+            held = F.one_hot(state, self.num_categories + 1)[..., :-1] > 0
+            if self._separates_members:
+                barred[..., :-1] |= ~self._fitting_assets(held[..., :-1].any(dim=1))[:, None]
+            barred &= ~held
         return barred
+
+    def step_table(self, num_steps: int) -> StepTable:
+        """The reverse steps of a chain of ``num_steps``, any number in 1..T.
+
+        Where scenes are those of one member of a union, the first steps decide about one slot each.
+        """
+        if self._separates_members:
+            return StepTable.gradual(self.categories.schedule.mask, self.mixed.slots, num_steps)
+        return super().step_table(num_steps)
+
+    @property
+    def _separates_members(self) -> bool:
+        """Whether a scene holds the assets of one member of a union only."""
+        return self.mixed.union == "one_type" and len(self._members) > 1 and self.categories.only_absorbs
+
+    @cached_property
+    def _members(self) -> Tensor:
+        """(M, C) bool: assets of each member of a union of scene types; one row for any other type."""
+        assets = self.scene_type.assets
+        return torch.tensor([[asset in member.assets for asset in assets] for member in members_of(self.scene_type)])
+
+    def _fitting_assets(self, present: Tensor) -> Tensor:
+        """(B, C) bool: assets of the members that have all of ``present`` (B, C) bool; all where no member has."""
+        members = self._members.to(present.device)
+        fits = ~(present[:, None] & ~members).any(dim=-1)  # (B, M)
+        allowed = (fits[..., None] & members).any(dim=1)
+        return allowed | ~fits.any(dim=-1, keepdim=True)

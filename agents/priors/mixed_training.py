@@ -7,6 +7,7 @@ from torch import Generator, Tensor
 from torch.nn import functional as F
 
 from agents.diffusion import ResidualVariance, StepTable
+from agents.diffusion.divergence import categorical_kl
 from agents.diffusion.reverse_steps import state_of
 from agents.diffusion.weighting import loss_weights
 from agents.networks.mixed_denoiser import Observed
@@ -90,6 +91,18 @@ class TrainableMixedPrior(MixedStates):
         poses, states = noised.x_t[..., :POSE_FEATURES], state_of(noised.x_t[..., POSE_FEATURES:])
         moments = self.denoiser.moments(states, noised.t)
         return self.process.x0_from_output(poses, noised.t, output.continuous, moments)
+
+    def category_kl(self, noised: NoisedScenes, now: DenoiserOutput, then: DenoiserOutput) -> Tensor:
+        """(B, N) KL divergences of the categories' reverse steps t -> t - 1, nats; 0 where nothing is drawn."""
+        assert now.logits is not None
+        assert then.logits is not None
+        assert noised.drawn is not None
+        state = state_of(noised.x_t[..., POSE_FEATURES:])
+        probs, others = (
+            self.categories.posterior(state, logits.softmax(dim=-1), noised.t, noised.t - 1)
+            for logits in (now.logits, then.logits)
+        )
+        return categorical_kl(probs, others) * noised.drawn
 
     def draw_observed(self, x0: Tensor, generator: Generator | None) -> Observed:
         """Random observed entries: slots (completion), all categories (rearrangement), or any attribute of any slot."""

@@ -4,6 +4,7 @@ from scene_envs.scene_types.base import Camera, FixedObject, SceneType
 from scene_envs.scene_types.registry import (
     get_scene_type,
     list_scene_types,
+    members_of,
     register_scene_type,
     union_scene_type,
 )
@@ -14,6 +15,7 @@ __all__ = [
     "SceneType",
     "get_scene_type",
     "list_scene_types",
+    "members_of",
     "register_scene_type",
     "union_scene_type",
 ]

@@ -67,3 +67,18 @@ def union_scene_type(types: Sequence[str | SceneType], name: str | None = None) 
     if not members:
         raise InvalidInputError("a union needs at least one scene type, got none")
     return union_of(members, name or "+".join(dict.fromkeys(member.name for member in members)))
+
+
+def members_of(scene_type: SceneType) -> tuple[SceneType, ...]:
+    """The scene types of which ``scene_type`` is the union by its name; itself where it is none.
+
+    A union from a file is known by its members only where they are registered and have its assets.
+
+    >>> [member.name for member in members_of(get_scene_type("dimsum_table+pantry_shelf"))]
+    ['dimsum_table', 'pantry_shelf']
+    """
+    names = scene_type.name.split("+")
+    if len(names) < 2 or any(name not in _SCENE_TYPES for name in names):
+        return (scene_type,)
+    members = tuple(get_scene_type(name) for name in names)
+    return members if {a for member in members for a in member.assets} == set(scene_type.assets) else (scene_type,)
