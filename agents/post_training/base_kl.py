@@ -17,6 +17,7 @@ from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import Rollout
 from agents.priors.base import ScenePrior
 from agents.priors.forward import NoisedScenes
+from agents.utils.process_group import ProcessGroup, gather_rows
 
 
 def chain_kl(
@@ -52,24 +53,27 @@ def forward_kl(
 ) -> Iterator[Tensor]:
     """Terms () whose sum estimates the same from finished scenes, noised again, without the chains that made them.
 
-    The scenes of a batch take timesteps that are spread evenly over the chain of all timesteps.
+    The scenes of a batch take timesteps that are spread evenly over the chain of all timesteps. Several processes
+    draw timesteps and noise for the scenes of all of them, and each takes its own.
 
     Args:
         prior: in training.
         base: what it is compared with.
-        rollout: B finished scenes.
+        rollout: B finished scenes of this process.
         generator: source of timesteps and noise (CPU).
         chunk: scenes per pass.
     """
     x0 = prior.encode(rollout.batch.to(prior.device))
-    count, total = len(x0), prior.config.num_timesteps
-    even = (torch.randperm(count, generator=generator) + torch.rand((), generator=generator)) / count
+    count, everything, total = len(x0), gather_rows(x0), prior.config.num_timesteps
+    order = torch.randperm(len(everything), generator=generator)
+    even = (order + torch.rand((), generator=generator)) / len(everything)
     timesteps = (2 + even * (total - 1)).long().clamp(max=total).to(x0.device)  # the last step, t = 1, is certain
+    noised = prior.noised(everything, generator, timesteps, prior.observed_entries(everything))
+    noised = noised.rows(ProcessGroup.current().rows(len(everything)))
     size = chunk or count
     for start in range(0, count, size):
         rows = slice(start, start + size)
-        noised = prior.noised(x0[rows], generator, timesteps[rows], prior.observed_entries(x0[rows]))
-        yield noised_kl(prior, base, noised, _rows(rollout.text, rows)).sum() * ((total - 1) / count)
+        yield noised_kl(prior, base, noised.rows(rows), _rows(rollout.text, rows)).sum() * ((total - 1) / count)
 
 
 def noised_kl(prior: ScenePrior, base: ScenePrior, noised: NoisedScenes, text: Text | None = None) -> Tensor:

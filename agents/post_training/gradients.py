@@ -180,7 +180,7 @@ def add_gradient(
         for total, gradient in zip(gradients, torch.autograd.grad(term, trained, allow_unused=True), strict=True):
             if gradient is not None:
                 total.add_(gradient, alpha=coefficient / processes.size)
-    gradients = [processes.sum(gradient) for gradient in gradients]
+    gradients = processes.sum_tensors(gradients)
     for parameter, gradient in zip(trained, gradients, strict=True):
         parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
     norm = float(torch.stack([gradient.norm() for gradient in gradients]).norm()) if gradients else 0.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
@@ -91,6 +91,14 @@ class ProcessGroup:
                 distributed.all_reduce(value)
         return value
 
+    def sum_tensors(self, values: Sequence[Tensor]) -> list[Tensor]:
+        """The sum of each tensor over all processes, in one message; all are of one type."""
+        if self.size == 1 or not values:
+            return list(values)
+        flat = self.sum(torch.cat([value.flatten() for value in values]))
+        parts = flat.split([value.numel() for value in values])
+        return [part.view_as(value).clone() for part, value in zip(parts, values, strict=True)]
+
     def sum_numbers(self, *values: float) -> list[float]:
         """The sum of each number over all processes."""
         return list(values) if self.size == 1 else self.sum(torch.tensor(values, dtype=torch.float64)).tolist()
@@ -111,11 +119,8 @@ class ProcessGroup:
         present = self.sum(torch.tensor([float(p.grad is not None) for p in taken])).tolist()
         taken = [p for p, some in zip(taken, present, strict=True) if some]
         gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in taken]
-        if not gradients:
-            return
-        flat = self.sum(torch.cat([gradient.flatten() for gradient in gradients]))
-        for parameter, total in zip(taken, flat.split([p.numel() for p in taken]), strict=True):
-            parameter.grad = total.view_as(parameter).clone()
+        for parameter, total in zip(taken, self.sum_tensors(gradients), strict=True):
+            parameter.grad = total
 
     def share(self, parameters: Iterable[nn.Parameter]) -> None:
         """Replace the values of every process by those of the first."""
