@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
+from typing import Self
 
 import torch
 from torch import Generator, Tensor
@@ -13,6 +15,7 @@ from agents.networks.mixed_denoiser import MixedDenoiser, Observed
 from agents.priors.base import ScenePrior
 from agents.priors.config import MixedPriorConfig
 from agents.priors.text import PromptReader
+from scene_envs.errors import unknown_name
 from scene_envs.scene import POSE_FEATURES, SceneBatch
 from scene_envs.scene_types import members_of
 
@@ -38,6 +41,17 @@ class MixedStates(PromptReader, ScenePrior):
         fixed = torch.zeros(x.shape[:2], dtype=torch.bool, device=x.device)
         fixed[:, : len(self.scene_type.fixed)] = True
         return Observed(x, fixed, fixed)
+
+    def with_union(self, union: str) -> Self:
+        """This prior, for scenes of ``"one_type"`` of a union of scene types or of ``"any"`` of its assets.
+
+        Raises:
+            UnknownNameError: another word.
+        """
+        if union not in UNIONS:
+            raise unknown_name("union", union, UNIONS)
+        self.mixed = replace(self.mixed, union=union)
+        return self
 
     @property
     def num_categories(self) -> int:

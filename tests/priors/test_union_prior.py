@@ -61,11 +61,12 @@ def test_scenes_hold_the_assets_of_one_member(union_prior: MixedPrior) -> None:
 
 
 def test_any_assets_can_be_asked_for(union_prior: MixedPrior) -> None:
-    union_prior.mixed = replace(union_prior.mixed, union="any")
-    assert all(mixes(union_prior.sample(10, num_steps=20, seed=0)))
+    assert all(mixes(union_prior.with_union("any").sample(10, num_steps=20, seed=0)))
 
 
 def test_an_unknown_rule_names_the_known_ones(union_prior: MixedPrior) -> None:
+    with pytest.raises(UnknownNameError, match="one_type"):
+        union_prior.with_union("one")
     with pytest.raises(UnknownNameError, match="one_type"):
         MixedPrior(replace(union_prior.mixed, union="one"), union_prior.normalizer, union_prior.preconditioning)
 

@@ -27,6 +27,7 @@ class SampleConfig:
         num_steps: denoising steps per scene.
         eta: scale of the noise of the Gaussian steps, 1 for the ancestral chain, 0 for a deterministic one (DDIM).
         slots: slots per scene, more than trained is allowed; null means as trained.
+        union: what a scene of a prior of several scene types may hold, one_type (objects of one of them) or any.
         seed: of the noise.
         reward: scores the samples, for metrics.json; null for none.
         reward_timeout: seconds that a reward from outside this package, which runs in a process of its own, may take.
@@ -48,6 +49,7 @@ class SampleConfig:
     num_steps: int = 50
     eta: float = 1.0
     slots: int | None = None
+    union: str = "one_type"
     seed: int = 0
     reward: Any = named("feasible_objects", "reward")
     reward_timeout: float = 60.0
@@ -63,6 +65,7 @@ class SampleConfig:
 def run(settings: SampleConfig, run: Run) -> None:
     """Draw, score, save and picture the scenes."""
     from agents.priors.base import ScenePrior
+    from agents.priors.mixed import MixedPrior
     from rewards.isolation import close_reward, run_reward
     from scene_envs.export.formats import resolve_formats
     from scene_envs.physics import PhysicsPool
@@ -78,6 +81,8 @@ def run(settings: SampleConfig, run: Run) -> None:
     if not prior.scene_type.has_geometry:
         settings = _without_geometry(settings, prior.scene_type, run)
         reward = None if settings.reward is None else reward
+    if isinstance(prior, MixedPrior):
+        prior.with_union(settings.union)
     started = time.perf_counter()
     batch = prior.sample(
         settings.count,
