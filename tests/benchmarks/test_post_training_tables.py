@@ -1,0 +1,46 @@
+"""The tables of post-training: their keys are those of the command, and their figures follow from the log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from agents.cli.keys import compose
+from agents.post_training.config import PostTrainConfig
+from benchmarks.post_training.__main__ import main
+from benchmarks.post_training.rows import TABLES
+from benchmarks.post_training.runs import training_figures
+from rewards import make_reward
+
+
+@pytest.mark.parametrize("table", sorted(TABLES))
+def test_every_row_is_a_valid_run(table: str) -> None:
+    names = [row.name for row in TABLES[table].rows]
+    assert len(names) == len(set(names))
+    for row in TABLES[table].rows:
+        words = [f"prior={row.prior}", *row.keys, f"iterations={row.iterations}"]
+        make_reward(compose("post-train", PostTrainConfig, words).reward)
+
+
+def test_the_largest_fall_is_measured_from_the_best_mean_before_it(tmp_path: Path) -> None:
+    means = [0.7, 0.9, 0.8, 0.85, 0.95, 0.94]
+    lines = ["iteration,reward,seconds,guard_ratio"]
+    for window, mean in enumerate(means):
+        for place in range(20):
+            lines.append(f"{20 * window + place + 1},{mean + (0.01 if place % 2 else -0.01)},{window},1.0{window}")
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
+    figures = training_figures(tmp_path)
+    assert figures["fall"] == pytest.approx(0.1)
+    assert (figures["first"], figures["best"], figures["last"]) == pytest.approx((0.7, 0.95, 0.94))
+    assert figures["loss"] == 1.05
+
+
+@pytest.mark.parametrize("word", ["table=placements", "rows=[dimsum-*]"])
+def test_unknown_tables_and_rows_name_the_known_ones(
+    word: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([word, f"output={tmp_path}"]) == 2
+    message = capsys.readouterr().err
+    assert word.partition("=")[2].strip("[]") in message
+    assert "placement" in message or "dimsum_table-nft-0" in message
