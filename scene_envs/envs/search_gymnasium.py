@@ -94,7 +94,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     | `max_nfe` | `None` | denoiser evaluations per episode; `None` is any number |
     | `workers` | `0` | worker processes for physics in the objective; 0 computes in the calling process |
     | `render_mode` | `None` | `"rgb_array"` renders the current scene |
-    | `prompt` | `None` | text that all scenes should satisfy, for priors that read prompts; the objective gets it, too |
+    | `prompt` | `None` | text that all scenes should satisfy, for priors that read prompts; the objective gets it too |
     | `guidance` | `0.0` | weight of classifier-free guidance, which doubles the NFE; needs a prompt |
 
     ## Vectorized environment
