@@ -61,7 +61,7 @@ class DenoisingEnv(SpecMixin, gym.Env[Any, np.ndarray]):
 
     ## Observation Space
 
-    `Dict` of
+    A `Dict` with the keys
 
     | key | space | meaning |
     |---|---|---|
@@ -89,7 +89,7 @@ class DenoisingEnv(SpecMixin, gym.Env[Any, np.ndarray]):
 
     ## Episode End
 
-    `terminated` after exactly `num_steps` steps, at t = 0. Never `truncated`.
+    The episode is `terminated` after exactly `num_steps` steps, at t = 0. It is never `truncated`.
 
     ## Arguments
 

@@ -41,7 +41,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
 
     ## Observation Space
 
-    `Dict` of
+    A `Dict` with the keys
 
     | key | space | meaning |
     |---|---|---|
@@ -69,8 +69,8 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
 
     ## Episode End
 
-    `terminated` when nothing is left to improve: no slot is masked, or Φ is 1. `truncated` at depth `max_depth`, or
-    when `max_nfe` denoiser evaluations are spent since the reset.
+    The episode is `terminated` when nothing is left to improve: no slot is masked, or Φ is 1. It is `truncated` at
+    depth `max_depth`, or when `max_nfe` denoiser evaluations are spent since the reset.
 
     ## Arguments
 

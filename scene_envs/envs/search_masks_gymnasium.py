@@ -40,7 +40,7 @@ class SearchMaskEnv(SearchEnv):
 
     ## Observation Space
 
-    `Dict` of
+    A `Dict` with the keys
 
     | key | space | meaning |
     |---|---|---|
@@ -65,8 +65,8 @@ class SearchMaskEnv(SearchEnv):
 
     ## Episode End
 
-    `terminated` when nothing is left to improve: no mask has a slot, or Φ is 1. `truncated` at depth `max_depth`, or
-    when `max_nfe` denoiser evaluations are spent since the reset.
+    The episode is `terminated` when nothing is left to improve: no mask has a slot, or Φ is 1. It is `truncated` at
+    depth `max_depth`, or when `max_nfe` denoiser evaluations are spent since the reset.
 
     ## Arguments
 
