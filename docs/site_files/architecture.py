@@ -24,13 +24,13 @@ ROWS: tuple[dict[str, tuple[int, str]], ...] = (
         "agents.networks": (3, "denoisers, text encoders"),
     },
     {
-        "rewards": (2, "what scenes are worth"),
+        "rewards": (2, "scores of scenes"),
         "agents.planning": (3, "UCT, best of N"),
         "agents.evaluation": (4, "measures of scenes"),
     },
     {"agents.priors": (3, "sample, inpaint, save")},
-    {"agents.pretraining": (3, "teaches a prior the data")},
-    {"agents.post_training": (3, "steers it; report.html")},
+    {"agents.pretraining": (3, "training of priors")},
+    {"agents.post_training": (3, "steering of priors")},
     {"agents.cli": (3, "scene-envs COMMAND")},
 )
 """Subpackages by row, with their column and what they hold. A subpackage imports those of higher rows alone."""
@@ -79,9 +79,9 @@ def drawing() -> str:
     legend = height - 26
     parts += [
         f'<path d="M20 {legend} h40" stroke="#00796b" stroke-width="3" marker-end="url(#way)"/>',
-        f'<text x="74" y="{legend + 4}" font-size="13" fill="#3a3e46">one sample\'s way, downwards only</text>',
+        f'<text x="74" y="{legend + 4}" font-size="13" fill="#3a3e46">path of one sample</text>',
         f'<path d="M330 {legend} h40" stroke="#8a8f98" stroke-dasharray="5 4" marker-end="url(#asks)"/>',
-        f'<text x="384" y="{legend + 4}" font-size="13" fill="#3a3e46">asks on the way</text>',
+        f'<text x="384" y="{legend + 4}" font-size="13" fill="#3a3e46">calls on the path</text>',
         f'<text x="540" y="{legend + 4}" font-size="13" fill="#3a3e46">',
         "A subpackage imports only subpackages of higher rows.</text>",
         "</svg>",
