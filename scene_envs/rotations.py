@@ -1,8 +1,8 @@
 """Rotation representations: small pure functions on torch tensors.
 
-All matrices map body-frame vectors to the frame they are expressed in; angles are in radians;
-quaternions are (w, x, y, z). All of them run in batches on the device of their argument and can be differentiated, as
-priors that diffuse quaternions need; ``scipy.spatial.transform`` does neither.
+All matrices map body-frame vectors to the frame they are expressed in. Angles are in radians, quaternions are (w, x, y,
+z). All functions run in batches on the device of their argument and can be differentiated, which priors that diffuse
+quaternions need; ``scipy.spatial.transform`` does neither.
 """
 
 from __future__ import annotations

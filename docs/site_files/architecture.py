@@ -1,4 +1,4 @@
-"""Drawing of the rooms and of one sample's way through them: ``python docs/site_files/architecture.py``."""
+"""Drawing of the subpackages and of one sample's way through them: ``python docs/site_files/architecture.py``."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ ROWS: tuple[dict[str, tuple[int, str]], ...] = (
         "agents.networks": (3, "denoisers, text encoders"),
     },
     {
-        "rewards": (2, "what scenes are worth"),
+        "rewards": (2, "scores of scenes"),
         "agents.planning": (3, "UCT, best of N"),
         "agents.evaluation": (4, "measures of scenes"),
     },
     {"agents.priors": (3, "sample, inpaint, save")},
-    {"agents.pretraining": (3, "teaches a prior the data")},
-    {"agents.post_training": (3, "steers it; report.html")},
+    {"agents.pretraining": (3, "training of priors")},
+    {"agents.post_training": (3, "steering of priors")},
     {"agents.cli": (3, "scene-envs COMMAND")},
 )
-"""Rooms by row, with their column and what they hold. A room imports rooms of higher rows alone."""
+"""Subpackages by row, with their column and what they hold. A subpackage imports those of higher rows alone."""
 
 WAY = ("scene_envs.grammars", "scene_envs.datasets", "agents.pretraining", "agents.post_training", "agents.cli")
-"""Rooms that hold one sample, in order; each imports the one before it."""
+"""Subpackages that hold one sample, in order; each imports the one before it."""
 
 ASKS = (
     ("scene_envs.datasets", "scene_envs.physics"),
@@ -53,7 +53,7 @@ _COLUMNS = (("scene_envs", 0, 2), ("rewards", 2, 1), ("agents", 3, 2))
 
 
 def corner(room: str) -> tuple[int, int]:
-    """Left upper corner of a room's box, pixels."""
+    """Left upper corner of a subpackage's box, pixels."""
     row = next(index for index, rooms in enumerate(ROWS) if room in rooms)
     return _LEFT + ROWS[row][room][0] * _STEP_X, _TOP + row * _STEP_Y
 
@@ -79,11 +79,11 @@ def drawing() -> str:
     legend = height - 26
     parts += [
         f'<path d="M20 {legend} h40" stroke="#00796b" stroke-width="3" marker-end="url(#way)"/>',
-        f'<text x="74" y="{legend + 4}" font-size="13" fill="#3a3e46">one sample\'s way, downwards only</text>',
+        f'<text x="74" y="{legend + 4}" font-size="13" fill="#3a3e46">path of one sample</text>',
         f'<path d="M330 {legend} h40" stroke="#8a8f98" stroke-dasharray="5 4" marker-end="url(#asks)"/>',
-        f'<text x="384" y="{legend + 4}" font-size="13" fill="#3a3e46">asks on the way</text>',
+        f'<text x="384" y="{legend + 4}" font-size="13" fill="#3a3e46">calls on the path</text>',
         f'<text x="540" y="{legend + 4}" font-size="13" fill="#3a3e46">',
-        "A room imports rooms of higher rows alone.</text>",
+        "A subpackage imports only subpackages of higher rows.</text>",
         "</svg>",
     ]
     return "\n".join(parts) + "\n"

@@ -180,8 +180,8 @@ class SceneDataset:
     def split(self, fractions: Sequence[float], seed: int = 0) -> tuple[SceneDataset, ...]:
         """Disjoint random parts of the given sizes; fractions may sum to less than one.
 
-        Rows that repeat a scene (with another prompt) come into the same part. Parts of a dataset that grew are
-        others; :meth:`stable_split` keeps them.
+        Rows that repeat a scene (with another prompt) come into the same part. When a dataset grows, scenes change
+        parts; :meth:`stable_split` keeps each scene in its part.
 
         Raises:
             InvalidInputError: a fraction is negative, or they sum to more than one.
@@ -191,7 +191,7 @@ class SceneDataset:
     def stable_split(self, fractions: Sequence[float], seed: int = 0) -> tuple[SceneDataset, ...]:
         """Disjoint parts decided scene by scene, so that a scene keeps its part when the dataset grows.
 
-        Their sizes are as asked for on average.
+        The given sizes are met on average.
 
         Raises:
             InvalidInputError: a fraction is negative, or they sum to more than one.

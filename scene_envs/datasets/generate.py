@@ -35,8 +35,8 @@ class GenerationReport:
     Attributes:
         output: the dataset folder.
         scenes: scenes in it.
-        tried: scenes built by the grammar to get them (those that physics then threw away included).
-        reasons: why structures and scenes were thrown away, most frequent first.
+        tried: scenes that the grammar built, those rejected by physics included.
+        reasons: rejected structures and scenes by reason, most frequent first.
         seconds: wall time of this call; short when a run was resumed.
     """
 
@@ -62,9 +62,9 @@ def generate(
 ) -> GenerationReport:
     """Write ``count`` scenes with three prompts each into the folder ``output``.
 
-    Each shard depends on (grammar, seed, shard index) alone, so the result does not depend on the number
-    of workers or on where they run, and a run killed at any point gives the same files when it is started again:
-    finished shards are kept, and in those under way what was judged is not judged again (with Ray they begin anew).
+    Each shard depends on (grammar, seed, shard index) alone, so the result does not depend on the number of workers or
+    on where they run. A run killed at any point gives the same files when it is started again. Finished shards are
+    kept, and the verdicts of an unfinished shard are reused (with Ray an unfinished shard begins anew).
 
     Args:
         scene_type: name of a grammar (built-in ones are called like their scene type).

@@ -11,8 +11,9 @@ from scene_envs.files import storage_error
 class Journal:
     """An append-only text file with the number of a candidate and its verdict per line.
 
-    A process may be killed while it writes: a last line without its end is dropped. Two processes that make the same
-    shard may write here by turns (a worker outlives its killed parent by a second): what is told twice counts once.
+    A process may be killed while it writes, so a last line without its end is dropped. Two processes that make the same
+    shard may write by turns, because a worker outlives its killed parent by a second; a verdict that is written twice
+    counts once.
 
     Args:
         path: the file; made by the first :meth:`append`.
@@ -22,7 +23,7 @@ class Journal:
         self.path = path
 
     def read(self) -> list[str]:
-        """The verdicts on candidates 0, 1, … so far; what follows the last whole line is cut off the file.
+        """The verdicts on candidates 0, 1, … so far; an incomplete last line is cut off the file.
 
         Raises:
             StorageError: the file cannot be read or written.
@@ -57,5 +58,5 @@ class Journal:
             raise storage_error(self.path, error) from error
 
     def remove(self) -> None:
-        """Forget it, when the shard is written."""
+        """Delete the file, when the shard is written."""
         self.path.unlink(missing_ok=True)

@@ -27,11 +27,11 @@ _PLANE = [3, 4, 6, 7]
 def fixed_normalizer(grammar: Grammar) -> Normalizer:
     """The normalizer of a grammar's scenes, a function of the grammar alone.
 
-    x and y take the workspace's range, one-hots [0, 1], z the range of a sample of unverified scenes, empty slots
-    included. Rotations: if any object of the sample is tilted, all nine entries take [-1, 1]; if objects only turn
-    about z, the four entries that tell of tilt are constant (they come back exactly) and the four of the turn take
-    [-1, 1] each if they vary. The sample has 128 scenes, or, as long as nothing in it is tilted, 10,000 objects
-    (4,096 scenes at most), so that a rare tilt is not taken for none.
+    x and y take the workspace's range, one-hots [0, 1], and z the range of a sample of unverified scenes, empty slots
+    included. If any object of the sample is tilted, all nine rotation entries take [-1, 1]. If objects only turn about
+    z, the four entries that encode tilt are constant (they come back exactly), and the four of the turn take [-1, 1]
+    each if they vary. The sample has 128 scenes. As long as nothing in it is tilted it grows to 10,000 objects (4,096
+    scenes at most), so that a rare tilt is not missed.
     """
     low, high, tilted = _ranges(grammar)
     grammar.reasons.clear()

@@ -19,8 +19,8 @@ Keys = NDArray[np.uint64]
 class Part:
     """One of several disjoint parts of a dataset, decided scene by scene from the scene's key.
 
-    A scene stays in its part when the dataset grows, or is read in another order, and rows that repeat a
-    scene share its part. Sizes are therefore as asked for on average only.
+    A scene stays in its part when the dataset grows or is read in another order. Rows that repeat a scene share its
+    part. The fractions are therefore only met on average.
 
     Attributes:
         fractions: of all parts, in order; they may sum to less than one.

@@ -1,4 +1,4 @@
-"""Check of what planners rely on: states that can be kept, sent away and branched from in any order."""
+"""Check of the promises that planners rely on: states can be stored, sent elsewhere and expanded in any order."""
 
 from __future__ import annotations
 

@@ -35,40 +35,40 @@ class DenoisingEnv(SpecMixin, gym.Env[Any, np.ndarray]):
 
     ## Description
 
-    A scene starts as Gaussian noise and becomes clean in `num_steps` steps; then a reward scores it, once. The
-    agent's goal is a scene with a high reward. This is the Markov decision process of DDPO (Black et
-    al. 2024, Section 4.2) on scenes of objects with full SE(3) poses: the state is `(x_t, t)`, the action is
-    `x_{t-1}`, and the transition is the identity. The reverse process itself belongs to the agent, except in
-    `action_mode="noise"`, where the prior takes the reverse step and the agent chooses the noise of that step.
+    A scene starts as Gaussian noise and is denoised in `num_steps` steps. A reward then scores the clean scene. The
+    agent's goal is a scene with a high reward. The environment is the Markov decision process of DDPO (Black et al.
+    2024, Section 4.2) on scenes of objects with full SE(3) poses: the state is `(x_t, t)`, the action is `x_{t-1}`, and
+    the transition is the identity, so the action is the next scene. The reverse process belongs to the agent, except in
+    `action_mode="noise"`: there the prior takes the reverse step, and the agent chooses the noise of that step.
 
-    Scenes are normalised tensors of N slots by D features: translation | rotation matrix | one-hot over C assets
-    and *empty*. On `dimsum_table`, N = 34, C = 7, D = 20. A prior that diffuses quaternions or axis-angle vectors has
-    these in place of the matrix, and D is smaller by 5 or 6.
+    Scenes are normalised tensors of N slots by D features: translation | rotation matrix | one-hot over C assets and
+    *empty*. On `dimsum_table`, N = 34, C = 7, D = 20. Priors that diffuse quaternions or axis-angle vectors use these
+    in place of the matrix; D is then smaller by 5 or 6.
 
     ## Action Space
 
-    `Box(-max_action, max_action, (N, D), float32)`, `max_action` being 10.
+    `Box(-max_action, max_action, (N, D), float32)`; `max_action` is 10 by default.
 
     | `action_mode` | the action is | next scene |
     |---|---|---|
     | `"next_sample"` | x_{t-1}, normalised | the action |
     | `"noise"` | noise of the reverse step | mean(x_t, t) + std(t) * action, of the prior |
 
-    In `noise` mode an action drawn from N(0, I) reproduces the prior, so stock agents begin at the prior's own
-    behaviour. The last step has std 0: its action has no effect. Actions beyond the bound are clipped. A wrong
-    shape, NaN or infinity raises `InvalidInputError`. Entries known to the prior (welded objects with one
-    constant pose, features that never vary) are set to their values whatever the action says.
+    In `noise` mode an action drawn from N(0, I) reproduces the prior, so standard agents start from the prior's own
+    behaviour. The last step has std 0, so its action has no effect. Actions beyond the bound are clipped. A wrong
+    shape, NaN or infinity raises `InvalidInputError`. Entries that the prior knows (welded objects with one constant
+    pose, features that never vary) keep their values, whatever the action is.
 
     ## Observation Space
 
-    `Dict` of
+    A `Dict` with the keys
 
     | key | space | meaning |
     |---|---|---|
     | `scene` | `Box(-10, 10, (N, D), float32)` | x_t, normalised |
     | `timestep` | `Box(0, T, (1,), int64)` | diffusion timestep t, 0 when the scene is finished |
-    | `object_mask` | `MultiBinary(N)` | slots whose arg-max category is drawn and not *empty* |
-    | `prompt` | `Box(0, V-1, (L,), int64)` | tokens of the prompt, 0 being padding; only if the prior reads prompts |
+    | `object_mask` | `MultiBinary(N)` | slots whose arg-max category is an asset, not *empty* |
+    | `prompt` | `Box(0, V-1, (L,), int64)` | tokens of the prompt, padded with 0; only if the prior reads prompts |
 
     `info` holds the same numbers at every reset and step: `step` (steps taken), `timestep`, `objects` (slots that
     are not empty, welded ones included), `reward_valid` (0 or 1), and `term_<name>` for each term of the reward
@@ -76,18 +76,20 @@ class DenoisingEnv(SpecMixin, gym.Env[Any, np.ndarray]):
 
     ## Rewards
 
-    0 at every step but the last, where it is the reward's value of the decoded scene. If the reward could not
-    score that scene, the step gives 0.0 with `info["reward_valid"] = 0`: leave such episodes out of statistics.
+    The reward is 0 at every step except the last. There it is the value of `reward` for the decoded scene. If `reward`
+    cannot score that scene, the step returns 0.0 with `info["reward_valid"] = 0`; leave such episodes out of
+    statistics.
 
     ## Starting State
 
-    x_T: standard normal noise from `self.np_random`, known entries set; and a prompt, drawn from it too if `prompt`
-    leaves a choice. The same seed gives the same x_T and the same prompt. In `noise` mode the prior follows the
-    prompt; in `next_sample` mode the agent may use or ignore it. Rewards get it in their context.
+    The first scene, x_T, is standard normal noise from `self.np_random`, with known entries set. If `prompt` leaves a
+    choice, `self.np_random` draws the prompt, too. The same seed gives the same x_T and the same prompt. In `noise`
+    mode the prior is conditioned on the prompt; in `next_sample` mode the agent may use or ignore the prompt. Rewards
+    get the prompt in their context.
 
     ## Episode End
 
-    `terminated` after exactly `num_steps` steps, at t = 0. Never `truncated`.
+    The episode is `terminated` after exactly `num_steps` steps, at t = 0. It is never `truncated`.
 
     ## Arguments
 
@@ -106,7 +108,7 @@ class DenoisingEnv(SpecMixin, gym.Env[Any, np.ndarray]):
     | `slots` | `None` | slots per scene; `None` is the scene type's number, more is allowed |
     | `action_mode` | `"next_sample"` | or `"noise"` |
     | `max_action` | `10.0` | bound of the action space |
-    | `workers` | `0` | processes for physics in the reward; 0 computes in this one |
+    | `workers` | `0` | worker processes for physics in the reward; 0 computes in the calling process |
     | `render_mode` | `None` | `"rgb_array"` renders the decoded current scene |
     | `prompt` | `None` | one prompt, a list to draw from, or `"grammar"` for descriptions of the grammar's scenes |
     | `guidance` | `0.0` | weight of classifier-free guidance in `noise` mode; needs a prompt |
@@ -116,8 +118,8 @@ class DenoisingEnv(SpecMixin, gym.Env[Any, np.ndarray]):
     `gym.make_vec("scene_envs:SceneEnvs/Denoising-v0", num_envs=128, ...)` builds one batched environment
     (`DenoisingVectorEnv`): tensors inside, NumPy arrays outside. `autoreset_mode` is `"SameStep"` by default;
     `"NextStep"` and `"Disabled"` (with `options={"reset_mask": ...}`) are available. Environment i of a vector
-    environment seeded with s plays the episodes of a single environment seeded with s + i.
-    `scene_envs.envs.DenoisingTorchRLEnv` is the torchrl adapter; it agrees bit for bit.
+    environment seeded with s plays the same episodes as a single environment seeded with s + i.
+    `scene_envs.envs.DenoisingTorchRLEnv` is the torchrl adapter; it agrees with `DenoisingVectorEnv` bit for bit.
 
     ## Version History
 

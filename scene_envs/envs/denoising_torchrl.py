@@ -19,7 +19,7 @@ from scene_envs.envs.trajectories import StepResult, Trajectories
 
 
 class DenoisingTorchRLEnv(EnvBase):
-    """B denoising episodes as a batch-locked torchrl environment; its page is ``DenoisingEnv``'s.
+    """B denoising episodes as a batch-locked torchrl environment; :class:`DenoisingEnv` describes them.
 
     Keys: ``scene`` (B, N, D) float32, ``timestep`` (B, 1) int64, ``object_mask`` (B, N) int8, ``valid`` (B, 1) bool
     (False where the reward could not score the finished scene, whose reward is then 0), ``prompt`` (B, L) int64 if the

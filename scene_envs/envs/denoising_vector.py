@@ -19,7 +19,7 @@ from scene_envs.errors import InvalidInputError, unknown_name
 
 
 class DenoisingVectorEnv(SpecMixin, VectorEnv[Observation, np.ndarray, np.ndarray]):
-    """B denoising environments as one batch; the page of the environment is :class:`DenoisingEnv`.
+    """B denoising environments as one batch; :class:`DenoisingEnv` describes the environment.
 
     Args:
         num_envs: B.

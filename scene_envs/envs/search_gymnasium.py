@@ -26,23 +26,22 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
 
     ## Description
 
-    A state is a scene with a mask that says which of its slots are to be regenerated: by default the fewest objects
-    whose removal ends all overlaps, those that fall or slide, and a few empty slots. An action chooses one of
-    `branching` inpaintings of those slots by the scene prior (Pfaff et al. 2025, inference-time search). Good choices
-    keep what works and replace what does not.
+    A state is a scene with a mask of the slots to regenerate. By default the mask holds the fewest objects whose
+    removal ends all overlaps, the objects that fall or slide, and a few empty slots. The scene prior makes `branching`
+    inpaintings of these slots, and an action chooses one of the inpaintings (Pfaff et al. 2025, inference-time search).
 
-    Planners use the state directly. It is immutable and picklable and holds no simulator: `clone_state`,
-    `restore_state`, `legal_actions`, `action_masks`, `expand`, `expand_batch`, `evaluate`, `best_state`. The random
-    numbers of a child are a function of the root's seed and the child's path, so a tree is the same whatever the
-    order of its expansion. Batches of different sizes may differ in the network's rounding, by about 1e-6.
+    Planners work on states directly: `clone_state`, `restore_state`, `legal_actions`, `action_masks`, `expand`,
+    `expand_batch`, `evaluate`, `best_state`. A state is immutable and picklable and holds no simulator. The random
+    numbers of a child depend only on the root's seed and the child's path, so a tree does not depend on the order of
+    its expansion. Batches of different sizes may differ in the network's rounding, by about 1e-6.
 
     ## Action Space
 
-    `Discrete(branching)`: which inpainting. All are legal until the episode ends.
+    `Discrete(branching)`: which inpainting. All actions are legal until the episode ends.
 
     ## Observation Space
 
-    `Dict` of
+    A `Dict` with the keys
 
     | key | space | meaning |
     |---|---|---|
@@ -50,29 +49,28 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     | `object_mask` | `MultiBinary(N)` | slots that are not *empty* |
     | `regenerate` | `MultiBinary(N)` | slots that the next action regenerates |
     | `depth` | `Box(0, max_depth, (1,), int64)` | actions taken |
-    | `value` | `Box(0, 1, (1,), float32)` | Φ of the scene |
-    | `prompt` | `Box(0, V-1, (L,), int64)` | tokens of the prompt, 0 being padding; only if `prompt=` is given |
+    | `value` | `Box(0, 1, (1,), float32)` | Φ of the scene, see Rewards |
+    | `prompt` | `Box(0, V-1, (L,), int64)` | tokens of the prompt, padded with 0; only if `prompt=` is given |
 
-    `info` holds the same numbers at every reset and step: `depth`, `value` (Φ), `objective` (raw), `reward_valid`
-    (0 or 1), `objects` (slots that are not empty, welded ones included), `regenerate` (slots in the mask),
-    `best_value` (highest Φ since the reset) and `nfe` (denoiser evaluations since the reset, planner's ones
-    included).
+    `info` holds the same numbers at every reset and step: `depth`, `value` (Φ), `objective` (raw), `reward_valid` (0 or
+    1), `objects` (slots that are not empty, welded ones included), `regenerate` (slots in the mask), `best_value`
+    (highest Φ since the reset) and `nfe` (denoiser evaluations since the reset, including those of planners).
 
     ## Rewards
 
-    Φ(s') - Φ(s), with Φ the objective's value divided by the number of free slots (or by `objective_scale`),
-    clipped to [0, 1]. The rewards of an episode add up to Φ(end) - Φ(root). Where the objective could not score the
-    child, Φ is that of the parent, the reward is 0 and `info["reward_valid"]` is 0.
+    The reward is Φ(s') - Φ(s). Φ is the objective's value divided by the number of free slots (or by
+    `objective_scale`), clipped to [0, 1]. The rewards of an episode add up to Φ(end) - Φ(root). If the objective cannot
+    score the child, the child takes the parent's Φ, so the reward is 0, and `info["reward_valid"]` is 0.
 
     ## Starting State
 
-    A sample of the prior, from a seed that `self.np_random` draws. `reset(options={"state": state})` starts from a
-    given `SearchState` instead, and `options={"scene": batch}` from a given scene.
+    An episode starts from a sample of the prior; `self.np_random` draws the sample's seed. `reset(options={"state":
+    state})` starts from a given `SearchState` instead, and `options={"scene": batch}` from a given scene.
 
     ## Episode End
 
-    `terminated` when nothing is left to improve: no slot is masked, or Φ is 1. `truncated` at depth `max_depth`, or
-    when `max_nfe` denoiser evaluations are spent since the reset.
+    The episode is `terminated` when nothing is left to improve: no slot is masked, or Φ is 1. It is `truncated` at
+    depth `max_depth`, or when `max_nfe` denoiser evaluations are spent since the reset.
 
     ## Arguments
 
@@ -94,15 +92,15 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     | `mask` | `"culprits"` | [mask](../search.md#masks): a name, a mapping with its settings, or a function |
     | `objective_scale` | `None` | objective value at which Φ = 1; `None` is the number of free slots |
     | `max_nfe` | `None` | denoiser evaluations per episode; `None` is any number |
-    | `workers` | `0` | processes for physics in the objective; 0 computes in this one |
+    | `workers` | `0` | worker processes for physics in the objective; 0 computes in the calling process |
     | `render_mode` | `None` | `"rgb_array"` renders the current scene |
-    | `prompt` | `None` | what all scenes should hold, for priors that read prompts; the objective sees it too |
+    | `prompt` | `None` | text that all scenes should satisfy, for priors that read prompts; the objective gets it too |
     | `guidance` | `0.0` | weight of classifier-free guidance, which doubles the NFE; needs a prompt |
 
     ## Vectorized environment
 
-    `gym.make_vec("scene_envs:SceneEnvs/Search-v0", num_envs=4, ...)` runs copies one after another. A planner is
-    better served by `expand_batch`, which denoises many children in one batch.
+    `gym.make_vec("scene_envs:SceneEnvs/Search-v0", num_envs=4, ...)` runs copies one after another. Planners should use
+    `expand_batch`, which denoises many children in one batch.
 
     ## Version History
 

@@ -20,27 +20,27 @@ class SearchMaskEnv(SearchEnv):
 
     ## Description
 
-    As [Search-v0](search.md), but a state has K masks instead of one, and an action chooses both a mask and one of
-    `branching` inpaintings of its slots by the scene prior. Which mask is best depends on the scene: a crowded one
-    needs repair, one without faults has room for more, and one that is stuck needs a larger change. An agent can
-    learn that; [maskable_ppo.py](../../examples/maskable_ppo.py) does with MaskablePPO of sb3-contrib.
+    This environment is [Search-v0](search.md) with K masks per state instead of one. An action chooses a mask and one
+    of the scene prior's `branching` inpaintings of that mask's slots. Which mask is best depends on the scene: a
+    crowded scene needs repair, a scene without faults has room for more objects, and a scene in which repair fails
+    needs a larger change. An agent can learn this choice; [maskable_ppo.py](../../examples/maskable_ppo.py) trains one
+    with MaskablePPO of sb3-contrib.
 
-    Planners use the state as in `Search-v0`, with the same methods: `clone_state`, `restore_state`, `legal_actions`,
-    `action_masks`, `expand`, `expand_batch`, `evaluate`, `best_state`. All masks of a state are drawn from the same
-    random numbers, a function of the root's seed and the path; with one mask the tree is that of `Search-v0`, bit for
-    bit.
+    Planners use the same methods as in `Search-v0`: `clone_state`, `restore_state`, `legal_actions`, `action_masks`,
+    `expand`, `expand_batch`, `evaluate`, `best_state`. All masks of a state use the same random numbers, which depend
+    on the root's seed and the path. With one mask the tree equals that of `Search-v0`, bit for bit.
 
     ## Action Space
 
-    `Discrete(K * branching)`: action `k * branching + j` is inpainting j of mask k. An action is legal where its mask
-    has a slot. `action_masks()` tells the legal ones, as MaskablePPO asks for them. `legal_actions()` lists an
-    inpainting of every mask before the second of any, so that a planner that expands a few actions tries all masks.
-    `step` with another action leaves the scene as it is: it costs a step of `max_depth` and no denoiser evaluations.
-    `expand` refuses it.
+    `Discrete(K * branching)`: action `k * branching + j` is inpainting j of mask k. An action is legal if its mask has
+    a slot. `action_masks()` marks the legal actions in the form that MaskablePPO expects. `legal_actions()` lists the
+    first inpainting of every mask before the second of any, so a planner that expands a few actions tries all masks.
+    `step` with an illegal action leaves the scene as it is; it counts as a step of `max_depth` and costs no denoiser
+    evaluations. `expand` refuses an illegal action.
 
     ## Observation Space
 
-    `Dict` of
+    A `Dict` with the keys
 
     | key | space | meaning |
     |---|---|---|
@@ -48,25 +48,25 @@ class SearchMaskEnv(SearchEnv):
     | `object_mask` | `MultiBinary(N)` | slots that are not *empty* |
     | `regenerate` | `MultiBinary((K, N))` | slots that each mask regenerates |
     | `depth` | `Box(0, max_depth, (1,), int64)` | actions taken |
-    | `value` | `Box(0, 1, (1,), float32)` | Φ of the scene |
+    | `value` | `Box(0, 1, (1,), float32)` | Φ of the scene, see Rewards |
 
-    `info` is that of `Search-v0`; `regenerate` there is the number of slots in any mask.
+    `info` has the same keys as in `Search-v0`; `regenerate` is the number of slots that are in any mask.
 
     ## Rewards
 
-    Φ(s') - Φ(s), with Φ the objective's value divided by the number of free slots (or by `objective_scale`),
-    clipped to [0, 1]. The rewards of an episode add up to Φ(end) - Φ(root). Where the objective could not score the
-    child, Φ is that of the parent, the reward is 0 and `info["reward_valid"]` is 0.
+    The reward is Φ(s') - Φ(s). Φ is the objective's value divided by the number of free slots (or by
+    `objective_scale`), clipped to [0, 1]. The rewards of an episode add up to Φ(end) - Φ(root). If the objective cannot
+    score the child, the child takes the parent's Φ, so the reward is 0, and `info["reward_valid"]` is 0.
 
     ## Starting State
 
-    A sample of the prior, from a seed that `self.np_random` draws. `reset(options={"state": state})` starts from a
-    given `MaskChoiceState` instead, and `options={"scene": batch}` from a given scene.
+    An episode starts from a sample of the prior; `self.np_random` draws the sample's seed. `reset(options={"state":
+    state})` starts from a given `MaskChoiceState` instead, and `options={"scene": batch}` from a given scene.
 
     ## Episode End
 
-    `terminated` when nothing is left to improve: no mask has a slot, or Φ is 1. `truncated` at depth `max_depth`, or
-    when `max_nfe` denoiser evaluations are spent since the reset.
+    The episode is `terminated` when nothing is left to improve: no mask has a slot, or Φ is 1. It is `truncated` at
+    depth `max_depth`, or when `max_nfe` denoiser evaluations are spent since the reset.
 
     ## Arguments
 
@@ -89,15 +89,15 @@ class SearchMaskEnv(SearchEnv):
     | `slots` | `None` | slots per scene; `None` is the scene type's number, more is allowed |
     | `objective_scale` | `None` | objective value at which Φ = 1; `None` is the number of free slots |
     | `max_nfe` | `None` | denoiser evaluations per episode; `None` is any number |
-    | `workers` | `0` | processes for physics in the objective; 0 computes in this one |
+    | `workers` | `0` | worker processes for physics in the objective; 0 computes in the calling process |
     | `render_mode` | `None` | `"rgb_array"` renders the current scene |
-    | `prompt` | `None` | what all scenes should hold, for priors that read prompts; the objective sees it too |
+    | `prompt` | `None` | text that all scenes should satisfy, for priors that read prompts; the objective gets it too |
     | `guidance` | `0.0` | weight of classifier-free guidance, which doubles the NFE; needs a prompt |
 
     ## Vectorized environment
 
-    `gym.make_vec("scene_envs:SceneEnvs/SearchMask-v0", num_envs=4, ...)` runs copies one after another. A planner is
-    better served by `expand_batch`, which denoises many children in one batch.
+    `gym.make_vec("scene_envs:SceneEnvs/SearchMask-v0", num_envs=4, ...)` runs copies one after another. Planners should
+    use `expand_batch`, which denoises many children in one batch.
 
     ## Version History
 

@@ -15,7 +15,7 @@ class SceneEnvSpec(EnvSpec):
     """A spec whose ``to_json`` names the keyword argument that is in the way."""
 
     def to_json(self) -> str:
-        """The spec as JSON; InvalidInputError for a function or an object, which only its name can stand for."""
+        """The spec as JSON; InvalidInputError for a function or an object: give its name instead."""
         for name, value in self.kwargs.items():
             try:
                 json.dumps(value)

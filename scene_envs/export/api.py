@@ -56,12 +56,12 @@ def export(
     scenes by a second call; an interrupted export goes on when the same call is made again.
 
     Args:
-        batch: B scenes. Export what is simulation-ready (:func:`scene_envs.physics.make_ready`) if it is to stand
-            still: nothing is moved here.
-        output: folder; made where there is none. Other files in it are left alone.
+        batch: B scenes. Nothing is moved here: make scenes simulation-ready first
+            (:func:`scene_envs.physics.make_ready`) if they must stand still.
+        output: folder; made if it does not exist. Other files in it are left alone.
         formats: a name, several, or ``"all"`` that can be written here; see
             :func:`scene_envs.export.list_formats`.
-        friction: Coulomb friction coefficient between any two surfaces; that of :mod:`scene_envs.physics` unless given.
+        friction: Coulomb friction coefficient between any two surfaces; by default that of :mod:`scene_envs.physics`.
 
     Raises:
         UnknownNameError: no such format.

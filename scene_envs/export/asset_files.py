@@ -21,7 +21,7 @@ _CELL = 4
 
 
 class AssetFiles:
-    """Writes what a format asks for, the first time it is asked for.
+    """Writer of asset files; each file is written when a format first asks for it.
 
     Args:
         folder: the ``assets`` folder.

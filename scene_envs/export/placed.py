@@ -83,8 +83,8 @@ class PlacedScene:
 def place(batch: SceneBatch) -> list[PlacedScene]:
     """The scenes of a batch with exact poses and unique names.
 
-    Rotations come in single precision; here they are doubles on SO(3), no further from what was given than its
-    rounding. Objects are called after their asset and numbered in slot order. An asset without mass is welded.
+    Rotations come in single precision. They become doubles on SO(3) that differ from the given ones by no more than
+    their rounding. Objects are named after their asset and numbered in slot order. An asset without mass is welded.
 
     Raises:
         InvalidInputError: a rotation is not one; its scene and slot are named.

@@ -38,7 +38,7 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
 
 
 def asset_usd(asset: Asset, files: AssetFiles) -> Path:
-    """``<name>.usda``: a coloured mesh, and convex colliders of purpose *guide*. Whoever places it makes it a body."""
+    """``<name>.usda``: a coloured mesh, and convex colliders of purpose *guide*; the scene makes it a body."""
     path: Path = files.once(asset, "usd", lambda folder: _write_asset(asset, files, folder))
     return path
 

@@ -27,7 +27,7 @@ _NOWHERE = Camera((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
 
 @dataclass(frozen=True)
 class Standing:
-    """Long things (their long axis is x, the heavier end toward +x) that stand in a jar, heads up, leaning outward.
+    """Long objects (long axis x, heavier end toward +x) that stand in a jar, heavier end up, leaning outward.
 
     Attributes:
         node: draws the contents.
@@ -63,7 +63,7 @@ class Standing:
 
 @dataclass(frozen=True)
 class Heap:
-    """Things poured into a bowl one above the other, turned at random.
+    """Objects poured into a bowl one above the other, turned at random.
 
     Attributes:
         node: draws the contents.

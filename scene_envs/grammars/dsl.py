@@ -1,8 +1,8 @@
-"""Words of a grammar: objects, stacks, choices and repetitions, each of which draws towers.
+"""Nodes of a grammar: objects, stacks, choices and repetitions, each of which draws towers.
 
-A *tower* is what stands on a support: one object, or a stack of objects on the same vertical axis, with what
-stands on it and what is in it. Nodes say what is there (the structure); a distribution such as
-:class:`~scene_envs.grammars.distributions.Gaussian` says where.
+A *tower* stands on a support. It is one object, or a stack of objects on the same vertical axis, with the objects on it
+and in it. Nodes determine which objects there are (the structure). A distribution such as
+:class:`~scene_envs.grammars.distributions.Gaussian` determines where they are.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _CENTER = Gaussian(along=0.0)
 
 @dataclass(frozen=True)
 class Object:
-    """One object at a distribution of places, with what stands on it or is in it.
+    """One object at a distribution of places, with the objects on it and in it.
 
     Attributes:
         asset: asset name.
@@ -54,7 +54,7 @@ class Object:
 
 @dataclass(frozen=True)
 class Tiers:
-    """Several surfaces of what carries this node, such as the boards of a fixed shelf, drawn together."""
+    """Several surfaces of the object that carries this node, such as the boards of a fixed shelf, drawn together."""
 
     surfaces: Sequence[Surface]
 
@@ -83,7 +83,7 @@ class Cluster:
 
 @dataclass(frozen=True)
 class Stack:
-    """A stack that grows by chance: after each ``base``, one of ``then``.
+    """A stack of random height: after each ``base``, one of ``then``.
 
     Attributes:
         base: the asset that carries others.

@@ -30,15 +30,16 @@ _MAX_WITHOUT_ROOM = 100
 class Grammar:
     """A distribution over scenes of one type.
 
-    Poses are exact: objects stand upright, towers on one axis; only what is inside a container comes to rest there.
+    Poses are exact: objects stand upright, and the objects of a tower share one axis. Only the contents of containers
+    are settled in simulation.
 
     Attributes:
         name: the registered name.
         scene_type: the scene type, or its name.
         surfaces: the supports with their children.
-        such_that: named conditions on all towers of a scene, those that stand on others included; a structure
-            that fails one is thrown away.
-        reasons: how often, and why, draws were thrown away since the grammar was made.
+        such_that: named conditions on all towers of a scene, those that stand on others included; a structure that
+            fails one is rejected.
+        reasons: number of rejected draws by reason since the grammar was made.
 
     >>> from scene_envs.grammars import get_grammar
     >>> grammar = get_grammar("dimsum_table")

@@ -1,7 +1,7 @@
 """Pantry Shelf: four tiers of cans, bottles and fruit, from nearly empty to packed.
 
-Kinds and counts follow the scene grammar of the paper's dataset (Pfaff et al., CoRL 2025). There, overlap was left to a
-solver and objects fell off the shelf; here everything is placed where there is room.
+Kinds and counts follow the scene grammar of the paper's dataset (Pfaff et al., CoRL 2025). There a solver removes
+overlap and objects fall off the shelf; here every object is placed where there is room.
 """
 
 from __future__ import annotations

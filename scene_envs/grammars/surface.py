@@ -132,7 +132,7 @@ class FreeSurface:
         return len(self._placed)
 
     def reset(self, mark: int) -> None:
-        """Take away what was placed since :meth:`mark`."""
+        """Remove the children placed since :meth:`mark`."""
         del self._placed[mark:], self._cores[mark:]
 
     def fit(self, x: float, y: float, yaws: Sequence[float], outline: Outline) -> list[Placed] | None:
@@ -151,10 +151,10 @@ class FreeSurface:
     def place(
         self, where: PositionDistribution, yaw: Yaw, outline: Outline, rng: np.random.Generator, levels: int = 1
     ) -> tuple[float, float, tuple[float, ...]] | None:
-        """Place one child at a draw of ``where`` cut to the free region; None when there is no room.
+        """Place one child at a draw of ``where`` restricted to the free region; None when there is no room.
 
-        A few plain draws are tried first; on a crowded support the free cells are enumerated and one of
-        them is drawn by its density.
+        A few plain draws are tried first. On a crowded support the free cells are enumerated, and one of them is drawn
+        in proportion to its density.
 
         Returns:
             x, y (m) and the yaw (rad) of each of its ``levels``.

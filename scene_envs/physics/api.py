@@ -28,13 +28,13 @@ def feasibility(
     duration: float = 0.1,
     pool: PhysicsPool | None = None,
 ) -> FeasibilityResult:
-    """Judge every object: does it overlap another, and does it stay where it is.
+    """Feasibility of every object: whether it overlaps another one, and whether it stays where it is.
 
-    A free object is feasible when its frame is in the workspace, it is in no object pair that overlaps deeper than
-    ``max_penetration`` and, with all such objects removed, moves and turns no further than the limits in ``duration``
-    seconds of simulation under gravity. Welded objects hold others but are not judged. A scene whose simulation takes
-    more work than :func:`settle` may spend is invalid. Where exact depths of a heap would take long, ``depth`` is that
-    of shapes that enclose the objects.
+    A free object is feasible when its frame is in the workspace, when it is in no object pair that overlaps deeper than
+    ``max_penetration``, and when it moves and turns no further than the limits in ``duration`` seconds of simulation
+    under gravity, after all overlapping objects are removed. Welded objects support others but are not judged. A scene
+    whose simulation takes more work than :func:`settle` may spend is invalid. If exact depths of a heap would take
+    long, ``depth`` is that of the enclosing coarse parts.
 
     Args:
         batch: B scenes of N slots.
@@ -67,9 +67,9 @@ def feasibility(
 
 
 def penetration(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> PenetrationResult:
-    """Overlap of every object pair, and in total over pairs of convex parts.
+    """Overlap of every object pair, and the total over pairs of convex parts.
 
-    Needs no simulator. A heap of objects whose depths would take long is invalid.
+    No simulator is needed. A heap of objects whose exact depths would take long is invalid.
 
     Raises InvalidInputError as :func:`feasibility` does.
     """
@@ -90,8 +90,8 @@ def penetration(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> Penetr
 def equilibrium(batch: SceneBatch, *, duration: float = 0.1, pool: PhysicsPool | None = None) -> EquilibriumResult:
     """Displacement of every object under gravity in ``duration`` seconds, nothing removed.
 
-    A heap of objects so deep in each other that its simulation would take long is invalid: project it first. So is a
-    scene that takes more work than :func:`settle` may spend.
+    A heap whose objects overlap so deeply that its simulation would take long is invalid: project it first. A scene
+    that takes more work than :func:`settle` may spend is invalid as well.
 
     Raises InvalidInputError and MissingDependencyError as :func:`feasibility` does.
     """
@@ -104,11 +104,11 @@ def settle(
 ) -> SettleResult:
     """Let every scene come to rest under gravity, with slight damping.
 
-    Simulates up to ``duration`` seconds, and stops earlier when nothing moves any more. Objects that fall off
-    their support are where they fell to, outside the workspace; those more than a metre below it stay there. A heap
-    of objects so deep in each other that its simulation would take long is invalid: project it first. The work on a
-    scene is bounded, the more so where many objects are deep in each other (:mod:`scene_envs.physics.budget`). When it
-    does not suffice, objects stay where they have got to, and ``finished`` is False.
+    The simulation lasts up to ``duration`` seconds and stops earlier when nothing moves any more. Objects that fall off
+    their support end where they fell to, outside the workspace; they stop once they are a metre below it. A heap whose
+    objects overlap so deeply that its simulation would take long is invalid: project it first. The work per scene has
+    a limit, which is smaller if many objects overlap deeply (:mod:`scene_envs.physics.budget`). When the limit is
+    reached, objects stay at the poses reached, and ``finished`` is False.
 
     Args:
         batch: B scenes of N slots.
@@ -130,8 +130,7 @@ def settle(
 def project(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> ProjectionResult:
     """The nearest scenes without overlap: translations change, rotations and welded objects do not.
 
-    Touching is allowed. Where objects cannot be separated (more of them than room), the best effort is
-    returned and ``converged`` is False.
+    Objects may touch. If there is no room to separate them, the best effort is returned and ``converged`` is False.
 
     Raises InvalidInputError as :func:`feasibility` does.
     """

@@ -38,7 +38,7 @@ def run_kernel(
         batch: B scenes.
         options: keyword arguments of the kernel.
         pool: worker processes; None computes in this process.
-        units: (B,) float64, what the simulation of each scene may spend; None leaves that to its objects.
+        units: (B,) float64, units that the simulation of each scene may spend; None derives them from its objects.
 
     Raises:
         InvalidInputError: a pose is not finite, or a rotation is not one; its scene and slot are named.
@@ -80,7 +80,7 @@ def valid_rows(rows: Rows) -> Tensor:
 
 
 def spent(rows: Rows) -> Tensor:
-    """(B,) float64, units of simulation that each scene took; all there are where the scene failed twice."""
+    """(B,) float64, units of simulation that each scene took; all of its units if the scene failed twice."""
     return torch.tensor([np.inf if row is None else float(row["spent"]) for row in rows], dtype=torch.float64)
 
 

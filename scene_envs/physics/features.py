@@ -1,4 +1,4 @@
-"""Corners, faces and edges of a convex part, with the normals that say which of them can touch.
+"""Corners, faces and edges of a convex part, with the normals at which each of them can touch another part.
 
 The outward normals at which a corner, edge or face of a convex part is extreme form a region, an arc and a point of
 the unit sphere: the part's Gauss map. The arc of an edge leads from the normal of one of its faces to the other's.

@@ -42,8 +42,8 @@ class AssetGeometry:
 
     Attributes:
         asset: the asset.
-        fine: hollow where the asset is hollow.
-        coarse: encloses ``fine``; the same object as ``fine`` when there is nothing to gain.
+        fine: parts that are hollow where the asset is hollow.
+        coarse: parts that enclose ``fine``; the same object as ``fine`` where simpler parts gain nothing.
         bottom: the flat face at the lowest z of the asset frame, or None.
         top: the flat face at the highest z, or None.
     """
@@ -143,7 +143,7 @@ def _table(parts: Sequence[PartGeometry]) -> PartTable:
 def inset_hull(part: PartGeometry, distance: float) -> Array:
     """Corners (V, 3) of the part with every face moved inward by ``distance`` (m).
 
-    Bullet grows convex meshes by its margin, so a hull that is to act at its true size goes in smaller.
+    Bullet enlarges convex meshes by its margin, so a hull that is smaller by the margin acts at its true size.
     A part too thin for the whole distance is inset by two fifths of its thickness.
     """
     from scipy.optimize import linprog

@@ -85,7 +85,7 @@ class Gripper:
 
 @dataclass(frozen=True, eq=False)
 class ReachResult:
-    """Which objects a gripper comes to.
+    """Objects that a gripper reaches.
 
     Attributes:
         reached: (A, B, N) bool, for each approach; False for welded and empty slots.
@@ -97,12 +97,11 @@ class ReachResult:
 
 
 def reachable(batch: SceneBatch, approaches: Sequence[Sequence[float]], gripper: Gripper | None = None) -> ReachResult:
-    """Objects to which an open gripper comes in a straight line without touching anything.
+    """Objects that an open gripper reaches in a straight line without touching anything.
 
     For each approach the gripper is tried at the middle and at both edges of the object, with four closing directions
-    and all reaches. It comes to the object when some of the object is between its fingers, and neither fingers nor
-    palm, nor the palm on its way, overlap the object or anything else by more than 0.1 mm (fine convex parts, exact
-    depths).
+    and all reaches. It reaches the object when a part of the object is between the fingers, and when the fingers, the
+    palm and the path of the palm overlap no object by more than 0.1 mm (fine convex parts, exact depths).
 
     Args:
         batch: B scenes of N slots.
@@ -148,7 +147,7 @@ class _Hand:
     def reach(self, objects: Objects, back: Array, budget: Budget) -> Index:
         """Rows of the free objects of one scene that the gripper reaches from the direction ``back`` (3,).
 
-        ``budget`` counts pairs of convex parts; when it is spent, what is returned means nothing.
+        ``budget`` counts pairs of convex parts; when it is spent, the result is not valid.
         """
         free = np.flatnonzero(~objects.fixed)
         if not len(free):

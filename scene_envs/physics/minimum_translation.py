@@ -1,8 +1,8 @@
 """Minimum translations: the shortest straight moves that free overlapping object pairs.
 
-Along a straight line, two convex parts overlap during one interval, which follows from their face planes. A translation
-in some direction is long enough where no interval of any two parts reaches: beside the other object, above it, or in
-its hollow.
+A convex part that moves along a straight line overlaps another convex part during one interval, which follows from the
+face planes of both. A translation frees an object pair when it lies outside the intervals of all pairs of their parts:
+beside the other object, above it, or in its hollow.
 """
 
 from __future__ import annotations

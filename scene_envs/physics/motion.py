@@ -156,8 +156,8 @@ def advance(
 ) -> Moved:
     """The objects of one scene ``duration`` seconds later.
 
-    What is at rest is where its closed form says, all else is simulated with what it touches. When something
-    simulated reaches an object that was not, or one that had come to rest and left, the two are simulated
+    Objects at rest get the pose of their closed form; all others are simulated with the objects they touch. When a
+    simulated object reaches one that was not simulated, or one that had come to rest and left, the two are simulated
     again together.
 
     Args:
@@ -278,7 +278,7 @@ def _merge(objects: Objects, pairs: ObjectPairs, group: Index, first: Index, sec
 
 
 def settings_for(height: int) -> SolverSettings:
-    """Taller stacks need a finer integration to stand as still as they do in reality.
+    """Integration of a stack: a taller stack gets a finer one, so that it stands as still as in reality.
 
     Args:
         height: how many objects carry the topmost one.

@@ -70,8 +70,8 @@ def separating_planes(
 ) -> Planes:
     """Planes that keep object pairs apart.
 
-    Every pair of parts gets a face plane that separates it now; among several, the one that asks for the least
-    move away from home. Coarse parts serve where they are apart already, fine ones elsewhere.
+    Every pair of parts gets a face plane that separates the two parts now. Among several such planes the one with the
+    least move away from home is taken. Coarse parts are used where they are already apart, fine ones elsewhere.
 
     Args:
         collider: geometry and exact distances.
@@ -165,7 +165,7 @@ def least_distance(matrix: Array, needed: Array, budget: Budget) -> Array:
     """The shortest x with ``matrix @ x + s >= needed``, slack s costing ``_SLACK`` squared.
 
     Lawson and Hanson's least-distance programme (1974, ch. 23) through non-negative least squares on its dual.
-    Most rows are met by themselves: they join only when a solution without them breaks them. Problems of more than
+    Most rows hold anyway: a row joins only when a solution without it violates it. Problems of more than
     ``_EXACT`` rows, and those on which the exact method fails, are solved approximately. When ``budget`` is spent,
     the last solution is returned.
     """

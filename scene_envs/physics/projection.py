@@ -1,14 +1,14 @@
 """Projection: the nearest translations at which no two objects overlap, rotations kept.
 
-With rotations fixed, "this part lies on that side of a plane with normal d" is exactly linear in the
-translations. Each object pair that overlaps is given a minimum translation; the planes that separate its parts
-*there* are consistent with each other, so a thin wall that is straddled cannot ask for opposite moves. The nearest
-point under all planes is a least-distance problem, with slack that costs far more than distance, so that a crowded
-scene has a best effort. Exact depths have the last word after every round. Once nothing overlaps, planes are chosen
-anew at the solution, which can only shorten the way, until it does not.
+With rotations fixed, "this part lies on that side of a plane with normal d" is exactly linear in the translations. Each
+object pair that overlaps gets a minimum translation. The planes that separate its parts after this translation are
+consistent with each other, so an object that straddles a thin wall cannot get opposite moves. The nearest point under
+all planes is a least-distance problem, with slack that costs far more than distance, so that a crowded scene has a best
+effort. Exact depths check the result of every round. Once nothing overlaps, planes are chosen anew at the solution as
+long as this shortens the distance moved.
 
-The rounds end when their work budget is spent. Objects that overlap then, and heaps of objects from the start, are
-spread to free places, from where the rounds go on.
+The rounds end when their work budget is spent. Objects that then overlap are spread to free places, and the rounds
+continue from there. Heaps of objects are spread before the first round.
 """
 
 from __future__ import annotations

@@ -47,16 +47,16 @@ def make_ready(
     """Project, settle, then count the simulation-ready objects.
 
     A free object is ready when it is inside the workspace, overlaps nothing deeper than 0.1 mm, and stays within 1 mm
-    and 0.01 rad of where it is for 2 s of simulation, also without the objects that are not ready. In the end it has to
-    stay within 2 mm and 0.02 rad for half a second when gravity leans by 0.12 rad, in each of four directions: a stack
-    that leans and only just holds is not ready. Objects whose rest has a closed form need no simulation.
+    and 0.01 rad of its pose for 2 s of simulation, also after the objects that are not ready are removed. It also has
+    to stay within 2 mm and 0.02 rad for half a second when gravity leans by 0.12 rad, in each of four directions. This
+    test rejects leaning stacks that barely hold. Objects whose rest has a closed form need no simulation.
 
-    Scenes with objects in the workspace that are not ready go through projection and settling again, with more solver
-    iterations, up to ``rounds`` times in all, until two in a row have made no more of them ready. The round with most
-    ready objects is kept, the earliest of equal ones. A heap, whose objects are so deep in each other that projection
-    has to spread them, is invalid. All rounds of a scene together do half of the work that :func:`settle` may do, and
-    the last trials the rest; where it does not suffice, the scene is the best of the rounds that ended, what was not
-    judged is not ready, and ``finished`` is False.
+    Scenes with unready objects in the workspace go through projection and settling again, with more solver iterations,
+    up to ``rounds`` times in all. They stop after two rounds in a row without more ready objects. The round with most
+    ready objects is kept, the earliest of equal ones. A heap is invalid: its objects overlap so deeply that projection
+    has to spread them. All rounds of a scene together may spend half of the work that :func:`settle` may spend, and the
+    last trials the rest. If this does not suffice, the result is the best finished round, objects that were not judged
+    are not ready, and ``finished`` is False.
 
     Args:
         batch: B scenes of N slots.

@@ -1,8 +1,8 @@
 """Statics of upright stacks: objects that are at rest without simulation.
 
-An upright object rests on the one object under it when its centre of mass, with everything that it carries, lies
-inside both its own foot and the flat face below. Gaps close and small overlaps open, from the lowest object up. What
-stands like that, and meets nothing on that way, is at rest; all else has to be simulated.
+An upright object rests on the one object under it when the centre of mass of the object and everything it carries lies
+inside both the object's foot and the flat face below. From the lowest object up, gaps are closed and small overlaps
+opened. Objects that meet no other object on this way are at rest; all others are simulated.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class _Polygons:
 
 
 class Statics:
-    """Judges from precomputed feet and surfaces what stands.
+    """Closed-form test of rest, from precomputed feet and surfaces.
 
     Args:
         library: geometry of the assets.

@@ -18,7 +18,7 @@ class FeasibilityResult:
         depth: (B, N) m, deepest overlap of each object with any other, welded ones included.
         displacement: (B, N) m, how far the object frame moved; 0 where the object was not simulated.
         rotation: (B, N) rad, the angle it turned.
-        valid: (B,) bool; False where physics could not judge the scene. All else is 0 there.
+        valid: (B,) bool; False where physics could not judge the scene. All other fields are 0 there.
         counts: (B,) int64, feasible objects per scene.
     """
 
@@ -89,8 +89,8 @@ class SettleResult:
         batch: the scenes at their new poses; invalid rows as they were.
         displacement: (B, N) m, from the given poses.
         rotation: (B, N) rad.
-        finished: (B,) bool; False where the scene's work budget was spent first: objects are where they had got to, and
-            may be moving. False also where ``valid`` is.
+        finished: (B,) bool; False where the scene's work budget was spent first: objects are at the poses reached, and
+            may be moving. False also where ``valid`` is False.
         valid: (B,) bool.
     """
 
@@ -131,7 +131,7 @@ class ReadyResult:
         ready: (B, N) bool; free objects that are simulation-ready there (see :func:`make_ready`).
         counts: (B,) int64, ready objects per scene.
         finished: (B,) bool; False where the scene's work budget was spent first: the batch is the best effort, and
-            objects that were not judged are not ready. False also where ``valid`` is.
+            objects that were not judged are not ready. False also where ``valid`` is False.
         valid: (B,) bool, of the first round.
     """
 

@@ -1,8 +1,8 @@
 """Separating planes between many pairs of convex parts at once, in numpy.
 
-For two convex parts every face direction gives a lower bound on their distance when it separates them,
-and otherwise an upper bound on how deep they overlap. For flat contact the bound is exact, which decides
-nearly all pairs of a tidy scene without a call per pair.
+For two convex parts, a face direction that separates them gives a lower bound on their distance; any other face
+direction gives an upper bound on the depth of their overlap. For flat contact the bound is exact, so nearly all pairs
+of a tidy scene need no further test.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Settling: scenes that come to rest under gravity, a segment of time after the other."""
+"""Settling: motion of scenes under gravity until they are at rest, in segments of time."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
 """Spreading of heaps: free places for objects that overlap too much for separating planes, by bounding boxes.
 
-Objects are placed one after the other, the largest first, each at the free place nearest to where it should be. The
-places looked at are those where the object's box touches the boxes around it, which holds the nearest free place as
-long as the boxes are few; where they are many, an even selection is looked at, so that the work is bounded.
+Objects are placed one after the other, the largest first, each at the free place nearest to its wanted place. The
+candidates are the places where the object's box touches the boxes around it. They include the nearest free place as
+long as the boxes are few. Where boxes are many, only an even selection of places is tested, so that the work is
+bounded.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ _FIXED = 1000
 def heaps(collider: Collider, objects: Objects) -> Mask:
     """(n,) free objects of one scene in groups that overlap so much that exact tests would take too long.
 
-    Nested objects that stand as they should meet as often, but hardly overlap: they are no heap.
+    Objects nested as intended meet as many others but hardly overlap, so they are no heap.
     """
     low, high = object_boxes(place(collider.library, objects, "coarse"))
     first, second = scene_pairs(objects)

@@ -50,7 +50,7 @@ class _Faces:
 
 
 class Support:
-    """Judges contacts from precomputed faces.
+    """Test of contacts, from precomputed faces.
 
     Args:
         library: geometry of the assets.
@@ -153,7 +153,7 @@ def components(count: int, first: Index, second: Index) -> Index:
 def company(objects: Objects, pairs: ObjectPairs, chosen: Mask) -> Mask:
     """(n,) free objects that must be simulated with the ``chosen`` ones.
 
-    These are what touches or nearly touches a chosen object, and whatever those stand on or carry.
+    These are objects that touch or nearly touch a chosen object, and the objects on or under those.
     """
     free = ~(objects.fixed[pairs.first] | objects.fixed[pairs.second]) & (pairs.gap < _REACH)
     first, second = pairs.first[free], pairs.second[free]

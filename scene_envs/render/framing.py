@@ -48,9 +48,9 @@ class Framing:
 def frame_scene_type(scene_type: SceneType) -> Framing:
     """Framing of scenes of this type.
 
-    A support that rises through the workspace (a shelf) is seen whole, from its open side and slightly above; one that
-    is open to the sky (a bin) steeply from above. Where objects stand on a support (a table, a floor) or on nothing,
-    the view is a three-quarter one from above, across the longer side, steeper the flatter the workspace is.
+    A support that rises through the workspace (a shelf) is seen whole, from its open side and slightly above. A support
+    that is open above (a bin) is seen steeply from above. If objects stand on a support (a table, a floor) or on
+    nothing, the view is a three-quarter view from above, across the longer side; it is steeper for flatter workspaces.
     """
     low, high = (np.array(corner) for corner in scene_type.workspace)
     extent = high - low
@@ -78,10 +78,11 @@ def frame_scene_type(scene_type: SceneType) -> Framing:
 def scene_type_of_one(
     scene_type: SceneType, translations: Array, rotations: Array, categories: NDArray[np.int64]
 ) -> SceneType:
-    """The scene type as which to look at one scene: that of its only support, in types that hold tables and rooms.
+    """Scene type by which one scene is framed: that of its only support, in types that hold tables and rooms.
 
-    A union of scene types has no fixed objects and the workspace of the largest, in which a table is a speck. A scene
-    with one welded object is framed as if that were fixed there; any other as ``scene_type``.
+    A union of scene types has no fixed objects and the workspace of the largest type, in which a table would be tiny. A
+    scene with one welded object is framed as if this object were fixed there; any other scene is framed as
+    ``scene_type``.
 
     Args:
         scene_type: of the scene.

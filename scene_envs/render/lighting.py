@@ -71,7 +71,7 @@ def soft_shadow(
 
 
 def contact_shade(frame: Frame, normals: Image, *, radius: float = 0.04, taps: int = 12, stride: int = 2) -> Image:
-    """(H, W) in 0..1: how much the surroundings within ``radius`` m close a point in (ambient occlusion).
+    """(H, W) in 0..1: ambient occlusion of each point by its surroundings within ``radius`` m.
 
     Worked out for every ``stride``-th pixel of each axis and repeated; meant to be blurred.
     """

@@ -43,9 +43,9 @@ def render(
 
     Args:
         batch: B scenes.
-        style: ``"picture"`` is a lit three-quarter view with soft shadows, in types without fixed objects of the only
-            support where a scene has but one; ``"semantic"`` is one flat colour per asset on white, seen by the camera
-            of the scene type (the paper's: 640 x 480, 45 degrees).
+        style: ``"picture"`` is a lit three-quarter view with soft shadows. In types without fixed objects it shows the
+            only support of a scene that has just one. ``"semantic"`` is one flat colour per asset on white, seen by the
+            camera of the scene type (the paper's: 640 x 480, 45 degrees).
         camera: replaces the camera of the style.
         width: image width, pixels; the camera's by default. The view of a picture is fitted to the image.
         height: image height, pixels; the camera's by default.

@@ -150,7 +150,7 @@ class SceneType:
     def has_geometry(self) -> bool:
         """Whether every asset has a model here; those of a scene type made from a dataset's metadata may have none.
 
-        Without models there is no physics and there are no pictures; priors can be sampled all the same.
+        Without models there are no physics and no pictures, but priors can be sampled.
 
         >>> from scene_envs import get_scene_type
         >>> get_scene_type("dimsum_table").has_geometry

@@ -33,7 +33,7 @@ class Reference:
     place: Place | None = None
 
     def resolve(self, scene: SceneFacts) -> int:
-        """Index of the thing, or -1 when there is none, or several where it says there is one."""
+        """Index of the thing; -1 when there is none, or when there are several and the claim names the only one."""
         members = scene.named(self.name)
         if self.place is not None:
             members = members[self.place.holds(scene)[members]]
@@ -138,9 +138,9 @@ class PlaceCount:
 
 @dataclass(frozen=True)
 class SupportCount:
-    """ "two apples are in the bowl", "a mug is on top of the second plate from the left": one certain thing holds them.
+    """ "two apples are in the bowl", "a mug is on top of the second plate from the left": held by one thing.
 
-    On top of means directly on it; in means in it, directly or on top of what lies there.
+    "On top of" means directly on the thing. "In" means in the thing, directly or on top of something in it.
     """
 
     name: str
