@@ -29,6 +29,8 @@ class NFTLoss(ForwardProcessLoss):
         clip: c, the advantage at which a sample is fully good or bad.
 
     >>> from agents.priors.testing import tiny_prior
+    >>> import torch
+    >>> from tensordict import TensorDict
     >>> prior = tiny_prior("dimsum_table", process="mixed")
     >>> scenes = TensorDict({"scene": prior.encode(prior.sample(2, num_steps=3)), "advantage": torch.ones(2, 34)}, [2])
     >>> loss = NFTLoss(prior, prior)(scenes)
