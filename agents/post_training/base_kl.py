@@ -1,7 +1,7 @@
 """KL divergence of a prior in training from the base prior, on scenes of its own.
 
 Both estimates have the same target: the KL divergence of the reverse chains, in nats per random variable of a scene.
-Each estimate is a list of terms with a graph each, so that memory does not grow with the number of terms.
+Each estimate is a series of terms with a graph each, so that memory does not grow with the number of terms.
 """
 
 from __future__ import annotations
