@@ -38,7 +38,7 @@ class RewardOutput:
         value: (B,) float, larger is better; ignored where ``valid`` is False.
         per_object: (B, N) float credit per slot, or None.
         terms: named (B,) floats worth logging.
-        valid: (B,) bool, or None when every row is valid. Invalid rows leave all statistics.
+        valid: (B,) bool, or None when every row is valid. Invalid rows are left out of all statistics.
         object_flags: named (B, N) bools, such as ``"feasible"``.
         problem: why the whole batch is invalid when the reward raised or broke its contract, else empty.
     """

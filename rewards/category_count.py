@@ -1,4 +1,4 @@
-"""Reward: number of objects of some assets or of a kind, such as edible things."""
+"""Reward: number of objects of some assets or groups, such as edible things."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from scene_envs.scene import SceneBatch
 @register_reward("category_count")
 @dataclass(frozen=True)
 class CategoryCount:
-    """Number of objects in the workspace that are of the named assets or kinds.
+    """Number of objects in the workspace that belong to the named assets or groups.
 
     Attributes:
         assets: one or several of asset names ("teacup"), display names ("steamer lid") and groups ("edible").

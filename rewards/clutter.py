@@ -27,11 +27,11 @@ _PARALLEL = 1e-12
 @register_reward("clutter")
 @dataclass(frozen=True)
 class Clutter:
-    """Share of the supporting surfaces that is covered by what stands on them, from 0 to 1.
+    """Share of the supporting surfaces that is covered by objects, from 0 to 1.
 
-    A surface is the top of a welded object, or each of its tiers, as large as the object's outline from above. It is
-    covered by the outlines of the free objects in the workspace that stand on it, directly or on or in others there;
-    where outlines overlap, the surface is covered once.
+    A surface is the top or a tier of a welded object; its area is that of the object's outline from above. Free objects
+    in the workspace cover the surface that they stand on, directly or on or in other objects there. Where outlines
+    overlap, the surface is covered once.
 
     Attributes:
         lines: lines along which each surface is measured; the more, the more exact.

@@ -1,4 +1,4 @@
-"""Reward: what a scene adds to the places and assets that its batch covers."""
+"""Reward: contribution of a scene to the places and assets that its batch covers."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from scene_envs.scene import SceneBatch
 @register_reward("coverage")
 @dataclass(frozen=True)
 class Coverage:
-    """Scene's part in the coverage of its batch: the share of (asset, place) pairs that occur in some scene.
+    """Contribution of a scene to the coverage of its batch, the share of (asset, place) pairs that occur in some scene.
 
     Places are the cells of a grid over the workspace; pairs are of all assets but those of fixed objects. A pair that
-    occurs in k scenes counts 1/k for each of them, times the number of scenes, so that the mean of the values over the
-    batch is the coverage (Shapley 1953). Only objects in the workspace count.
+    occurs in k scenes counts 1/k for each of them (Shapley 1953). Values are multiplied by the number of scenes, so
+    that their mean over the batch is the coverage. Only objects in the workspace count.
 
     Attributes:
         cells: of the grid along x, y and z.

@@ -1,4 +1,4 @@
-"""Reward: how far a scene is from the others of its batch."""
+"""Reward: mean distance of a scene to the other scenes of its batch."""
 
 from __future__ import annotations
 

@@ -17,9 +17,9 @@ from scene_envs.scene import SceneBatch
 class FeasibleObjects:
     """Number of free objects in the workspace that neither penetrate another object nor move when simulated.
 
-    An object is feasible when its frame is in the workspace, no pair it is in is deeper than ``max_penetration`` and,
-    with the penetrating objects removed, it moves and turns less than the limits while simulated. Welded objects are
-    not counted.
+    An object is feasible when its frame is in the workspace, it overlaps no other object by more than
+    ``max_penetration`` and, with the penetrating objects removed, it moves and turns by at most the limits in
+    simulation. Welded objects are not counted.
 
     Attributes:
         max_penetration: deepest allowed overlap with any other object, m.

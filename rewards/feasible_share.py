@@ -16,8 +16,8 @@ from scene_envs.scene import SceneBatch
 class FeasibleShare(FeasibleObjects):
     """Share of the free objects that are in the workspace, overlap nothing and stay where they are; from 0 to 1.
 
-    The verdict is that of ``feasible_objects``, with the same settings. A scene without free objects scores 0, so that
-    nothing is won by emptying scenes.
+    Definition and settings are those of ``feasible_objects``. A scene without free objects scores 0, so that emptying a
+    scene gains nothing.
 
     Attributes:
         max_penetration: deepest allowed overlap with any other object, m.

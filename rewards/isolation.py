@@ -1,4 +1,4 @@
-"""Rewards in processes of their own, which can be ended: what a reward does there harms no run."""
+"""Rewards in separate processes that can be ended, so that a failing reward harms no run."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def close_reward(reward: Any) -> None:
 
 
 def is_foreign(reward: Any) -> bool:
-    """Whether a name or mapping needs code from outside this package that another process can load, too.
+    """Whether a name or mapping needs code from outside this package that another process can also load.
 
     >>> is_foreign("object_count"), is_foreign({"name": "clip", "reward": "./mine.py:clutter", "high": 1.0})
     (False, True)

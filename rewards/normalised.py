@@ -17,7 +17,7 @@ from scene_envs.scene import SceneBatch
 @register_reward("normalised")
 @dataclass(frozen=True)
 class Normalised:
-    """A reward in standard deviations from its mean, so that parts of a weighted sum weigh alike.
+    """A reward in standard deviations from its mean, so that parts of a weighted sum have equal weight.
 
     Mean and standard deviation are given, or are those of the valid scenes of the batch. They are not carried from
     batch to batch: a reward with a memory would score the same scene differently in training, in search and after a

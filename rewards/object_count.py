@@ -15,8 +15,8 @@ from scene_envs.scene import SceneBatch
 class ObjectCount:
     """Number of objects in a scene, welded ones included.
 
-    Says nothing of where they are: objects may overlap. The objective of the paper's post-training
-    experiment (section 4.3).
+    The value ignores where objects are; they may overlap. The objective of the paper's post-training experiment
+    (section 4.3).
 
     >>> output = ObjectCount()(SceneBatch.empty("dimsum_table", 2), RewardContext())
     >>> output.value, output.per_object.sum(dim=1)

@@ -1,4 +1,4 @@
-"""Reward: how deep objects are in each other, counted negatively."""
+"""Reward: minus the depth of overlaps between objects."""
 
 from __future__ import annotations
 

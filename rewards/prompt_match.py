@@ -25,11 +25,11 @@ logger = logging.getLogger(__name__)
 @register_reward("prompt_match")
 @dataclass(frozen=True)
 class PromptMatch:
-    """Mean over a prompt's claims of how well the scene bears them out, from 0 to 1; 1 exactly when all hold.
+    """How well a scene matches its prompt: mean score of the claims, from 0 to 1; 1 exactly when all hold.
 
-    A claim that does not hold scores the smaller number over the larger one, and a relation a quarter for each of its
-    two things that is there. The prompt is the one that the scene was made for, or ``prompt`` for all scenes. Scenes
-    whose prompt says nothing, or cannot be read, are invalid.
+    A false claim about a number scores the smaller number over the larger one; a false relation scores a quarter for
+    each of its two things that is present. The prompt is the one that the scene was made for, or ``prompt`` for all
+    scenes. Scenes whose prompt is empty, or cannot be read, are invalid.
 
     Attributes:
         prompt: in place of the prompts that the scenes were made for.

@@ -1,4 +1,4 @@
-"""Reward: share of the free objects that a parallel gripper comes to."""
+"""Reward: share of the free objects that a parallel gripper can reach."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ SIDES = ("above", "front")
 @register_reward("reachability")
 @dataclass(frozen=True)
 class Reachability:
-    """Share of the free objects that an open parallel gripper comes to without a collision, from 0 to 1.
+    """Share of the free objects that an open parallel gripper can reach without a collision, from 0 to 1.
 
-    The gripper moves in a straight line from above or from the front, until some of the object is between its
-    fingers (:func:`scene_envs.physics.grasping.reachable`). Whether the grasp would hold is not asked. Objects outside
-    the workspace are not reached; a scene without free objects scores 0. A heap of objects whose trials would take
-    long is invalid.
+    The gripper moves in a straight line from above or from the front, until some of the object is between its fingers
+    (:func:`scene_envs.physics.grasping.reachable`). Whether the grasp would hold is not tested. Objects outside the
+    workspace are not reachable; a scene without free objects scores 0. A scene is invalid if the trials of a heap in it
+    would take too long.
 
     Attributes:
         sides: ``"above"``, ``"front"`` (the side of the scene type's camera, level) or both; one of them is enough.

@@ -24,9 +24,9 @@ from scene_envs.scene import SceneBatch
 class Realism:
     """Minus the training loss of a scene under a frozen prior, at fixed timesteps and noise; 0 at most.
 
-    The loss is a bound on the negative log-likelihood up to weights (Ho et al. 2020, Eq. 14). Every scene meets the
-    same noise. Its objects are sorted first, so that neither the order of slots nor empty slots matter. A scene whose
-    fixed objects are missing is invalid.
+    The loss is a bound on the negative log-likelihood up to weights (Ho et al. 2020, Eq. 14). Every scene gets the same
+    noise. Its objects are sorted first, so that neither the order of slots nor empty slots matter. A scene whose fixed
+    objects are missing is invalid.
 
     Attributes:
         prior: name or path of the prior; that of the scene type's name when null.

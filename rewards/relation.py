@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 @register_reward("relation")
 @dataclass(frozen=True)
 class Relation:
-    """Mean over the relations of a prompt of how well the scene bears them out; 1 when all hold, or none is claimed.
+    """How well a scene matches the relations of its prompt: their mean score; 1 when all hold, or none is claimed.
 
-    Relations are what a prompt says of things to each other and to places: on, in, beside, to the left, right, front
-    or back. Numbers of objects are left to ``prompt_match``. Each relation scores as there. Scenes whose prompt is
-    empty or cannot be read are invalid.
+    A relation places a thing by another thing or a place: on, in, beside, to the left, right, front or back. Each
+    relation scores as in ``prompt_match``, which also scores numbers of objects. Scenes whose prompt is empty or
+    cannot be read are invalid.
 
     Attributes:
         prompt: in place of the prompts that the scenes were made for.

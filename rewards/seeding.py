@@ -44,7 +44,7 @@ def seeded_generators(seed: int, batch: SceneBatch) -> Iterator[None]:
 
 @contextmanager
 def other_draw(number: int) -> Iterator[None]:
-    """Context in which rewards meet other random numbers than usual, a stream for each ``number`` but 0."""
+    """Context in which rewards get other random numbers than usual, one stream for each ``number`` but 0."""
     before = current_draw()
     _local.draw = number
     try:
@@ -54,5 +54,5 @@ def other_draw(number: int) -> Iterator[None]:
 
 
 def current_draw() -> int:
-    """The stream of random numbers that this thread's rewards meet."""
+    """The stream of random numbers that this thread's rewards get."""
     return int(getattr(_local, "draw", 0))

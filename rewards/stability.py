@@ -17,11 +17,11 @@ from scene_envs.scene import SceneBatch
 @register_reward("stability")
 @dataclass(frozen=True)
 class Stability:
-    """Mean over the free objects of how still they stay under gravity, from 0 (far gone) to 1 (at rest).
+    """How still the free objects stay under gravity: their mean score, from 0 to 1 (at rest).
 
     An object that moves by d and turns by a scores ``exp(-(d / scale + a / scale_rotation))``. Objects deeper than
-    ``max_penetration`` in others are removed before the simulation, as for ``feasible_objects``, and score 0, as do
-    those outside the workspace. A scene without free objects scores 0.
+    ``max_penetration`` in others are removed before the simulation, as for ``feasible_objects``, and score 0. Objects
+    outside the workspace also score 0. A scene without free objects scores 0.
 
     Attributes:
         scale: movement that costs a factor of e, m.

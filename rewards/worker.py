@@ -68,7 +68,7 @@ class _Answers:
         self.pool: PhysicsPool | None = None
 
     def make(self, reward: Any, targets: list[str], files: list[Any], workers: int) -> bool:
-        """Make the reward; whether it depends on the batch."""
+        """Make the reward; returns whether it depends on the batch."""
         for target in targets:
             allow_reward_targets(target)
         for file in files:

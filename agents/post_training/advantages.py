@@ -20,7 +20,7 @@ def compute_advantages(
     clip: float = 5.0,
     groups: Tensor | None = None,
 ) -> Tensor:
-    """(reward - baseline) / std, clipped; invalid rows get 0 and leave all statistics.
+    """(reward - baseline) / std, clipped; invalid rows get 0 and are left out of all statistics.
 
     The std is the population's (divided by n) over the valid rows. The leave-one-out baseline of a row is
     the mean of the *other* valid rows (Kool et al. 2019), which keeps the gradient unbiased; ``"mean"`` is the
@@ -64,7 +64,7 @@ def sibling_advantages(reward: Tensor, valid: Tensor, siblings: int) -> Tensor:
     """Rewards of slots minus those of the same slot in sibling scenes, over the root mean square of all differences.
 
     Siblings are neighbouring rows whose chains share their first steps, so that slot n of each holds the same object.
-    What the shared state decides is the same for all of them and cancels; what the rest of the chain does remains.
+    The part of the reward that the shared steps decide cancels; the part that the later steps decide remains.
 
     Args:
         reward: (B, N) floats.

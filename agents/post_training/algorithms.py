@@ -1,4 +1,4 @@
-"""Post-training algorithms by name: their settings, and where their code is; imports no torch."""
+"""Registry of post-training algorithms: names, settings and location of the code; imports no torch."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Algorithm = TypeVar("Algorithm", bound=type)
 
 @dataclass
 class AlgorithmSettings:
-    """What every algorithm is told.
+    """Settings that all algorithms share.
 
     Attributes:
         name: the algorithm, a registered name.
@@ -86,7 +86,7 @@ class DDPOSFSettings(AlgorithmSettings):
 
 @dataclass
 class DDPOISSettings(DDPOSFSettings):
-    """DDPO-IS: the same with clipped importance weights, for several updates per batch (Eq. 4).
+    """DDPO-IS: DDPO with clipped importance weights, for several updates per batch (Eq. 4).
 
     Attributes:
         clip_epsilon: half-width of the clip of the probability ratio.
@@ -111,7 +111,7 @@ class DDPOISSettings(DDPOSFSettings):
 
 @dataclass
 class ForwardProcessSettings(AlgorithmSettings):
-    """What the algorithms that noise finished scenes again have in common.
+    """Settings that the forward-process algorithms share.
 
     Attributes:
         updates: optimiser steps per batch.

@@ -1,4 +1,4 @@
-"""Base class of post-training algorithms: what the loop asks of one."""
+"""Base class of post-training algorithms: the interface that the training loop uses."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class BatchGradient(Protocol):
 
 
 class Algorithm(ABC, Generic[Credit]):
-    """How a batch of scenes becomes a gradient.
+    """Rule that turns a batch of scenes into a gradient.
 
     Attributes:
         policy: the reverse chain of the prior in training.
@@ -45,12 +45,12 @@ class Algorithm(ABC, Generic[Credit]):
 
     @property
     def sampling_policy(self) -> DenoisingPolicy:
-        """What samples the scenes; the policy in training unless an algorithm keeps another."""
+        """Policy that samples the scenes; the policy in training unless an algorithm keeps another."""
         return self.policy
 
     @property
     def branching(self) -> Branching:
-        """Which scenes of a batch share the first steps of their chain; none unless an algorithm says so."""
+        """Groups of scenes that share the first steps of their chain; none unless an algorithm defines them."""
         return Branching()
 
     @property
@@ -79,11 +79,11 @@ class Algorithm(ABC, Generic[Credit]):
         return
 
     def return_to(self, prior: ScenePrior) -> None:
-        """Called when the weights in training became those of ``prior``, an earlier checkpoint."""
+        """Called after the weights in training were replaced by those of ``prior``, an earlier checkpoint."""
         return
 
     def state(self) -> dict[str, Any]:
-        """What a resumed run needs beside the weights in training."""
+        """State that a resumed run needs beside the weights in training."""
         return {}
 
     def restore(self, state: dict[str, Any]) -> None:

@@ -1,7 +1,7 @@
 """KL divergence of a prior in training from the base prior, on scenes of its own.
 
-Both estimates are of one quantity: the KL divergence of the reverse chains, in nats per random variable of a scene.
-They come as terms, of which each has a graph of its own, so that memory does not grow with their number.
+Both estimates have the same target: the KL divergence of the reverse chains, in nats per random variable of a scene.
+Each estimate is a series of terms with a graph each, so that memory does not grow with the number of terms.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ def chain_kl(
 ) -> Iterator[Tensor]:
     """Terms () whose sum is the KL divergence of the chain that made a rollout from the base prior's (Fan et al. 2023).
 
-    Steps differ much more than scenes do, so every random step has part in it, with as many scenes as the budget
-    allows.
+    The estimate includes every random step, with as many scenes as the budget allows, because steps differ much more
+    than scenes do.
 
     Args:
         policy: in training.
@@ -51,7 +51,7 @@ def chain_kl(
 def forward_kl(
     prior: ScenePrior, base: ScenePrior, rollout: Rollout, generator: Generator, chunk: int | None = None
 ) -> Iterator[Tensor]:
-    """Terms () whose sum estimates the same from finished scenes, noised again, without the chains that made them.
+    """Terms () whose sum estimates the same divergence from finished scenes, noised again, without their chains.
 
     The scenes of a batch take timesteps that are spread evenly over the chain of all timesteps. Several processes
     draw timesteps and noise for the scenes of all of them, and each takes its own.

@@ -1,4 +1,4 @@
-"""All knobs of one post-training run; imports no torch."""
+"""Configuration of one post-training run; imports no torch."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ FEWEST_SAMPLES = 20
 
 @dataclass
 class GuardSettings:
-    """What watches over a run.
+    """Settings of the guard.
 
     Attributes:
         every: iterations between guard checks.
@@ -100,7 +100,7 @@ class GuardSettings:
 
 @dataclass
 class PostTrainLoggerSettings(LoggerSettings):
-    """What a post-training run shows and keeps.
+    """Settings of the progress display and the report of a post-training run.
 
     Attributes:
         progress: ``bar``, ``lines`` or ``none``.
@@ -130,9 +130,9 @@ class PostTrainConfig:
         + regularisation.kl * KL divergence from the base prior
 
     with ``step_scale = steps with weight > 0 / gradient_steps``, log p reduced over a scene's entries as
-    ``algorithm.log_prob_reduction`` says, and the pretraining loss a mean over scenes and entries. The weight means
-    nothing without these reductions: with ``"sum"`` the same balance needs one larger by the number of random
-    entries of a scene.
+    ``algorithm.log_prob_reduction`` says, and the pretraining loss a mean over scenes and entries. The weight is
+    meaningful only together with these reductions: with ``"sum"`` the same balance needs a weight larger by the number
+    of random entries of a scene.
 
     Attributes:
         prior: the prior to start from, a shipped name or a path.

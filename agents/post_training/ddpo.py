@@ -1,4 +1,4 @@
-"""DDPO on a denoising policy: its loss, its advantages, its gradient of a batch."""
+"""DDPO on a denoising policy: loss, advantages and gradient of a batch."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from agents.priors.base import ScenePrior
 
 
 class DDPO(Algorithm[Tensor]):
-    """DDPO-SF, or DDPO-IS with the settings of that (Black et al. 2024).
+    """DDPO-SF, or DDPO-IS if given the settings of DDPO-IS (Black et al. 2024).
 
     Args:
         settings: its keys.
@@ -27,7 +27,7 @@ class DDPO(Algorithm[Tensor]):
         stds: (S,) smallest sigma of every step, normalised units.
 
     Attributes:
-        loss: of a batch of transitions; its ``step_weights`` (S,) say which steps have part in the gradient.
+        loss: of a batch of transitions; its ``step_weights`` (S,) say which steps enter the gradient.
     """
 
     loss: DDPOSFLoss
@@ -52,10 +52,10 @@ class DDPO(Algorithm[Tensor]):
         )
 
     def accumulate(self, rollout: Rollout, advantage: Tensor, generator: Generator) -> PolicyGradient:
-        """Add the policy gradient of a batch to ``.grad``; ``generator`` draws the steps that have part in it."""
+        """Add the policy gradient of a batch to ``.grad``; ``generator`` draws the steps that enter it."""
         steps, scale = draw_steps(self.loss.step_weights.cpu(), self.settings.gradient_steps, generator)
         return accumulate_policy_gradient(self.loss, rollout, advantage, steps, scale=scale)
 
     def kl(self, rollout: Rollout, base: ScenePrior, generator: Generator) -> Iterator[Tensor]:
-        """Terms of the KL divergence of the chain, ``gradient_steps`` of its steps standing for all."""
+        """Terms of the KL divergence of the chain, estimated at the cost of ``gradient_steps`` steps."""
         return chain_kl(self.policy, base, rollout, self.settings.gradient_steps, generator)

@@ -1,4 +1,4 @@
-"""Expectation of the own samples: a copy of the denoiser that is trained on them, as in pretraining."""
+"""Mean of own samples: a copy of the denoiser that is trained on the policy's samples as in pretraining."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from agents.utils.process_group import ProcessGroup
 
 
 class Expectation(nn.Module):
-    """What the target of a denoiser is on average at a noised scene, over the scenes that the sampling policy makes.
+    """Mean target of a denoiser at a noised scene, over the scenes that the sampling policy makes.
 
-    A forward-process loss pulls toward the targets of good samples and away from those of bad ones, and takes the
-    sampling policy's output as their mean. It is not: a policy in training is no denoiser of its own samples. Where all
-    samples are bad, the difference pushes the policy on, the policy follows, and the difference grows. This copy of the
-    denoiser learns the mean, so that only the covariance of target and advantage is left, as in a policy gradient whose
-    baseline is exact.
+    A forward-process loss attracts the output to the targets of good samples, repels it from the targets of bad
+    samples, and takes the output of the sampling policy as the mean target. This output is not the mean, because a
+    policy in training is not an exact denoiser of its own samples. Where all samples are bad, the difference repels the
+    output, the sampling policy follows, and the difference grows. This copy of the denoiser learns the mean. Only the
+    covariance of target and advantage is then left, as in a policy gradient with an exact baseline.
 
     Args:
         prior: whose denoiser is copied.

@@ -19,8 +19,9 @@ class NFTLoss(ForwardProcessLoss):
         o_plus = (1 - beta) o_old + beta o,    o_minus = (1 + beta) o_old - beta o
 
     the loss is r |o_plus - target|^2 + (1 - r) |o_minus - target|^2. Its minimum over o at one x_t is
-    o_old + (2 E[r] - 1 + cov) / beta in the direction of the error of o_old: a step that is bounded by beta. Categories
-    have the same with cross-entropies of l_plus and l_minus, which are made of logits as o_plus and o_minus are.
+    o_old + (2 E[r] - 1 + cov) / beta in the direction of the error of o_old: a step that is bounded by beta. The loss
+    of categories has the same form, with cross-entropies of l_plus and l_minus, which combine logits as o_plus and
+    o_minus combine outputs.
 
     Args:
         prior, sampler, base, push_limit, expectation, generator: as in :class:`ForwardProcessLoss`.
@@ -28,6 +29,8 @@ class NFTLoss(ForwardProcessLoss):
         clip: c, the advantage at which a sample is fully good or bad.
 
     >>> from agents.priors.testing import tiny_prior
+    >>> import torch
+    >>> from tensordict import TensorDict
     >>> prior = tiny_prior("dimsum_table", process="mixed")
     >>> scenes = TensorDict({"scene": prior.encode(prior.sample(2, num_steps=3)), "advantage": torch.ones(2, 34)}, [2])
     >>> loss = NFTLoss(prior, prior)(scenes)
@@ -115,8 +118,8 @@ class AWMLoss(ForwardProcessLoss):
 class RewardWeightedLoss(ForwardProcessLoss):
     """Reward-weighted fine-tuning: the pretraining loss of own samples, weighted by exp(A / temperature).
 
-    The baseline that every other method is compared with (Peters and Schaal 2007; Lee et al. 2023): good samples pull,
-    none pushes. Weights are bounded by ``largest``.
+    The baseline of the other losses (Peters and Schaal 2007; Lee et al. 2023): good samples attract the output, and no
+    sample repels it. Weights are bounded by ``largest``.
 
     Args:
         prior, sampler, generator: as in :class:`ForwardProcessLoss`.

@@ -34,7 +34,7 @@ class ForwardGradient:
     Attributes:
         loss: value of the objective.
         distance: root mean square of the trained denoiser's output minus that of the sampling policy's.
-        limited: share of bad poses that do not push any more.
+        limited: share of bad poses that no longer repel the output.
     """
 
     loss: float
@@ -47,10 +47,10 @@ class ForwardGradient:
 
 
 class ForwardProcess(Algorithm[TensorDict]):
-    """What NFT, AWM and reward weighting have in common; see :class:`ForwardProcessLoss`.
+    """Algorithm of NFT, AWM and reward weighting, which differ in their loss; see :class:`ForwardProcessLoss`.
 
-    Scenes are sampled by a slower copy of the prior in training, an average of its weights, which is also what is
-    evaluated and saved.
+    A slower copy of the prior in training, an average of its weights, samples the scenes. This copy is also evaluated
+    and saved.
 
     Args:
         settings: its keys.

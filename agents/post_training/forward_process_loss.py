@@ -1,7 +1,7 @@
-"""What the losses of forward-process reinforcement learning have in common, as a torchrl loss.
+"""Base class of the losses of forward-process reinforcement learning, as a torchrl loss.
 
-They weight the pretraining loss of finished scenes by how good the scenes were. They need no log-probabilities, no
-stored trajectories and no particular sampler.
+The losses weight the pretraining loss of finished scenes by how good the scenes were. They need no log-probabilities,
+no stored trajectories and no particular sampler.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from scene_envs.errors import InvalidInputError
 class ForwardProcessLoss(LossModule):
     """A loss of finished scenes x_0 at random timesteps of the forward process.
 
-    Every scene is noised once per call. The trained denoiser says o, the sampling policy's denoiser says o_old, and a
-    subclass says what the loss of an entry is, given the advantage of its slot. Squared errors are weighted and reduced
-    as in pretraining: a mean over the entries of a scene, then over the valid scenes. Losses of categories are a mean
-    over the slots whose category is masked at that timestep, times the prior's ``category_weight``.
+    Every scene is noised once per call. o is the output of the trained denoiser, and o_old that of the sampling policy.
+    A subclass defines the loss of an entry, given the advantage of its slot. Squared errors are weighted and reduced as
+    in pretraining: a mean over the entries of a scene, then over the valid scenes. Losses of categories are a mean over
+    the slots whose category is masked at that timestep, times the prior's ``category_weight``.
 
     The error of a sample is its target minus the mean target of own samples at that noised scene. ``expectation``
-    learns this mean; without one o_old stands for it, and where all samples are bad its own error drives it off.
+    learns this mean. Without it, o_old replaces the mean, and drifts away where all samples are bad.
 
-    Poses take ``advantage``, categories ``category_advantage``; each is one number per scene or one per slot. In x_t
-    every slot sees the others, so an advantage per slot credits an object for its own pose alone.
+    Poses take ``advantage``, categories ``category_advantage``; each is one number per scene or one per slot. The
+    network denoises every slot given the others, so an advantage per slot credits an object for its own pose alone.
 
     Accepted keys (``set_keys``):
         scene: (B, N, D) float, finished scenes x_0 as the prior encodes them. Default ``"scene"``.

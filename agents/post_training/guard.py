@@ -1,4 +1,4 @@
-"""Guard against over-optimisation: held-out pretraining loss, and samples beside those of the base prior."""
+"""Guard against over-optimisation: held-out pretraining loss, and measures of samples relative to the base prior."""
 
 from __future__ import annotations
 
@@ -46,9 +46,10 @@ class GuardReading:
 class Guard:
     """Watches the held-out pretraining loss and samples, and knows the best checkpoint within all limits.
 
-    The best is the one with the largest reward among checks that find nothing beyond its limit. The reward of a check
-    is the mean over all batches since the one before, which single batches are too noisy for; where the guard samples,
-    it is that of the samples, whose noise is the same at every check, and checks of the loss alone keep nothing.
+    The best checkpoint has the largest reward among the checks within all limits. If the guard samples, the reward of a
+    check is that of the samples, which start from the same noise at every check; checks of the loss alone then keep
+    nothing. Otherwise the reward of a check is the mean over all batches since the previous check, because single
+    batches are too noisy.
 
     Args:
         heldout: (K, N, D) normalised real scenes that the regularisation never sees.

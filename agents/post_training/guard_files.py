@@ -1,4 +1,4 @@
-"""Guard of a run: how it is made, and its files, the best prior and the samples that the report shows."""
+"""Guard of a run and its files: the best prior, and the samples that the report shows."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def make_guard(config: PostTrainConfig, learner: Learner, scenes: SceneBank) -> 
 
 
 class GuardFiles:
-    """What the guard keeps in a run's folder; the first process alone writes.
+    """Files of the guard in a run's folder; only the first process writes.
 
     Args:
         config: of the run.

@@ -19,7 +19,7 @@ _LABELS = {
 
 
 def guard_verdict(guard: Mapping[str, Any]) -> str:
-    """What the guard found, in one sentence."""
+    """Result of the guard, in one sentence."""
     over = guard["over_optimised_from"]
     if over is None:
         return "The guard found nothing beyond its limits."

@@ -1,4 +1,4 @@
-"""Adaptive control of the regularisation: what a run may lose, and the factor on the weights that holds it there."""
+"""Adaptive control of the regularisation: a target, and the factor on the weights that holds it."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Target:
         return cls(figure, value)
 
     def error(self, measured: float) -> float:
-        """How far a run is beyond the target, as a share of what it may lose: -1 where it has lost nothing."""
+        """Distance beyond the target, divided by that of the target from the base value: -1 at the base value."""
         base = BASE_VALUES[self.figure]
         error = (measured - base) / (self.value - base) - 1.0
         return max(-1.0, min(error, LARGEST_ERROR)) if error == error else LARGEST_ERROR
@@ -68,7 +68,7 @@ class Target:
 
 @dataclass(frozen=True)
 class HoldState:
-    """What the controller knows; plain numbers, for checkpoints.
+    """State of the controller; plain numbers, for checkpoints.
 
     Attributes:
         log_factor: logarithm of the factor on the weights of the regularisation.

@@ -1,4 +1,4 @@
-"""What a report says of a target that a run held: a sentence, and a picture of the figure and of the weight."""
+"""Report of the target that a run held: a sentence, and a picture of the measured value and of the weight."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ from scene_envs.errors import InvalidInputError
 
 
 class NonFiniteGradient(Exception):
-    """An update was refused; ``figures`` says what it would have been."""
+    """An update was refused; ``figures`` describes the refused update."""
 
     def __init__(self, figures: dict[str, float]) -> None:
         super().__init__(str(figures))
@@ -42,7 +42,7 @@ class NonFiniteGradient(Exception):
 
 
 class Learner:
-    """Samples scenes under the current policy and updates it. All randomness hangs on (seed, purpose, iteration).
+    """Samples scenes under the current policy and updates it. All randomness depends on (seed, purpose, iteration).
 
     Args:
         config: the run.

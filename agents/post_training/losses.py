@@ -23,16 +23,16 @@ class DDPOSFLoss(LossModule):
 
         - mean over valid rows of  weight(t) * A * log p(x_{t-1} | x_t)
 
-    where x_t and x_{t-1} are constants: the gradient is the score function's, and one step's graph can be freed
-    before the next is built, so memory does not grow with the length of the chain. Known entries, the
-    deterministic last step and steps of weight 0 have no part in it.
+    where x_t and x_{t-1} are constants: the gradient is the score function's, and one step's graph can be freed before
+    the next is built, so memory does not grow with the length of the chain. Known entries, the deterministic last step
+    and steps of weight 0 do not enter the loss.
 
     With ``clip_epsilon`` the surrogate is ``min(ratio * A, clip(ratio, 1 ± epsilon) * A)``, the ratio being that
     of the *reduced* probabilities to the ones stored at sampling; before the first update the ratio is exactly 1.
 
-    The scale of the gradient, and so the meaning of any coefficient beside it, hangs on the reduction of
-    log p over the entries of a scene: ``"sum"`` (the log-probability itself) or ``"mean"`` (divided by the number
-    of random entries, as in the published code). It is always the mean over rows, never over steps.
+    The scale of the gradient, and so the meaning of any coefficient beside it, depends on the reduction of log p over
+    the entries of a scene: ``"sum"`` (the log-probability itself) or ``"mean"`` (divided by the number of
+    random entries, as in the published code). It is always the mean over rows, never over steps.
 
     Accepted keys (``set_keys``):
         scene: (B, N, D) float, x_t. Default ``"scene"``.

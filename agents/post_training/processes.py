@@ -1,4 +1,4 @@
-"""Shares of a post-training run's batch on several processes: their sizes, and rewards that need all of it."""
+"""Division of a batch among processes: sizes of the shares, and rewards that need the whole batch."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scene_envs.scene import SceneBatch
 
 
 def check_shares(config: PostTrainConfig, processes: int) -> None:
-    """Refuse a batch that cannot be parted among ``processes`` without parting siblings.
+    """Refuse a batch that cannot be split among ``processes`` without splitting siblings.
 
     Raises:
         InvalidInputError: the number of processes does not divide the batch.
@@ -32,7 +32,7 @@ def check_shares(config: PostTrainConfig, processes: int) -> None:
 
 
 class WholeBatchReward:
-    """A reward that depends on the other scenes of a batch, scored on the scenes of all processes in each of them.
+    """A reward that depends on the other scenes of a batch: each process scores the scenes of all processes.
 
     Args:
         reward: what scores, resolved.

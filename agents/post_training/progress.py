@@ -10,7 +10,7 @@ from scene_envs.progress import Progress
 
 @contextmanager
 def run_progress(title: str, total: int, style: str, done: int = 0) -> Iterator[Callable[[int, float, float], None]]:
-    """Shows how a run goes; yields the function that advances it.
+    """Show the progress of a run; yields the function that advances it.
 
     It is called with the iterations done, the mean reward of the last batch, and the held-out loss over the base
     prior's. Lines come after the first iteration, every 5 s and at the end.

@@ -30,7 +30,7 @@ class GrammarPrompts:
 
     Args:
         batch: the scenes.
-        seed: what is said of scene i hangs on it and on i alone.
+        seed: the descriptions of scene i depend only on the seed and on i.
     """
 
     def __init__(self, batch: SceneBatch, seed: int) -> None:
@@ -81,7 +81,7 @@ class PromptDeck:
         return [different[row * groups // count] for row in range(count)]
 
     def _indices(self, groups: int, generator: Generator) -> list[int]:
-        """Without repetition as far as there are enough."""
+        """Indices of prompts, without repetition while there are enough."""
         size = len(self._texts) or self._count
         rounds = [torch.randperm(size, generator=generator) for _ in range(-(-groups // size))]
         return torch.cat(rounds)[:groups].tolist()  # type: ignore[no-any-return]

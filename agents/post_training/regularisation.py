@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 
 
 class Regularisation:
-    """What keeps a prior in training near the base prior, and how strongly.
+    """Terms that keep a prior in training near the base prior, and their weights.
 
     Args:
         settings: its keys.

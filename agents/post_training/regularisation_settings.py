@@ -1,4 +1,4 @@
-"""Keys of what keeps a prior near where it began: regularisation and adapters; imports no torch."""
+"""Settings of the regularisation and of adapters; imports no torch."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from scene_envs.errors import InvalidInputError
 
 @dataclass
 class RegularisationSettings:
-    """What keeps a prior a prior: the pretraining loss on real scenes, and the KL divergence from the base prior.
+    """Settings of the regularisation: pretraining loss on real scenes, and KL divergence from the base prior.
 
     Attributes:
         weight: coefficient of the pretraining loss; null takes the algorithm's own.
         kl: coefficient of the KL divergence from the base prior, on own samples, in nats per random variable of a
             scene; null for none, or 1 with ``hold=kl:VALUE``.
-        hold: what the run may lose, held by a factor on both coefficients: ``guard:1.05`` for the held-out loss as a
-            ratio to the base prior's, ``kl:0.01`` for the KL divergence; null keeps the coefficients as they are.
+        hold: target that is held by a factor on both coefficients: ``guard:1.05`` for the held-out loss as a ratio to
+            the base prior's, ``kl:0.01`` for the KL divergence; null keeps the coefficients as they are.
         batch_size: real scenes per update.
         scenes: ``grammar``, or the directory of a dataset.
         bank_size: how many real scenes are drawn (grammar) or read (dataset), the held-out ones included.
@@ -44,7 +44,7 @@ class RegularisationSettings:
 
     @property
     def target(self) -> Target | None:
-        """What ``hold`` says."""
+        """Target that ``hold`` names."""
         return None if self.hold is None else Target.parse(self.hold)
 
     @property

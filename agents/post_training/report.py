@@ -59,7 +59,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """All that a report says.
+    """Content of a report.
 
     Attributes:
         title: heading of the page.

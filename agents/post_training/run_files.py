@@ -54,7 +54,7 @@ def run_metrics(
     best_reward: float,
     guard: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """What ``metrics.json`` says of a run with the log ``history``."""
+    """Content of ``metrics.json`` for a run with the log ``history``."""
     rewards = [row["reward"] for row in history if math.isfinite(row["reward"])]
     return {
         "iterations": len(history),

@@ -63,7 +63,7 @@ class SampleCheck:
         return SceneBatch(torch.cat([parts[start] for start in starts]), self.real.scene_type)
 
     def _chunk(self, prior: ScenePrior, start: int) -> Tensor:
-        """Scenes (b, N, D) from number ``start`` on, whose noise hangs on that number."""
+        """Scenes (b, N, D) from number ``start`` on, whose noise depends on that number."""
         count = min(_AT_ONCE, self.count - start)
         prompts = None if self.prompts is None else list(self.prompts[start : start + count])
         batch = prior.sample(

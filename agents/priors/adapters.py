@@ -25,7 +25,7 @@ AdapterSpec = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 
 @dataclass(frozen=True)
 class AdapterFacts:
-    """What an adapter says of itself, in the JSON file beside its tensors.
+    """Facts about an adapter, from the JSON file beside its tensors.
 
     Attributes:
         rank: of the updates.
@@ -41,7 +41,7 @@ class AdapterFacts:
 
 
 class Adaptable(Protocol):
-    """What adapters ask of a prior; :class:`~agents.priors.base.ScenePrior` has it."""
+    """Interface of a prior that adapters use; :class:`~agents.priors.base.ScenePrior` has it."""
 
     adapter: AdapterFacts | None
     denoiser: Any

@@ -60,7 +60,7 @@ class ScenePrior(Loadable, Inpainting, nn.Module, ABC):
         card: dict[str, Any] | None,
         residual: ResidualVariance | None,
     ) -> None:
-        """What priors of every process have in common."""
+        """Store the parts that priors of every process have."""
         self.config = config
         self.scene_type: SceneType = get_scene_type(config.scene_type)
         self.normalizer = normalizer
@@ -281,7 +281,7 @@ class ScenePrior(Loadable, Inpainting, nn.Module, ABC):
 
     @abstractmethod
     def output(self, noised: NoisedScenes, text: Text | None = None) -> DenoiserOutput:
-        """What the denoiser says of noised scenes; differentiable in its parameters.
+        """Output of the denoiser for noised scenes; differentiable in its parameters.
 
         Args:
             noised: as :meth:`noised` gives them.
@@ -289,7 +289,7 @@ class ScenePrior(Loadable, Inpainting, nn.Module, ABC):
         """
 
     def denoised(self, noised: NoisedScenes, output: DenoiserOutput) -> Tensor:
-        """(B, N, F) what the continuous ``output`` of noised scenes says of x_0."""
+        """(B, N, F) estimate of x_0 from the continuous ``output`` of noised scenes."""
         features = output.continuous.shape[-1]
         return self.process.x0_from_output(noised.x_t[..., :features], noised.t, output.continuous)
 

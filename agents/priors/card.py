@@ -1,4 +1,4 @@
-"""Priors as folders to give away, and their model cards."""
+"""Packaging of priors as folders to publish, with model cards."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def package_prior(
     machine: str = "",
     limits: str = "",
 ) -> Path:
-    """Write a prior as a folder to give away: ``config.json``, ``model.safetensors`` and the model card ``README.md``.
+    """Write a prior as a folder to publish: ``config.json``, ``model.safetensors`` and the model card ``README.md``.
 
     Args:
         source: name, prior directory or run directory; a run's metrics tell how it was trained.
@@ -210,7 +210,7 @@ def _training_of(source: Path) -> dict[str, Any]:
 
 
 def _without_folders(state: dict[str, Any]) -> dict[str, Any]:
-    """A configuration in which no folder of this machine is named: of that of a BERT model the last part stays."""
+    """A configuration that names no folder of this machine; of the folder of a BERT model only the last part stays."""
     text = state["prior"].get("text")
     if not text or not os.path.isabs(text.get("model", "")):
         return state

@@ -153,7 +153,7 @@ def bert_of(width: int, name: str, file: str | os.PathLike[str]) -> BertTextConf
 
 
 def scene_type_of(info: DatasetInfo, name: str) -> SceneType:
-    """A scene type made from a dataset's metadata alone, registered as ``name``.
+    """A scene type made only from a dataset's metadata, registered as ``name``.
 
     Its workspace is the range of the normalizer, its camera looks straight down on that.
     """

@@ -84,7 +84,7 @@ class MixedPriorConfig:
             work at low noise and needs an absorbing kernel; ``"attended"`` is the paper's.
         clip: bound on denoised poses while sampling, normalised units; 0 for none (1 is the paper's).
         unmasking: which masked slots a step of an absorbing kernel unmasks: ``"even"``, as near to the expected number
-            as can be, or ``"independent"``, each by its own chance. Other kernels know the second alone.
+            as can be, or ``"independent"``, each by its own chance. Other kernels take only ``"independent"``.
         union: what a scene of a union of scene types may hold: ``"one_type"``, the assets of one member, which is
             settled by the first objects of the scene, or ``"any"`` assets. Needs an absorbing kernel; other scene
             types have one member.

@@ -123,7 +123,7 @@ def read_prior(name: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, 
 
 @contextmanager
 def _weights_of(name: str | os.PathLike[str]) -> Iterator[Path]:
-    """The path of a prior's weights; what goes wrong while they are read is said in our words."""
+    """The path of a prior's weights; errors while the weights are read become errors of this package."""
     directory = find_prior(name)
     weights = directory / WEIGHTS_NAME
     try:

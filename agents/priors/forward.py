@@ -11,7 +11,7 @@ from agents.networks.mixed_denoiser import Observed
 
 @dataclass(frozen=True)
 class NoisedScenes:
-    """B scenes of N slots at timesteps of the forward process, with what the denoiser is trained to say of them.
+    """B scenes of N slots at timesteps of the forward process, with the training targets of the denoiser.
 
     Attributes:
         x_t: (B, N, D) noised scenes; observed and known entries carry no noise.
@@ -46,7 +46,7 @@ class NoisedScenes:
 
 @dataclass(frozen=True)
 class DenoiserOutput:
-    """What the denoiser says of noised scenes.
+    """Output of the denoiser for noised scenes.
 
     Attributes:
         continuous: (B, N, F), in the units of :attr:`NoisedScenes.target`.

@@ -25,7 +25,7 @@ _CLASSES: dict[str, type[Loadable]] = {}
 
 
 class Loadable(ABC):
-    """The part of a prior that is about its files."""
+    """The part of a prior that loads and saves its files."""
 
     process_name = ""
     """Name of the process in configuration files; a subclass that sets it can be loaded by :meth:`load`."""

@@ -1,4 +1,4 @@
-"""States of a mixed prior: a pose beside a discrete category per slot, what of them is known, and their noise."""
+"""States of a mixed prior: pose and discrete category of each slot, their known entries, and their noise."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ UNIONS = ("one_type", "any")
 
 
 class MixedStates(PromptReader, ScenePrior):
-    """The part of :class:`~agents.priors.mixed.MixedPrior` that says what its scenes x (B, N, 12 + K) are."""
+    """The part of :class:`~agents.priors.mixed.MixedPrior` that defines its scenes x (B, N, 12 + K)."""
 
     mixed: MixedPriorConfig
     denoiser: MixedDenoiser

@@ -87,7 +87,7 @@ class TrainableMixedPrior(MixedStates):
         return DenoiserOutput(*self.denoiser.output(noised.x_t, noised.t, noised.observed, text))
 
     def denoised(self, noised: NoisedScenes, output: DenoiserOutput) -> Tensor:
-        """(B, N, 12) what the pose output of noised scenes says of the clean poses."""
+        """(B, N, 12) estimate of the clean poses from the pose output of noised scenes."""
         poses, states = noised.x_t[..., :POSE_FEATURES], state_of(noised.x_t[..., POSE_FEATURES:])
         moments = self.denoiser.moments(states, noised.t)
         return self.process.x0_from_output(poses, noised.t, output.continuous, moments)

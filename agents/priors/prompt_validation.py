@@ -49,7 +49,7 @@ def check_prompts(
 
 
 def check_guidance(prompt: object, guidance: float) -> None:
-    """Refuse guidance where there is no prompt to strengthen; ``""`` is none."""
+    """Refuse guidance without a prompt; ``""`` is no prompt."""
     if guidance and not prompt:
         raise InvalidInputError(
             f"guidance={guidance:g} strengthens a prompt, and prompt={prompt!r} asks for none; "

@@ -101,7 +101,7 @@ def write_stored(directory: str | os.PathLike[str], stored: StoredPrior, precisi
 
 
 def _known_scene_type(state: dict[str, Any], directory: Path) -> SceneType:
-    """The scene type that a prior was saved with, which is registered unless one of that name is known.
+    """The scene type that a prior was saved with; it is registered unless its name is already known.
 
     Of its folders of assets, those in the prior's own are read, and those that the user named in ``ASSET_FOLDERS``.
     """

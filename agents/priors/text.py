@@ -17,7 +17,7 @@ from scene_envs.scene_types import SceneType
 
 
 class PromptReader:
-    """The part of a prior that turns prompts into what its network attends to.
+    """The part of a prior that turns prompts into tokens of its network.
 
     A prompt becomes token indices (``read_prompts``), which an environment can show, and these become tokens of the
     network (``encode_tokens``). ``""`` stands for no prompt.

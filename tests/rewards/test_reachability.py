@@ -1,4 +1,4 @@
-"""The reward of what a gripper comes to."""
+"""The reward of what a gripper can reach."""
 
 from __future__ import annotations
 
