@@ -18,27 +18,22 @@ class RewardResult(Protocol):
     @property
     def value(self) -> Tensor:
         """(B,) float32, larger is better; anything where not valid."""
-        ...
 
     @property
     def is_valid(self) -> Tensor:
         """(B,) bool: rows that could be scored."""
-        ...
 
     @property
     def terms(self) -> Mapping[str, Tensor]:
         """Named (B,) floats worth logging."""
-        ...
 
     @property
     def per_object(self) -> Tensor | None:
         """(B, N) float credit per slot, or None."""
-        ...
 
     @property
     def object_flags(self) -> Mapping[str, Tensor]:
         """Named (B, N) bools, such as ``"feasible"``."""
-        ...
 
 
 class SceneScorer(Protocol):
@@ -46,7 +41,6 @@ class SceneScorer(Protocol):
 
     def __call__(self, batch: SceneBatch, *, prompts: tuple[str, ...] | None = None, pool: Any = None) -> RewardResult:
         """Score B scenes, made for ``prompts`` if any, with worker processes ``pool`` for physics if any."""
-        ...
 
 
 class StepTableLike(Protocol):
@@ -55,12 +49,10 @@ class StepTableLike(Protocol):
     @property
     def timesteps(self) -> Tensor:
         """(S,) int64, strictly decreasing, in 1..T."""
-        ...
 
     @property
     def previous(self) -> Tensor:
         """(S,) int64, where each step lands; the last is 0."""
-        ...
 
     def __len__(self) -> int: ...
 
@@ -81,32 +73,26 @@ class PriorLike(Protocol):
     @property
     def conditional(self) -> bool:
         """Whether the prior reads prompts."""
-        ...
 
     def step_table(self, num_steps: int) -> StepTableLike:
         """The reverse steps of a chain of ``num_steps``."""
-        ...
 
     def initial(self, count: int, slots: int, generator: Generator | None = None) -> Tensor:
         """x_T (count, slots, D): standard normal with the known entries clamped."""
-        ...
 
     def clamp(self, x: Tensor) -> Tensor:
         """``x`` with its known entries (fixed welded slots, constant features) set to their values."""
-        ...
 
     def transition(self, x_t: Tensor, step: int, table: StepTableLike) -> Any:
         """p(x_{t-1} | x_t) at ``table.timesteps[step]``, an object with ``from_noise(noise)``.
 
         Known entries are certain; at the last step all are.
         """
-        ...
 
     def inpaint(
         self, batch: SceneBatch, mask: Tensor, *, num_steps: int, generators: list[Generator] | None = None
     ) -> SceneBatch:
         """Regenerate the slots where ``mask`` (B, N) is True, keep the others bit-identical."""
-        ...
 
 
 @runtime_checkable
@@ -119,11 +105,9 @@ class EncodedPriorLike(PriorLike, Protocol):
     @property
     def features(self) -> int:
         """D, numbers per slot of what is denoised."""
-        ...
 
     def decode(self, x: Tensor) -> SceneBatch:
         """Scenes of x (B, N, D)."""
-        ...
 
 
 @runtime_checkable
@@ -132,7 +116,6 @@ class LikelihoodPriorLike(PriorLike, Protocol):
 
     def encode(self, batch: SceneBatch) -> Tensor:
         """Normalised x_0 (B, N, D) of scenes that begin with the scene type's fixed objects."""
-        ...
 
     def pretraining_loss(
         self, x0: Tensor, generator: Generator | None = None, reduction: str = "mean", t: Tensor | None = None
@@ -141,7 +124,6 @@ class LikelihoodPriorLike(PriorLike, Protocol):
 
         All noise comes from ``generator``.
         """
-        ...
 
 
 class PromptedPriorLike(PriorLike, Protocol):
@@ -150,21 +132,17 @@ class PromptedPriorLike(PriorLike, Protocol):
     @property
     def prompt_space(self) -> tuple[int, int]:
         """Largest number of tokens of a prompt, and size of the vocabulary; 0 is padding."""
-        ...
 
     def read_prompts(self, prompts: Sequence[str], slots: int) -> Tensor:
         """Token indices (B, L) int64 on the CPU; ``""`` stands for no prompt."""
-        ...
 
     def encode_tokens(self, indices: Tensor) -> Any:
         """Text that the network attends to, from token indices (B, L)."""
-        ...
 
     def transition(
         self, x_t: Tensor, step: int, table: StepTableLike, *, text: Any = None, guidance: float = 0.0
     ) -> Any:
         """As for any prior, given ``text`` as :meth:`encode_tokens` returns it."""
-        ...
 
     def inpaint(
         self,
@@ -177,4 +155,3 @@ class PromptedPriorLike(PriorLike, Protocol):
         guidance: float = 0.0,
     ) -> SceneBatch:
         """As for any prior, the whole scenes following ``prompt``."""
-        ...

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 from agents.configuration.compose import check_option, choice_word, compose_tree, group_options, hidden, shown
-from agents.configuration.tree import build, check_not_moved, dotted_keys
+from agents.configuration.tree import build, check_not_moved, dotted_keys, typed
 from agents.utils.docstrings import attribute_meanings
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
 
@@ -77,7 +77,7 @@ def describe_fields(config: type | Any, prefix: str = "") -> list[KeyHelp]:
         if dataclasses.is_dataclass(value):
             groups += describe_fields(value, f"{prefix}{field.name}.")
         else:
-            keys.append(KeyHelp(prefix + field.name, _typed(value), meanings.get(field.name, "")))
+            keys.append(KeyHelp(prefix + field.name, typed(value), meanings.get(field.name, "")))
     keys.sort(key=lambda key: _FIRST.index(key.name) if key.name in _FIRST else len(_FIRST))
     return keys + groups
 
@@ -287,9 +287,3 @@ def _text_list(word: str, value: str) -> str:
 def _quoted(text: str) -> str:
     """``text`` in Hydra's quotes, where backslashes count only before a quote."""
     return "'" + re.sub(r"(\\*)('|$)", lambda found: 2 * found[1] + ("\\'" if found[2] else ""), text) + "'"
-
-
-def _typed(value: Any) -> str:
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    return str(value)

@@ -53,7 +53,7 @@ def convert(field: dataclasses.Field[Any], hint: Any, value: Any, path: str, com
     """``value`` as a field of type ``hint`` wants it."""
     if field.metadata.get("named"):
         if isinstance(value, int | float):
-            raise InvalidInputError(f"{path}={_typed(value)[:60]} is neither a name nor a mapping with a name")
+            raise InvalidInputError(f"{path}={typed(value)[:60]} is neither a name nor a mapping with a name")
         alone = isinstance(value, Mapping) and set(value) == {"name"}
         return value["name"] if alone else _plain(value)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
@@ -61,7 +61,7 @@ def convert(field: dataclasses.Field[Any], hint: Any, value: Any, path: str, com
             return value
         if not isinstance(value, Mapping):
             keys = ", ".join(f"{path}.{inner.name}" for inner in dataclasses.fields(hint))
-            raise InvalidInputError(f"{path}={_typed(value)}: {path} is a group of keys; give one of {keys}")
+            raise InvalidInputError(f"{path}={typed(value)}: {path} is a group of keys; give one of {keys}")
         return build(kind_of(field, hint, value), value, f"{path}.", command)
     return _scalar(hint, value, path)
 
@@ -179,7 +179,7 @@ def _scalar(hint: Any, value: Any, path: str) -> Any:
             with contextlib.suppress(InvalidInputError):
                 return _scalar(option, value, path)
         wanted = " or ".join(map(_wanted, options))
-        raise InvalidInputError(f"{path}={_typed(value)} is not {wanted}{' or null' * (type(None) in arguments)}")
+        raise InvalidInputError(f"{path}={typed(value)} is not {wanted}{' or null' * (type(None) in arguments)}")
     if origin in (list, tuple):
         if not isinstance(value, list | tuple):
             _refuse(hint, value, path)
@@ -200,7 +200,7 @@ def _scalar(hint: Any, value: Any, path: str) -> Any:
 
 
 def _refuse(hint: Any, value: Any, path: str) -> Any:
-    raise InvalidInputError(f"{path}={_typed(value)[:300]} is not {_wanted(hint)}")
+    raise InvalidInputError(f"{path}={typed(value)[:300]} is not {_wanted(hint)}")
 
 
 def _wanted(hint: Any) -> str:
@@ -212,10 +212,10 @@ def _wanted(hint: Any) -> str:
     return _WANTED.get(hint, str(hint))
 
 
-def _typed(value: Any) -> str:
-    """As it would be typed on the command line."""
+def typed(value: Any) -> str:
+    """A value as it would be typed on the command line."""
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     if isinstance(value, list | tuple):
-        return ",".join(map(_typed, value))
+        return ",".join(map(typed, value))
     return str(value)

@@ -21,29 +21,23 @@ class ReverseStep(Protocol):
     @property
     def std(self) -> Tensor:
         """(N, D) standard deviation of continuous entries; 0 where an entry is certain or discrete."""
-        ...
 
     @property
     def denoised(self) -> Tensor | None:
         """(B, N, D) the denoiser's estimate of x_0, where it is known."""
-        ...
 
     @property
     def entries(self) -> int:
         """Number of random variables of the step of each scene."""
-        ...
 
     def take(self, rows: Tensor) -> ReverseStep:
         """The step of scenes ``rows`` (K,), which may come more than once."""
-        ...
 
     def from_noise(self, noise: Tensor) -> Tensor:
         """x_s (B, N, D) from standard normal noise (B, N, D): normal noise gives exactly this distribution."""
-        ...
 
     def log_prob(self, x: Tensor) -> Tensor:
         """(B, N) log-probability of ``x`` (B, N, D), summed over each slot's random variables, nats."""
-        ...
 
 
 def gaussian_log_prob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:

@@ -27,6 +27,7 @@ from agents.evaluation.two_sample_test import (
 )
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
+from scene_envs.scene_distance import check_same_assets
 
 RESOLUTION = (1e-3, 1e-2)
 """Standard deviation (m, rad) of the noise both classes get: what a feasible object may move."""
@@ -73,10 +74,7 @@ def classifier_accuracy(
     Raises:
         InvalidInputError: other scene types, fewer than 20 scenes in one batch, no seeds, a negative resolution.
     """
-    if real.scene_type.assets != fake.scene_type.assets:
-        raise InvalidInputError(
-            f"a classifier needs scenes of one type, got {real.scene_type.name!r} and {fake.scene_type.name!r}"
-        )
+    check_same_assets(real, fake)
     if min(resolution) < 0:
         raise InvalidInputError(f"resolution is (m, rad), neither negative, got {resolution}")
     check_classes(len(real), len(fake), seeds)

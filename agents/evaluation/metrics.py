@@ -10,6 +10,7 @@ from torch import Tensor
 from agents.evaluation.supports import CONTAINERS, SUPPORTS, Container, Support
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
+from scene_envs.scene_distance import check_same_assets
 
 KL_EPS = 1e-6
 """Probability added to every category before renormalising, so that a category never sampled stays finite."""
@@ -41,7 +42,7 @@ def category_kl(batch: SceneBatch, reference: SceneBatch, eps: float = KL_EPS) -
     >>> category_kl(SceneBatch.empty("dimsum_table", 3), SceneBatch.empty("dimsum_table", 5))
     0.0
     """
-    _check_same_type(batch, reference)
+    check_same_assets(batch, reference)
     p, q = category_distribution(reference, eps), category_distribution(batch, eps)
     return float((p * (p / q).log()).sum())
 
@@ -50,7 +51,7 @@ def count_wasserstein(batch: SceneBatch, reference: SceneBatch) -> float:
     """Wasserstein-1 distance of the distributions of objects per scene, in objects."""
     from scipy.stats import wasserstein_distance
 
-    _check_same_type(batch, reference)
+    check_same_assets(batch, reference)
     return float(wasserstein_distance(batch.counts.cpu().numpy(), reference.counts.cpu().numpy()))
 
 
@@ -145,11 +146,3 @@ def _is_one_of(batch: SceneBatch, names: Sequence[str]) -> Tensor:
     assets = batch.scene_type.assets
     wanted = [assets.index(name) for name in names if name in assets]
     return torch.isin(batch.categories, torch.tensor(wanted, device=batch.tensor.device))
-
-
-def _check_same_type(batch: SceneBatch, reference: SceneBatch) -> None:
-    if batch.scene_type.assets != reference.scene_type.assets:
-        raise InvalidInputError(
-            f"samples of {batch.scene_type.name!r} cannot be compared with reference scenes of "
-            f"{reference.scene_type.name!r}: their assets differ"
-        )

@@ -19,6 +19,7 @@ from agents.evaluation.two_sample_test import (
 )
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
+from scene_envs.scene_distance import check_same_assets
 
 WIDTH, HEIGHT = 96, 72
 """Default size of the renders, pixels."""
@@ -58,10 +59,7 @@ def render_classifier_accuracy(
         MissingDependencyError: PyBullet is not installed.
         InvalidInputError: other scene types, fewer than 20 scenes in one batch, no seeds, renders below 16 pixels.
     """
-    if real.scene_type.assets != fake.scene_type.assets:
-        raise InvalidInputError(
-            f"a classifier needs scenes of one type, got {real.scene_type.name!r} and {fake.scene_type.name!r}"
-        )
+    check_same_assets(real, fake)
     if min(width, height) < 16:
         raise InvalidInputError(f"renders need at least 16 x 16 pixels, got width={width}, height={height}")
     check_classes(len(real), len(fake), seeds)

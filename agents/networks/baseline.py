@@ -112,6 +112,7 @@ class _Baseline(nn.Module):
 
     def __init__(self, config: BaselineConfig, trunk: nn.Module) -> None:
         super().__init__()
+        self.config = config
         hidden = config.hidden
         self.time_in = mlp(_TIME_WIDTH, hidden, hidden)
         self.text_in = nn.Linear(config.text_width, hidden) if config.text_width else None

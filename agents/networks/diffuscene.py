@@ -162,7 +162,6 @@ class DiffuScene(ContinuousBaseline):
 
     def __init__(self, config: DiffuSceneConfig) -> None:
         super().__init__(config, config.features, _UNet(config))
-        self.config = config
 
 
 class MixedDiffuScene(MixedBaseline):
@@ -177,4 +176,3 @@ class MixedDiffuScene(MixedBaseline):
 
     def __init__(self, config: MixedDiffuSceneConfig) -> None:
         super().__init__(config, _UNet(config))
-        self.config = config

@@ -19,42 +19,34 @@ class FluxSizes(Protocol):
     @property
     def categories(self) -> int:
         """Assets and *empty*."""
-        ...
 
     @property
     def hidden(self) -> int:
         """Width of the token streams."""
-        ...
 
     @property
     def heads(self) -> int:
         """Attention heads."""
-        ...
 
     @property
     def embedding(self) -> int:
         """Width of the embedding of a slot."""
-        ...
 
     @property
     def text_width(self) -> int:
         """Width of the text tokens; 0 without text."""
-        ...
 
     @property
     def unit(self) -> tuple[float, float, float]:
         """Metres per normalised unit along x, y, z."""
-        ...
 
     @property
     def blocks(self) -> int:
         """Number of blocks, of both kinds."""
-        ...
 
     @property
     def pair_width(self) -> int:
         """Number of features of a pair of slots, of all modules that offer some."""
-        ...
 
 
 @dataclass

@@ -124,7 +124,6 @@ class MiDiffusion(ContinuousBaseline):
 
     def __init__(self, config: MiDiffusionConfig) -> None:
         super().__init__(config, config.features, _Transformer(config))
-        self.config = config
 
 
 class MixedMiDiffusion(MixedBaseline):
@@ -140,4 +139,3 @@ class MixedMiDiffusion(MixedBaseline):
 
     def __init__(self, config: MixedMiDiffusionConfig) -> None:
         super().__init__(config, _Transformer(config))
-        self.config = config

@@ -33,19 +33,15 @@ class Searchable(Protocol):
 
     def clone_state(self) -> Any:
         """The current state, the root of the plan."""
-        ...
 
     def legal_actions(self, state: Any) -> Sequence[int]:
         """Actions that can be expanded from ``state``; none at a leaf."""
-        ...
 
     def expand_batch(self, pairs: Sequence[tuple[Any, int]]) -> Sequence[Any]:
         """The child of every (state, action) pair."""
-        ...
 
     def evaluate(self, state: Any) -> float:
         """The objective of ``state``, in [0, 1]."""
-        ...
 
 
 @dataclass

@@ -58,11 +58,6 @@ class Node:
     pending: int = 0
 
     @property
-    def untried(self) -> Sequence[int]:
-        """Legal actions not yet expanded nor reserved."""
-        return self.actions[self.tried :]
-
-    @property
     def mean(self) -> float:
         """Average of the values backed up; pending visits count as 0 (the virtual loss)."""
         tries = self.visits + self.pending

@@ -25,11 +25,9 @@ class BatchGradient(Protocol):
     @property
     def loss(self) -> float:
         """Value of the objective, over the scenes of all processes."""
-        ...
 
     def figures(self) -> Mapping[str, float]:
         """Further columns of the log."""
-        ...
 
 
 class Algorithm(ABC, Generic[Credit]):

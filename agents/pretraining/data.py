@@ -24,11 +24,9 @@ class TrainingData(Protocol):
     @property
     def size(self) -> int:
         """Number of distinct scenes; 0 for an endless stream."""
-        ...
 
     def draw(self, count: int, generator: Generator, *, prompts: bool) -> tuple[Tensor, list[Sequence[str]]]:
         """(count, N, D) encoded scenes, and the prompts of each, if asked for."""
-        ...
 
 
 class SceneTable:

@@ -48,11 +48,9 @@ class Adaptable(Protocol):
 
     def weights(self) -> dict[str, Tensor]:
         """Trained tensors by name."""
-        ...
 
     def requires_grad_(self, requires_grad: bool = True) -> Any:
         """As of torch modules."""
-        ...
 
 
 Prior = TypeVar("Prior", bound=Adaptable)

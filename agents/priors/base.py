@@ -10,28 +10,26 @@ import torch
 from torch import Generator, Tensor, nn
 
 from agents.diffusion import (
-    GaussianProcess,
     Preconditioning,
     ResidualVariance,
     ReverseStep,
     StepTable,
 )
 from agents.networks.count_conditioning import CountConditioning
-from agents.networks.mixed_denoiser import Observed
 from agents.networks.text import Text
 from agents.priors.adapters import AdapterFacts
-from agents.priors.forward import DenoiserOutput, NoisedScenes
+from agents.priors.forward import Trainable
 from agents.priors.inpainting import Inpainting
 from agents.priors.loading import Loadable
 from agents.priors.prompt_validation import check_prompts, no_text
 from scene_envs.errors import InvalidInputError
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
-from scene_envs.scene import POSE_FEATURES, TRANSLATION, SceneBatch
+from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
 
-class ScenePrior(Loadable, Inpainting, nn.Module, ABC):
+class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
     """A trained denoiser with its schedule, layout and normalizer. Tensors x are normalised scenes (B, N, D).
 
     Fixed welded objects and constant features are *known*: clamped to their values while sampling and left
@@ -46,9 +44,6 @@ class ScenePrior(Loadable, Inpainting, nn.Module, ABC):
 
     denoiser: Any
     """The network inside its process, a module with ``.network``."""
-    process: GaussianProcess
-    """The process of what is continuous."""
-    _timestep_weights: Tensor
     adapter: AdapterFacts | None = None
     """Facts about the low-rank updates in training; None for a prior without."""
 
@@ -235,89 +230,6 @@ class ScenePrior(Loadable, Inpainting, nn.Module, ABC):
     def normalised(self, batch: SceneBatch) -> Tensor:
         """(B, N, D) scenes as this process sees them, before known entries are clamped."""
         return batch.to_tensor(normalised=self.normalizer)
-
-    # -- the training loss ----------------------------------------------------------------------
-
-    def draw_timesteps(self, count: int, generator: Generator | None = None) -> Tensor:
-        """(count,) int64 training timesteps, ln(noise-to-signal) being normal."""
-        return torch.multinomial(self._timestep_weights, count, replacement=True, generator=generator)
-
-    def pretraining_loss(
-        self,
-        x0: Tensor,
-        generator: Generator | None = None,
-        reduction: str = "mean",
-        t: Tensor | None = None,
-        text: Text | None = None,
-    ) -> Tensor:
-        """The training loss of scenes ``x0`` (B, N, D) as :meth:`encode` gives them, on entries that are not known.
-
-        Args:
-            x0: normalised scenes.
-            generator: source of timesteps and noise (CPU).
-            reduction: ``"mean"`` over scenes, or ``"none"`` for (B,); always the mean over entries.
-            t: (B,) timesteps, drawn when None.
-            text: tokens (B, L, W) and their mask (B, L), as :meth:`encode_prompts` gives them; None without prompts.
-        """
-        per_scene = self.noised_loss(self.noised(x0, generator, t), text)
-        return per_scene.mean() if reduction == "mean" else per_scene
-
-    @abstractmethod
-    def noised_loss(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
-        """(B,) training losses of scenes that :meth:`noised` has noised; arguments as for :meth:`output`."""
-
-    @abstractmethod
-    def noised(
-        self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None, observed: Observed | None = None
-    ) -> NoisedScenes:
-        """A draw of the forward process for scenes ``x0`` (B, N, D), as the pretraining loss takes it.
-
-        Args:
-            x0: normalised scenes.
-            generator: source of timesteps, noise and observed entries (CPU).
-            t: (B,) timesteps, drawn when None.
-            observed: entries without noise; None draws them as in pretraining.
-        """
-
-    @abstractmethod
-    def output(self, noised: NoisedScenes, text: Text | None = None) -> DenoiserOutput:
-        """Output of the denoiser for noised scenes; differentiable in its parameters.
-
-        Args:
-            noised: as :meth:`noised` gives them.
-            text: tokens (B, L, W) and their mask (B, L), as :meth:`encode_prompts` gives them; None without prompts.
-        """
-
-    def denoised(self, noised: NoisedScenes, output: DenoiserOutput) -> Tensor:
-        """(B, N, F) estimate of x_0 from the continuous ``output`` of noised scenes."""
-        features = output.continuous.shape[-1]
-        return self.process.x0_from_output(noised.x_t[..., :features], noised.t, output.continuous)
-
-    def observed_entries(self, x: Tensor, observed: Observed | None = None) -> Observed | None:
-        """What the network is told of scenes ``x`` (B, N, D) without noise, given ``observed``; None for nothing."""
-        return observed
-
-    def category_kl(self, noised: NoisedScenes, now: DenoiserOutput, then: DenoiserOutput) -> Tensor | None:
-        """(B, N) KL divergences of the categories' reverse steps t -> t - 1 by two outputs, nats.
-
-        ``None`` where categories are a part of the continuous output.
-        """
-        return None
-
-    @property
-    def pose_width(self) -> int:
-        """Leading features of the continuous output that are poses; the others, if any, are categories."""
-        return POSE_FEATURES
-
-    @abstractmethod
-    def fit_residual(self, x0: Tensor, levels: int = 40, seed: int = 0) -> ResidualVariance:
-        """Measure the denoiser's error on normalised scenes ``x0`` (B, N, D) at ``levels`` timesteps, and keep it."""
-
-    def loss_weight(self, slots: int) -> Tensor:
-        """(slots, D) weights of the pretraining loss; 0 on known entries."""
-        weight = (~self.known(slots)).float()
-        weight[:, TRANSLATION] *= self.config.translation_weight
-        return weight
 
 
 def _chunk_sizes(total: int, size: int) -> Iterator[int]:

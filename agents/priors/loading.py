@@ -6,7 +6,7 @@ import os
 from abc import ABC, abstractmethod
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, TypeVar, cast
 
 from torch import Tensor
 
@@ -19,6 +19,8 @@ from agents.priors.storage import StoredPrior, explained, read_stored, write_sto
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene_types import SceneType
+
+Prior = TypeVar("Prior", bound="Loadable")
 
 _CLASSES: dict[str, type[Loadable]] = {}
 """Classes of priors by the name of their process."""
@@ -51,17 +53,17 @@ class Loadable(ABC):
     @classmethod
     @abstractmethod
     def from_state(
-        cls,
+        cls: type[Prior],
         fields: dict[str, Any],
         normalizer: Normalizer,
         preconditioning: Preconditioning,
         card: dict[str, Any] | None,
         residual: ResidualVariance | None,
-    ) -> Self:
+    ) -> Prior:
         """From the ``prior`` entry of a configuration file."""
 
     @classmethod
-    def load(cls, name: str | os.PathLike[str] | Loadable, adapter: AdapterSpec | None = None) -> Self:
+    def load(cls: type[Prior], name: str | os.PathLike[str] | Loadable, adapter: AdapterSpec | None = None) -> Prior:
         """A shipped prior by name, or one from a prior or run directory; in evaluation mode.
 
         Args:
@@ -80,7 +82,7 @@ class Loadable(ABC):
                     f"adapter={adapter!r} is added to a prior that is loaded by name; give its name or folder, not the "
                     "prior itself"
                 )
-            return cast(Self, name)
+            return cast(Prior, name)
         name, named = split_name(name)
         terms = [term for spec in (named, adapter) if spec for term in parse_adapters(spec)]
         stored = read_stored(name)
@@ -91,7 +93,7 @@ class Loadable(ABC):
             prior.load_weights(stored.tensors)
         if terms:
             merge_adapters(prior, str(name), terms)
-        return cast(Self, prior.eval())
+        return cast(Prior, prior.eval())
 
     def save(self, directory: str | os.PathLike[str], precision: str = "float32") -> Path:
         """Write ``config.json`` and ``model.safetensors`` into ``directory``.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
-from typing import Self
+from typing import TypeVar
 
 import torch
 from torch import Generator, Tensor
@@ -21,6 +21,8 @@ from scene_envs.scene_types import members_of
 
 UNIONS = ("one_type", "any")
 """What a scene of a union of scene types may hold."""
+
+Prior = TypeVar("Prior", bound="MixedStates")
 
 
 class MixedStates(PromptReader, ScenePrior):
@@ -42,7 +44,7 @@ class MixedStates(PromptReader, ScenePrior):
         fixed[:, : len(self.scene_type.fixed)] = True
         return Observed(x, fixed, fixed)
 
-    def with_union(self, union: str) -> Self:
+    def with_union(self: Prior, union: str) -> Prior:
         """This prior, for scenes of ``"one_type"`` of a union of scene types or of ``"any"`` of its assets.
 
         Raises:
@@ -50,7 +52,7 @@ class MixedStates(PromptReader, ScenePrior):
         """
         if union not in UNIONS:
             raise unknown_name("union", union, UNIONS)
-        self.mixed = replace(self.mixed, union=union)
+        self.mixed = self.config = replace(self.mixed, union=union)
         return self
 
     @property

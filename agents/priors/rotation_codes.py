@@ -87,7 +87,6 @@ class SceneCode:
     def __init__(self, scene_type: SceneType, rotation: str, normalizer: Normalizer) -> None:
         _check_rotation(rotation)
         self.scene_type, self.rotation = scene_type, rotation
-        self.scene_normalizer = normalizer
         self.normalizer = normalizer if rotation == "matrix" else _code_normalizer(normalizer, rotation)
 
     @property

@@ -14,7 +14,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from scene_envs.assets.base import Array
-from scene_envs.assets.surfaces import Color, join, surface
+from scene_envs.assets.surfaces import Color, fan, grid_faces, join, quad_faces, surface
 
 Face = Literal["-x", "+x", "-y", "+y", "bottom", "top"]
 FACES: tuple[Face, ...] = ("-x", "+x", "-y", "+y", "bottom", "top")
@@ -80,17 +80,6 @@ def _rectangles(owner: NDArray[np.int64]) -> dict[int, list[tuple[int, int, int,
     return joined
 
 
-def quad_faces(count: int) -> NDArray[np.int64]:
-    """(2 count, 3): two triangles for each of ``count`` quadrilaterals with corners 4 k .. 4 k + 3."""
-    first = 4 * np.arange(count)[:, None]
-    return np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])])
-
-
-def fan(count: int) -> NDArray[np.int64]:
-    """(count - 2, 3): triangles of a convex outline of ``count`` corners."""
-    return np.stack([np.zeros(count - 2, dtype=np.int64), np.arange(1, count - 1), np.arange(2, count)], axis=1)
-
-
 def painted_box(
     size: tuple[float, float, float],
     color: Color | Mapping[Face, Color],
@@ -144,13 +133,10 @@ def loft(sections: ArrayLike, color: Color, *, caps: tuple[bool, bool] = (True, 
     """
     grid = np.asarray(sections, dtype=np.float64)
     count, around = grid.shape[:2]
-    index = np.arange(count * around).reshape(count, around)
-    a, b = index[:-1], np.roll(index[:-1], -1, axis=1)
-    d, c = index[1:], np.roll(index[1:], -1, axis=1)
-    faces = np.concatenate([np.stack([a, b, c], axis=-1).reshape(-1, 3), np.stack([a, c, d], axis=-1).reshape(-1, 3)])
     ends = [surface(grid[0], fan(around)[:, ::-1], color), surface(grid[-1], fan(around), color)]
     return join(
-        surface(grid.reshape(-1, 3), faces, color), *(end for end, kept in zip(ends, caps, strict=True) if kept)
+        surface(grid.reshape(-1, 3), grid_faces(count, around), color),
+        *(end for end, kept in zip(ends, caps, strict=True) if kept),
     )
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from scene_envs.assets.base import Array
 from scene_envs.assets.shapes import Profile, circle
@@ -34,16 +34,14 @@ def surface(vertices: ArrayLike, faces: ArrayLike, color: Color, normals: ArrayL
 
 def join(*meshes: trimesh.Trimesh) -> trimesh.Trimesh:
     """One mesh of several; colours and normals are kept."""
-    joined = trimesh.Trimesh(
+    starts = [0, *np.cumsum([len(mesh.vertices) for mesh in meshes[:-1]]).tolist()]
+    return trimesh.Trimesh(
         vertices=np.concatenate([mesh.vertices for mesh in meshes]),
-        faces=np.concatenate(
-            [mesh.faces + start for mesh, start in zip(meshes, _starts(meshes), strict=True)],
-        ),
+        faces=np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]),
         vertex_normals=np.concatenate([mesh.vertex_normals for mesh in meshes]),
         vertex_colors=np.concatenate([_colors(mesh) for mesh in meshes]),
         process=False,
     )
-    return joined
 
 
 def _colors(mesh: trimesh.Trimesh) -> Any:
@@ -51,8 +49,23 @@ def _colors(mesh: trimesh.Trimesh) -> Any:
     return visual.vertex_colors
 
 
-def _starts(meshes: Sequence[trimesh.Trimesh]) -> list[int]:
-    return [0, *np.cumsum([len(mesh.vertices) for mesh in meshes[:-1]]).tolist()]
+def quad_faces(count: int) -> NDArray[np.int64]:
+    """(2 count, 3): two triangles for each of ``count`` quadrilaterals with corners 4 k .. 4 k + 3."""
+    first = 4 * np.arange(count)[:, None]
+    return np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])])
+
+
+def fan(count: int) -> NDArray[np.int64]:
+    """(count - 2, 3): triangles of a convex outline of ``count`` corners."""
+    return np.stack([np.zeros(count - 2, dtype=np.int64), np.arange(1, count - 1), np.arange(2, count)], axis=1)
+
+
+def grid_faces(rows: int, around: int) -> NDArray[np.int64]:
+    """(2 (rows - 1) around, 3): triangles between neighbouring rows of points, each row closed around."""
+    grid = np.arange(rows * around).reshape(rows, around)
+    a, b = grid[:-1], np.roll(grid[:-1], -1, axis=1)
+    d, c = grid[1:], np.roll(grid[1:], -1, axis=1)
+    return np.concatenate([np.stack([a, b, c], axis=-1).reshape(-1, 3), np.stack([a, c, d], axis=-1).reshape(-1, 3)])
 
 
 def lathe(
@@ -95,11 +108,7 @@ def _span(
         quads = np.stack([corners[0], corners[0][there], corners[1][there], corners[1]], axis=1)
         facing = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
         facing /= np.linalg.norm(facing, axis=1, keepdims=True)
-        first = 4 * here
-        faces = np.concatenate(
-            [np.stack([first, first + 1, first + 2], axis=1), np.stack([first, first + 2, first + 3], axis=1)]
-        )
-        return surface(quads.reshape(-1, 3), faces[keep], color, facing.repeat(4, axis=0))
+        return surface(quads.reshape(-1, 3), quad_faces(segments)[keep], color, facing.repeat(4, axis=0))
     faces = np.concatenate(
         [np.stack([here, there, segments + there], axis=1), np.stack([here, segments + there, segments + here], axis=1)]
     )
@@ -117,13 +126,8 @@ def tube(path: ArrayLike, radii: ArrayLike, color: Color, *, sides: int = 10) ->
     unit = circle(sides)
     spokes = across[:, None] * unit[None, :, :1] + np.array([0.0, 1.0, 0.0]) * unit[None, :, 1:]  # (P, sides, 3)
     vertices = points[:, None] + size[:, None, None] * spokes
-    grid = np.arange(len(points) * sides).reshape(len(points), sides)
-    a, b = grid[:-1], np.roll(grid[:-1], -1, axis=1)
-    d, c = grid[1:], np.roll(grid[1:], -1, axis=1)
-    faces = np.concatenate([np.stack([a, b, c], axis=-1).reshape(-1, 3), np.stack([a, c, d], axis=-1).reshape(-1, 3)])
-    body = surface(vertices.reshape(-1, 3), faces, color, spokes.reshape(-1, 3))
-    fan = np.stack([np.zeros(sides - 2, int), np.arange(1, sides - 1), np.arange(2, sides)], axis=1)
-    caps = [surface(vertices[0], fan[:, ::-1], color), surface(vertices[-1], fan, color)]
+    body = surface(vertices.reshape(-1, 3), grid_faces(len(points), sides), color, spokes.reshape(-1, 3))
+    caps = [surface(vertices[0], fan(sides)[:, ::-1], color), surface(vertices[-1], fan(sides), color)]
     return join(body, *caps)
 
 

@@ -27,7 +27,7 @@ from scene_envs.envs.spaces import (
     prior_features,
     resolve_scene_and_prior,
 )
-from scene_envs.envs.trajectories import BoolArray, IntArray, StepResult, Trajectories
+from scene_envs.envs.trajectories import BoolArray, IntArray, StepResult, Trajectories, replace_rows, take_rows
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
@@ -176,7 +176,7 @@ class DenoisingCore:
         if len(rows) == 0:
             return
         start = torch.cat([self._draw_start(rngs[row]) for row in rows.tolist()])
-        self._x = _replace_rows(self._x, rows, start)
+        self._x = replace_rows(self._x, rows, start)
         self._steps[rows] = 0
         if self.prompting.given:
             for row in rows.tolist():
@@ -196,7 +196,7 @@ class DenoisingCore:
             return None
         if self._text is None:
             self._text = tuple(reader.encode_tokens(self._tokens))
-        return tuple(_take_rows(part, rows) for part in self._text)
+        return tuple(take_rows(part, rows) for part in self._text)
 
     def _draw_start(self, rng: np.random.Generator) -> Tensor:
         generator = torch.Generator(self.device).manual_seed(int(rng.integers(2**63)))
@@ -221,8 +221,8 @@ class DenoisingCore:
         given = given.clamp(-self.max_action, self.max_action)
         for step in np.unique(self._steps[rows]):
             group = rows[self._steps[rows] == step]
-            moved = self._transition(_take_rows(self._x, group), _take_rows(given, group), int(step), group)
-            self._x = _replace_rows(self._x, group, moved)
+            moved = self._transition(take_rows(self._x, group), take_rows(given, group), int(step), group)
+            self._x = replace_rows(self._x, group, moved)
         self._steps[rows] += 1
         return self._judge(rows[self.finished[rows]])
 
@@ -256,10 +256,10 @@ class DenoisingCore:
         batch = self.scenes() if together else self.scenes()[torch.from_numpy(ended)]
         prompts = None if self.prompts is None else [self._prompts[row] for row in ended.tolist()]
         score = self.scorer(batch, prompts).to(device)
-        reward = _replace_rows(reward, ended, score.value)
-        valid = _replace_rows(valid, ended, score.valid)
+        reward = replace_rows(reward, ended, score.value)
+        valid = replace_rows(valid, ended, score.valid)
         for name in terms.keys() & score.terms.keys():
-            terms[name] = _replace_rows(terms[name], ended, score.terms[name])
+            terms[name] = replace_rows(terms[name], ended, score.terms[name])
         if not together:
             return StepResult(reward, valid, terminated, terms)
         return StepResult(reward, valid, terminated, terms, score, batch)
@@ -304,17 +304,3 @@ class DenoisingCore:
     def close(self) -> None:
         """Stop physics workers, if any."""
         self.scorer.close()
-
-
-def _take_rows(x: Tensor, rows: IntArray) -> Tensor:
-    """``x[rows]`` without a copy when ``rows`` are all of them."""
-    return x if len(rows) == x.shape[0] else x[torch.from_numpy(rows).to(x.device)]
-
-
-def _replace_rows(x: Tensor, rows: IntArray, values: Tensor) -> Tensor:
-    """A new tensor: ``x`` with ``rows`` (ascending) set to ``values``."""
-    if len(rows) == x.shape[0]:
-        return values
-    changed = x.clone()
-    changed[torch.from_numpy(rows).to(x.device)] = values
-    return changed

@@ -1,4 +1,4 @@
-"""Records of the denoising MDP: results of one step, and whole trajectories."""
+"""Records of the denoising MDP: results of one step, whole trajectories, and rows of their tensors."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from scene_envs.envs.scoring import Score
@@ -59,3 +60,17 @@ class Trajectories:
     score: Score
     batch: SceneBatch
     prompts: tuple[str, ...] | None = None
+
+
+def take_rows(x: Tensor, rows: IntArray) -> Tensor:
+    """``x[rows]`` without a copy when ``rows`` are all of them."""
+    return x if len(rows) == x.shape[0] else x[torch.from_numpy(rows).to(x.device)]
+
+
+def replace_rows(x: Tensor, rows: IntArray, values: Tensor) -> Tensor:
+    """A new tensor: ``x`` with ``rows`` (ascending) set to ``values``."""
+    if len(rows) == x.shape[0]:
+        return values
+    changed = x.clone()
+    changed[torch.from_numpy(rows).to(x.device)] = values
+    return changed

@@ -16,11 +16,9 @@ class PositionDistribution(Protocol):
 
     def draw(self, rng: np.random.Generator) -> tuple[float, float]:
         """One place."""
-        ...
 
     def log_density(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """(P,) log density up to a constant, at ``points`` (P, 2); None when it lives on a line or point."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,6 @@ class Node(Protocol):
 
     def draw(self, rng: np.random.Generator, reasons: Counter[str]) -> list[Tower]:
         """Draw towers; count in ``reasons`` why draws were thrown away."""
-        ...
 
 
 class Filling(Protocol):
@@ -102,8 +101,6 @@ class Filling(Protocol):
     @property
     def node(self) -> Node:
         """Draws the contents; only their asset names count."""
-        ...
 
     def start(self, container: Asset, contents: Sequence[Asset], rng: np.random.Generator) -> list[ContentPose]:
         """A pose for each of ``contents`` from which gravity takes it into the container."""
-        ...

@@ -203,7 +203,7 @@ class _Faces:
         self._own = depths._normals.vectors.take(self.normal, axis=1)
         self._seen = _turned(halves.turn.take(half, axis=2), self._own)  # in the other's frame
         self._level = _dot(self._seen, halves.move.take(half, axis=1)) + depths._offset[self.normal]
-        self._half, self._halves = half, halves
+        self._half = half
         self.support = np.empty(len(half), dtype=np.int64)
         self._corner = np.empty((3, len(half)))
         self.depth = np.empty(len(half))

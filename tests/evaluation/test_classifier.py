@@ -125,7 +125,7 @@ def test_the_network_ignores_order_and_padding() -> None:
 
 def test_bad_input_is_refused(scenes: SceneBatch) -> None:
     other = SceneBatch.empty("pantry_shelf", 30)
-    with pytest.raises(InvalidInputError, match="'dimsum_table' and 'pantry_shelf'"):
+    with pytest.raises(InvalidInputError, match="'dimsum_table' cannot be compared with scenes of 'pantry_shelf'"):
         classifier_accuracy(scenes, other)
     with pytest.raises(InvalidInputError, match="at least 20 real scenes and samples each, got 320 and 3"):
         classifier_accuracy(scenes, scenes[:3])

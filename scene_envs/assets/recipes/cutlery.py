@@ -9,10 +9,10 @@ import numpy as np
 import trimesh
 
 from scene_envs.assets.base import Array, ConvexPart
-from scene_envs.assets.panels import fan, loft, quad_faces
+from scene_envs.assets.panels import loft
 from scene_envs.assets.recipe import Model, asset_recipe
 from scene_envs.assets.shapes import circle, convex_hull, hull_of
-from scene_envs.assets.surfaces import Color, join, surface
+from scene_envs.assets.surfaces import Color, fan, join, quad_faces, surface
 
 _STEEL: Color = (196, 200, 207)
 _BRIGHT: Color = (222, 226, 231)

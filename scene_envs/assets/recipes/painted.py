@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scene_envs.assets.base import Array
 from scene_envs.assets.shapes import Profile, circle
-from scene_envs.assets.surfaces import Color, arc, join, surface
+from scene_envs.assets.surfaces import Color, arc, fan, join, quad_faces, surface
 
 Cells = NDArray[np.int64]
 """Indices into the colours of a surface, one per cell."""
@@ -96,17 +96,14 @@ def loft(loops: ArrayLike, colors: Sequence[Color]) -> trimesh.Trimesh:
         corner = facing + np.roll(facing, 1, axis=0)
         corner /= np.linalg.norm(corner, axis=1, keepdims=True)
         normals = np.stack([corner, np.roll(corner, -1, axis=0), np.roll(corner, -1, axis=0), corner], axis=1)
-        first = 4 * np.arange(len(quads))[:, None]
-        faces = np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])])
-        walls.append(surface(quads.reshape(-1, 3), faces, color, normals.reshape(-1, 3)))
+        walls.append(surface(quads.reshape(-1, 3), quad_faces(len(quads)), color, normals.reshape(-1, 3)))
     return join(sheet(outlines[0, ::-1], colors[0]), *walls, sheet(outlines[-1], colors[-1]))
 
 
 def sheet(outline: ArrayLike, color: Color) -> trimesh.Trimesh:
     """A flat convex face (P, 3), counter-clockwise seen from its front: a lid, a label, a letter's stroke."""
     points = np.asarray(outline, dtype=np.float64)
-    corner = np.arange(1, len(points) - 1)
-    return surface(points, np.stack([np.zeros_like(corner), corner, corner + 1], axis=1), color)
+    return surface(points, fan(len(points)), color)
 
 
 def _normals(points: Array, section: Array) -> Array:
