@@ -6,6 +6,7 @@ import os
 import socket
 from collections.abc import Callable, Iterable
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import multiprocessing
@@ -25,7 +26,8 @@ def train(runs: Iterable[Run]) -> None:
         torch.set_default_dtype(dtype)
         hook = register_module_forward_pre_hook(lambda module, inputs: tuple(map(_as_default, inputs)))
         try:
-            post_train(config, prior=tiny_prior(process=process, text=config.prompt is not None).to(dtype))
+            with patch("matplotlib.figure.Figure.savefig"):  # nobody looks at the curves
+                post_train(config, prior=tiny_prior(process=process, text=config.prompt is not None).to(dtype))
         finally:
             hook.remove()
             torch.set_default_dtype(before)
