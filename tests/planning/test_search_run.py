@@ -131,6 +131,7 @@ def test_an_objective_that_never_scores_is_an_error(run: Run) -> None:
         run_search(run.prior, broken, **SETTINGS)
 
 
+@pytest.mark.slow
 def test_an_objective_beyond_its_scale_is_reported_with_its_raw_value(
     run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
