@@ -1,5 +1,6 @@
 """Isolation of tests: what one test or doctest registers, draws or warns of is unknown to the next."""
 
+import gc
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,6 +11,7 @@ import pytest
 for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # parallel tests do not fight for cores
 os.environ.setdefault("MPLBACKEND", "Agg")
+gc.disable()  # what collection imports is kept: the search of it for garbage costs seconds
 
 
 def _registries() -> list[dict[str, Any]]:
@@ -56,6 +58,12 @@ def _registries_of_test(_registries_of_module: None) -> Iterator[None]:
     evaluation._warned.clear()
     with _restored():
         yield
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_finish() -> None:
+    gc.freeze()  # no later search visits it either
+    gc.enable()
 
 
 @pytest.hookimpl(tryfirst=True)

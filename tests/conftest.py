@@ -2,7 +2,34 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+from typing import Any
+
 import pytest
+from PIL import Image
+
+
+def pytest_collection_finish() -> None:
+    """The ranges of a built-in grammar, which take a sample of seconds, are measured once per process."""
+    ranges = sys.modules.get("scene_envs.datasets.ranges")
+    if ranges is None:  # nothing that was collected generates
+        return
+    from scene_envs.grammars.grammar import Grammar
+    from scene_envs.scene_types.built_in import BUILT_IN
+
+    names, measure = {scene_type.name for scene_type in BUILT_IN}, ranges._ranges
+    known: dict[str, tuple[Any, Any, bool]] = {}
+
+    def once(grammar: Any) -> tuple[Any, Any, bool]:
+        if type(grammar) is not Grammar or grammar.name not in names:
+            return measure(grammar)  # type: ignore[no-any-return]
+        if grammar.name not in known:
+            known[grammar.name] = measure(grammar)
+        low, high, tilted = known[grammar.name]
+        return low.clone(), high.clone(), tilted
+
+    ranges._ranges = once
 
 
 @pytest.fixture
@@ -10,3 +37,13 @@ def few_grammar_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
     """A run on ``data=grammar`` draws 32 scenes for its moments and its vocabulary, and holds 32 out."""
     monkeypatch.setattr("agents.pretraining.setup._SAMPLE", 32)
     monkeypatch.setattr("agents.pretraining.setup._HELD_OUT", 32)
+
+
+@pytest.fixture
+def blank_curves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Curves of runs are composed and not rastered, which is half of a small run's time; a blank PNG is written."""
+
+    def blank(figure: object, path: Path) -> None:
+        Image.new("L", (1, 1)).save(path)
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", blank)

@@ -74,6 +74,7 @@ def test_what_is_measured_already_is_not_measured_again(prior: Path, tmp_path: P
     assert "feasible_fraction" not in first
 
 
+@pytest.mark.slow
 def test_other_settings_or_another_prior_are_measured_anew(
     prior: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
@@ -90,6 +91,7 @@ def test_other_settings_or_another_prior_are_measured_anew(
     assert log(tmp_path / "out").count("layout measured in") == 4
 
 
+@pytest.mark.slow
 def test_other_guidance_measures_the_prompts_alone_anew(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     reads = tiny_prior(process="mixed", text=True).save(tmp_path / "reads")
     words = ["evaluate", f"prior={reads}", *QUICK, "measures=[layout,prompts]", f"output={tmp_path / 'out'}"]

@@ -124,6 +124,7 @@ def test_a_checkpoint_of_the_authors_becomes_a_prior(tmp_path: Path) -> None:
     assert torch.equal(prior.sample(2, num_steps=3, seed=0).tensor, saved.tensor)
 
 
+@pytest.mark.slow
 def test_an_imported_prior_without_geometry_is_sampled_without_physics(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -195,6 +195,7 @@ def test_vector_seeds_and_bad_arguments(prior, height):
         gym.make_vec(ID, num_envs=0, prior=prior, reward=height)
 
 
+@pytest.mark.slow
 def test_physics_rewards_bring_their_terms_and_pictures_their_shape():
     pytest.importorskip("pybullet")
     kwargs = {"prior": tiny_prior(slots=6), "slots": 6, "reward": "feasible_objects", "num_steps": 1}

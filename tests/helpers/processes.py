@@ -6,6 +6,7 @@ import os
 import socket
 from collections.abc import Callable, Iterable
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import multiprocessing
@@ -25,7 +26,8 @@ def train(runs: Iterable[Run]) -> None:
         torch.set_default_dtype(dtype)
         hook = register_module_forward_pre_hook(lambda module, inputs: tuple(map(_as_default, inputs)))
         try:
-            post_train(config, prior=tiny_prior(process=process, text=config.prompt is not None).to(dtype))
+            with patch("matplotlib.figure.Figure.savefig"):  # nobody looks at the curves
+                post_train(config, prior=tiny_prior(process=process, text=config.prompt is not None).to(dtype))
         finally:
             hook.remove()
             torch.set_default_dtype(before)
@@ -37,11 +39,15 @@ def _as_default(x: Any) -> Any:
 
 
 def in_processes(function: Callable[..., None], *arguments: Any, count: int = 2) -> list[int]:
-    """Call ``function`` in ``count`` processes that find each other as under ``torchrun``; returns their statuses."""
+    """Call ``function`` in ``count`` processes that find each other as under ``torchrun``; returns their statuses.
+
+    They begin as copies of a process that has imported what a run needs and done nothing else.
+    """
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1]), "WORLD_SIZE": str(count)}
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__, "scene_envs.assets.built_in", "matplotlib.figure", "scipy.stats"])
     processes = [
         context.Process(target=_launched, args=({"RANK": str(rank), **address}, function, arguments))
         for rank in range(count)

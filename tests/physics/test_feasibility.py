@@ -240,6 +240,7 @@ def test_projection_before_simulation_keeps_objects_closer_to_what_was_asked(nam
     assert int(ready.sum()) >= 0.97 * int(given.is_free.sum())
 
 
+@pytest.mark.slow
 def test_an_object_at_rest_outside_the_workspace_is_not_feasible() -> None:
     """Standing on the floor 2 m across, 1 cm within and 1 cm beyond the edge of a workspace 1 m from the middle."""
     batch = scene(("cube", 0.99, 0.0, 0.0), ("cube", 1.01, 0.5, 0.0))

@@ -61,6 +61,7 @@ def test_every_function_runs_in_workers(batch: SceneBatch, pool: PhysicsPool) ->
     assert penetration(few, pool=pool).pairs == penetration(few).pairs
 
 
+@pytest.mark.slow
 def test_a_scene_type_that_only_this_process_knows_works_in_workers(pool: PhysicsPool) -> None:
     """Its assets come from no recipe: geometry travels with it."""
     batch = SceneBatch.concatenate([scene(("cube", 0.1 * i, 0.0, 0.0)) for i in range(3)])

@@ -131,9 +131,13 @@ def test_an_objective_that_never_scores_is_an_error(run: Run) -> None:
         run_search(run.prior, broken, **SETTINGS)
 
 
+@pytest.mark.slow
 def test_an_objective_beyond_its_scale_is_reported_with_its_raw_value(
-    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    for name in ("draw_curve", "draw_scene"):
+        monkeypatch.setattr(f"agents.planning.search_run.{name}", lambda *_, **__: None)
+
     @register_reward("far_beyond")
     def far_beyond(batch: SceneBatch, context: RewardContext) -> RewardOutput:
         return RewardOutput(torch.where(batch.is_free.any(-1), 50.0 + batch.is_free.sum(-1), 0.0))

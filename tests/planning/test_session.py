@@ -69,6 +69,7 @@ def prior() -> ScenePrior:
     return tiny_prior()
 
 
+@pytest.mark.slow
 def test_the_planners_are_those_that_ship() -> None:
     assert set(PLANNERS) <= set(list_planners())
     alone = "from agents.planning import list_planners; print(*list_planners())"  # before anything else is imported
@@ -76,6 +77,7 @@ def test_the_planners_are_those_that_ship() -> None:
     assert set(PLANNERS) <= set(shown)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("planner", PLANNERS)
 def test_a_killed_run_goes_on_bit_for_bit(planner: str, prior: ScenePrior, tmp_path: Path) -> None:
     settings = {**SETTINGS, "planner": {"name": planner}}

@@ -29,6 +29,7 @@ def example() -> ModuleType:
     return load_example("forward_process")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("process", ["continuous", "mixed"])
 def test_it_trains_and_saves_a_prior(
     example: ModuleType, tmp_path: Path, process: str, monkeypatch: pytest.MonkeyPatch

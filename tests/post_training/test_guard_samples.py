@@ -30,6 +30,7 @@ def trainer(path: Path, **changes: object) -> PostTrainer:
     return made
 
 
+@pytest.mark.slow
 def test_the_base_prior_measures_as_itself(tmp_path: Path) -> None:
     """The same prior has the same samples at every check, so nothing exceeds the base prior."""
     guard = trainer(tmp_path, **{"guard.count_limit": 0.0, "guard.classifier_limit": 0.0}).guard
@@ -42,6 +43,7 @@ def test_the_base_prior_measures_as_itself(tmp_path: Path) -> None:
     assert reading.samples["count_distance"] == count_wasserstein(guard.last_samples, guard.samples.real)
 
 
+@pytest.mark.slow
 def test_a_figure_beyond_its_limit_is_named_and_keeps_nothing(tmp_path: Path) -> None:
     made = trainer(tmp_path, **{"guard.count_limit": 1.0})
     other = tiny_prior()

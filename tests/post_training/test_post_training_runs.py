@@ -229,6 +229,7 @@ def test_prompt_match_without_a_prompt_ends_before_anything_is_sampled(tmp_path:
         post_train(small_config(tmp_path, reward="prompt_match"), prior=tiny_prior())
 
 
+@pytest.mark.slow
 def test_batches_without_valid_reward_change_nothing_and_end_a_run_after_some(tmp_path: Path) -> None:
     calls = []
 
@@ -260,6 +261,7 @@ def test_some_invalid_scenes_leave_the_statistics(tmp_path: Path) -> None:
     assert row["reward"] <= 34
 
 
+@pytest.mark.slow
 def test_guard_keeps_the_best_within_its_limit_and_stops(tmp_path: Path) -> None:
     config = small_config(
         tmp_path, iterations=40, regularisation=0.0, learning_rate=3e-2, guard_limit=1.2, guard_action="stop"

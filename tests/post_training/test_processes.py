@@ -158,7 +158,8 @@ def wait_in_vain(note: Path) -> None:
     """The second process comes, and then never answers."""
     processes = ProcessGroup.join(patience=2.0)
     if not processes.is_first:
-        time.sleep(15)
+        while not note.exists():
+            time.sleep(0.05)
         return
     try:
         processes.wait()

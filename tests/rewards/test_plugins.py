@@ -24,6 +24,7 @@ def test_installed_rewards_are_listed_and_keep_the_contract():
     assert len(check_reward("open_space")) == 6
 
 
+@pytest.mark.slow
 def test_a_target_in_an_installed_reward_package_is_allowed(cups):
     reward = resolve_reward({"_target_": "open_space_rewards.open_space.OpenSpace", "scale": 1.0})
     torch.testing.assert_close(reward(cups, RewardContext()).value, torch.tensor([0.2, 0.4]))
