@@ -45,9 +45,9 @@ PARTS = {
     "full": Part(full_disks, 100, 20),
     "writers": Part(two_writers, 40, 20),
     "rewards": Part(hostile_rewards, 100, 20),
-    "files": Part(fuzzed_files, 10_000, 500),
+    "files": Part(fuzzed_files, 5_000, 500),
     "two_ways": Part(two_ways, 20, 10),
-    "lines": Part(fuzzed_lines, 10_000, 250),
+    "lines": Part(fuzzed_lines, 5_000, 250),
     "episodes": Part(episodes, 10_000, 10_000),
     "physics": Part(physics_calls, 2_000, 2_000),
 }

@@ -64,7 +64,7 @@ def physics_calls(count: int, seed: int = 0) -> Figures:
             moved = batch.tensor.clone()
             noise = torch.randn(moved[..., :3].shape, generator=torch.Generator().manual_seed(number))
             moved[..., :3] += 0.004 * noise * batch.is_free[..., None]
-            batch = SceneBatch(batch.scene_type, moved)
+            batch = SceneBatch(moved, batch.scene_type)
         if number % 40 == 0:
             physics.make_ready(batch)
         elif number % 3:

@@ -27,12 +27,15 @@ def get_scene_type(name: str | SceneType) -> SceneType:
 
     Raises:
         UnknownNameError: no scene type has that name; says which is nearest.
+        InvalidInputError: ``name`` is neither text nor a scene type.
 
     >>> get_scene_type("dimsum_table+pantry_shelf").slots
     61
     """
     if isinstance(name, SceneType):
         return name
+    if not isinstance(name, str):
+        raise InvalidInputError(f"a scene type or its name is needed, got a {type(name).__name__}")
     if name not in _SCENE_TYPES and "+" in name:
         return union_scene_type(name.split("+"), name)
     return _SCENE_TYPES[name]

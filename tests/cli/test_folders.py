@@ -102,6 +102,23 @@ def test_sigterm_ends_a_command_like_ctrl_c_with_its_own_status(monkeypatch, tmp
     assert signal.getsignal(signal.SIGTERM) == before
 
 
+def test_sigterm_during_an_import_that_makes_another_error_of_it_ends_a_command_with_status_143(capsys, monkeypatch):
+    class Told:
+        WRITES = False
+
+        def run(settings: RewardsConfig):
+            try:
+                os.kill(os.getpid(), signal.SIGTERM)
+            except KeyboardInterrupt:
+                raise ImportError("initialization failed") from None
+
+    monkeypatch.setattr(parser, "import_module", lambda name: Told)
+    assert main(["rewards"]) == 143
+    err = capsys.readouterr().err
+    assert "terminated" in err
+    assert "unexpected" not in err
+
+
 def test_a_step_is_finished_before_a_signal_ends_the_run():
     done = []
 
