@@ -19,6 +19,10 @@ _SCENE_TYPES = Registry("scene type", PLUGINS, {scene_type.name: scene_type for 
 def register_scene_type(scene_type: SceneType) -> SceneType:
     """Make ``scene_type`` available by name everywhere; the same name again replaces it."""
     _SCENE_TYPES[scene_type.name] = scene_type
+    if scene_type.asset_folders:
+        from scene_envs.assets.library import know_folders
+
+        know_folders(scene_type.asset_folders)
     return scene_type
 
 
