@@ -16,6 +16,7 @@ from torch import Tensor
 from rewards.base import Reward, RewardContext, RewardOutput
 from rewards.local_files import is_local, load_local
 from scene_envs.errors import InvalidInputError, RewardError
+from scene_envs.plugins import PluginError, load_plugin
 from scene_envs.registry import Registry
 from scene_envs.scene import SceneBatch
 
@@ -230,18 +231,10 @@ def _of_plugin(point: EntryPoint) -> Callable[..., Any]:
     name = point.name
     package = point.dist.name if point.dist is not None else point.module
     try:
-        loaded = point.load()
-    except KeyboardInterrupt:
-        raise
-    except SystemExit as error:
+        loaded = load_plugin(point)
+    except PluginError as error:
         raise RewardError(
-            f"reward {name!r} of the installed package {package!r} cannot be loaded from {point.value!r}: it calls "
-            f"sys.exit({str(error.code)[:80]}) when it is imported"
-        ) from error
-    except BaseException as error:
-        raise RewardError(
-            f"reward {name!r} of the installed package {package!r} cannot be loaded from {point.value!r}: "
-            f"{type(error).__name__}: {error}"
+            f"reward {name!r} of the installed package {package!r} cannot be loaded from {point.value!r}: {error}"
         ) from error
     if isinstance(loaded, ModuleType):  # its decorators have run
         if name not in _REWARDS:

@@ -24,7 +24,15 @@ from agents.cli.sweep import expand_sweeps
 from agents.configuration.tree import config_text
 from agents.utils.interrupts import Terminated, terminable
 from scene_envs import __version__
-from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError, UnknownNameError, unknown_name
+from scene_envs.errors import (
+    CorruptFileError,
+    InvalidInputError,
+    SceneEnvsError,
+    StorageError,
+    TrainingError,
+    UnknownNameError,
+    unknown_name,
+)
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 
@@ -90,7 +98,7 @@ def _guarded(words: list[str], work: Callable[[list[str]], int]) -> int:
     except Exception as error:
         if show_traceback:
             traceback.print_exc()
-        if signals and not isinstance(error, SceneEnvsError):  # compiled code turns an interrupt into another error
+        if signals and not isinstance(error, StorageError | TrainingError):  # some code turns it into another error
             return _ended(TERMINATED)
         return _complain(*_verdict(error))
 

@@ -27,7 +27,7 @@ class Started:
 
     def __init__(self, words: Sequence[str], fresh: bool = False) -> None:
         self.words = list(words)
-        self._told = tempfile.TemporaryFile()
+        self._told = tempfile.TemporaryFile()  # noqa: SIM115 (ends with this object)
         self.status: int | None = None
         self.pid = self._popen() if fresh else self._fork()
 
@@ -50,7 +50,7 @@ class Started:
             os.setsid()
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
             os.dup2(self._told.fileno(), 2)
-            sys.stdout, sys.stderr = (open(number, "w", closefd=False, errors="replace") for number in (1, 2))
+            sys.stdout, sys.stderr = (os.fdopen(number, "w", closefd=False, errors="replace") for number in (1, 2))
             from agents.cli import main
 
             status = main(self.words)

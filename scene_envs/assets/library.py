@@ -10,7 +10,6 @@ from scene_envs.assets.built_in import build_asset, list_assets
 from scene_envs.assets.importing.user_library import find_asset, folder_index
 from scene_envs.errors import InvalidInputError, UnknownNameError, unknown_name
 
-
 _known_folders: dict[str, None] = {}
 """Folders of the scene types that were registered, in that order."""
 

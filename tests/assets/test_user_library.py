@@ -276,6 +276,13 @@ def test_an_unreadable_mesh_names_the_file_and_the_reason(
     assert name in str(caught.value)
 
 
+def test_corners_with_two_coordinates_are_refused_by_name(tmp_path: Path) -> None:
+    (tmp_path / "flat.obj").write_text("v 0 0\nv 1 0\nv 1 1\nf 1 2 3\n")
+    write_yaml(tmp_path, "- {file: flat.obj}")
+    with pytest.raises(CorruptFileError, match=r"flat.obj.*\(3, 2\)"):
+        load_library(tmp_path)
+
+
 def test_a_folder_that_is_missing_or_empty(tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError, match="there is no folder"):
         load_library(tmp_path / "nowhere")

@@ -154,6 +154,13 @@ def test_a_model_path_that_is_no_asset_names_its_file(scenes: torch.Tensor, tmp_
         _load(tmp_path)
 
 
+def test_a_scene_type_that_nobody_knows_names_the_file(scenes: torch.Tensor, tmp_path: Path) -> None:
+    _metadata(tmp_path, scene_type="dimsum]table")
+    _write(_table(NORMALIZER.normalize(scenes).numpy(), "list", pa.float32()), tmp_path / "a.parquet")
+    with pytest.raises(UnknownNameError, match=rf"{tmp_path}.*did you mean 'dimsum_table'"):
+        SceneDataset.load(tmp_path)
+
+
 def test_a_dataset_with_fewer_assets_loads(scenes: torch.Tensor, tmp_path: Path) -> None:
     """The toy scenes hold no plate; a file that does not know plates has the same scenes."""
     few = [*range(13), 14, 15]

@@ -75,8 +75,8 @@ def check_file(path: Path) -> None:
         return  # whoever reads it says why it cannot be read
     if size > limits.megabytes * 1e6:
         raise InvalidInputError(
-            f"{path} has {size / 1e6:,.0f} MB, more than the {limits.megabytes:g} MB that one file of an asset may have; "
-            f"simplify it, or set {_PREFIX}MEGABYTES"
+            f"{path} has {size / 1e6:,.0f} MB, more than the {limits.megabytes:g} MB that one file of an asset may "
+            f"have; simplify it, or set {_PREFIX}MEGABYTES"
         )
     check_triangles(path, _promised(path, size))
 
@@ -86,8 +86,8 @@ def check_triangles(path: Path, count: int) -> None:
     most = ImportLimits.current().triangles
     if count > most:
         raise InvalidInputError(
-            f"{path} has {count:,} triangles, more than the {most:,.0f} that one mesh file may have; simplify it, or set "
-            f"{_PREFIX}TRIANGLES"
+            f"{path} has {count:,} triangles, more than the {most:,.0f} that one mesh file may have; simplify it, or "
+            f"set {_PREFIX}TRIANGLES"
         )
 
 

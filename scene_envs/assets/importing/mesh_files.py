@@ -96,6 +96,10 @@ def _check_content(path: Path) -> None:
 
 def _check_mesh(mesh: trimesh.Trimesh, path: Path) -> None:
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise CorruptFileError(
+            f"{path}: vertices of shape {vertices.shape} and faces of shape {faces.shape} are no triangles in space"
+        )
     if not np.isfinite(vertices).all():
         row = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
         raise CorruptFileError(f"{path}: vertex {row} is {vertices[row].tolist()}; coordinates must be finite")
