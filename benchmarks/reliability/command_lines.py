@@ -124,8 +124,9 @@ def _spoil(line: list[str], rng: random.Random) -> None:
     if kind == "add" or not places:
         line.insert(0, rng.choice((
             "=", "==", "a", "=1", "x.y=1", "++seed=1", "~seed", "+new=1", "hydra.run.dir=/tmp", "--help=",
-            "--config-dir", "--config=/dev/null", "--nothing", "-x", "+experiment=none", "seed", "seed=", "adapter=", "adapter=/",
-            "\udcff=1", "scene@x=1", "/seed=1", "seed=1,2", "--config-dir=/proc", "recipe=none", "é=1", "a" * 5000, ".=1", "..=2",
+            "--config-dir", "--config=/dev/null", "--nothing", "-x", "+experiment=none", "seed", "seed=", "adapter=",
+            "adapter=/", "\udcff=1", "scene@x=1", "/seed=1", "seed=1,2", "--config-dir=/proc", "recipe=none", "é=1",
+            "a" * 5000, ".=1", "..=2",
         )))  # fmt: skip
     elif kind == "twist":
         spot = rng.choice(places)
