@@ -97,6 +97,12 @@ class IsolatedReward:
             body = self._started().ask(message, self.timeout)
         return _unpacked(body, batch.tensor.device)
 
+    def maximum(self, slots: int, free_slots: int) -> float | None:
+        """The largest value that the reward declares; see :func:`rewards.base.declared_maximum`."""
+        with self._lock:
+            found: float | None = self._started().ask(("maximum", slots, free_slots), self.timeout)
+        return found
+
     def close(self) -> None:
         """End the worker; the next call starts another."""
         if self._worker is not None:

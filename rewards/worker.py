@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from rewards.base import RewardContext, depends_on_batch
+from rewards.base import RewardContext, declared_maximum, depends_on_batch
 from rewards.evaluation import describe_error, evaluate_reward
 from rewards.isolation import packed
 from rewards.local_files import allow_local_rewards
@@ -76,6 +76,10 @@ class _Answers:
         self.reward = resolve_reward(reward)
         self.pool = PhysicsPool(workers=workers) if workers else None
         return depends_on_batch(self.reward)
+
+    def maximum(self, slots: int, free_slots: int) -> float | None:
+        """The largest value that the reward declares."""
+        return declared_maximum(self.reward, slots, free_slots)
 
     def describe(self, name: str) -> RewardInfo:
         """The listing of a reward, whose plug-in is imported."""

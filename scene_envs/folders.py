@@ -105,8 +105,8 @@ def _lock(path: Path, owner: str) -> int:
             os.close(descriptor)
             raise InvalidInputError(
                 f"{str(path.parent)!r} is being written by {foreign}, whose last sign of life is less than "
-                f"{_SILENCE} s old; give another output, or, if that computer was switched off, wait a minute or remove "
-                f"{str(path)!r}"
+                f"{_SILENCE} s old; give another output, or, if that computer was switched off, wait a minute or "
+                f"remove {str(path)!r}"
             )
         with contextlib.suppress(FileNotFoundError):
             if os.fstat(descriptor).st_ino == os.stat(path).st_ino:  # nobody removed it meanwhile

@@ -60,7 +60,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
 
     ## Rewards
 
-    Φ(s') - Φ(s), with Φ the objective's value divided by the number of free slots (or by `objective_scale`),
+    Φ(s') - Φ(s), with Φ the objective's value divided by `objective_scale`,
     clipped to [0, 1]. The rewards of an episode add up to Φ(end) - Φ(root). Where the objective could not score the
     child, Φ is that of the parent, the reward is 0 and `info["reward_valid"]` is 0.
 
@@ -92,7 +92,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     | `prior` | `None` | name, path or prior; `None` is the shipped prior of the scene type |
     | `slots` | `None` | slots per scene; `None` is the scene type's number, more is allowed |
     | `mask` | `"culprits"` | [mask](../search.md#masks): a name, a mapping with its settings, or a function |
-    | `objective_scale` | `None` | objective value at which Φ = 1; `None` is the number of free slots |
+    | `objective_scale` | `None` | objective at which Φ = 1; `None` is the largest it declares, else the free slots |
     | `max_nfe` | `None` | denoiser evaluations per episode; `None` is any number |
     | `workers` | `0` | processes for physics in the objective; 0 computes in this one |
     | `render_mode` | `None` | `"rgb_array"` renders the current scene |
