@@ -14,6 +14,7 @@ from rewards import (
     RewardOutput,
     WeightedSum,
     evaluate_reward,
+    resolve_reward,
 )
 from rewards.base import declared_maximum
 from scene_envs import SceneBatch
