@@ -62,7 +62,8 @@ class Reward(Protocol):
     """Anything callable as ``(SceneBatch, RewardContext) -> RewardOutput``.
 
     A scene scores the same alone and in any batch, unless the reward says otherwise by an attribute
-    ``depends_on_batch`` that is True (see :func:`depends_on_batch`).
+    ``depends_on_batch`` that is True (see :func:`depends_on_batch`). It may declare the largest value it gives by an
+    attribute ``maximum`` (see :func:`declared_maximum`), which searches take for their scale.
     """
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput: ...
@@ -75,3 +76,24 @@ def depends_on_batch(*rewards: object) -> bool:
     False
     """
     return any(bool(getattr(reward, "depends_on_batch", False)) for reward in rewards)
+
+
+def declared_maximum(reward: object, slots: int, free_slots: int) -> float | None:
+    """The largest value that a reward declares for scenes of this size, None where it declares no positive number.
+
+    Args:
+        reward: its attribute ``maximum`` is a number, or a method that takes the two arguments below.
+        slots: slots per scene.
+        free_slots: those that fixed objects do not take.
+
+    >>> class Share:
+    ...     maximum = 1.0
+    >>> declared_maximum(Share(), 40, 39), declared_maximum(len, 40, 39)
+    (1.0, None)
+    """
+    declared = getattr(reward, "maximum", None)
+    if callable(declared):
+        declared = declared(slots, free_slots)
+    if isinstance(declared, bool) or not isinstance(declared, int | float):
+        return None
+    return float(declared) if 0 < declared < float("inf") else None

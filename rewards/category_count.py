@@ -34,6 +34,10 @@ class CategoryCount:
             raise InvalidInputError("category_count: assets is empty; name an asset or a group such as 'edible'")
         object.__setattr__(self, "assets", names)
 
+    def maximum(self, slots: int, free_slots: int) -> float:
+        """The largest value: every slot holds one."""
+        return slots
+
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Count; ``per_object`` (B, N) is 1 for each object that counts. Term: ``share`` of all objects.
 

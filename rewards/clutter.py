@@ -47,6 +47,10 @@ class Clutter:
         if self.lines < 1:
             raise InvalidInputError(f"clutter: lines={self.lines} must be at least 1")
 
+    def maximum(self, slots: int, free_slots: int) -> float:
+        """The largest value: all is covered."""
+        return 1.0
+
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Measure covered lengths along parallel lines over each surface.
 

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from rewards.base import Reward, RewardContext, RewardOutput, depends_on_batch
+from rewards.base import Reward, RewardContext, RewardOutput, declared_maximum, depends_on_batch
 from rewards.evaluation import evaluate_reward
 from rewards.registry import register_reward, resolve_reward, reward_name
 from scene_envs.errors import InvalidInputError
@@ -156,6 +156,12 @@ class Clip:
     def depends_on_batch(self) -> bool:
         """Whether ``reward`` does."""
         return depends_on_batch(self.reward)
+
+    def maximum(self, slots: int, free_slots: int) -> float | None:
+        """``high``, or the largest value of the reward where that is less."""
+        inner = declared_maximum(resolve_reward(self.reward), slots, free_slots)
+        bounds = [bound for bound in (self.high, inner) if bound is not None]
+        return min(bounds, default=None)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score and clip; scenes beyond a bound give their objects no credit."""

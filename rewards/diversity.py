@@ -30,6 +30,10 @@ class Diversity:
     name: ClassVar[str] = "diversity"
     depends_on_batch: ClassVar[bool] = True
 
+    def maximum(self, slots: int, free_slots: int) -> float:
+        """The largest value: nothing in common."""
+        return 1.0
+
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Compare all pairs of scenes. Term: ``nearest``, the distance to the nearest other scene, from 0 to 1."""
         count, limit = len(batch), cutoff(batch.scene_type)

@@ -6,6 +6,7 @@ import linecache
 import logging
 from collections.abc import Mapping
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rewards.base import RewardContext, RewardOutput
+from rewards.base import RewardContext, RewardOutput, declared_maximum
 from rewards.function_reward import as_output
 from rewards.registry import is_own, resolve_reward, reward_name
 from rewards.seeding import seeded_generators
@@ -72,6 +73,7 @@ def reward_scorer(reward: Any) -> SceneScorer:
     def score(batch: SceneBatch, *, prompts: tuple[str, ...] | None = None, pool: Any = None) -> RewardOutput:
         return evaluate_reward(resolved, batch, RewardContext(prompts=prompts, pool=pool))
 
+    score.maximum = partial(declared_maximum, resolved)  # type: ignore[attr-defined]
     return score
 
 

@@ -39,6 +39,10 @@ class FeasibleObjects:
             if not getattr(self, setting) > 0:
                 raise InvalidInputError(f"{self.name}: {setting}={getattr(self, setting)} must be positive")
 
+    def maximum(self, slots: int, free_slots: int) -> float:
+        """The largest value: every free slot holds a feasible object."""
+        return free_slots
+
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Count feasible objects; rows that physics could not judge are invalid.
 

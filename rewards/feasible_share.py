@@ -28,6 +28,10 @@ class FeasibleShare(FeasibleObjects):
 
     name: ClassVar[str] = "feasible_share"
 
+    def maximum(self, slots: int, free_slots: int) -> float:
+        """The largest value: all are feasible."""
+        return 1.0
+
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Divide the feasible objects by the free ones; rows that physics could not judge are invalid.
 

@@ -31,6 +31,7 @@ class FunctionReward:
         self.function = function
         self.name = str(name or getattr(function, "__name__", type(function).__name__))
         self.settings = settings
+        self.maximum = getattr(function, "maximum", None)
         self._takes_context = _accepts(function, 2, settings, self.name)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:

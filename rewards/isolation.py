@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import weakref
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from typing import Any
@@ -20,7 +20,16 @@ import torch
 
 from rewards.base import RewardContext, RewardOutput
 from rewards.local_files import allowed_files, is_local, names_in
-from rewards.registry import allowed_targets, is_own, plugin_module, registered_module, resolve_reward, reward_name
+from rewards.registry import (
+    RewardInfo,
+    allowed_targets,
+    is_own,
+    plugin_module,
+    registered_module,
+    resolve_reward,
+    reward_info,
+    reward_name,
+)
 from rewards.seeding import current_draw
 from scene_envs.errors import InvalidInputError, RewardError, SceneEnvsError, UnknownNameError
 from scene_envs.scene import SceneBatch
@@ -88,6 +97,12 @@ class IsolatedReward:
             body = self._started().ask(message, self.timeout)
         return _unpacked(body, batch.tensor.device)
 
+    def maximum(self, slots: int, free_slots: int) -> float | None:
+        """The largest value that the reward declares; see :func:`rewards.base.declared_maximum`."""
+        with self._lock:
+            found: float | None = self._started().ask(("maximum", slots, free_slots), self.timeout)
+        return found
+
     def close(self) -> None:
         """End the worker; the next call starts another."""
         if self._worker is not None:
@@ -147,6 +162,37 @@ def run_reward(reward: Any, *, seed: int = 0, timeout: float = 60.0, memory: flo
         return IsolatedReward(reward, timeout=timeout, memory=memory, seed=seed, workers=workers)
     resolved = resolve_reward(reward)
     return resolved if isinstance(reward, str) and is_own(resolved) else SeededReward(resolved, seed)
+
+
+def describe_rewards(
+    names: Sequence[str], timeout: float = 60.0, memory: float = 1.0
+) -> Iterator[tuple[str, RewardInfo | None, str]]:
+    """Each name with its listing, or with why the reward cannot be used.
+
+    Those of installed packages are imported in another process, so that one which exits, crashes or hangs at its
+    import leaves the others to be listed.
+
+    Args:
+        names: registered names.
+        timeout: seconds that an import may take.
+        memory: GiB that an import may allocate.
+    """
+    worker: _Worker | None = None
+    try:
+        for name in names:
+            try:
+                if not is_foreign(name):
+                    yield name, reward_info(name), ""
+                    continue
+                if worker is None or not worker.alive:
+                    worker = _Worker(name, timeout, memory)
+                worker.name = name
+                yield name, worker.ask(("describe", name), timeout), ""
+            except SceneEnvsError as error:
+                yield name, None, str(error)
+    finally:
+        if worker is not None:
+            worker.stop()
 
 
 def close_reward(reward: Any) -> None:

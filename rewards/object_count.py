@@ -25,6 +25,10 @@ class ObjectCount:
 
     name: ClassVar[str] = "object_count"
 
+    def maximum(self, slots: int, free_slots: int) -> float:
+        """The largest value: every slot holds an object."""
+        return slots
+
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Count the slots that are not empty; ``per_object`` (B, N) is 1 for each of them."""
         present = (~batch.is_empty).float()

@@ -42,6 +42,10 @@ class PromptMatch:
     name: ClassVar[str] = "prompt_match"
     prompt: str | None = None
 
+    def maximum(self, slots: int, free_slots: int) -> float:
+        """The largest value: every claim holds."""
+        return 1.0
+
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Compare every scene with its prompt.
 

@@ -52,6 +52,10 @@ class Reachability:
         object.__setattr__(self, "sides", sides)
         self._gripper()
 
+    def maximum(self, slots: int, free_slots: int) -> float:
+        """The largest value: all are within reach."""
+        return 1.0
+
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Try the gripper at each object. ``per_object`` (B, N) is 1 for what it reaches, as is the flag ``reachable``.
 

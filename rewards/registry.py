@@ -14,6 +14,7 @@ from rewards.base import Reward
 from rewards.function_reward import FunctionReward
 from rewards.local_files import is_local, load_local
 from scene_envs.errors import InvalidInputError, RewardError
+from scene_envs.plugins import PluginError, load_plugin
 from scene_envs.registry import Registry
 
 ENTRY_POINT_GROUP = "scene_envs.rewards"
@@ -193,18 +194,10 @@ def _of_plugin(point: EntryPoint) -> Callable[..., Any]:
     name = point.name
     package = point.dist.name if point.dist is not None else point.module
     try:
-        loaded = point.load()
-    except KeyboardInterrupt:
-        raise
-    except SystemExit as error:
+        loaded = load_plugin(point)
+    except PluginError as error:
         raise RewardError(
-            f"reward {name!r} of the installed package {package!r} cannot be loaded from {point.value!r}: it calls "
-            f"sys.exit({str(error.code)[:80]}) when it is imported"
-        ) from error
-    except BaseException as error:
-        raise RewardError(
-            f"reward {name!r} of the installed package {package!r} cannot be loaded from {point.value!r}: "
-            f"{type(error).__name__}: {error}"
+            f"reward {name!r} of the installed package {package!r} cannot be loaded from {point.value!r}: {error}"
         ) from error
     if isinstance(loaded, ModuleType):  # its decorators have run
         if name not in _REWARDS:

@@ -37,6 +37,10 @@ class Relation:
     name: ClassVar[str] = "relation"
     prompt: str | None = None
 
+    def maximum(self, slots: int, free_slots: int) -> float:
+        """The largest value: every relation holds."""
+        return 1.0
+
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Compare every scene with its prompt.
 

@@ -41,6 +41,10 @@ class Stability:
             if not getattr(self, setting) > 0:
                 raise InvalidInputError(f"stability: {setting}={getattr(self, setting)} must be positive")
 
+    def maximum(self, slots: int, free_slots: int) -> float:
+        """The largest value: all are at rest."""
+        return 1.0
+
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Simulate; rows that physics could not judge are invalid.
 

@@ -17,11 +17,11 @@ from typing import Any
 
 import torch
 
-from rewards.base import RewardContext, depends_on_batch
+from rewards.base import RewardContext, declared_maximum, depends_on_batch
 from rewards.evaluation import describe_error, evaluate_reward
 from rewards.isolation import packed
 from rewards.local_files import allow_local_rewards
-from rewards.registry import allow_reward_targets, resolve_reward
+from rewards.registry import RewardInfo, allow_reward_targets, resolve_reward, reward_info
 from rewards.seeding import other_draw
 from scene_envs.errors import SceneEnvsError
 from scene_envs.physics import PhysicsPool
@@ -76,6 +76,14 @@ class _Answers:
         self.reward = resolve_reward(reward)
         self.pool = PhysicsPool(workers=workers) if workers else None
         return depends_on_batch(self.reward)
+
+    def maximum(self, slots: int, free_slots: int) -> float | None:
+        """The largest value that the reward declares."""
+        return declared_maximum(self.reward, slots, free_slots)
+
+    def describe(self, name: str) -> RewardInfo:
+        """The listing of a reward, whose plug-in is imported."""
+        return reward_info(name)
 
     def score(self, scene_type: Any, scenes: Any, facts: tuple[Any, int, int]) -> dict[str, Any]:
         """Score one batch."""

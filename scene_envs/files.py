@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import math
 import os
@@ -12,7 +13,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from scene_envs.errors import StorageError
+from scene_envs.errors import CorruptFileError, StorageError
+
+_SEAL = "# scene-envs, sha256 of the lines below: "
 
 
 @contextmanager
@@ -46,6 +49,32 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
+
+
+def sealed(text: str) -> str:
+    """YAML text under a first line, a comment, that holds the digest of the lines below it.
+
+    >>> sealed("seed: 0\\n").splitlines()[1:]
+    ['seed: 0']
+    """
+    return f"{_SEAL}{hashlib.sha256(text.encode()).hexdigest()}\n{text}"
+
+
+def read_sealed(path: str | os.PathLike[str]) -> str:
+    """The text of a file that :func:`sealed` text was written to; one without a digest, of earlier versions, as it is.
+
+    Raises:
+        CorruptFileError: it is not what was written, or no text.
+        OSError: it cannot be read.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise CorruptFileError(f"{str(path)!r} is damaged: byte {error.start} is no text") from error
+    head, _, rest = text.partition("\n")
+    if _SEAL.startswith(head[: len(_SEAL)]) and head and head != f"{_SEAL}{hashlib.sha256(rest.encode()).hexdigest()}":
+        raise CorruptFileError(f"{str(path)!r} was cut off or changed after it was written (checksum)")
+    return rest if head.startswith(_SEAL) else text
 
 
 def is_file(path: Path) -> bool:

@@ -17,6 +17,8 @@ from scene_envs.errors import InvalidInputError, StorageError
 from scene_envs.files import storage_error
 
 LOCK = ".writer.lock"
+_BEAT, _SILENCE = 15, 60
+"""Seconds between signs of life of a writer, and without one after which a writer on another computer has ended."""
 _PARTIAL = re.compile(r"\..*?\.(?P<process>\d+)(\.\w+)?\.partial")
 _held: set[Path] = set()
 _guard = threading.Lock()
@@ -62,7 +64,8 @@ def claimed(folder: str | os.PathLike[str], owner: str) -> Iterator[Path]:
             raise
         except OSError as error:
             raise storage_error(folder, error) from error
-        yield folder
+        with _heartbeat(lock):
+            yield folder
     finally:
         with _guard:
             _held.discard(key)
@@ -95,9 +98,16 @@ def _lock(path: Path, owner: str) -> int:
             if error.errno in (errno.EAGAIN, errno.EACCES):
                 raise InvalidInputError(
                     f"{str(path.parent)!r} is being written by {told or 'another process'}; wait until it is done, "
-                    "or give another output"
+                    f"or give another output{_takeover(told, path)}"
                 ) from None
             raise
+        if (foreign := _owner_elsewhere(descriptor)) is not None:
+            os.close(descriptor)
+            raise InvalidInputError(
+                f"{str(path.parent)!r} is being written by {foreign}, whose last sign of life is less than "
+                f"{_SILENCE} s old; give another output, or, if that computer was switched off, wait a minute or "
+                f"remove {str(path)!r}"
+            )
         with contextlib.suppress(FileNotFoundError):
             if os.fstat(descriptor).st_ino == os.stat(path).st_ino:  # nobody removed it meanwhile
                 text = f"{owner}, process {os.getpid()} on {socket.gethostname()}, since {time.strftime('%F %T')}"
@@ -105,6 +115,38 @@ def _lock(path: Path, owner: str) -> int:
                 os.pwrite(descriptor, text.encode(), 0)
                 return descriptor
         os.close(descriptor)
+
+
+def _takeover(told: str, path: Path) -> str:
+    elsewhere = told and f" on {socket.gethostname()}, since" not in told
+    return f"; if that computer was switched off, remove {str(path)!r}" if elsewhere else ""
+
+
+def _owner_elsewhere(descriptor: int) -> str | None:
+    """Who on another computer gave a sign of life lately: a file system may share files and not their locks."""
+    told = os.pread(descriptor, 500, 0).decode(errors="replace").strip()
+    found = re.search(r"process \d+ on (.+), since", told)
+    recent = time.time() - os.fstat(descriptor).st_mtime < _SILENCE
+    return told if found is not None and found[1] != socket.gethostname() and recent else None
+
+
+@contextmanager
+def _heartbeat(descriptor: int) -> Iterator[None]:
+    """Context in which the lock's time of change is set to now every few seconds, for other computers to see."""
+    done = threading.Event()
+
+    def beat() -> None:
+        while not done.wait(_BEAT):
+            with contextlib.suppress(OSError):
+                os.utime(descriptor)
+
+    thread = threading.Thread(target=beat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
 
 
 def _is_alive(process: int) -> bool:

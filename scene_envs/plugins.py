@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 import logging
+import os
+import signal
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from types import FrameType
+from typing import Any, NoReturn
+
+from scene_envs.errors import SceneEnvsError
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -42,10 +51,91 @@ def load_plugins(group: str) -> None:
     """
     for point in plugin_entry_points(group).values():
         try:
-            point.load()
-        except KeyboardInterrupt:
+            load_plugin(point)
+        except PluginError as error:
+            _LOGGER.warning("the plug-in %r (%s) could not be loaded: %s", point.value, group, error)
+
+
+def load_plugin(point: EntryPoint) -> Any:
+    """What an entry point names, its module imported.
+
+    ``sys.exit`` and ``os._exit`` at import end the import and not the process, and an import that takes longer than
+    ``SCENE_ENVS_PLUGIN_SECONDS`` (60 by default) is ended; that of compiled code which holds the interpreter is
+    not, nor one outside the main thread.
+
+    Raises:
+        PluginError: the import failed; says how.
+    """
+    seconds = _seconds()
+    try:
+        with _exits_as_errors(), _ended_after(seconds):
+            return point.load()
+    except KeyboardInterrupt as error:
+        if error.args != (_LATE,):
             raise
-        except BaseException as error:  # a module may also call sys.exit
-            _LOGGER.warning(
-                "the plug-in %r (%s) could not be loaded: %s: %s", point.value, group, type(error).__name__, error
-            )
+        raise PluginError(f"its import took longer than {seconds:g} s; SCENE_ENVS_PLUGIN_SECONDS allows more") from None
+    except SystemExit as error:
+        raise PluginError(f"it calls sys.exit({str(error.code)[:80]}) when it is imported") from None
+    except BaseException as error:
+        raise PluginError(f"{type(error).__name__}: {_text(error)}") from error
+
+
+class PluginError(SceneEnvsError):
+    """A plug-in cannot be imported."""
+
+
+_LATE = "the import of a plug-in takes too long"
+_MOST_TEXT = 500
+
+
+def _text(error: BaseException) -> str:
+    try:
+        text = str(error)
+    except Exception:
+        return "(its text cannot be read)"
+    return text if len(text) <= _MOST_TEXT else f"{text[:_MOST_TEXT]}..."
+
+
+def _seconds() -> float:
+    try:
+        seconds = float(os.environ.get("SCENE_ENVS_PLUGIN_SECONDS", "60"))
+    except ValueError:
+        return 60.0
+    return seconds if 0 < seconds < 1e6 else 60.0
+
+
+@contextmanager
+def _exits_as_errors() -> Iterator[None]:
+    """Context in which ``os._exit`` of this process raises SystemExit."""
+    leave, process = os._exit, os.getpid()
+
+    def refuse(status: int) -> NoReturn:
+        if os.getpid() != process:  # a process that the plug-in forked
+            leave(status)
+        raise SystemExit(status)
+
+    os._exit = refuse  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        os._exit = leave
+
+
+@contextmanager
+def _ended_after(seconds: float) -> Iterator[None]:
+    """Context that is interrupted after ``seconds``, unless something else uses the alarm or this is no main thread."""
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or not hasattr(signal, "setitimer") or signal.getitimer(signal.ITIMER_REAL)[0]:
+        yield
+        return
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt(_LATE)  # which code that catches every Exception lets through
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, signal.SIG_DFL if before is None else before)

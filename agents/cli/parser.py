@@ -24,7 +24,15 @@ from agents.cli.sweep import expand_sweeps
 from agents.configuration.tree import config_text
 from agents.utils.interrupts import Terminated, terminable
 from scene_envs import __version__
-from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError, UnknownNameError, unknown_name
+from scene_envs.errors import (
+    CorruptFileError,
+    InvalidInputError,
+    SceneEnvsError,
+    StorageError,
+    TrainingError,
+    UnknownNameError,
+    unknown_name,
+)
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 
@@ -72,13 +80,14 @@ def _guarded(words: list[str], work: Callable[[list[str]], int]) -> int:
     if "--traceback" in words:
         show_traceback = True
         words.remove("--traceback")
+    signals: list[int] = []
     try:
-        with terminable():
+        with terminable(signals):
             return work(words)
     except Terminated:
-        return _complain("terminated; where the output can be resumed, the same command goes on", TERMINATED)
+        return _ended(TERMINATED)
     except KeyboardInterrupt:
-        return _complain("interrupted; where the output can be resumed, the same command goes on", INTERRUPTED)
+        return _ended(INTERRUPTED)
     except BrokenPipeError:  # the reader of our output has gone, as in `scene-envs rewards | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
@@ -89,7 +98,14 @@ def _guarded(words: list[str], work: Callable[[list[str]], int]) -> int:
     except Exception as error:
         if show_traceback:
             traceback.print_exc()
+        if signals and not isinstance(error, StorageError | TrainingError):  # some code turns it into another error
+            return _ended(TERMINATED)
         return _complain(*_verdict(error))
+
+
+def _ended(status: int) -> int:
+    what = "terminated" if status == TERMINATED else "interrupted"
+    return _complain(f"{what}; where the output can be resumed, the same command goes on", status)
 
 
 def entry_point() -> None:

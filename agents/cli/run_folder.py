@@ -14,8 +14,8 @@ from typing import Any
 
 from agents.configuration.tree import config_text, dotted
 from agents.utils.process_group import is_first_process, launched_processes
-from scene_envs.errors import InvalidInputError
-from scene_envs.files import storage_error, write_json, write_text
+from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.files import read_sealed, sealed, storage_error, write_json, write_text
 from scene_envs.folders import claimed
 
 _PACKAGES = ("scene_envs", "rewards", "agents")
@@ -125,13 +125,16 @@ class Run:
     def _check_keys(self) -> None:
         import yaml
 
+        path = self.directory / "config.yaml"
         try:
-            before = yaml.safe_load((self.directory / "config.yaml").read_text(encoding="utf-8"))
-            now = yaml.safe_load(config_text(self.settings))
-        except (OSError, yaml.YAMLError, UnicodeDecodeError):
+            before = yaml.safe_load(read_sealed(path))
+        except OSError:
             return
+        except (CorruptFileError, yaml.YAMLError) as error:
+            raise _unreadable(path, " ".join(str(error).split())) from error
         if not isinstance(before, dict):
-            return
+            raise _unreadable(path, f"{str(path)!r} holds no keys")
+        now = yaml.safe_load(config_text(self.settings))
         was, is_now = dotted(before), dotted(now)
         changed = [
             f"{key} was {was[key]!r}, is {is_now[key]!r}"
@@ -186,7 +189,7 @@ class Run:
 
     def _write_config(self) -> None:
         if self._is_first:
-            write_text(self.directory / "config.yaml", config_text(self.settings))
+            write_text(self.directory / "config.yaml", sealed(config_text(self.settings)))
 
     def _start_logging(self) -> None:
         screen = logging.StreamHandler(sys.stderr)
@@ -199,6 +202,13 @@ class Run:
             logger.setLevel(logging.INFO)
             for handler in self._handlers:
                 logger.addHandler(handler)
+
+
+def _unreadable(path: Path, reason: str) -> CorruptFileError:
+    return CorruptFileError(
+        f"{reason}, so whether {str(path.parent)!r} was written with these keys cannot be told; give another output, "
+        f"or remove {path.name} to write into the folder all the same"
+    )
 
 
 def _writer(folder: Path) -> str | None:

@@ -32,7 +32,8 @@ class SearchConfig:
         mask: which objects to regenerate: a registered name, or a mapping of it and its settings; in Python a function
             as well.
         slots: slots per scene; null takes the scene type's.
-        objective_scale: objective at which Φ is 1; null takes the environment's.
+        objective_scale: objective at which Φ is 1; null takes the largest value that it declares, or else the number of
+            free slots.
         seed: of the tree; the baseline's first scenes are those of the tree.
         workers: physics worker processes; 0 computes in this process.
         prompt: what all scenes should hold, for priors that read prompts; the objective sees it too. null for anything.

@@ -24,7 +24,7 @@ from agents.planning.tree_page import shown_nodes, write_tree_page
 from scene_envs.envs import SearchEnv, SearchState
 from scene_envs.envs.resolvers import resolve_prior
 from scene_envs.errors import InvalidInputError, SceneEnvsError
-from scene_envs.files import finite, write_json, write_text
+from scene_envs.files import finite, sealed, write_json, write_text
 from scene_envs.folders import claimed
 from scene_envs.scene import SceneBatch
 
@@ -167,7 +167,7 @@ def _search(
         if len(parts) == 1:
             _write_tree(outcome, env, session, folder)
         plain = {key: value for key, value in named.items() if isinstance(value, _PLAIN)}
-        write_text(folder / "config.yaml", config_text(plain))
+        write_text(folder / "config.yaml", sealed(config_text(plain)))
     return outcome
 
 

@@ -136,7 +136,8 @@ class PostTrainConfig:
 
     Attributes:
         prior: the prior to start from, a shipped name or a path.
-        reward: registered name, or a mapping with ``name`` and settings.
+        reward: registered name, or a mapping with ``name`` and settings; in Python a function or reward object as
+            well, which runs in this process: a hang or crash of it is the run's.
         output: run directory; an interrupted run found there goes on where it stopped; empty for runs/COMMAND-TIME
             on the command line, runs/post-train in Python.
         prompt: what the scenes should hold, for priors that read prompts: one text, a list such as

@@ -44,7 +44,7 @@ def writing(what: str, write: Callable[[], object]) -> None:
 
 def write_config(directory: Path, config: PostTrainConfig) -> None:
     """``config.yaml``, every field."""
-    write_text(directory / "config.yaml", config_text(config.plain()))
+    write_text(directory / "config.yaml", files.sealed(config_text(config.plain())))
 
 
 def run_metrics(

@@ -30,7 +30,7 @@ from agents.utils.process_group import ProcessGroup, is_first_process
 from agents.utils.seeds import derived_generator
 from agents.utils.weight_average import AveragedWeights, WeightAverage
 from scene_envs.errors import InvalidInputError, TrainingError
-from scene_envs.files import write_json, write_text
+from scene_envs.files import sealed, write_json, write_text
 from scene_envs.folders import claimed
 
 logger = logging.getLogger(__name__)
@@ -295,6 +295,6 @@ def _pretrain(config: PretrainConfig) -> dict[str, Any]:
     metrics = {**trained.card, "evaluations": trainer.evaluations}
     if not trainer.processes.is_first:
         return metrics
-    write_text(trainer.directory / "config.yaml", config_text(config))
+    write_text(trainer.directory / "config.yaml", sealed(config_text(config)))
     write_json(trainer.directory / "metrics.json", metrics)
     return metrics

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from agents.priors.facts import PriorFacts
 from agents.priors.files import read_config, write_config
 from scene_envs.errors import CorruptFileError, InvalidInputError
-from scene_envs.files import write_text
+from scene_envs.files import read_sealed, write_text
 
 if TYPE_CHECKING:
     from agents.priors.base import ScenePrior
@@ -198,7 +198,7 @@ def _training_of(source: Path) -> dict[str, Any]:
     folder = source.parent if source.name == "prior" else source
     if not (folder / "config.yaml").is_file():
         return {}
-    config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
+    config = yaml.safe_load(read_sealed(folder / "config.yaml"))
     optimizer = config.get("optimizer") if isinstance(config, dict) else None
     if not isinstance(optimizer, dict):
         return {}

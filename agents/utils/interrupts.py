@@ -21,9 +21,20 @@ class Terminated(KeyboardInterrupt):
 
 
 @contextmanager
-def terminable() -> Iterator[None]:
-    """Context in which SIGTERM raises :class:`Terminated`; in other threads than the first nothing is changed."""
-    with _handling({signal.SIGTERM: _raise}):
+def terminable(received: list[int] | None = None) -> Iterator[None]:
+    """Context in which SIGTERM raises :class:`Terminated`; in other threads than the first nothing is changed.
+
+    Args:
+        received: gets the number of each such signal, for who meets another error that compiled code made of it, as an
+            import of an extension module does.
+    """
+
+    def note_and_raise(number: int, frame: FrameType | None) -> None:
+        if received is not None:
+            received.append(number)
+        _raise(number, frame)
+
+    with _handling({signal.SIGTERM: note_and_raise}):
         yield
 
 

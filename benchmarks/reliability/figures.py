@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 
 @dataclass
@@ -15,6 +16,7 @@ class Figures:
         different: a result was not that of an undisturbed run.
         silent: something wrong was told as success, or not in the project's own words.
         notes: the first cases, for whoever looks into them.
+        measured: further figures by name.
     """
 
     tried: int = 0
@@ -22,6 +24,7 @@ class Figures:
     different: int = 0
     silent: int = 0
     notes: list[str] = field(default_factory=list)
+    measured: dict[str, Any] = field(default_factory=dict)
 
     def note(self, text: str) -> None:
         """Remember a case, if there are not many yet."""

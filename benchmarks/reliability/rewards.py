@@ -42,7 +42,7 @@ def hostile_rewards(count: int, seed: int = 0) -> Figures:
                 told, lost = output.problem, not bool(output.is_valid.any())
             except Exception as error:
                 told, lost = str(error), True
-            if not lost or (not told and "nan" not in body) or len(told) > 2000 or time.monotonic() - started > 20:
+            if not lost or (not told and "nan" not in body) or len(told) > 2000 or time.monotonic() - started > 60:
                 figures.silent += 1
                 figures.note(f"{body!r}{' at import' * at_import}: {told!r} in {time.monotonic() - started:.1f} s")
     return figures

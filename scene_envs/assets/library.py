@@ -5,10 +5,18 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
-from scene_envs.assets.base import AssetLibrary
+from scene_envs.assets.base import Asset, AssetLibrary
 from scene_envs.assets.built_in import build_asset, list_assets
 from scene_envs.assets.importing.user_library import find_asset, folder_index
-from scene_envs.errors import unknown_name
+from scene_envs.errors import InvalidInputError, UnknownNameError, unknown_name
+
+_known_folders: dict[str, None] = {}
+"""Folders of the scene types that were registered, in that order."""
+
+
+def know_folders(folders: Sequence[str | os.PathLike[str]]) -> None:
+    """Let :func:`get_library` find the assets of these folders by name alone, after the built-in ones."""
+    _known_folders.update(dict.fromkeys(map(str, folders)))
 
 
 def get_library(names: Sequence[str], folders: Sequence[str | os.PathLike[str]] = ()) -> AssetLibrary:
@@ -16,17 +24,32 @@ def get_library(names: Sequence[str], folders: Sequence[str | os.PathLike[str]] 
 
     Args:
         names: asset names in category order.
-        folders: of users' own assets, searched in this order before the built-in ones.
+        folders: of users' own assets, searched in this order before the built-in ones. The folders of registered scene
+            types are searched after them.
 
     Raises:
         UnknownNameError: neither a folder nor a recipe has that name; the nearest known one is offered.
-        InvalidInputError: a folder or one of its entries is wrong.
+        InvalidInputError: a folder or one of its entries is wrong, or ``names`` is no list of names.
         CorruptFileError: a file of a folder cannot be read.
     """
-    if not folders:
-        return AssetLibrary(tuple(build_asset(name) for name in names))
+    if isinstance(names, str | os.PathLike):
+        raise InvalidInputError(
+            f"get_library takes a list of asset names, as in [{str(names)!r}]; load_library(folder) reads a folder"
+        )
     own = [name for folder in folders for name in folder_index(folder).names]
-    for name in names:
-        if name not in own and name not in list_assets():
-            raise unknown_name("asset", name, [*own, *list_assets()])
-    return AssetLibrary(tuple(find_asset(name, folders) or build_asset(name) for name in names))
+    return AssetLibrary(tuple(_find(name, own, folders) for name in names))
+
+
+def _find(name: str, own: Sequence[str], folders: Sequence[str | os.PathLike[str]]) -> Asset:
+    """The asset called ``name``; ``own`` are the names in ``folders``."""
+    if name in own:
+        places: tuple[str | os.PathLike[str], ...] = tuple(folders)
+    elif name in list_assets():
+        return build_asset(name)
+    else:
+        places = tuple(folder for folder in _known_folders if os.path.isdir(folder))
+    if (asset := find_asset(name, places)) is not None:
+        return asset
+    known = [known for folder in places for known in folder_index(folder).names]
+    error = unknown_name("asset", name, [*own, *known, *list_assets()])
+    raise UnknownNameError(f"{error} Assets of your own: give the folder in folders=, or register their scene type.")

@@ -18,7 +18,7 @@ from scene_envs.datasets.files import Rows, find_files, find_metadata, list_bloc
 from scene_envs.datasets.info import DatasetInfo, read_metadata
 from scene_envs.datasets.layout import FIXED_TOLERANCE, Layout, scene_keys
 from scene_envs.datasets.splits import Part, check_fractions, split_rows
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
@@ -233,4 +233,10 @@ def make_layout(
     name = scene_type if scene_type is not None else info.scene_type
     if name is None:
         raise InvalidInputError(f"{str(info.path)!r} names no scene type; pass scene_type=")
-    return Layout(info, get_scene_type(name), aliases or {}, fixed_tolerance, slots)
+    try:
+        known = get_scene_type(name)
+    except (InvalidInputError, UnknownNameError) as error:
+        if scene_type is not None:
+            raise
+        raise type(error)(f"{str(info.path)!r}: {error} Register it, or pass scene_type=") from error
+    return Layout(info, known, aliases or {}, fixed_tolerance, slots)

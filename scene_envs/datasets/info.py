@@ -70,7 +70,7 @@ class DatasetInfo:
             whole = Path(path).name  # our paths have no suffix, but a name may hold a dot
             name = aliases.get(path, aliases.get(stem, whole if whole in scene_type.assets else stem))
             if name not in scene_type.assets:
-                kind = f"asset of {scene_type.name!r} (model path {path!r}; pass aliases=)"
+                kind = f"asset of {scene_type.name!r} (model path {path!r} in {str(self.path)!r}; pass aliases=)"
                 raise unknown_name(kind, name, scene_type.assets)
             found.append(scene_type.assets.index(name))
         return torch.tensor([*found, scene_type.num_assets])

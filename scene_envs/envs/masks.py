@@ -12,6 +12,7 @@ from torch import Tensor
 from scene_envs.envs import mask_generators as shipped
 from scene_envs.envs.scoring import Score
 from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.plugins import load_plugin
 from scene_envs.registry import Registry
 from scene_envs.scene import SceneBatch
 
@@ -41,7 +42,7 @@ _SHIPPED: dict[str, MaskGenerator] = {
     "unstable": shipped.unstable_mask,
 }
 _MASKS: Registry[MaskGenerator] = Registry(
-    "mask generator", ENTRY_POINT_GROUP, _SHIPPED, read=lambda point: _checked(point.name, point.load())
+    "mask generator", ENTRY_POINT_GROUP, _SHIPPED, read=lambda point: _checked(point.name, load_plugin(point))
 )
 
 

@@ -81,6 +81,11 @@ class RewardScorer:
         terms = {name: torch.nan_to_num(term.float(), 0.0, 0.0, 0.0) for name, term in output.terms.items()}
         return Score(value, valid, terms, output.per_object, output.object_flags)
 
+    def maximum(self, slots: int, free_slots: int) -> float | None:
+        """The largest value that the reward declares for scenes of this size, None where it declares none."""
+        declared = getattr(self._score, "maximum", None)
+        return None if declared is None else declared(slots, free_slots)
+
     def probe(self, empty: SceneBatch, prompts: Sequence[str] | None = None) -> tuple[str, ...]:
         """Names of the terms this reward reports, found by scoring one empty scene in this process."""
         output = self._score(empty, prompts=None if prompts is None else tuple(prompts))

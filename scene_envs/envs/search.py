@@ -139,11 +139,12 @@ class SearchProblem:
         self.branching, self.max_depth, self.num_steps = chosen.branching, chosen.max_depth, chosen.num_steps
         self.num_actions, self.max_nfe = chosen.branching, chosen.max_nfe
         self.prior.step_table(self.num_steps)  # says now, not later, that num_steps is more than the prior has
-        free_slots = self.slots - len(self.scene_type.fixed)
-        self.scale = float(free_slots) if chosen.objective_scale is None else chosen.objective_scale
         self.prompting = EnvPrompts(self.prior, chosen.prompt, chosen.guidance, self.slots)
         self.prompt = self.prompting.draw(np.random.default_rng(0)) if self.prompting.given else None
         self.scorer = RewardScorer(chosen.objective, chosen.workers)
+        free_slots = self.slots - len(self.scene_type.fixed)
+        declared = self.scorer.maximum(self.slots, free_slots) if chosen.objective_scale is None else None
+        self.scale = chosen.objective_scale or declared or float(free_slots)
         self.evaluations = 0
         self._told_of_scale = False
 

@@ -58,9 +58,9 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
 
     ## Rewards
 
-    The reward is Φ(s') - Φ(s). Φ is the objective's value divided by the number of free slots (or by
-    `objective_scale`), clipped to [0, 1]. The rewards of an episode add up to Φ(end) - Φ(root). If the objective cannot
-    score the child, the child takes the parent's Φ, so the reward is 0, and `info["reward_valid"]` is 0.
+    The reward is Φ(s') - Φ(s). Φ is the objective's value divided by `objective_scale`, clipped to [0, 1]. The
+    rewards of an episode add up to Φ(end) - Φ(root). If the objective cannot score the child, the child takes the
+    parent's Φ, so the reward is 0, and `info["reward_valid"]` is 0.
 
     ## Starting State
 
@@ -90,7 +90,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     | `prior` | `None` | name, path or prior; `None` is the shipped prior of the scene type |
     | `slots` | `None` | slots per scene; `None` is the scene type's number, more is allowed |
     | `mask` | `"culprits"` | [mask](../search.md#masks): a name, a mapping with its settings, or a function |
-    | `objective_scale` | `None` | objective value at which Φ = 1; `None` is the number of free slots |
+    | `objective_scale` | `None` | objective at which Φ = 1; `None` is the largest it declares, else the free slots |
     | `max_nfe` | `None` | denoiser evaluations per episode; `None` is any number |
     | `workers` | `0` | worker processes for physics in the objective; 0 computes in the calling process |
     | `render_mode` | `None` | `"rgb_array"` renders the current scene |

@@ -54,9 +54,9 @@ class SearchMaskEnv(SearchEnv):
 
     ## Rewards
 
-    The reward is Φ(s') - Φ(s). Φ is the objective's value divided by the number of free slots (or by
-    `objective_scale`), clipped to [0, 1]. The rewards of an episode add up to Φ(end) - Φ(root). If the objective cannot
-    score the child, the child takes the parent's Φ, so the reward is 0, and `info["reward_valid"]` is 0.
+    The reward is Φ(s') - Φ(s). Φ is the objective's value divided by `objective_scale`, clipped to [0, 1]. The
+    rewards of an episode add up to Φ(end) - Φ(root). If the objective cannot score the child, the child takes the
+    parent's Φ, so the reward is 0, and `info["reward_valid"]` is 0.
 
     ## Starting State
 
@@ -87,7 +87,7 @@ class SearchMaskEnv(SearchEnv):
     | `num_steps` | `50` | denoising steps per inpainting |
     | `prior` | `None` | name, path or prior; `None` is the shipped prior of the scene type |
     | `slots` | `None` | slots per scene; `None` is the scene type's number, more is allowed |
-    | `objective_scale` | `None` | objective value at which Φ = 1; `None` is the number of free slots |
+    | `objective_scale` | `None` | objective at which Φ = 1; `None` is the largest it declares, else the free slots |
     | `max_nfe` | `None` | denoiser evaluations per episode; `None` is any number |
     | `workers` | `0` | worker processes for physics in the objective; 0 computes in the calling process |
     | `render_mode` | `None` | `"rgb_array"` renders the current scene |

@@ -91,7 +91,8 @@ class TreeSettings(EnvSettings):
         objective: any reward: name, mapping, function or reward object.
         branching: B, inpaintings to choose from.
         max_depth: actions per episode.
-        objective_scale: objective at which Φ is 1; None means the number of free slots.
+        objective_scale: objective at which Φ is 1; None means the largest value that it declares, or else the number
+            of free slots.
         max_nfe: denoiser evaluations per episode; None for any number.
 
     Raises:

@@ -19,6 +19,10 @@ _SCENE_TYPES = Registry("scene type", PLUGINS, {scene_type.name: scene_type for 
 def register_scene_type(scene_type: SceneType) -> SceneType:
     """Make ``scene_type`` available by name everywhere; the same name again replaces it."""
     _SCENE_TYPES[scene_type.name] = scene_type
+    if scene_type.asset_folders:
+        from scene_envs.assets.library import know_folders
+
+        know_folders(scene_type.asset_folders)
     return scene_type
 
 
@@ -27,12 +31,15 @@ def get_scene_type(name: str | SceneType) -> SceneType:
 
     Raises:
         UnknownNameError: no scene type has that name; says which is nearest.
+        InvalidInputError: ``name`` is neither text nor a scene type.
 
     >>> get_scene_type("dimsum_table+pantry_shelf").slots
     61
     """
     if isinstance(name, SceneType):
         return name
+    if not isinstance(name, str):
+        raise InvalidInputError(f"a scene type or its name is needed, got a {type(name).__name__}")
     if name not in _SCENE_TYPES and "+" in name:
         return union_scene_type(name.split("+"), name)
     return _SCENE_TYPES[name]

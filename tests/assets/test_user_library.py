@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import textwrap
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import trimesh
 
 from scene_envs.assets import Asset, get_library, import_report, load_library
 from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError, UnknownNameError
+from scene_envs.scene_types import get_scene_type, register_scene_type
 
 SIZE = (0.1, 0.06, 0.04)
 
@@ -178,6 +180,23 @@ def test_own_assets_come_before_built_in_ones_and_unknown_names_offer_both(tmp_p
         get_library(("teapott",), (str(tmp_path),))
 
 
+def test_assets_of_a_registered_scene_type_are_found_by_name_alone(tmp_path: Path) -> None:
+    brick().export(tmp_path / "yellow_brick.stl")
+    with pytest.raises(UnknownNameError, match="give the folder in folders="):
+        get_library(["yellow_brick"])
+    table = get_scene_type("dimsum_table")
+    changes = {"name": "a_yellow_table", "assets": ("cafe_table", "yellow_brick"), "asset_folders": (str(tmp_path),)}
+    register_scene_type(replace(table, **changes))
+    brick_again, cup = get_library(["yellow_brick", "teacup"])
+    assert brick_again.display_name == "yellow brick"
+    assert cup.name == "teacup"
+
+
+def test_a_name_that_is_no_list_of_names_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match=r"as in \['teacup'\]"):
+        get_library("teacup")
+
+
 def test_class_colors_differ_from_each_other_and_from_the_built_in_ones(tmp_path: Path) -> None:
     brick().export(tmp_path / "brick.stl")
     write_yaml(tmp_path, "\n".join(f"- {{file: brick.stl, name: brick_{i}}}" for i in range(10)))
@@ -255,6 +274,13 @@ def test_an_unreadable_mesh_names_the_file_and_the_reason(
         load_library(tmp_path)
     assert message in str(caught.value)
     assert name in str(caught.value)
+
+
+def test_corners_with_two_coordinates_are_refused_by_name(tmp_path: Path) -> None:
+    (tmp_path / "flat.obj").write_text("v 0 0\nv 1 0\nv 1 1\nf 1 2 3\n")
+    write_yaml(tmp_path, "- {file: flat.obj}")
+    with pytest.raises(CorruptFileError, match=r"flat.obj.*\(3, 2\)"):
+        load_library(tmp_path)
 
 
 def test_a_folder_that_is_missing_or_empty(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pyarrow.parquet as parquet
@@ -60,7 +61,9 @@ def test_every_figure_stands_beside_its_floor(prior: Path, data: Path, tmp_path:
     assert len(SceneBatch.load(tmp_path / "scenes.safetensors")) == 3
 
 
-def test_what_is_measured_already_is_not_measured_again(prior: Path, tmp_path: Path) -> None:
+def test_what_is_measured_already_is_not_measured_again(
+    prior: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
     words = ["evaluate", f"prior={prior}", *QUICK, f"output={tmp_path}"]
     assert main([*words, "measures=layout"]) == 0
     first, drawn = metrics(tmp_path), (tmp_path / "scenes.safetensors").stat().st_mtime_ns
@@ -72,6 +75,15 @@ def test_what_is_measured_already_is_not_measured_again(prior: Path, tmp_path: P
     assert all(second[name] == value for name, value in first.items() if name != "evaluation")
     assert "feasible_fraction" in second
     assert "feasible_fraction" not in first
+    path = tmp_path / "metrics.json"
+    whole = path.read_text()
+    for damaged, reason in (
+        (whole[:200], "cut off"),
+        (whole.replace('"objects_max": ', '"objects_max": 1'), "changed"),
+    ):
+        path.write_text(damaged)
+        assert main([*words, "measures=layout"]) == 2
+        assert re.search(rf"metrics.json' (is|was) {reason}.*remove it to measure anew", capsys.readouterr().err)
 
 
 @pytest.mark.slow

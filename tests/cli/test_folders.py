@@ -53,6 +53,18 @@ def test_the_same_command_with_other_keys_is_refused_and_with_the_same_repeated(
     assert {name for name in before if before[name] != after[name]} <= {"metrics.json"}  # holds seconds
 
 
+def test_a_configuration_that_was_cut_off_is_named_and_nothing_is_written(drawn, capsys):
+    path = drawn / "out" / "config.yaml"
+    whole = path.read_bytes()
+    for content in (whole[: len(whole) // 2], b"", b"\xff\xfe"):
+        path.write_bytes(content)
+        before = _contents(drawn / "out")
+        assert main([*_words(drawn), f"output={drawn / 'out'}"]) == 2
+        assert "config.yaml" in capsys.readouterr().err
+        assert _contents(drawn / "out") == before
+    path.write_bytes(whole)
+
+
 def test_a_dataset_made_in_python_is_no_place_for_a_command(tmp_path, capsys):
     (tmp_path / "metadata.json").write_text("{}")
     assert main(["export", "prior=dimsum_table", f"output={tmp_path}"]) == 2
@@ -100,6 +112,23 @@ def test_sigterm_ends_a_command_like_ctrl_c_with_its_own_status(monkeypatch, tmp
     assert main(["rewards"]) == 143
     assert "terminated" in capsys.readouterr().err
     assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_sigterm_during_an_import_that_makes_another_error_of_it_ends_a_command_with_status_143(capsys, monkeypatch):
+    class Told:
+        WRITES = False
+
+        def run(settings: RewardsConfig):
+            try:
+                os.kill(os.getpid(), signal.SIGTERM)
+            except KeyboardInterrupt:
+                raise ImportError("initialization failed") from None
+
+    monkeypatch.setattr(parser, "import_module", lambda name: Told)
+    assert main(["rewards"]) == 143
+    err = capsys.readouterr().err
+    assert "terminated" in err
+    assert "unexpected" not in err
 
 
 def test_a_step_is_finished_before_a_signal_ends_the_run():

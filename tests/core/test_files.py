@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from agents.utils.checkpoints import load_checkpoint, save_checkpoint
 from scene_envs import SceneBatch
 from scene_envs.datasets.store import read_notes
 from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError, StorageError
-from scene_envs.files import replacing, write_text
+from scene_envs.files import read_sealed, replacing, sealed, write_text
 from scene_envs.folders import LOCK, claimed, sweep
 from scene_envs.tensor_files import read_tensors, write_tensors
 
@@ -161,6 +162,47 @@ def test_a_second_writer_is_told_who_the_first_is(tmp_path):
         with claimed(tmp_path, "the second"), claimed(tmp_path, "the same process"):
             pass
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("age", [5, 3600])
+def test_a_lock_of_another_computer_holds_while_it_gives_signs_of_life(tmp_path, age):
+    lock = tmp_path / LOCK
+    lock.write_text("scene-envs pretrain, process 7 on elsewhere.example, since 2026-01-01 10:00:00")
+    os.utime(lock, (time.time() - age, time.time() - age))
+    if age > 60:
+        with claimed(tmp_path, "the second"):
+            assert "elsewhere" not in lock.read_text()
+        return
+    with pytest.raises(InvalidInputError, match=r"process 7 on elsewhere.example.* or remove '.*\.writer\.lock'"):
+        claimed(tmp_path, "the second").__enter__()
+    lock.unlink()  # as it was told
+    with claimed(tmp_path, "the second"):
+        pass
+
+
+def test_a_writer_gives_signs_of_life(tmp_path, monkeypatch):
+    monkeypatch.setattr("scene_envs.folders._BEAT", 0.01)
+    with claimed(tmp_path, "the first"):
+        os.utime(tmp_path / LOCK, (0, 0))
+        for _ in range(500):
+            if (tmp_path / LOCK).stat().st_mtime > 0:
+                break
+            time.sleep(0.01)
+        assert (tmp_path / LOCK).stat().st_mtime > 0
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda text: text[:-3], lambda text: text[:20], lambda text: text.replace("1", "2")]
+)
+def test_a_configuration_that_was_cut_or_changed_is_told(tmp_path, damage):
+    path = tmp_path / "config.yaml"
+    path.write_text(sealed("seed: 1\ncount: 10\n"))
+    assert read_sealed(path) == "seed: 1\ncount: 10\n"
+    path.write_text(damage(path.read_text()))
+    with pytest.raises(CorruptFileError, match=r"config\.yaml"):
+        read_sealed(path)
+    path.write_text("seed: 1\n")  # of an earlier version
+    assert read_sealed(path) == "seed: 1\n"
 
 
 def test_what_killed_writers_left_is_swept_and_what_others_write_is_not(tmp_path):

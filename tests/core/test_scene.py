@@ -94,5 +94,10 @@ def test_unknown_scene_types_offer_the_nearest() -> None:
     assert "dimsum_table" in list_scene_types()
 
 
+def test_a_scene_type_that_is_no_name_is_refused(batch: SceneBatch) -> None:
+    with pytest.raises(InvalidInputError, match="a scene type or its name is needed, got a Tensor"):
+        SceneBatch("dimsum_table", batch.tensor)  # type: ignore[arg-type]
+
+
 def test_scenes_pickle(batch: SceneBatch) -> None:
     assert torch.equal(pickle.loads(pickle.dumps(batch)).tensor, batch.tensor)

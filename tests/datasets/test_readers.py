@@ -147,6 +147,20 @@ def test_categories_are_matched_by_path_never_by_index(scenes: torch.Tensor, tmp
     torch.testing.assert_close(loaded.normalizer.normalize(scenes), NORMALIZER.normalize(scenes))
 
 
+def test_a_model_path_that_is_no_asset_names_its_file(scenes: torch.Tensor, tmp_path: Path) -> None:
+    _metadata(tmp_path, model_paths=["cafe_table", "teacupp", "dinner_plate"])
+    _write(_table(NORMALIZER.normalize(scenes).numpy(), "list", pa.float32()), tmp_path / "a.parquet")
+    with pytest.raises(UnknownNameError, match=rf"{tmp_path}.*did you mean 'teacup'"):
+        _load(tmp_path)
+
+
+def test_a_scene_type_that_nobody_knows_names_the_file(scenes: torch.Tensor, tmp_path: Path) -> None:
+    _metadata(tmp_path, scene_type="dimsum]table")
+    _write(_table(NORMALIZER.normalize(scenes).numpy(), "list", pa.float32()), tmp_path / "a.parquet")
+    with pytest.raises(UnknownNameError, match=rf"{tmp_path}.*did you mean 'dimsum_table'"):
+        SceneDataset.load(tmp_path)
+
+
 def test_a_dataset_with_fewer_assets_loads(scenes: torch.Tensor, tmp_path: Path) -> None:
     """The toy scenes hold no plate; a file that does not know plates has the same scenes."""
     few = [*range(13), 14, 15]

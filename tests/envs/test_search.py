@@ -225,6 +225,14 @@ def test_nothing_masked_ends_the_episode(prior, free_objects):
         env.expand(env.state, 0)
 
 
+@pytest.mark.parametrize(
+    ("objective", "scale"), [("object_count", 34), ("feasible_objects", 33), ("feasible_share", 1)]
+)
+def test_the_scale_is_the_largest_value_that_the_objective_declares(prior, objective, scale):
+    assert SearchEnv(prior=prior, objective=objective, num_steps=1).problem.scale == scale
+    assert SearchEnv(prior=prior, objective=objective, num_steps=1, objective_scale=7.0).problem.scale == 7
+
+
 def test_the_largest_value_ends_the_episode_and_a_larger_objective_is_told(prior, caplog):
     env = SearchEnv(prior=prior, objective=lambda b, c: RewardOutput(torch.full((len(b),), 50.0)), num_steps=1)
     env.reset(seed=0)

@@ -72,6 +72,11 @@ def test_a_configuration_that_is_none_names_the_prior(foreign, text):
         ScenePrior.load(folder)
 
 
+def test_a_normaliser_that_lacks_a_part_names_the_prior(foreign):
+    with pytest.raises(InvalidInputError, match=r"prior '.*prior'.*normalizer_state lacks 'input_stats'"):
+        ScenePrior.load(foreign(normalizer_state={"params": {"scale": [1.0], "min": [0.0]}}))
+
+
 @pytest.mark.parametrize("prompt", [3, ["a", 3], {"a": 1}, 2.5])
 def test_a_prompt_is_text(prompt):
     with pytest.raises(InvalidInputError, match="must be a text"):

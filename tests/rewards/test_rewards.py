@@ -14,7 +14,9 @@ from rewards import (
     RewardOutput,
     WeightedSum,
     evaluate_reward,
+    resolve_reward,
 )
+from rewards.base import declared_maximum
 from scene_envs import SceneBatch
 from scene_envs.errors import InvalidInputError
 
@@ -139,3 +141,28 @@ def test_what_stands_outside_the_workspace_counts_for_nothing(table):
     assert score(FeasibleObjects(), moved).value.tolist() == [0.0]
     assert score(FeasibleShare(), moved).value.tolist() == [0.0]
     assert score(ObjectCount(), moved).value.tolist() == [6.0]
+
+
+@pytest.mark.parametrize(
+    ("reward", "largest"),
+    [
+        ("object_count", 40.0),
+        ("feasible_objects", 39.0),
+        ("feasible_share", 1.0),
+        ("stability", 1.0),
+        ({"name": "clip", "reward": "object_count", "high": 12.0}, 12.0),
+        ({"name": "clip", "reward": "feasible_share", "low": 0.5}, 1.0),
+        ("penetration", None),
+        (lambda batch: batch.counts, None),
+    ],
+)
+def test_the_largest_value_is_declared(reward, largest):
+    assert declared_maximum(resolve_reward(reward), 40, 39) == largest
+
+
+def test_a_function_declares_its_largest_value_by_an_attribute():
+    def share(batch):
+        return batch.counts / 40
+
+    share.maximum = 1.0
+    assert declared_maximum(resolve_reward(share), 40, 39) == 1.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import time
 from dataclasses import dataclass
@@ -125,6 +126,35 @@ def run(settings: EvaluateConfig, run: Run) -> None:
     run.say(report)
 
 
+def _read_figures(path: Path) -> tuple[dict[str, Any], dict[str, dict[str, float]]]:
+    """What the figures in ``metrics.json`` depend on, and the figures by group; nothing where there are none.
+
+    Raises:
+        CorruptFileError: it is cut off, or was changed after it was written.
+    """
+    from scene_envs.errors import CorruptFileError
+
+    try:
+        found = dict(json.loads(path.read_text(encoding="utf-8"))).get("evaluation")
+        if found is None:
+            return {}, {}
+        digest = found.pop("sha256", None)
+        known, groups = dict(found["identity"]), dict(found["groups"])
+    except FileNotFoundError:
+        return {}, {}
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise CorruptFileError(f"{str(path)!r} is cut off or damaged; remove it to measure anew") from error
+    if digest is not None and digest != _digest(found):
+        raise CorruptFileError(f"{str(path)!r} was changed after it was written (checksum); remove it to measure anew")
+    return known, groups
+
+
+def _digest(evaluation: dict[str, Any]) -> str:
+    from scene_envs.files import finite
+
+    return hashlib.sha256(json.dumps(finite(evaluation), sort_keys=True).encode()).hexdigest()
+
+
 class _Results:
     """Figures by group, in ``metrics.json`` after each group, and the samples they are of.
 
@@ -143,11 +173,7 @@ class _Results:
     def of(cls, run: Run, identity: dict[str, Any]) -> _Results:
         """Go on with what the folder holds, as far as it depends on the same."""
         path = run.directory / "metrics.json"
-        try:
-            found = json.loads(path.read_text(encoding="utf-8"))["evaluation"]
-            known, groups = dict(found["identity"]), dict(found["groups"])
-        except (OSError, ValueError, KeyError, TypeError):
-            known, groups = {}, {}
+        known, groups = _read_figures(path)
         changed = {key for key in {*known, *identity} if known.get(key) != identity.get(key)}
         if known and not changed:
             return cls(run, identity, groups)
@@ -190,7 +216,7 @@ class _Results:
         """``metrics.json``: all figures by name, then the same by group."""
         flat = {name: value for figures in self.groups.values() for name, value in figures.items()}
         evaluation = {"identity": self.identity, "groups": self.groups, "skipped": self.skipped}
-        self.run_.write_metrics({**self._steps, **flat, "evaluation": evaluation})
+        self.run_.write_metrics({**self._steps, **flat, "evaluation": {**evaluation, "sha256": _digest(evaluation)}})
 
     def report(self, groups: list[str]) -> str:
         """The figures of ``groups`` as Markdown, and what was not measured."""

@@ -9,21 +9,25 @@ WRITES = False
 
 @dataclass
 class RewardsConfig:
-    """No keys."""
+    """What may be listed.
+
+    Attributes:
+        reward_timeout: seconds that the import of an installed reward, which runs in a process of its own, may take.
+    """
+
+    reward_timeout: float = 60.0
 
 
 def run(settings: RewardsConfig) -> None:
     """Print every reward with its settings and where it comes from."""
-    from rewards import list_rewards, reward_info
-    from scene_envs.errors import RewardError
+    from rewards import list_rewards
+    from rewards.isolation import describe_rewards
 
-    for name in list_rewards():
-        try:
-            info = reward_info(name)
-        except RewardError as error:
-            print(f"{name}: cannot be used. {error}")
+    for name, info, problem in describe_rewards(list_rewards(), timeout=settings.reward_timeout):
+        if info is None:
+            print(f"{name}: cannot be used. {problem}", flush=True)
             continue
-        print(f"{name}: {info.summary or 'no description.'}")
+        print(f"{name}: {info.summary or 'no description.'}", flush=True)
         if info.parameters:
             print(f"    settings: {', '.join(info.parameters)}")
         if info.source.split(".")[0] != "rewards":

@@ -13,6 +13,7 @@ from scene_envs.assets.base import Array, Asset, ConvexPart
 from scene_envs.assets.importing.entries import AssetEntry, Axis
 from scene_envs.assets.importing.hulls import enclosing_hull, thickness
 from scene_envs.assets.importing.inertials import weigh
+from scene_envs.assets.importing.limits import seconds_left
 from scene_envs.assets.importing.model import Inertial, Model, Shape, merged_inertial, pose_of
 from scene_envs.assets.importing.report import AssetReport
 from scene_envs.assets.importing.sdf import read_sdf
@@ -166,6 +167,7 @@ def _collide(
         seen.add(key)
         parts += found.parts
         volume += found.volume
+        seconds_left()
         notes += [note for note in found.notes if note not in notes]
         warnings += [warning for warning in found.warnings if warning not in warnings]
     if not parts:

@@ -11,7 +11,11 @@ import io
 import json
 import logging
 import os
+import subprocess
+import sys
+import tempfile
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,6 +23,7 @@ import numpy as np
 
 from scene_envs.assets.base import Array, ConvexPart
 from scene_envs.assets.importing.hulls import MOST_CORNERS, concavity, few_cornered_hull, has_volume
+from scene_envs.assets.importing.limits import seconds_left, too_slow
 from scene_envs.assets.importing.mesh_files import bare
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.files import replacing
@@ -79,6 +84,7 @@ def convex_parts(
     warnings: list[str] = []
     parts: list[ConvexPart] = []
     for body in bodies:
+        seconds_left()
         hull = _hull(body.vertices, tolerance)
         if _depth(body, hull) <= tolerance:
             parts.append(hull)
@@ -118,7 +124,31 @@ def _depth(body: trimesh.Trimesh, hull: ConvexPart) -> float:
 
 def _decompose(body: trimesh.Trimesh, method: Method, threshold: float, what: str) -> list[Array] | None:
     """Corners of the convex pieces of a concave body, from the cache where possible; None without CoACD."""
-    settings = {
+    settings = coacd_settings(threshold)
+    path = cache_folder() / "decompositions" / f"{_key(body, settings)}.npz"
+    pieces = _read(path)
+    if pieces is not None:
+        return pieces
+    if not _has_coacd():
+        if method == "coacd":
+            raise MissingDependencyError(
+                f"{what} asks for CoACD, which is not installed; `pip install 'scene-envs[decomposition]'`"
+            )
+        return None
+    _LOGGER.info("decomposing %s (%d triangles); the result is kept in %s", what, len(body.faces), path.parent)
+    size = float(body.scale)  # CoACD's numerics want a size near 1
+    found = run_coacd(np.asarray(body.vertices) / size, np.asarray(body.faces), settings, what)
+    pieces = [drawn_to(body, vertices * size, _DRAWN * size) for vertices in found]
+    pieces = [piece for piece in pieces if has_volume(piece)]
+    if not pieces:
+        raise InvalidInputError(f"CoACD found no convex parts in {what}; set `decomposition: convex` for it")
+    _write(path, pieces)
+    return pieces
+
+
+def coacd_settings(threshold: float) -> dict[str, Any]:
+    """Keywords of ``coacd.run_coacd`` for a concavity threshold."""
+    return {
         "threshold": threshold,
         "max_convex_hull": 32,
         "preprocess_resolution": 30,
@@ -130,27 +160,50 @@ def _decompose(body: trimesh.Trimesh, method: Method, threshold: float, what: st
         "decimate": True,
         "seed": 0,
     }
-    path = cache_folder() / "decompositions" / f"{_key(body, settings)}.npz"
-    pieces = _read(path)
-    if pieces is not None:
-        return pieces
+
+
+def _has_coacd() -> bool:
     try:
-        import coacd
-    except ImportError as error:
-        if method == "coacd":
-            raise MissingDependencyError(
-                f"{what} asks for CoACD, which is not installed; `pip install 'scene-envs[decomposition]'`"
-            ) from error
-        return None
-    _LOGGER.info("decomposing %s (%d triangles); the result is kept in %s", what, len(body.faces), path.parent)
-    coacd.set_log_level("error")
-    size = float(body.scale)  # CoACD's numerics want a size near 1
-    found = coacd.run_coacd(coacd.Mesh(np.asarray(body.vertices) / size, np.asarray(body.faces)), **settings)
-    pieces = [drawn_to(body, np.asarray(vertices) * size, _DRAWN * size) for vertices, _ in found]
-    pieces = [piece for piece in pieces if has_volume(piece)]
-    if not pieces:
-        raise InvalidInputError(f"CoACD found no convex parts in {what}; set `decomposition: convex` for it")
-    _write(path, pieces)
+        return find_spec("coacd") is not None
+    except ValueError:  # a module that was put out of reach
+        return False
+
+
+def run_coacd(vertices: Array, faces: Array, settings: dict[str, Any], what: str) -> list[Array]:
+    """Corners (P, 3) of the convex pieces, from a process that ends with the time of the import.
+
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3) int.
+        settings: keywords of ``coacd.run_coacd``.
+        what: name of the mesh, for messages.
+
+    Raises:
+        InvalidInputError: CoACD took too long, or failed.
+    """
+    left = seconds_left()
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = Path(folder) / "mesh.npz", Path(folder) / "parts.npz"
+        np.savez(source, vertices=vertices, faces=faces, settings=np.array(json.dumps(settings)))
+        path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
+        try:
+            done = subprocess.run(
+                [sys.executable, "-m", "scene_envs.assets.importing.coacd_worker", str(source), str(target)],
+                env=os.environ | {"PYTHONPATH": path},
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                timeout=left,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            raise too_slow(f"CoACD decomposing {what} of {len(faces):,} triangles") from None
+        pieces = _read(target)
+        if done.returncode or pieces is None:
+            reason = done.stderr.decode(errors="replace").strip().rpartition("\n")[2][:300]
+            raise InvalidInputError(
+                f"CoACD failed on {what} (exit status {done.returncode}{reason and ': '}{reason}); set "
+                "`decomposition: convex` for it"
+            )
     return pieces
 
 

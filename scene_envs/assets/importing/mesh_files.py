@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_envs.assets.base import Array
+from scene_envs.assets.importing.limits import check_file, check_triangles, seconds_left
 from scene_envs.assets.importing.model import Color
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
 
@@ -42,7 +43,7 @@ def read_mesh(path: Path) -> list[trimesh.Trimesh]:
     says which way is up and how long its unit is, and both are applied.
 
     Raises:
-        InvalidInputError: no such file, or a format that cannot be read.
+        InvalidInputError: no such file, a format that cannot be read, or more than the limits of imports.
         CorruptFileError: the file cannot be read, holds no triangles, or a coordinate that is not finite.
         MissingDependencyError: COLLADA without pycollada.
     """
@@ -54,6 +55,7 @@ def read_mesh(path: Path) -> list[trimesh.Trimesh]:
     if not path.is_file():
         raise InvalidInputError(f"{path} does not exist")
     _check_content(path)
+    check_file(path)
     import trimesh
 
     options: dict[str, Any] = {"split_objects": True} if suffix == ".obj" else {}
@@ -72,6 +74,8 @@ def read_mesh(path: Path) -> list[trimesh.Trimesh]:
         raise CorruptFileError(f"{path} holds no triangles")
     for mesh in pieces:
         _check_mesh(mesh, path)
+    check_triangles(path, sum(len(mesh.faces) for mesh in pieces))
+    seconds_left()
     turn = _axes(path)
     for mesh in pieces:
         mesh.vertices = mesh.vertices @ turn.T
@@ -92,6 +96,10 @@ def _check_content(path: Path) -> None:
 
 def _check_mesh(mesh: trimesh.Trimesh, path: Path) -> None:
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise CorruptFileError(
+            f"{path}: vertices of shape {vertices.shape} and faces of shape {faces.shape} are no triangles in space"
+        )
     if not np.isfinite(vertices).all():
         row = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
         raise CorruptFileError(f"{path}: vertex {row} is {vertices[row].tolist()}; coordinates must be finite")

@@ -22,6 +22,7 @@ from scene_envs.assets.importing.entries import (
     default_entry,
     read_entries,
 )
+from scene_envs.assets.importing.limits import check_file, timed
 from scene_envs.assets.importing.model import Color
 from scene_envs.assets.importing.report import AssetReport, ImportReport
 from scene_envs.errors import InvalidInputError, SceneEnvsError, unknown_name
@@ -167,8 +168,9 @@ def _unlisted(folder: Path, stamp: tuple[int, int]) -> FolderIndex:
 def _named_files(path: Path) -> set[str]:
     """Names of the meshes that a URDF or SDF uses; empty when it cannot be read."""
     try:
+        check_file(path)
         root = ElementTree.parse(path).getroot()
-    except (ElementTree.ParseError, OSError):
+    except (ElementTree.ParseError, OSError, SceneEnvsError):
         return set()
     texts = [element.get("filename") or "" for element in root.iter("mesh")]
     texts += [element.text or "" for element in root.iter("uri")]
@@ -188,7 +190,8 @@ def _colored(entries: list[AssetEntry]) -> tuple[AssetEntry, ...]:
 def _built(folder: Path, entry: AssetEntry, stamp: tuple[int, int]) -> tuple[Asset, AssetReport]:
     from scene_envs.assets.importing.build import build_asset  # with trimesh, which the import of this package spares
 
-    asset, report = build_asset(folder / entry.file, entry)
+    with timed(folder / entry.file):
+        asset, report = build_asset(folder / entry.file, entry)
     level = logging.WARNING if report.warnings else logging.INFO
     _LOGGER.log(level, "%s", report)
     return asset, report

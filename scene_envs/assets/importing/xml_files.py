@@ -11,6 +11,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from scene_envs.assets.base import Array
+from scene_envs.assets.importing.limits import check_file
 from scene_envs.assets.importing.model import Color
 from scene_envs.errors import CorruptFileError, InvalidInputError
 
@@ -23,7 +24,9 @@ def read_xml(path: Path) -> Element:
 
     Raises:
         CorruptFileError: the file cannot be read or is not XML; the line is named.
+        InvalidInputError: the file is larger than imports may be.
     """
+    check_file(path)
     try:
         data = path.read_bytes()
     except OSError as error:

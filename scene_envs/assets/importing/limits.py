@@ -1,0 +1,175 @@
+"""Limits on the size of a user's model file and on the time that its import takes."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import struct
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from scene_envs.errors import InvalidInputError
+
+_PREFIX = "SCENE_ENVS_IMPORT_"
+_HEAD = 1 << 16
+"""Bytes in which the header of a mesh file ends."""
+_Clock = tuple[Path, float, float]
+"""A file, the time at which its import must be done, and the seconds it was given."""
+_clock: ContextVar[_Clock | None] = ContextVar("import_clock", default=None)
+
+
+@dataclass(frozen=True)
+class ImportLimits:
+    """Limits for each file of a user's assets.
+
+    The environment variables ``SCENE_ENVS_IMPORT_MEGABYTES``, ``SCENE_ENVS_IMPORT_TRIANGLES`` and
+    ``SCENE_ENVS_IMPORT_SECONDS`` replace the defaults: the folder, which may be another's, has no say.
+
+    Attributes:
+        megabytes: size of a file, 10⁶ bytes.
+        triangles: triangles (or corners) of a mesh file, as its header or its content says.
+        seconds: time for reading, decomposing and weighing one asset; CoACD is ended in the middle of its work.
+    """
+
+    megabytes: float = 256.0
+    triangles: float = 1e6
+    seconds: float = 300.0
+
+    @classmethod
+    def current(cls) -> ImportLimits:
+        """The limits with what the environment says of them.
+
+        Raises:
+            InvalidInputError: a variable is no positive number.
+        """
+        chosen = {}
+        for field in fields(cls):
+            text = os.environ.get(_PREFIX + field.name.upper())
+            if text is None:
+                continue
+            try:
+                chosen[field.name] = float(text)
+            except ValueError:
+                chosen[field.name] = math.nan
+            if not chosen[field.name] > 0:
+                raise InvalidInputError(f"{_PREFIX}{field.name.upper()}={text[:50]!r} must be a positive number")
+        return cls(**chosen)
+
+
+def check_file(path: Path) -> None:
+    """Refuse a file that is larger, or whose header promises more triangles, than the limits.
+
+    Raises:
+        InvalidInputError: it is; names the file, the limit and the variable that raises it.
+    """
+    limits = ImportLimits.current()
+    try:
+        size = path.stat().st_size
+    except OSError:
+        return  # whoever reads it says why it cannot be read
+    if size > limits.megabytes * 1e6:
+        raise InvalidInputError(
+            f"{path} has {size / 1e6:,.0f} MB, more than the {limits.megabytes:g} MB that one file of an asset may "
+            f"have; simplify it, or set {_PREFIX}MEGABYTES"
+        )
+    check_triangles(path, _promised(path, size))
+
+
+def check_triangles(path: Path, count: int) -> None:
+    """Refuse ``count`` triangles if they are too many; raises as :func:`check_file` does."""
+    most = ImportLimits.current().triangles
+    if count > most:
+        raise InvalidInputError(
+            f"{path} has {count:,} triangles, more than the {most:,.0f} that one mesh file may have; simplify it, or "
+            f"set {_PREFIX}TRIANGLES"
+        )
+
+
+@contextmanager
+def timed(path: Path) -> Iterator[None]:
+    """Context of the import of one asset, whose time runs; :func:`seconds_left` tells how much is left."""
+    seconds = ImportLimits.current().seconds
+    token = _clock.set((path, time.monotonic() + seconds, seconds))
+    try:
+        yield
+    finally:
+        _clock.reset(token)
+
+
+def seconds_left() -> float | None:
+    """Seconds until the import that runs has to be done; None outside of one.
+
+    Raises:
+        InvalidInputError: none are left.
+    """
+    clock = _clock.get()
+    if clock is None:
+        return None
+    left = clock[1] - time.monotonic()
+    if left <= 0:
+        raise too_slow("")
+    return left
+
+
+def too_slow(doing: str) -> InvalidInputError:
+    """The error for an import that took too long, ``doing`` something at the end."""
+    path, _, seconds = _clock.get() or (Path("the mesh"), 0.0, ImportLimits.current().seconds)
+    return InvalidInputError(
+        f"{path}: the import took longer than {seconds:g} s{doing and ', '}{doing}; simplify the mesh, set "
+        f"`decomposition: convex` for it, or set {_PREFIX}SECONDS"
+    )
+
+
+def _promised(path: Path, size: int) -> int:
+    """The number of triangles or corners that the header of a mesh file states, 0 where it states none."""
+    suffix = path.suffix.lower()
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD)
+            if suffix == ".obj":
+                return _count(path, b"\nf ")
+            if suffix in (".glb", ".gltf"):
+                return _gltf_count(path, head)
+    except OSError:
+        return 0
+    if suffix == ".stl":
+        stated = struct.unpack("<I", head[80:84])[0] if len(head) >= 84 else 0
+        return stated if size >= 84 + 50 * stated or not head.startswith(b"solid") else _count(path, b"facet normal")
+    if suffix == ".ply":
+        counts = re.findall(rb"^element\s+\w+\s+(\d{1,30})", head.partition(b"end_header")[0], re.MULTILINE)
+        return max(map(int, counts), default=0)
+    if suffix == ".off":
+        words = [word for line in head.splitlines()[:100] if not line.startswith(b"#") for word in line.split()]
+        return max((int(word) for word in words[1:3] if word.isdigit() and len(word) < 30), default=0)
+    return 0
+
+
+def _count(path: Path, what: bytes) -> int:
+    with path.open("rb") as file:
+        found, tail = 0, b""
+        while block := file.read(1 << 24):
+            found += (tail + block).count(what)
+            tail = block[-len(what) + 1 :]
+    return found
+
+
+def _gltf_count(path: Path, head: bytes) -> int:
+    """The largest accessor of a glTF file."""
+    if path.suffix.lower() == ".glb":
+        length = struct.unpack("<I", head[12:16])[0] if len(head) >= 16 else 0
+        with path.open("rb") as file:
+            file.seek(20)
+            text = file.read(length)
+    else:
+        text = path.read_bytes()
+    try:
+        accessors = json.loads(text)["accessors"]
+        return max((int(accessor["count"]) for accessor in accessors), default=0) // 3
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return 0  # whoever reads it says what is wrong

@@ -1,0 +1,95 @@
+"""Limits on the size of a user's model file and on the time of its import."""
+
+from __future__ import annotations
+
+import json
+import struct
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from scene_envs.assets import import_report, load_library
+from scene_envs.assets.importing import decomposition
+from scene_envs.errors import InvalidInputError
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SCENE_ENVS_CACHE", str(tmp_path_factory.mktemp("cache")))
+
+
+def listed(folder: Path, name: str) -> Path:
+    (folder / "library.yaml").write_text(f"- {{file: {name}}}")
+    return folder / name
+
+
+def refused(folder: Path, words: str) -> str:
+    started = time.monotonic()
+    with pytest.raises(InvalidInputError, match=words) as told:
+        load_library(folder)
+    assert time.monotonic() - started < 60
+    return str(told.value)
+
+
+@pytest.mark.parametrize("name", ["large.obj", "large.stl", "large.urdf", "large.sdf"])
+def test_a_file_of_two_gigabytes_is_refused_unread(tmp_path: Path, name: str) -> None:
+    with listed(tmp_path, name).open("wb") as file:
+        file.write(b"x")
+        file.truncate(2_000_000_000)  # a hole on the disk
+    text = refused(tmp_path, "2,000 MB, more than the 256 MB .* SCENE_ENVS_IMPORT_MEGABYTES")
+    assert name in text
+    assert "\n" not in text
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("many.ply", b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nelement face 50000000\nend_header\n"),
+        ("many.off", b"OFF\n# a comment\n3 50000000 0\n0 0 0\n"),
+        ("many.stl", bytes(80) + struct.pack("<I", 50_000_000) + bytes(100)),
+        ("many.gltf", json.dumps({"asset": {"version": "2.0"}, "accessors": [{"count": 150_000_000}]}).encode()),
+    ],
+)
+def test_a_header_of_fifty_million_faces_is_refused(tmp_path: Path, name: str, content: bytes) -> None:
+    listed(tmp_path, name).write_bytes(content)
+    assert name in refused(tmp_path, "50,000,000 triangles, more than the 1,000,000 .* SCENE_ENVS_IMPORT_TRIANGLES")
+
+
+def test_faces_of_an_obj_are_counted_before_they_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(listed(tmp_path, "box.obj"))
+    monkeypatch.setenv("SCENE_ENVS_IMPORT_TRIANGLES", "11")
+    assert "box.obj has 12 triangles" in refused(tmp_path, "more than the 11 ")
+    monkeypatch.setenv("SCENE_ENVS_IMPORT_TRIANGLES", "12")
+    assert load_library(tmp_path).names == ("box",)
+
+
+def test_without_a_list_a_file_beyond_the_limits_is_left_out_and_told(tmp_path: Path) -> None:
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "box.obj")
+    (tmp_path / "many.off").write_bytes(b"OFF\n3 50000000 0\n0 0 0\n")
+    assert load_library(tmp_path).names == ("box",)
+    assert "50,000,000 triangles" in import_report(tmp_path)["many"].error
+
+
+@pytest.mark.slow
+def test_coacd_is_ended_when_the_time_of_the_file_is_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("coacd")
+    torus = trimesh.creation.torus(0.1, 0.04, 60, 30)
+    torus.vertices += 0.002 * np.sin(90 * torus.vertices[:, ::-1])
+    torus.export(listed(tmp_path, "knotty.stl"))
+    monkeypatch.setenv("SCENE_ENVS_IMPORT_SECONDS", "1")
+    settings = decomposition.coacd_settings(0.05)
+    monkeypatch.setattr(decomposition, "coacd_settings", lambda threshold: settings | {"mcts_iterations": 10**6})
+    text = refused(tmp_path, "took longer than 1 s, CoACD decomposing .*`decomposition: convex`.*IMPORT_SECONDS")
+    assert "knotty.stl" in text
+
+
+@pytest.mark.parametrize("text", ["a lot", "0", "-1", "nan"])
+def test_a_limit_that_is_no_positive_number_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(listed(tmp_path, "box.obj"))
+    monkeypatch.setenv("SCENE_ENVS_IMPORT_MEGABYTES", text)
+    refused(tmp_path, "SCENE_ENVS_IMPORT_MEGABYTES=.* must be a positive number")
