@@ -22,7 +22,9 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import re
 import statistics
+import sys
 import time
 import tracemalloc
 from collections.abc import Sequence
@@ -34,7 +36,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from agents.planning import list_planners, run_search
+from agents.planning import Session, list_planners
 from agents.planning.registry import planner_settings
 from scene_envs.envs import SearchEnv
 from scene_envs.envs.mask_generators import CulpritsMask
@@ -55,44 +57,99 @@ def planner_of(text: str) -> dict[str, Any]:
     }
 
 
+def word(text: str) -> Any:
+    """A name, or the mapping of JSON that ``text`` is."""
+    return json.loads(text) if text.startswith("{") else text
+
+
+def slug(key: dict[str, Any]) -> str:
+    """A file name for a run."""
+    words = (key["prior"], key["objective"], key["mask"], key["planner"], key["slots"], key["num_steps"], key["seed"])
+    return re.sub(r"[^A-Za-z0-9_.=]+", "-", "-".join(map(str, words)))
+
+
+def run_together(prior: Any, keys: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Records of runs that differ in their seed alone: in common batches of the denoiser, with the best scenes."""
+    key = keys[0]
+    planner = planner_of(key["planner"])
+    settings = planner_settings(planner["name"])(**planner)
+    env = SearchEnv(
+        scene=prior.scene_type,
+        prior=prior,
+        objective=word(key["objective"]),
+        mask=word(key["mask"]),
+        slots=key["slots"],
+        objective_scale=key["scale"],
+        num_steps=key["num_steps"],
+        branching=max(key["scenes"], key["branching"]) if settings.widens else key["branching"],
+        max_depth=1000,
+    )
+    empty, roots = SceneBatch.empty(prior.scene_type, 1, env.problem.slots), []
+    for each in keys:
+        env.reset(seed=each["seed"], options={"scene": empty})
+        roots.append(env.clone_state())
+    session = Session(env)
+    begun = time.process_time()
+
+    def told(done: int, best: float) -> None:
+        if done % 50 < len(keys) * key["branching"]:
+            print(f"  {done} scenes, the worst search has {best:.3f}", flush=True)
+
+    plans = session.run(settings.make(key["branching"]), roots, key["scenes"], told)
+    if session.stopped:
+        sys.exit(session.stopped)
+    seconds = (time.process_time() - begun) / sum(len(plan.values) for plan in plans)
+    env.close()
+    return [
+        {
+            **each,
+            "curve": [env.problem.scale * value for value in plan.curve],
+            "objective_found": plan.best_state.objective,
+            "seconds_per_scene": seconds,
+            "together": len(keys),
+            "best": env.scene(plan.best_state),
+        }
+        for each, plan in zip(keys, plans, strict=True)
+    ]
+
+
 def compare(options: argparse.Namespace) -> None:
     """Run what is not recorded, and print the table."""
     prior, records = resolve_prior(options.prior), Path(options.records)
     known = [json.loads(line) for line in records.read_text().splitlines()] if records.exists() else []
-    common = {key: getattr(options, key) for key in ("prior", "objective", "branching", "num_steps", "mask", "scenes")}
-    for seed in options.seeds:
-        for planner in options.planners:
-            key = {**common, "planner": planner, "seed": seed}
-            if any(all(record[name] == value for name, value in key.items()) for record in known):
-                continue
-            outcome = run_search(
-                prior,
-                options.objective,
-                budget=options.scenes,
-                branching=options.branching,
-                num_steps=options.num_steps,
-                mask=options.mask,
-                seed=seed,
-                baseline=False,
-                planner=planner_of(planner),
-            )
-            if outcome.metrics["stopped"]:
-                return
-            scale = outcome.metrics["objective_scale"]
-            curve = [scale * value for value in outcome.search.curve]
-            seconds = outcome.metrics["seconds"]["search"]
-            known.append({**key, "curve": curve, "seconds": seconds, "final": outcome.metrics["search"]["objective"]})
-            with records.open("a") as file:
-                file.write(json.dumps(known[-1]) + "\n")
-            print(planner, seed, f"{curve[-1]:g} after {len(curve)} scenes, {seconds:.0f} s", flush=True)
-    table = Table("planner", "seeds", *(f"after {at}" for at in options.at), "s")
+    names = ("prior", "objective", "branching", "num_steps", "mask", "scenes", "slots", "scale")
+    common = {name: getattr(options, name) for name in names}
+
+    def same(record: dict[str, Any], key: dict[str, Any]) -> bool:
+        return all(record.get(name) == value for name, value in key.items())
+
     for planner in options.planners:
-        runs = [r for r in known if r["planner"] == planner and all(r[k] == v for k, v in common.items())]
+        keys = [{**common, "planner": planner, "seed": seed} for seed in options.seeds]
+        keys = [key for key in keys if not any(same(record, key) for record in known)]
+        for start in range(0, len(keys), options.together):
+            for record in run_together(prior, keys[start : start + options.together]):
+                best = record.pop("best")
+                records.parent.mkdir(parents=True, exist_ok=True)
+                best.save(records.parent / f"{slug(record)}.safetensors")
+                known.append(record)
+                with records.open("a") as file:
+                    file.write(json.dumps(record) + "\n")
+                curve = record["curve"]
+                per = record["seconds_per_scene"]
+                print(planner, record["seed"], f"{curve[-1]:g} after {len(curve)} scenes, {per:.3f} s each", flush=True)
+    table = Table("planner", "seeds", *(f"after {at}" for at in options.at), "all of it after", "CPU s per scene")
+    for planner in options.planners:
+        runs = [r for r in known if same(r, {**common, "planner": planner}) and r["seed"] in options.seeds]
+        if not runs:
+            continue
         cells = []
         for at in options.at:
             values = [run["curve"][min(at, len(run["curve"])) - 1] for run in runs]
             cells.append(f"{statistics.median(values):g} ({min(values):g} to {max(values):g})")
-        table.add_row(planner, str(len(runs)), *cells, f"{statistics.median(run['seconds'] for run in runs):.0f}")
+        ended = sorted(len(run["curve"]) for run in runs if len(run["curve"]) < run["scenes"])
+        cells.append(f"{', '.join(map(str, ended))}" if ended else "")
+        seconds = statistics.median(run["seconds_per_scene"] for run in runs)
+        table.add_row(planner, str(len(runs)), *cells, f"{seconds:.3f}")
     CONSOLE.print(table)
 
 
@@ -221,7 +278,10 @@ def main() -> None:
     parser.add_argument("--branching", type=int, default=3)
     parser.add_argument("--num-steps", type=int, default=50)
     parser.add_argument("--mask", default="culprits")
-    parser.add_argument("--records", default="search_records.jsonl")
+    parser.add_argument("--records", default="runs/search/records.jsonl")
+    parser.add_argument("--together", type=int, default=5)
+    parser.add_argument("--slots", type=int)
+    parser.add_argument("--scale", type=float)
     parser.add_argument("--samples", type=int, default=24)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--expansions", type=int, default=5000)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,8 @@ _SAME = 1e-4
 Steering = Callable[[Sequence[tuple["SearchState", int]], Callable[[SceneBatch], Tensor]], Any]
 """``(pairs, values) -> watch``: makes what watches the denoising of an expansion, as a prior's ``inpaint`` takes it.
 
-``values`` gives Φ (B,) of scenes that are being denoised, 0 where the objective cannot score one.
+``values`` gives Φ (B,) of scenes that are being denoised, 0 where the objective cannot score one. What watches may have
+``trace(row)``, the ``trace`` of that child, and ``first_step(steps)``, the step that its denoising begins at.
 """
 
 
@@ -45,6 +46,7 @@ class SearchState:
         value: Φ in [0, 1]; the parent's where ``valid`` is False.
         objective: the objective's raw value; 0 where not valid.
         valid: whether the objective could score this scene.
+        trace: tensors that what steered the denoising left behind, such as the scene on its way; None mostly.
 
     Two states are equal when they are the same node: same seed, path and scene.
     """
@@ -57,6 +59,7 @@ class SearchState:
     value: float
     objective: float
     valid: bool
+    trace: Mapping[str, Tensor] | None = None
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, SearchState):
@@ -189,7 +192,10 @@ class SearchProblem:
         watch = None if steering is None else steering(pairs, self._values)
         children = self._inpaint(parents, masks, noises, watch)
         origins = [(state.seed, path, state.value) for (state, _), path in zip(pairs, paths, strict=True)]
-        return self._score(children, origins)
+        states = self._score(children, origins)
+        if hasattr(watch, "trace"):
+            states = [replace(state, trace=watch.trace(row)) for row, state in enumerate(states)]
+        return states
 
     def expand(self, state: SearchState, action: int) -> SearchState:
         """The child of ``state`` under ``action``."""
@@ -248,11 +254,12 @@ class SearchProblem:
         self, batch: SceneBatch, masks: Tensor, noises: list[torch.Generator], watch: Any = None
     ) -> SceneBatch:
         guidance, reader = self.prompting.guidance, self.prompting.reader
-        self.evaluations += self.nfe_per_scene * len(batch)
+        spared = watch.first_step(self.num_steps) if hasattr(watch, "first_step") else 0
+        self.evaluations += self.nfe_per_scene // self.num_steps * (self.num_steps - spared) * len(batch)
         batch, masks = batch.to(self.device), masks.to(self.device)
         how: dict[str, Any] = {"num_steps": self.num_steps, "generators": noises}
         if watch is not None:
-            how["watch"] = watch
+            how[getattr(watch, "role", "watch")] = watch
         if reader is None or self.prompt is None:
             return self.prior.inpaint(batch, masks, **how).to("cpu")
         return reader.inpaint(batch, masks, prompt=self.prompt, guidance=guidance, **how).to("cpu")

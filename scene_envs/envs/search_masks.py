@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 import torch
@@ -25,7 +25,7 @@ class MaskChoiceState(SearchState):
         masks: (K, N) bool, the slots that each mask regenerates.
     """
 
-    masks: Tensor
+    masks: Tensor = field(kw_only=True)
 
     def __eq__(self, other: object) -> bool:
         same = super().__eq__(other)
