@@ -31,6 +31,7 @@ class SearchConfig:
         num_steps: denoiser evaluations per scene.
         mask: which objects to regenerate: a registered name, or a mapping of it and its settings; in Python a function
             as well.
+        masks: several masks, each as ``mask``, of which every action takes one; null for ``mask`` alone.
         slots: slots per scene; null takes the scene type's.
         objective_scale: objective at which Φ is 1; null takes the environment's.
         seed: of the tree; the baseline's first scenes are those of the tree.
@@ -53,6 +54,7 @@ class SearchConfig:
     max_depth: int = 1000
     num_steps: int = 50
     mask: Any = named("culprits", "mask")
+    masks: list[Any] | None = None
     slots: int | None = None
     objective_scale: float | None = None
     seed: int = 0

@@ -94,8 +94,8 @@ class GradientPlanner(PlannerSettings):
     """Gradient guidance of every inpainting, in rounds of iterated repair.
 
     Scenes follow the prior times exp(strength * weight), to first order about what the network expects; what comes out
-    is scored by the objective and kept as in :class:`~agents.planning.GreedyPlanner`. Guidance costs one gradient of the
-    weight per step, and no evaluation of the denoiser.
+    is scored by the objective and kept as in :class:`~agents.planning.GreedyPlanner`. A step costs one gradient of the
+    weight more, and no evaluation of the denoiser.
 
     Attributes:
         weight: a differentiable log-weight: ``overlap``, or in Python a function.

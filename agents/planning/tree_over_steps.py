@@ -49,8 +49,8 @@ class TreeOverStepsPlanner(PlannerSettings):
     """Diffusion tree sampling (Jain et al. 2025), in rounds of iterated repair.
 
     The inpaintings of a state are a tree. Its nodes are scenes at a few stops on the way, its leaves finished scenes.
-    A round takes ``children`` new scenes from one node, chosen by UCB, each with noise of its own; the steps before that
-    node are not taken again. A node is worth the mean of the finished scenes below it and of what it promised itself.
+    A round takes ``children`` new scenes from one node, chosen by UCB, each with noise of its own; the steps before
+    that node are not taken again. A node is worth the mean of the finished scenes below it and of its own promise.
     After ``rounds`` rounds the best finished scene becomes the state unless it scores less; else the tree grows on.
 
     Attributes:

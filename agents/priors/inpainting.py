@@ -17,7 +17,8 @@ from scene_envs.scene import CATEGORY, POSE, TRANSLATION, SceneBatch
 from scene_envs.scene_types import SceneType
 
 Hook = Callable[[int, Tensor, ReverseStep], ReverseStep]
-"""``(step, x_t, reverse) -> reverse``: called at every step before x_{t-1} is drawn; may take other rows, or shift it."""
+"""``(step, x_t, reverse) -> reverse``: called at every step before x_{t-1} is drawn; may take other rows or shift it.
+"""
 Start = tuple[int, Tensor]
 """A step of a chain, and x_t (B, N, D) at it: where the chain begins instead of at x_T."""
 Guide = Callable[[int, int, Callable[[], SceneBatch]], Tensor | None]
@@ -132,7 +133,8 @@ class Inpainting(ABC):
             generators = [Generator().manual_seed(seed + i) for i in range(len(batch))]
         device, table = self.device, self.step_table(num_steps)
         hook = self._hook(watch, guide, batch, both, table)
-        start = watch.start(len(table)) if hasattr(watch, "start") else None
+        begins = getattr(watch, "start", None)
+        start = None if begins is None else begins(len(table))
         x = self.regenerate(
             batch.to(device), both.to(device), table, generators, resample, prompts, guidance, hook, start
         )
@@ -180,21 +182,28 @@ class Inpainting(ABC):
         prompt: str | Sequence[str] | None = None,
         guidance: float = 0.0,
         slots: int | None = None,
+        fill: int | None = None,
         num_steps: int = 50,
         seed: int = 0,
     ) -> SceneBatch:
         """Fill the empty slots of ``batch``, keeping its objects.
+
+        With all empty slots open a prior crowds a scene; with ``fill`` of them it adds that many at most.
 
         Args:
             batch: scenes.
             prompt: what the completed scenes should hold, one text for all or one per scene; None for anything.
             guidance: w of classifier-free guidance, as in :meth:`sample`.
             slots: slots of the result, at least those of ``batch``; None keeps them.
+            fill: most objects to add to a scene; None for as many as there are empty slots.
             num_steps: denoiser evaluations per scene.
             seed: of the noise; scene i uses ``seed + i``.
         """
         wide = batch if slots is None else batch.with_slots(slots)
-        return self.inpaint(wide, wide.is_empty, prompt=prompt, guidance=guidance, num_steps=num_steps, seed=seed)
+        if fill is not None and fill < 0:
+            raise InvalidInputError(f"fill={fill}: give the most objects to add, at least 0, or None")
+        open_slots = wide.is_empty if fill is None else wide.is_empty & (wide.is_empty.cumsum(dim=1) <= fill)
+        return self.inpaint(wide, open_slots, prompt=prompt, guidance=guidance, num_steps=num_steps, seed=seed)
 
     def rearrange(
         self,

@@ -282,7 +282,8 @@ class MixedPrior(TrainableMixedPrior):
 
     def regenerate(
         self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int,
-        prompts: Sequence[str] | None = None, guidance: float = 0.0, hook: Hook | None = None, start: Start | None = None,
+        prompts: Sequence[str] | None = None, guidance: float = 0.0, hook: Hook | None = None,
+        start: Start | None = None,
     ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; the rest is seen as it is."""
         text = None if prompts is None else self.encode_prompts(prompts)

@@ -238,6 +238,31 @@ class CulpritsMask:
         return mask
 
 
+@dataclass(frozen=True)
+class BalancedMask:
+    """The culprits of :class:`CulpritsMask`, and as large a share of the empty slots as of the objects.
+
+    Such a mask says nothing about what it hides, as the masks of training: the masked slots take as many objects as
+    the prior puts beside those that stay. A mask of all empty slots says that few objects stand outside it, and the
+    prior crowds the scene.
+
+    Args:
+        at_least: slots regenerated, when the scene has as many; the share grows until there are.
+    """
+
+    at_least: int = 4
+
+    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+        """(N,) bool, True where a slot is regenerated; arguments as for :class:`CulpritsMask`."""
+        free, empty = scene.is_free[0], scene.is_empty[0]
+        mask = CulpritsMask(at_least=0)(scene, score, rng)
+        slots, objects = int((free | empty).sum()), int(free.sum())
+        share = max(int((mask & free).sum()) / max(objects, 1), min(1.0, self.at_least / max(slots, 1)))
+        for kind in (free, empty):
+            mask |= _some(kind & ~mask, round(share * int(kind.sum())) - int((mask & kind).sum()), rng)
+        return mask
+
+
 def _culprits(scene: SceneBatch, bad: Tensor, rng: np.random.Generator) -> list[int]:
     """Slots of blamed objects (``bad``, (N,) bool), less those that are fine once others are gone."""
     blamed = torch.nonzero(bad).flatten().tolist()

@@ -28,6 +28,7 @@ ENTRY_POINT_GROUP = "scene_envs.masks"
 Generator = TypeVar("Generator", bound=MaskGenerator)
 
 _SHIPPED: dict[str, MaskGenerator] = {
+    "balanced": shipped.BalancedMask(),
     "culprits": shipped.CulpritsMask(),
     "empty": shipped.EmptyMask(),
     "given": shipped.GivenMask(),

@@ -148,7 +148,7 @@ class SearchProblem:
         self.prompt = self.prompting.draw(np.random.default_rng(0)) if self.prompting.given else None
         self.scorer = RewardScorer(chosen.objective, chosen.workers)
         self.evaluations = 0
-        self._told_of_scale = False
+        self._told_of_scale = self._told_of_zero = False
 
     def _resolve_mask(self, mask: Any) -> MaskGenerator:
         generator = resolve_mask(mask)
@@ -193,8 +193,9 @@ class SearchProblem:
         children = self._inpaint(parents, masks, noises, watch)
         origins = [(state.seed, path, state.value) for (state, _), path in zip(pairs, paths, strict=True)]
         states = self._score(children, origins)
-        if hasattr(watch, "trace"):
-            states = [replace(state, trace=watch.trace(row)) for row, state in enumerate(states)]
+        trace = getattr(watch, "trace", None)
+        if trace is not None:
+            states = [replace(state, trace=trace(row)) for row, state in enumerate(states)]
         return states
 
     def expand(self, state: SearchState, action: int) -> SearchState:
@@ -286,6 +287,13 @@ class SearchProblem:
                 objective,
                 self.scale,
             )
+        if valid and objective < 0 and not self._told_of_zero:
+            self._told_of_zero = True
+            _LOGGER.warning(
+                "the objective is %.4g: below 0 the search tells no scenes apart; shift it, as with "
+                "{name: normalised, reward: ..., mean: the value that becomes 0, std: 1}",
+                objective,
+            )
         return self.state_type(
             scene=scene.tensor[0].clone(),
             **self._masks(scene, score, seed, path),
@@ -297,7 +305,7 @@ class SearchProblem:
             valid=valid,
         )
 
-    def _masks(self, scene: SceneBatch, score: Score, seed: int, path: tuple[int, ...]) -> dict[str, Tensor]:
+    def _masks(self, scene: SceneBatch, score: Score, seed: int, path: tuple[int, ...]) -> dict[str, Any]:
         """The fields of the state that say what is regenerated."""
         return {"mask": self._mask(self.mask_generator, scene, score, seed, path)}
 

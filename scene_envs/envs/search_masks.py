@@ -84,7 +84,7 @@ class MaskChoiceProblem(SearchProblem):
                 f"{sorted(self.legal_actions(state))}"
             )
 
-    def _masks(self, scene: SceneBatch, score: Score, seed: int, path: tuple[int, ...]) -> dict[str, Tensor]:
+    def _masks(self, scene: SceneBatch, score: Score, seed: int, path: tuple[int, ...]) -> dict[str, Any]:
         masks = torch.stack([self._mask(generator, scene, score, seed, path) for generator in self.mask_generators])
         return {"mask": masks.any(dim=0), "masks": masks}
 

@@ -15,6 +15,7 @@ from agents.planning.search_run import SearchConfig
 from rewards import RewardOutput
 from scene_envs.envs import register_mask
 from scene_envs.envs.mask_generators import (
+    BalancedMask,
     CulpritsMask,
     EmptyMask,
     GivenMask,
@@ -104,6 +105,20 @@ def test_an_objective_that_blames_nobody_by_name_gets_random_slots() -> None:
     reached = torch.stack(masks).any(dim=0)
     assert not bool(reached[0])  # the table
     assert int(reached.sum()) > 25
+
+
+def test_a_balanced_mask_has_the_same_share_of_objects_and_empty_slots() -> None:
+    batch = table_with(*(("NAME", 0.0, 0.0, 5.0 + k) for k in range(10)))  # in the air, far apart
+    bad = torch.zeros(1, 34, dtype=torch.bool)
+    bad[0, 1:5] = True
+    score = Score(torch.zeros(1), torch.ones(1, dtype=torch.bool), {}, None, {"feasible": ~bad})
+    for seed in range(3):
+        mask = BalancedMask()(batch, score, np.random.default_rng(seed))
+        assert torch.equal(mask & batch.is_free[0], bad[0])  # 4 of 10 objects
+        assert int((mask & batch.is_empty[0]).sum()) == 9  # and of 23 empty slots
+    good = Score(torch.zeros(1), torch.ones(1, dtype=torch.bool), {}, None, {"feasible": torch.ones_like(bad)})
+    mask = BalancedMask(at_least=6)(batch, good, np.random.default_rng(0))
+    assert (int((mask & batch.is_free[0]).sum()), int((mask & batch.is_empty[0]).sum())) == (2, 4)  # 6 of 33
 
 
 def test_covers_touch_every_pair_and_spare_the_fixed() -> None:
