@@ -60,6 +60,18 @@ def infeasible_or_empty_mask(scene: SceneBatch, score: Score, rng: np.random.Gen
     return infeasible_mask(scene, score, rng) | scene.is_empty[0]
 
 
+def blamed_or_empty_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+    """The free objects that the objective blames, and all empty slots.
+
+    With an objective that counts feasible objects this is :func:`infeasible_or_empty_mask`. Where the objective says
+    nothing about single objects, or blames none of a full scene, it is :func:`random_mask`.
+    """
+    bad = bad_objects(scene, score)
+    if bad is None or not bool((bad | scene.is_empty[0]).any()):
+        return random_mask(scene, score, rng)
+    return bad | scene.is_empty[0]
+
+
 def random_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
     """A random half of the free objects (rounded up), and all empty slots."""
     free = torch.nonzero(scene.is_free[0]).flatten().numpy()

@@ -26,8 +26,8 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
 
     ## Description
 
-    A state is a scene with a mask that says which of its slots are to be regenerated: by default the fewest objects
-    whose removal ends all overlaps, those that fall or slide, and a few empty slots. An action chooses one of
+    A state is a scene with a mask that says which of its slots are to be regenerated: by default the objects
+    that the objective blames, and all empty slots. An action chooses one of
     `branching` inpaintings of those slots by the scene prior (Pfaff et al. 2025, inference-time search). Good choices
     keep what works and replace what does not.
 
@@ -91,7 +91,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     | `num_steps` | `50` | denoising steps per inpainting |
     | `prior` | `None` | name, path or prior; `None` is the shipped prior of the scene type |
     | `slots` | `None` | slots per scene; `None` is the scene type's number, more is allowed |
-    | `mask` | `"culprits"` | [mask](../search.md#masks): a name, a mapping with its settings, or a function |
+    | `mask` | `"blamed_or_empty"` | [mask](../search.md#masks): a name, a mapping with its settings, or a function |
     | `objective_scale` | `None` | objective value at which Φ = 1; `None` is the number of free slots |
     | `max_nfe` | `None` | denoiser evaluations per episode; `None` is any number |
     | `workers` | `0` | processes for physics in the objective; 0 computes in this one |

@@ -296,7 +296,7 @@ def test_an_interrupted_command_says_so_and_can_go_on(
     folder, output = prior.save(tmp_path / "prior"), tmp_path / "run"
     register_reward("interrupting")(Counting(act))
     words = ["search", f"prior={folder}", "objective=interrupting", "budget=9", "branching=3"]
-    words += ["num_steps=2", "slots=12", f"output={output}"]
+    words += ["num_steps=2", "slots=12", "planner=greedy", f"output={output}"]
     assert main(words) == status
     shown = capsys.readouterr()
     assert "by greedy with 12 denoiser evaluations" in shown.out

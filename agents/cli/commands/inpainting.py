@@ -56,7 +56,7 @@ def load_prior_and_scenes(command: str, settings: InpaintingConfig) -> tuple[Sce
     if not settings.scenes:
         if not settings.prior:
             raise InvalidInputError(
-                f"{command}: name a scene file, run or dataset, as in scenes=runs/mine, or a prior= whose samples to take"
+                f"{command}: name a scene file, run or dataset, as in scenes=runs/mine, or a prior= to sample from"
             )
         fresh = ScenePrior.load(settings.prior).to(settings.device)
         count = _FRESH if settings.count is None else settings.count
