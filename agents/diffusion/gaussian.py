@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from agents.diffusion.moments import Preconditioning
+from agents.diffusion.residual import ResidualVariance
 from agents.diffusion.schedules import NoiseSchedule
 from scene_envs.errors import InvalidInputError, unknown_name
 
@@ -170,6 +171,20 @@ class GaussianProcess:
         if residual is not None and previous > 0:
             variance = variance + (eta * x0_weight) ** 2 * residual.double().cpu()
         return x0_weight * x0 + xt_weight * x_t, variance.sqrt().float().to(x_t.device)
+
+    def estimate(self, t: int, previous: int, residual: ResidualVariance | None = None) -> tuple[float, Tensor]:
+        """How far the mean of x_s moves with the denoised scene, s < t, and the latter's standard deviation (D,).
+
+        The deviation is the root of ``residual``; None takes that of normal data of the moments of ``preconditioning``.
+        """
+        alpha, sigma = self.alpha[t], self.sigma[t]
+        if residual is None:
+            std = self.preconditioning.std
+            variance = (sigma * std) ** 2 / ((alpha * std) ** 2 + sigma**2)
+        else:
+            variance = residual.at(t)
+        weight, _ = self.posterior(torch.zeros(()), torch.ones(()), t, previous)
+        return float(weight), variance.sqrt()
 
     def _moments(self, like: Tensor, moments: Moments | None) -> Moments:
         if moments is not None:

@@ -33,6 +33,10 @@ class ReverseStep(Protocol):
     def take(self, rows: Tensor) -> ReverseStep:
         """The step of scenes ``rows`` (K,), which may come more than once."""
 
+    def shifted(self, shift: Tensor) -> ReverseStep:
+        """The step with the means of the first features moved by ``shift`` (B, N, F)."""
+        ...
+
     def from_noise(self, noise: Tensor) -> Tensor:
         """x_s (B, N, D) from standard normal noise (B, N, D): normal noise gives exactly this distribution."""
 
@@ -83,6 +87,10 @@ class GaussianStep(NamedTuple):
         """The step of scenes ``rows`` (K,), which may come more than once."""
         return self._replace(mean=self.mean[rows], denoised=None)
 
+    def shifted(self, shift: Tensor) -> GaussianStep:
+        """The step with the means of the first features moved by ``shift`` (B, N, F)."""
+        return self._replace(mean=_shifted(self.mean, shift))
+
     @property
     def entries(self) -> int:
         """Random entries of a scene."""
@@ -128,6 +136,10 @@ class MixedStep(NamedTuple):
         """The step of scenes ``rows`` (K,), which may come more than once."""
         masked = None if self.masked is None else self.masked[rows]
         return self._replace(mean=self.mean[rows], probs=self.probs[rows], masked=masked, denoised=None)
+
+    def shifted(self, shift: Tensor) -> MixedStep:
+        """The step with the means of the first features moved by ``shift`` (B, N, F)."""
+        return self._replace(mean=_shifted(self.mean, shift))
 
     @property
     def std(self) -> Tensor:
@@ -175,6 +187,10 @@ class MixedStep(NamedTuple):
             together = unmasking_log_prob(self.masked, chance.detach(), ~still)
             discrete = torch.where(self.masked, chosen + together, discrete)
         return continuous + torch.where(self.random, discrete, torch.zeros_like(discrete))
+
+
+def _shifted(mean: Tensor, shift: Tensor) -> Tensor:
+    return mean + F.pad(shift, (0, mean.shape[-1] - shift.shape[-1]))
 
 
 def _invert(cumulative: Tensor, uniform: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from agents.planning.config import SearchConfig
     from agents.planning.evolution import EvolutionPlanner
     from agents.planning.feynman_kac import FeynmanKacPlanner
+    from agents.planning.gradient import GradientPlanner
     from agents.planning.greedy import GreedyPlanner
     from agents.planning.journal import Journal
     from agents.planning.ledger import Ledger, PlanResult, Searchable, SearchStoppedError
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from agents.planning.session import Session
     from agents.planning.tree import Node, Tree
     from agents.planning.tree_file import SearchRecord, TreeNode
+    from agents.planning.tree_over_steps import TreeOverStepsPlanner
     from agents.planning.uct import UCTPlanner
 
 __all__ = [
@@ -26,6 +28,7 @@ __all__ = [
     "BestOfPlanner",
     "EvolutionPlanner",
     "FeynmanKacPlanner",
+    "GradientPlanner",
     "GreedyPlanner",
     "Journal",
     "Ledger",
@@ -41,6 +44,7 @@ __all__ = [
     "Session",
     "Tree",
     "TreeNode",
+    "TreeOverStepsPlanner",
     "UCTPlanner",
     "list_planners",
     "register_planner",

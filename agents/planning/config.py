@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from agents.configuration.fields import composed, moved, named, nested
-from agents.planning.greedy import GreedyPlanner
+from agents.planning.evolution import EvolutionPlanner
 from agents.planning.registry import PlannerSettings, list_planners, planner_settings
 from scene_envs.errors import InvalidInputError
 
@@ -31,6 +31,7 @@ class SearchConfig:
         num_steps: denoiser evaluations per scene.
         mask: which objects to regenerate: a registered name, or a mapping of it and its settings; in Python a function
             as well.
+        masks: several masks, each as ``mask``, of which every action takes one; null for ``mask`` alone.
         slots: slots per scene; null takes the scene type's.
         objective_scale: objective at which Φ is 1; null takes the largest value that it declares, or else the number of
             free slots.
@@ -53,7 +54,8 @@ class SearchConfig:
     branching: int = 4
     max_depth: int = 1000
     num_steps: int = 50
-    mask: Any = named("culprits", "mask")
+    mask: Any = named("blamed_or_empty", "mask")
+    masks: list[Any] | None = None
     slots: int | None = None
     objective_scale: float | None = None
     seed: int = 0
@@ -61,7 +63,7 @@ class SearchConfig:
     prompt: str | None = None
     guidance: float = 0.0
     planner: PlannerSettings = nested(
-        GreedyPlanner, folder="planner", option="greedy", kinds=planner_settings, registered=list_planners
+        EvolutionPlanner, folder="planner", option="evolution", kinds=planner_settings, registered=list_planners
     )
 
     @property

@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from agents.planning.ledger import (
     Candidate,
@@ -22,10 +20,6 @@ from agents.planning.ledger import (
 )
 from agents.planning.registry import PlannerSettings, check_at_least, register_planner
 from scene_envs.errors import InvalidInputError
-from scene_envs.scene import SceneBatch
-
-_SMALLEST_SHARE = 0.25
-"""A cut leaves at least this share of the objects of both scenes on either side."""
 
 
 @register_planner("evolution")
@@ -34,9 +28,9 @@ class EvolutionPlanner(PlannerSettings):
     """Evolution with cut and splice as crossover (Deaven and Ho 1995).
 
     The population begins with fresh samples. A round makes ``children`` offspring. A parent is the better of two
-    members at random. Offspring of one parent is an inpainting of it. Offspring of two is made by :func:`spliced`,
-    gets a mask of its own and is inpainted; the splice costs no denoiser evaluation. The best different scenes, old and
-    new, are the next population; of equal values the newer scene stays.
+    members at random. Offspring of one parent is an inpainting of it. Offspring of two is a splice of them
+    (:func:`~agents.planning.splice.spliced`), gets a mask of its own and is inpainted; the splice costs no denoiser
+    evaluation. The best different scenes, old and new, are the next population; of equal values the newer scene stays.
 
     Attributes:
         population: scenes that are kept, and fresh samples in the beginning.
@@ -87,6 +81,8 @@ class EvolutionPlanner(PlannerSettings):
 
     def _mated(self, ledger: Ledger, index: int, members: list[Member], rng: np.random.Generator) -> Candidate:
         """What is inpainted: a member, or its splice with another one."""
+        from agents.planning.splice import spliced
+
         problem: Any = ledger.problem
         (parent, _), others = members[index], members[:index] + members[index + 1 :]
         if not others or not hasattr(problem, "with_scene") or rng.random() >= self.crossover:
@@ -102,46 +98,3 @@ class EvolutionPlanner(PlannerSettings):
 def _better_of_two(members: Sequence[Member], rng: np.random.Generator) -> int:
     """The better of two members at random, as its index; members stand in the order of their values."""
     return int(rng.integers(len(members), size=2).min())
-
-
-def spliced(
-    first: SceneBatch, second: SceneBatch, first_mask: Tensor, second_mask: Tensor, rng: np.random.Generator
-) -> Tensor:
-    """One scene with the objects of ``first`` on one side of a vertical plane, and those of ``second`` on the other.
-
-    The plane has a random direction, and the place at which most objects are kept, a quarter of the objects of both at
-    least on either side. Where slots are missing, the objects nearest to the plane are left out.
-
-    Args:
-        first: a batch of one; the scene has its fixed objects.
-        second: a batch of one of the same shape.
-        first_mask: (N,) bool, slots of ``first`` that are left out.
-        second_mask: (N,) bool, slots of ``second`` that are left out.
-        rng: draws the direction.
-
-    Returns:
-        (N, D) raw scene.
-    """
-    fixed = torch.arange(first.tensor.shape[1]) < len(first.scene_type.fixed)
-    angle = rng.uniform(0, 2 * np.pi)
-    normal = torch.tensor([np.cos(angle), np.sin(angle)], dtype=torch.float32)
-    rows, places = [], []
-    for scene, mask in ((first, first_mask), (second, second_mask)):
-        kept = ~(scene.is_empty[0] | mask | fixed)
-        rows.append(scene.tensor[0, kept])
-        places.append(scene.translations[0, kept, :2] @ normal)
-    result = SceneBatch.empty(first.scene_type, 1, len(fixed)).tensor[0]
-    result[fixed] = first.tensor[0, fixed]
-    cuts = torch.cat(places).sort().values
-    if not len(cuts):
-        return result
-    edge = int(_SMALLEST_SHARE * (len(cuts) - 1))
-    cuts = cuts[edge : len(cuts) - edge]
-    gained = (places[0] >= cuts[:, None]).sum(-1) + (places[1] < cuts[:, None]).sum(-1)
-    cut = cuts[gained.argmax()]
-    sides = places[0] >= cut, places[1] < cut
-    objects = torch.cat([part[side] for part, side in zip(rows, sides, strict=True)])
-    distances = torch.cat([(place[side] - cut).abs() for place, side in zip(places, sides, strict=True)])
-    objects = objects[distances.argsort(descending=True, stable=True)][: int((~fixed).sum())]
-    result[len(first.scene_type.fixed) :][: len(objects)] = objects
-    return result

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +11,7 @@ import torch
 from torch import Tensor
 
 from agents.planning.greedy import GreedyPlanner
-from agents.planning.ledger import PlanResult, Progress, Searchable
+from agents.planning.ledger import PlanResult, Progress, Searchable, Steered
 from agents.planning.registry import PlannerSettings, check_at_least, register_planner
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
@@ -125,10 +123,8 @@ class FeynmanKacPlanner(PlannerSettings):
         Raises:
             InvalidInputError: the expansions of ``problem`` cannot be steered.
         """
-        if "steering" not in inspect.signature(problem.expand_batch).parameters:
-            takes = f"expand_batch of {type(problem).__name__} takes no steering="
-            raise InvalidInputError(f"planner {self.name} steers the denoising, and {takes}; choose another planner")
-        return GreedyPlanner(children=self.particles).plan(_Steered(problem, self._steer), budget, progress)
+        steered = Steered(problem, self.name, self._steer)
+        return GreedyPlanner(children=self.particles).plan(steered, budget, progress)
 
     def _steer(self, pairs: Sequence[tuple[Any, int]], values: Callable[[SceneBatch], Tensor]) -> Particles:
         parents, rngs = [(state.seed, state.path) for state, _ in pairs], {}
@@ -137,14 +133,3 @@ class FeynmanKacPlanner(PlannerSettings):
                 source = np.random.SeedSequence(entropy=seed, spawn_key=(*path, action, 2))
                 rngs[seed, path] = np.random.default_rng(source)
         return Particles(parents, rngs, values, self.resamplings, self.begin, self.strength)
-
-
-class _Steered:
-    """A problem whose expansions are steered."""
-
-    def __init__(self, problem: Any, steering: Any) -> None:
-        self.problem = problem
-        self.expand_batch = partial(problem.expand_batch, steering=steering)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.problem, name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -179,6 +180,32 @@ class Ledger:
     def result(self, tree: Tree | None = None) -> PlanResult:
         """The plan: the best state, the shallowest and then the first path among equals."""
         return PlanResult(self.best.state, self.best.value, self.best.path, self.values, tree)
+
+
+class Steered:
+    """A problem whose expansions are steered.
+
+    Args:
+        problem: what is searched.
+        planner: name of the planner that steers.
+        steering: as ``expand_batch`` takes it; may change between expansions.
+
+    Raises:
+        InvalidInputError: the expansions of ``problem`` cannot be steered.
+    """
+
+    def __init__(self, problem: Any, planner: str, steering: Any = None) -> None:
+        if "steering" not in inspect.signature(problem.expand_batch).parameters:
+            takes = f"expand_batch of {type(problem).__name__} takes no steering="
+            raise InvalidInputError(f"planner {planner} steers the denoising, and {takes}; choose another planner")
+        self.problem, self.steering = problem, steering
+
+    def expand_batch(self, pairs: Sequence[tuple[Any, int]]) -> Sequence[Any]:
+        """The child of every pair."""
+        return self.problem.expand_batch(pairs, steering=self.steering)  # type: ignore[no-any-return]
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.problem, name)
 
 
 def state_value(problem: Searchable, state: Any) -> float:

@@ -40,7 +40,18 @@ _PLANNERS: Registry[type[PlannerSettings]] = Registry(
     "planner",
     ENTRY_POINT_GROUP,
     modules=[
-        f"agents.planning.{name}" for name in ("beam", "best_of", "evolution", "feynman_kac", "greedy", "mcts", "uct")
+        f"agents.planning.{name}"
+        for name in (
+            "beam",
+            "best_of",
+            "evolution",
+            "feynman_kac",
+            "gradient",
+            "greedy",
+            "mcts",
+            "tree_over_steps",
+            "uct",
+        )
     ],
 )
 Settings = TypeVar("Settings", bound=type[PlannerSettings])

@@ -21,7 +21,7 @@ from agents.planning.search_report import draw_curve, draw_scene
 from agents.planning.session import Session
 from agents.planning.tree_file import SearchRecord
 from agents.planning.tree_page import shown_nodes, write_tree_page
-from scene_envs.envs import SearchEnv, SearchState
+from scene_envs.envs import SearchEnv, SearchMaskEnv, SearchState
 from scene_envs.envs.resolvers import resolve_prior
 from scene_envs.errors import InvalidInputError, SceneEnvsError
 from scene_envs.files import finite, sealed, write_json, write_text
@@ -136,8 +136,9 @@ def _search(
             break
     searched, best_of = time.perf_counter(), None
     if config.baseline and spent and stopped in ("", "time"):
-        # As many actions as scenes: the same seeds by path, so the first scenes are those of the first search.
-        _, _, (best_of,) = run.plan(BestOfPlanner(), spent, spent, range(1), "best of N", progress)
+        # The same seeds by path, so the first scenes are those of the first search.
+        wide = spent if config.masks is None else max(actions, -(-spent // len(config.masks)))
+        _, _, (best_of,) = run.plan(BestOfPlanner(), wide, spent, range(1), "best of N", progress)
     seconds = {"search": searched - started, "best_of": time.perf_counter() - searched}
     root = session.lanes[0].root
     if not searches and root.value >= 1:
@@ -193,7 +194,11 @@ class _Run:
     ) -> tuple[SearchEnv, Session, list[PlanResult]]:
         """Plans of ``budget`` scenes each, one per search of ``part``, in an environment of ``actions`` per state."""
         config = self.config
-        env = SearchEnv(
+        if config.masks is None:
+            kind, masks = SearchEnv, {"mask": config.mask}
+        else:
+            kind, masks = SearchMaskEnv, {"masks": config.masks}
+        env = kind(
             scene=self.prior.scene_type,
             objective=self.objective,
             branching=actions,
@@ -201,7 +206,7 @@ class _Run:
             num_steps=config.num_steps,
             prior=self.prior,
             slots=config.slots,
-            mask=config.mask,
+            **masks,
             objective_scale=config.objective_scale,
             workers=config.workers,
             prompt=config.prompt,
@@ -251,6 +256,7 @@ def _metrics(
         "objective": objective if isinstance(objective, str) else getattr(objective, "__name__", repr(objective)),
         "objective_scale": scale,
         "saturated": search.best_state.objective > scale,
+        "below_zero": search.best_state.objective < 0,
         "planner": config.planner.name,
         "stopped": stopped or None,
         "nfe": spent * config.nfe_per_scene,

@@ -19,13 +19,13 @@ from agents.networks.text import Text
 from agents.priors.base import ScenePrior
 from agents.priors.config import PriorConfig, current_names
 from agents.priors.forward import DenoiserOutput, NoisedScenes
-from agents.priors.inpainting import Hook, draw_noise
+from agents.priors.inpainting import Hook, Start, draw_noise
 from agents.priors.prompt_validation import no_text
 from agents.priors.rotation_codes import SceneCode
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
-from scene_envs.scene import SceneBatch
+from scene_envs.scene import TRANSLATION, SceneBatch
 from scene_envs.scene_types import get_scene_type
 
 SCENE_MOMENTS = ("feature", "scene")
@@ -171,12 +171,18 @@ class ContinuousPrior(ScenePrior):
         prompts: Sequence[str] | None = None,
         guidance: float = 0.0,
         hook: Hook | None = None,
+        start: Start | None = None,
     ) -> Tensor:
         """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; used by :meth:`inpaint`."""
         x0 = self.encode(batch)
         widths = torch.tensor([self.code.pose_width, x0.shape[-1] - self.code.pose_width], device=mask.device)
         keep = ~mask.repeat_interleave(widths, dim=-1)
-        return self._chain_with_noised(x0, keep, table, generators, resample, hook)
+        return self._chain_with_noised(x0, keep, table, generators, resample, hook, start)
+
+    def estimate(self, step: int, table: StepTable) -> tuple[float, Tensor]:
+        """Weight of the denoised translations in x_{t-1}, and their standard deviation (3,), normalised."""
+        weight, std = self.process.estimate(int(table.timesteps[step]), int(table.previous[step]), self.residual)
+        return weight, std[TRANSLATION].to(self.device)
 
     def _chain_with_noised(
         self,
@@ -186,10 +192,12 @@ class ContinuousPrior(ScenePrior):
         generators: Sequence[Generator],
         resample: int,
         hook: Hook | None,
+        start: Start | None,
     ) -> Tensor:
         """x_0 from a chain in which entries ``keep`` (B, N, D) of ``x0`` are put in with each level's noise."""
         x = self.clamp(draw_noise(x0, generators))
-        for step in range(len(table)):
+        first, x = (0, x) if start is None else (start[0], start[1].to(x))
+        for step in range(first, len(table)):
             level, after = table.timesteps[step], int(table.previous[step])
             rounds = resample if after > 0 else 1
             for again in range(rounds):
@@ -199,7 +207,7 @@ class ContinuousPrior(ScenePrior):
                 x = self.clamp(torch.where(keep, noised, x))
                 reverse: ReverseStep = self.transition(x, step, table)
                 if hook is not None and again == rounds - 1:
-                    reverse = hook(step, reverse)
+                    reverse = hook(step, x, reverse)
                 x = reverse.from_noise(draw_noise(x0, generators))
         return torch.where(keep, x0, x)
 

@@ -12,16 +12,28 @@ from agents.diffusion.reverse_steps import ReverseStep
 from agents.diffusion.step_tables import StepTable
 from agents.priors.prompt_validation import check_prompts
 from scene_envs.errors import InvalidInputError
-from scene_envs.scene import CATEGORY, POSE, SceneBatch
+from scene_envs.normalizer import Normalizer
+from scene_envs.scene import CATEGORY, POSE, TRANSLATION, SceneBatch
 from scene_envs.scene_types import SceneType
 
-Hook = Callable[[int, ReverseStep], ReverseStep]
-"""``(step, reverse) -> reverse``: called at every step of a chain before x_{t-1} is drawn; may take other rows."""
+Hook = Callable[[int, Tensor, ReverseStep], ReverseStep]
+"""``(step, x_t, reverse) -> reverse``: called at every step before x_{t-1} is drawn; may take other rows or shift it.
+"""
+Start = tuple[int, Tensor]
+"""A step of a chain, and x_t (B, N, D) at it: where the chain begins instead of at x_T."""
+Guide = Callable[[int, int, Callable[[], SceneBatch]], Tensor | None]
+"""``(step, steps, denoised) -> gradient``: d log w / d translation (B, N, 3), 1/m, of a weight w of scenes.
+
+Scenes then follow the prior times w. ``denoised`` is as for :data:`Watch`; None leaves a step alone.
+"""
 Watch = Callable[[int, int, Callable[[], SceneBatch]], Tensor | None]
 """``(step, steps, denoised) -> rows``: what happens to scenes while they are denoised.
 
 ``denoised()`` gives the B scenes as the network sees them at this step. ``rows`` (B,) are the scenes that go on in the
 place of each, such as ``[0, 0, 2]``; None for all as they are.
+
+Where a watch has ``start(steps)``, the chain begins at the :data:`Start` that it gives, if any; where it has
+``see(step, steps, x)``, it is shown x_t (B, N, D) at every step.
 """
 
 
@@ -33,6 +45,7 @@ class Inpainting(ABC):
     """
 
     scene_type: SceneType
+    normalizer: Normalizer
 
     @property
     def conditional(self) -> bool:
@@ -63,8 +76,13 @@ class Inpainting(ABC):
         prompts: Sequence[str] | None = None,
         guidance: float = 0.0,
         hook: Hook | None = None,
+        start: Start | None = None,
     ) -> Tensor:
         """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; used by :meth:`inpaint`."""
+
+    @abstractmethod
+    def estimate(self, step: int, table: StepTable) -> tuple[float, Tensor]:
+        """Weight of the denoised translations in x_{t-1}, and their standard deviation (3,), normalised."""
 
     @torch.no_grad()
     def inpaint(
@@ -79,6 +97,7 @@ class Inpainting(ABC):
         seed: int = 0,
         resample: int = 1,
         watch: Watch | None = None,
+        guide: Guide | None = None,
     ) -> SceneBatch:
         """Regenerate what is masked, given the rest.
 
@@ -94,6 +113,7 @@ class Inpainting(ABC):
             resample: how often each step is taken, going back in between (Lugmayr et al. 2022, Algorithm 1); 1 is once.
             watch: told of every step, and says which scenes go on; a scene may give way only to one of the same
                 ``batch`` and ``mask``.
+            guide: gradient of a log-weight of scenes; moves the poses that are regenerated.
 
         Returns:
             Scenes on the device of ``batch``, whose unmasked entries are bit-identical to its own. Where the category
@@ -112,19 +132,48 @@ class Inpainting(ABC):
         if generators is None:
             generators = [Generator().manual_seed(seed + i) for i in range(len(batch))]
         device, table = self.device, self.step_table(num_steps)
-        hook = None if watch is None else self._hook(watch, batch, both, len(table))
-        x = self.regenerate(batch.to(device), both.to(device), table, generators, resample, prompts, guidance, hook)
+        hook = self._hook(watch, guide, batch, both, table)
+        begins = getattr(watch, "start", None)
+        start = None if begins is None else begins(len(table))
+        x = self.regenerate(
+            batch.to(device), both.to(device), table, generators, resample, prompts, guidance, hook, start
+        )
         return merge(batch, self.decode(x).to(batch.tensor.device), both)
 
-    def _hook(self, watch: Watch, batch: SceneBatch, both: Tensor, steps: int) -> Hook:
-        def hook(step: int, reverse: ReverseStep) -> ReverseStep:
+    def _hook(
+        self, watch: Watch | None, guide: Guide | None, batch: SceneBatch, both: Tensor, table: StepTable
+    ) -> Hook | None:
+        see = getattr(watch, "see", None)
+
+        def hook(step: int, x: Tensor, reverse: ReverseStep) -> ReverseStep:
             estimate = reverse.denoised
+            if see is not None:
+                see(step, len(table), x)
             if estimate is None:
                 return reverse
-            rows = watch(step, steps, lambda: merge(batch, self.decode(estimate).to(batch.tensor.device), both))
+
+            def denoised() -> SceneBatch:
+                return merge(batch, self.decode(estimate).to(batch.tensor.device), both)
+
+            gradient = None if guide is None else guide(step, len(table), denoised)
+            if gradient is not None:
+                shift = self._tilted(step, table, gradient.to(self.device))
+                reverse = reverse.shifted(shift * both[..., :1].to(shift))
+            rows = None if watch is None else watch(step, len(table), denoised)
             return reverse if rows is None else reverse.take(rows.to(self.device))
 
-        return hook
+        return None if watch is None and guide is None else hook
+
+    def _tilted(self, step: int, table: StepTable, gradient: Tensor) -> Tensor:
+        """(B, N, 3) shift of x_{t-1} by which p(x_0 | x_t) is tilted by a weight.
+
+        Given x_t, x_0 is about normal around the denoised scene. Its mean moves by its variance times ``gradient``
+        (B, N, 3), of ln w by metres: exact where the gradient is constant. No object moves by more than a deviation.
+        """
+        weight, std = self.estimate(step, table)
+        scale = self.normalizer.scale[TRANSLATION].to(std)
+        deviations = torch.where(scale == 0, torch.zeros_like(scale), std / scale) * gradient
+        return weight * std * deviations / deviations.norm(dim=-1, keepdim=True).clamp(min=1.0)
 
     def complete(
         self,
@@ -133,21 +182,28 @@ class Inpainting(ABC):
         prompt: str | Sequence[str] | None = None,
         guidance: float = 0.0,
         slots: int | None = None,
+        fill: int | None = None,
         num_steps: int = 50,
         seed: int = 0,
     ) -> SceneBatch:
         """Fill the empty slots of ``batch``, keeping its objects.
+
+        With all empty slots open a prior crowds a scene; with ``fill`` of them it adds that many at most.
 
         Args:
             batch: scenes.
             prompt: what the completed scenes should hold, one text for all or one per scene; None for anything.
             guidance: w of classifier-free guidance, as in :meth:`sample`.
             slots: slots of the result, at least those of ``batch``; None keeps them.
+            fill: most objects to add to a scene; None for as many as there are empty slots.
             num_steps: denoiser evaluations per scene.
             seed: of the noise; scene i uses ``seed + i``.
         """
         wide = batch if slots is None else batch.with_slots(slots)
-        return self.inpaint(wide, wide.is_empty, prompt=prompt, guidance=guidance, num_steps=num_steps, seed=seed)
+        if fill is not None and fill < 0:
+            raise InvalidInputError(f"fill={fill}: give the most objects to add, at least 0, or None")
+        open_slots = wide.is_empty if fill is None else wide.is_empty & (wide.is_empty.cumsum(dim=1) <= fill)
+        return self.inpaint(wide, open_slots, prompt=prompt, guidance=guidance, num_steps=num_steps, seed=seed)
 
     def rearrange(
         self,

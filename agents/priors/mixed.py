@@ -32,13 +32,13 @@ from agents.networks.registry import build_network, config_from_state
 from agents.networks.text import Text
 from agents.networks.text_encoders import text_config_from_state, text_encoder
 from agents.priors.config import MixedPriorConfig, current_names
-from agents.priors.inpainting import Hook, draw_noise
+from agents.priors.inpainting import Hook, Start, draw_noise
 from agents.priors.mixed_states import UNIONS
 from agents.priors.mixed_training import TrainableMixedPrior
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
-from scene_envs.scene import POSE_FEATURES, SceneBatch
+from scene_envs.scene import POSE_FEATURES, TRANSLATION, SceneBatch
 from scene_envs.scene_types import get_scene_type
 
 CATEGORY_LOSSES = ("cross_entropy", "bound")
@@ -199,35 +199,43 @@ class MixedPrior(TrainableMixedPrior):
     def regenerate(
         self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int,
         prompts: Sequence[str] | None = None, guidance: float = 0.0, hook: Hook | None = None,
+        start: Start | None = None,
     ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; the rest is seen as it is."""
         text = None if prompts is None else self.encode_prompts(prompts)
         observed = Observed(self.encode(batch), ~mask[..., 0], ~mask[..., 1])
         noise = draw_noise(observed.x, generators)
         probs = self.categories.prior().to(noise).expand(*noise.shape[:2], -1)
-        start = self.clamp(self.with_states(noise[..., :POSE_FEATURES], probs, noise))
-        return self.run_chain(start, table, generators, observed, text, guidance, resample, hook=hook)
+        x = self.clamp(self.with_states(noise[..., :POSE_FEATURES], probs, noise))
+        first, x = (0, x) if start is None else (start[0], start[1].to(x))
+        return self.run_chain(x, table, generators, observed, text, guidance, resample, hook=hook, first=first)
+
+    def estimate(self, step: int, table: StepTable) -> tuple[float, Tensor]:
+        """Weight of the denoised translations in x_{t-1}, and their standard deviation (3,), normalised."""
+        weight, std = self.process.estimate(int(table.timesteps[step]), int(table.previous[step]), self.residual)
+        return weight, std[TRANSLATION].to(self.device)
 
     @torch.no_grad()
     def run_chain(
         self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None,
         observed: Observed | None = None, text: Text | None = None, guidance: float = 0.0, resample: int = 1,
-        eta: float = 1.0, hook: Hook | None = None,
+        eta: float = 1.0, hook: Hook | None = None, first: int = 0,
     ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D) from x_T, with observed entries kept.
 
         Args:
-            x: x_T (B, N, D).
+            x: x_T (B, N, D), or the scenes at step ``first``.
             table: the chain.
             noises: one generator for all scenes, or one per scene; None for torch's own.
             observed: entries that carry no noise.
             text, guidance, eta: as in :meth:`transition`.
             resample: how often each step is taken, going back in between.
             hook: called at the last taking of every step.
+            first: step that the chain begins at.
         """
         free = self.unconditional(len(x)) if text is None or guidance else None
         x = x if observed is None else observed.write(x)
-        for step in range(len(table)):
+        for step in range(first, len(table)):
             level, after = int(table.timesteps[step]), int(table.previous[step])
             rounds = resample if after > 0 else 1
             for again in range(rounds):
@@ -238,7 +246,7 @@ class MixedPrior(TrainableMixedPrior):
                     x, step, table, observed=observed, text=text, guidance=guidance, free=free, eta=eta
                 )
                 if hook is not None and again == rounds - 1:
-                    reverse = hook(step, reverse)
+                    reverse = hook(step, x, reverse)
                 x = reverse.from_noise(draw_noise(x, noises))
                 x = x if observed is None else observed.write(x)
         return x

@@ -60,6 +60,18 @@ def infeasible_or_empty_mask(scene: SceneBatch, score: Score, rng: np.random.Gen
     return infeasible_mask(scene, score, rng) | scene.is_empty[0]
 
 
+def blamed_or_empty_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+    """The free objects that the objective blames, and all empty slots.
+
+    With an objective that counts feasible objects this is :func:`infeasible_or_empty_mask`. Where the objective says
+    nothing about single objects, or blames none of a full scene, it is :func:`random_mask`.
+    """
+    bad = bad_objects(scene, score)
+    if bad is None or not bool((bad | scene.is_empty[0]).any()):
+        return random_mask(scene, score, rng)
+    return bad | scene.is_empty[0]
+
+
 def random_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
     """A random half of the free objects (rounded up), and all empty slots."""
     free = torch.nonzero(scene.is_free[0]).flatten().numpy()
@@ -235,6 +247,31 @@ class CulpritsMask:
         mask[_culprits(scene, bad, rng)] = True
         for more in (empty, free):
             mask |= _some(more & ~mask, self.at_least - int(mask.sum()), rng)
+        return mask
+
+
+@dataclass(frozen=True)
+class BalancedMask:
+    """The culprits of :class:`CulpritsMask`, and as large a share of the empty slots as of the objects.
+
+    Such a mask says nothing about what it hides, as the masks of training: the masked slots take as many objects as
+    the prior puts beside those that stay. A mask of all empty slots says that few objects stand outside it, and the
+    prior crowds the scene.
+
+    Args:
+        at_least: slots regenerated, when the scene has as many; the share grows until there are.
+    """
+
+    at_least: int = 4
+
+    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+        """(N,) bool, True where a slot is regenerated; arguments as for :class:`CulpritsMask`."""
+        free, empty = scene.is_free[0], scene.is_empty[0]
+        mask = CulpritsMask(at_least=0)(scene, score, rng)
+        slots, objects = int((free | empty).sum()), int(free.sum())
+        share = max(int((mask & free).sum()) / max(objects, 1), min(1.0, self.at_least / max(slots, 1)))
+        for kind in (free, empty):
+            mask |= _some(kind & ~mask, round(share * int(kind.sum())) - int((mask & kind).sum()), rng)
         return mask
 
 

@@ -29,6 +29,8 @@ ENTRY_POINT_GROUP = "scene_envs.masks"
 Generator = TypeVar("Generator", bound=MaskGenerator)
 
 _SHIPPED: dict[str, MaskGenerator] = {
+    "balanced": shipped.BalancedMask(),
+    "blamed_or_empty": shipped.blamed_or_empty_mask,
     "culprits": shipped.CulpritsMask(),
     "empty": shipped.EmptyMask(),
     "given": shipped.GivenMask(),

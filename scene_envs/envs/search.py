@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,8 @@ _SAME = 1e-4
 Steering = Callable[[Sequence[tuple["SearchState", int]], Callable[[SceneBatch], Tensor]], Any]
 """``(pairs, values) -> watch``: makes what watches the denoising of an expansion, as a prior's ``inpaint`` takes it.
 
-``values`` gives Φ (B,) of scenes that are being denoised, 0 where the objective cannot score one.
+``values`` gives Φ (B,) of scenes that are being denoised, 0 where the objective cannot score one. What watches may have
+``trace(row)``, the ``trace`` of that child, and ``first_step(steps)``, the step that its denoising begins at.
 """
 
 
@@ -45,6 +46,7 @@ class SearchState:
         value: Φ in [0, 1]; the parent's where ``valid`` is False.
         objective: the objective's raw value; 0 where not valid.
         valid: whether the objective could score this scene.
+        trace: tensors that what steered the denoising left behind, such as the scene on its way; None mostly.
 
     Two states are equal when they are the same node: same seed, path and scene.
     """
@@ -57,6 +59,7 @@ class SearchState:
     value: float
     objective: float
     valid: bool
+    trace: Mapping[str, Tensor] | None = None
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, SearchState):
@@ -146,7 +149,7 @@ class SearchProblem:
         declared = self.scorer.maximum(self.slots, free_slots) if chosen.objective_scale is None else None
         self.scale = chosen.objective_scale or declared or float(free_slots)
         self.evaluations = 0
-        self._told_of_scale = False
+        self._told_of_scale = self._told_of_zero = False
 
     def _resolve_mask(self, mask: Any) -> MaskGenerator:
         generator = resolve_mask(mask)
@@ -190,7 +193,11 @@ class SearchProblem:
         watch = None if steering is None else steering(pairs, self._values)
         children = self._inpaint(parents, masks, noises, watch)
         origins = [(state.seed, path, state.value) for (state, _), path in zip(pairs, paths, strict=True)]
-        return self._score(children, origins)
+        states = self._score(children, origins)
+        trace = getattr(watch, "trace", None)
+        if trace is not None:
+            states = [replace(state, trace=trace(row)) for row, state in enumerate(states)]
+        return states
 
     def expand(self, state: SearchState, action: int) -> SearchState:
         """The child of ``state`` under ``action``."""
@@ -249,11 +256,12 @@ class SearchProblem:
         self, batch: SceneBatch, masks: Tensor, noises: list[torch.Generator], watch: Any = None
     ) -> SceneBatch:
         guidance, reader = self.prompting.guidance, self.prompting.reader
-        self.evaluations += self.nfe_per_scene * len(batch)
+        spared = watch.first_step(self.num_steps) if hasattr(watch, "first_step") else 0
+        self.evaluations += self.nfe_per_scene // self.num_steps * (self.num_steps - spared) * len(batch)
         batch, masks = batch.to(self.device), masks.to(self.device)
         how: dict[str, Any] = {"num_steps": self.num_steps, "generators": noises}
         if watch is not None:
-            how["watch"] = watch
+            how[getattr(watch, "role", "watch")] = watch
         if reader is None or self.prompt is None:
             return self.prior.inpaint(batch, masks, **how).to("cpu")
         return reader.inpaint(batch, masks, prompt=self.prompt, guidance=guidance, **how).to("cpu")
@@ -280,6 +288,13 @@ class SearchProblem:
                 objective,
                 self.scale,
             )
+        if valid and objective < 0 and not self._told_of_zero:
+            self._told_of_zero = True
+            _LOGGER.warning(
+                "the objective is %.4g: below 0 the search tells no scenes apart; shift it, as with "
+                "{name: normalised, reward: ..., mean: the value that becomes 0, std: 1}",
+                objective,
+            )
         return self.state_type(
             scene=scene.tensor[0].clone(),
             **self._masks(scene, score, seed, path),
@@ -291,7 +306,7 @@ class SearchProblem:
             valid=valid,
         )
 
-    def _masks(self, scene: SceneBatch, score: Score, seed: int, path: tuple[int, ...]) -> dict[str, Tensor]:
+    def _masks(self, scene: SceneBatch, score: Score, seed: int, path: tuple[int, ...]) -> dict[str, Any]:
         """The fields of the state that say what is regenerated."""
         return {"mask": self._mask(self.mask_generator, scene, score, seed, path)}
 

@@ -26,9 +26,9 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
 
     ## Description
 
-    A state is a scene with a mask of the slots to regenerate. By default the mask holds the fewest objects whose
-    removal ends all overlaps, the objects that fall or slide, and a few empty slots. The scene prior makes `branching`
-    inpaintings of these slots, and an action chooses one of the inpaintings (Pfaff et al. 2025, inference-time search).
+    A state is a scene with a mask of the slots to regenerate. By default the mask holds the objects that the objective
+    blames, and all empty slots. The scene prior makes `branching` inpaintings of these slots, and an action chooses one
+    of the inpaintings (Pfaff et al. 2025, inference-time search).
 
     Planners work on states directly: `clone_state`, `restore_state`, `legal_actions`, `action_masks`, `expand`,
     `expand_batch`, `evaluate`, `best_state`. A state is immutable and picklable and holds no simulator. The random
@@ -89,7 +89,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     | `num_steps` | `50` | denoising steps per inpainting |
     | `prior` | `None` | name, path or prior; `None` is the shipped prior of the scene type |
     | `slots` | `None` | slots per scene; `None` is the scene type's number, more is allowed |
-    | `mask` | `"culprits"` | [mask](../search.md#masks): a name, a mapping with its settings, or a function |
+    | `mask` | `"blamed_or_empty"` | [mask](../search.md#masks): a name, a mapping with its settings, or a function |
     | `objective_scale` | `None` | objective at which Φ = 1; `None` is the largest it declares, else the free slots |
     | `max_nfe` | `None` | denoiser evaluations per episode; `None` is any number |
     | `workers` | `0` | worker processes for physics in the objective; 0 computes in the calling process |

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 import torch
@@ -25,7 +25,7 @@ class MaskChoiceState(SearchState):
         masks: (K, N) bool, the slots that each mask regenerates.
     """
 
-    masks: Tensor
+    masks: Tensor = field(kw_only=True)
 
     def __eq__(self, other: object) -> bool:
         same = super().__eq__(other)
@@ -84,7 +84,7 @@ class MaskChoiceProblem(SearchProblem):
                 f"{sorted(self.legal_actions(state))}"
             )
 
-    def _masks(self, scene: SceneBatch, score: Score, seed: int, path: tuple[int, ...]) -> dict[str, Tensor]:
+    def _masks(self, scene: SceneBatch, score: Score, seed: int, path: tuple[int, ...]) -> dict[str, Any]:
         masks = torch.stack([self._mask(generator, scene, score, seed, path) for generator in self.mask_generators])
         return {"mask": masks.any(dim=0), "masks": masks}
 

@@ -126,7 +126,7 @@ class SearchSettings(TreeSettings):
         mask: name of a mask generator, a mapping with its settings, or a function; see :mod:`scene_envs.envs.masks`.
     """
 
-    mask: Any = "culprits"
+    mask: Any = "blamed_or_empty"
 
 
 @dataclass(frozen=True, kw_only=True)

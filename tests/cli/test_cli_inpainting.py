@@ -38,6 +38,30 @@ def test_complete_adds_and_keeps(files: tuple[Path, Path], tmp_path: Path) -> No
     assert json.loads((tmp_path / "metrics.json").read_text())["added"] >= 0
 
 
+def test_complete_adds_no_more_than_fill(files: tuple[Path, Path], tmp_path: Path) -> None:
+    scenes, prior = files
+    words = ["complete", f"scenes={scenes}", f"prior={prior}", "fill=2", "num_steps=3", "pictures=0"]
+    assert main([*words, f"output={tmp_path}"]) == 0
+    before, after = SceneBatch.load(scenes), SceneBatch.load(tmp_path / "scenes.safetensors")
+    assert bool((after.counts - before.counts <= 2).all())
+    assert bool((after.counts > before.counts).any())
+    assert main([*words, "fill=-1", f"output={tmp_path / 'wrong'}"]) == 2
+
+
+@pytest.mark.parametrize("command", ["complete", "rearrange"])
+def test_fresh_samples_are_inpainted(files: tuple[Path, Path], tmp_path: Path, command: str) -> None:
+    _, prior = files
+    words = [command, f"prior={prior}", "count=2", "num_steps=3", "pictures=0", "seed=4", f"output={tmp_path}"]
+    assert main(words) == 0
+    fresh = ScenePrior.load(prior).sample(2, num_steps=3, seed=4)
+    after = SceneBatch.load(tmp_path / "scenes.safetensors")
+    assert len(after) == 2
+    if command == "complete":
+        assert bool((after.tensor[~fresh.is_empty] == fresh.tensor[~fresh.is_empty]).all())
+    else:
+        assert torch.equal(after.categories, fresh.categories)
+
+
 @pytest.mark.slow
 def test_rearrange_moves_and_keeps_what_there_is(files: tuple[Path, Path], tmp_path: Path) -> None:
     scenes, prior = files

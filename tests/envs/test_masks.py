@@ -15,12 +15,14 @@ from agents.planning.search_run import SearchConfig
 from rewards import RewardOutput
 from scene_envs.envs import register_mask
 from scene_envs.envs.mask_generators import (
+    BalancedMask,
     CulpritsMask,
     EmptyMask,
     GivenMask,
     LowestScoringMask,
     OffPromptMask,
     RegionMask,
+    blamed_or_empty_mask,
     cover,
     infeasible_mask,
     infeasible_or_empty_mask,
@@ -106,6 +108,20 @@ def test_an_objective_that_blames_nobody_by_name_gets_random_slots() -> None:
     assert int(reached.sum()) > 25
 
 
+def test_a_balanced_mask_has_the_same_share_of_objects_and_empty_slots() -> None:
+    batch = table_with(*(("teacup", 0.0, 0.0, 5.0 + k) for k in range(10)))  # in the air, far apart
+    bad = torch.zeros(1, 34, dtype=torch.bool)
+    bad[0, 1:5] = True
+    score = Score(torch.zeros(1), torch.ones(1, dtype=torch.bool), {}, None, {"feasible": ~bad})
+    for seed in range(3):
+        mask = BalancedMask()(batch, score, np.random.default_rng(seed))
+        assert torch.equal(mask & batch.is_free[0], bad[0])  # 4 of 10 objects
+        assert int((mask & batch.is_empty[0]).sum()) == 9  # and of 23 empty slots
+    good = Score(torch.zeros(1), torch.ones(1, dtype=torch.bool), {}, None, {"feasible": torch.ones_like(bad)})
+    mask = BalancedMask(at_least=6)(batch, good, np.random.default_rng(0))
+    assert (int((mask & batch.is_free[0]).sum()), int((mask & batch.is_empty[0]).sum())) == (2, 4)  # 6 of 33
+
+
 def test_covers_touch_every_pair_and_spare_the_fixed() -> None:
     for seed in range(50):
         rng = np.random.default_rng(seed)
@@ -171,12 +187,27 @@ def test_what_the_prompt_does_not_ask_for_is_off_prompt() -> None:
         masked(scene, OffPromptMask())
 
 
+def test_the_default_mask_has_what_the_objective_blames_and_all_empty_slots() -> None:
+    scene = table_with(("teapot", 0, 0, 0), ("dinner_plate", 0.02, 0, 0), ("teacup", -0.3, 0, 0))
+    assert masked(scene, blamed_or_empty_mask) == masked(scene, infeasible_or_empty_mask) == ([1, 2], 30)
+    credit = Score(torch.zeros(1), torch.ones(1, dtype=torch.bool), per_object=torch.arange(34.0)[None] - 1)
+    assert blamed_or_empty_mask(scene, credit, np.random.default_rng(0)).nonzero().flatten().tolist() == [
+        1,
+        *range(4, 34),
+    ]
+    silent = Score(torch.zeros(1), torch.ones(1, dtype=torch.bool))
+    assert int(blamed_or_empty_mask(scene, silent, np.random.default_rng(0)).sum()) == 2 + 30  # half of the objects
+    full = SceneBatch(scene.tensor[:, :4], scene.scene_type)
+    praised = Score(torch.zeros(1), torch.ones(1, dtype=torch.bool), per_object=torch.ones(1, 4))
+    assert int(blamed_or_empty_mask(full, praised, np.random.default_rng(0)).sum()) == 2
+
+
 def test_names_are_resolved_and_unknown_ones_get_an_offer() -> None:
     assert resolve_mask("culprits") == CulpritsMask()
     assert resolve_mask("infeasible") is infeasible_mask
     with pytest.raises(UnknownNameError, match="did you mean 'culprits'"):
         resolve_mask("culprit")
-    with pytest.raises(InvalidInputError, match="culprits, empty, given"):
+    with pytest.raises(InvalidInputError, match="balanced, blamed_or_empty, culprits, empty, given"):
         resolve_mask(3)
 
 
@@ -202,4 +233,4 @@ def test_a_mask_of_an_installed_package_works_by_name(monkeypatch: pytest.Monkey
 
 def test_the_environment_and_the_search_run_have_one_default(prior: ToyPrior, free_objects: Any) -> None:
     env = gym.make(ID, prior=prior, objective=free_objects, num_steps=1).unwrapped
-    assert env.problem.mask_generator == resolve_mask(SearchConfig().mask) == CulpritsMask()
+    assert env.problem.mask_generator is resolve_mask(SearchConfig().mask) is blamed_or_empty_mask

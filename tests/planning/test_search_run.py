@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -164,6 +165,37 @@ def test_an_objective_that_is_beyond_its_scale_without_objects_says_so(run: Run)
 
     with pytest.raises(InvalidInputError, match=r"is 50 for the empty scene already, .* at objective_scale=33"):
         run_search(run.prior, beyond, **SETTINGS)
+
+
+def test_an_objective_below_zero_is_said_with_a_shift_that_works(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["search", f"prior={run.prior.save(tmp_path / 'prior')}", "baseline=false", "budget=9", "branching=3"]
+    words += ["num_steps=2"]
+    assert main([*words, "objective=penetration", f"output={tmp_path / 'below'}"]) == 0
+    metrics = json.loads((tmp_path / "below" / "metrics.json").read_text())
+    assert metrics["below_zero"]
+    assert set(metrics["search"]["curve"]) == {0.0}
+    said = " ".join(capsys.readouterr().out.split())
+    shifted = re.search(r"objective='(\{name: normalised.*?\})' objective_scale=1", said)
+    assert shifted is not None
+    assert main([*words, f"objective={shifted[1]}", "objective_scale=1", f"output={tmp_path / 'shifted'}"]) == 0
+    metrics = json.loads((tmp_path / "shifted" / "metrics.json").read_text())
+    assert not metrics["below_zero"]
+    assert 0 < metrics["search"]["value"] < 1
+
+
+@pytest.mark.parametrize("planner", ["greedy", "uct", "evolution"])
+def test_an_action_may_choose_among_masks(run: Run, tmp_path: Path, planner: str) -> None:
+    settings = {**SETTINGS, "planner": planner, "masks": ["culprits", {"name": "empty", "count": 2}]}
+    outcome = run_search(run.prior, central_objects, output=tmp_path, **settings)
+    assert len(outcome.search.values) == SETTINGS["budget"]
+    assert outcome.best_of is not None
+    assert outcome.best_of.values[: SETTINGS["branching"]] == outcome.search.values[: SETTINGS["branching"]]
+    again = run_search(run.prior, central_objects, output=tmp_path, **settings)  # from the journal
+    assert again.search.values == outcome.search.values
+    with pytest.raises(InvalidInputError, match="at least one mask"):
+        run_search(run.prior, central_objects, **{**SETTINGS, "masks": []})
 
 
 @pytest.mark.parametrize(

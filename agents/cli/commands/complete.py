@@ -17,9 +17,11 @@ class CompleteConfig(InpaintingConfig):
 
     Attributes:
         slots: slots of the result; null keeps those of the scenes.
+        fill: most objects to add to a scene; null for as many as there are empty slots.
     """
 
     slots: int | None = None
+    fill: int | None = None
 
 
 def run(settings: CompleteConfig, run: Run) -> None:
@@ -30,6 +32,7 @@ def run(settings: CompleteConfig, run: Run) -> None:
         prompt=settings.prompt,
         guidance=settings.guidance,
         slots=settings.slots,
+        fill=settings.fill,
         num_steps=settings.num_steps,
         seed=settings.seed,
     )

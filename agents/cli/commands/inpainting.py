@@ -14,15 +14,19 @@ if TYPE_CHECKING:
     from scene_envs.scene import SceneBatch
 
 
+_FRESH = 12
+"""Fresh samples when no number is given."""
+
+
 @dataclass
 class InpaintingConfig:
     """Scenes of which a prior generates a part anew.
 
     Attributes:
         scenes: a scene file, the folder of a sample or project run (its simulation-ready scenes if it has any), or
-            a dataset.
+            a dataset; empty for fresh samples of ``prior``.
         prior: a shipped name, or the folder of a prior or a run; empty means the shipped prior of the scene type.
-        count: how many of the scenes, from the first; null for all.
+        count: how many of the scenes, from the first; null for all, or for 12 fresh samples.
         prompt: what the whole scenes should hold, for priors that read prompts; null for anything.
         guidance: weight of classifier-free guidance, 0 for none; needs a prompt.
         num_steps: denoising steps per scene.
@@ -50,7 +54,13 @@ def load_prior_and_scenes(command: str, settings: InpaintingConfig) -> tuple[Sce
     from scene_envs.errors import InvalidInputError
 
     if not settings.scenes:
-        raise InvalidInputError(f"{command}: name a scene file, run or dataset, as in scenes=runs/mine")
+        if not settings.prior:
+            raise InvalidInputError(
+                f"{command}: name a scene file, run or dataset, as in scenes=runs/mine, or a prior= to sample from"
+            )
+        fresh = ScenePrior.load(settings.prior).to(settings.device)
+        count = _FRESH if settings.count is None else settings.count
+        return fresh, fresh.sample(count, num_steps=settings.num_steps, seed=settings.seed).to("cpu")
     batch = load_scenes(Path(settings.scenes), settings.count)
     prior = ScenePrior.load(settings.prior or batch.scene_type.name).to(settings.device)
     if prior.scene_type.name != batch.scene_type.name:

@@ -76,6 +76,13 @@ def run(settings: SearchKeys, run: Run) -> None:
             f"that is beyond objective_scale={metrics['objective_scale']:.4g}, where the search takes a scene for "
             "perfect and ends; raise objective_scale to search on"
         )
+    if metrics["below_zero"]:
+        low = 2 * metrics["search"]["objective"]
+        run.say(
+            "that is below 0, where the search tells no scenes apart, so that it was chance; shift the objective, as "
+            f"objective='{{name: normalised, reward: {metrics['objective']}, mean: {low:.4g}, std: {-1.1 * low:.4g}}}' "
+            "objective_scale=1"
+        )
     if metrics["stopped"] == "time":
         run.say(f"ended after max_seconds={search.max_seconds:g}; the same command with more time goes on")
     run.say(f"written to {run.directory}")

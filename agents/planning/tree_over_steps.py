@@ -1,0 +1,118 @@
+"""Diffusion tree sampling: a tree over the denoising steps of an inpainting, whose branches begin midway."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+from torch import Tensor
+
+from agents.planning.branches import Branches
+from agents.planning.ledger import Candidate, Ledger, PlanResult, Progress, Searchable, Steered
+from agents.planning.registry import PlannerSettings, check_at_least, register_planner
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import SceneBatch
+
+
+@dataclass(eq=False)
+class _Stop:
+    """A scene on its way; the root is noise."""
+
+    level: int
+    x: Tensor | None = None
+    parent: _Stop | None = None
+    children: list[_Stop] = field(default_factory=list)
+    visits: int = 0
+    total: float = 0.0
+
+    def back_up(self, value: float) -> None:
+        """Count a value here and at all stops before."""
+        node: _Stop | None = self
+        while node is not None:
+            node.visits, node.total, node = node.visits + 1, node.total + value, node.parent
+
+    def select(self, last: int, exploration: float, widening: float) -> _Stop:
+        """Where the next scenes branch off: a stop with fewer branches than its visits allow, from here on by UCB."""
+        node = self
+        while node.level < last and len(node.children) >= max(1.0, node.visits**widening):
+            weight = exploration * math.sqrt(math.log(max(1, node.visits)))
+            node = max(node.children, key=lambda stop: stop.total / stop.visits + weight / math.sqrt(stop.visits))
+        return node
+
+
+@register_planner("tree_over_steps")
+@dataclass(frozen=True)
+class TreeOverStepsPlanner(PlannerSettings):
+    """Diffusion tree sampling (Jain et al. 2025), in rounds of iterated repair.
+
+    The inpaintings of a state are a tree. Its nodes are scenes at a few stops on the way, its leaves finished scenes.
+    A round takes ``children`` new scenes from one node, chosen by UCB, each with noise of its own; the steps before
+    that node are not taken again. A node is worth the mean of the finished scenes below it and of its own promise.
+    After ``rounds`` rounds the best finished scene becomes the state unless it scores less; else the tree grows on.
+
+    Attributes:
+        children: scenes per round, one batch of the denoiser; null takes ``branching``.
+        stops: shares of the denoising steps at which scenes can be branched from.
+        rounds: rounds per state.
+        exploration: weight of the bound.
+        widening: a node of n visits has n^widening branches before its branches are searched.
+    """
+
+    name: str = "tree_over_steps"
+    widens = True
+    children: int | None = None
+    stops: tuple[float, ...] = (0.5, 0.7)
+    rounds: int = 3
+    exploration: float = 0.05
+    widening: float = 0.5
+
+    def __post_init__(self) -> None:
+        check_at_least(self, 1, "children", "rounds")
+        check_at_least(self, 0, "exploration", "widening")
+        if not self.stops or any(not 0 < a < b for a, b in zip(self.stops, [*self.stops[1:], 1.0], strict=True)):
+            raise InvalidInputError(f"planner {self.name}: stops={list(self.stops)} are no increasing shares, in 0..1")
+
+    def make(self, branching: int) -> TreeOverStepsPlanner:
+        """The planner."""
+        return replace(self, children=branching if self.children is None else self.children)
+
+    def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
+        """Spend up to ``budget`` expansions below the current state; one that begins midway counts as a whole one.
+
+        Raises:
+            InvalidInputError: the expansions of ``problem`` cannot be steered.
+        """
+        steered = Steered(problem, self.name)
+        ledger = Ledger(steered, budget, progress)
+        state, actions, best = ledger.root, ledger.actions(ledger.root), None
+        tree = _Stop(-1)
+        while ledger.left and actions:
+            for _ in range(self.rounds):
+                node = tree.select(len(self.stops) - 1, self.exploration, self.widening)
+                taken, actions = actions[: self.children or 1], actions[self.children or 1 :]
+                steered.steering = partial(self._branches, node)
+                for child in ledger.expand([(state, action) for action in taken]):
+                    _grow(node, child)
+                    if child.valid and (best is None or child.value > best.value):
+                        best = child
+            if best is not None and (state is ledger.root or best.value >= state.value) and ledger.actions(best):
+                state, actions, best, tree = best, ledger.actions(best), None, _Stop(-1)
+        return ledger.result()
+
+    def _branches(self, node: _Stop, pairs: Sequence[Any], values: Callable[[SceneBatch], Tensor]) -> Branches:
+        x = None if node.x is None else node.x.expand(len(pairs), *node.x.shape)
+        return Branches(self.stops, node.level, x, values)
+
+
+def _grow(node: _Stop, child: Candidate) -> None:
+    """Add the stops of a finished scene below ``node``, and its value to all of them."""
+    trace = getattr(child.state, "trace", None) or {}
+    for x, promise in zip(trace.get("x", ()), trace.get("promises", ()), strict=True):
+        node.children.append(_Stop(node.level + 1, x, node))
+        node = node.children[-1]
+        node.visits, node.total = 1, float(promise)
+    if child.valid:
+        node.back_up(child.value)

@@ -1,0 +1,202 @@
+"""Trees over denoising steps and gradient guidance: branches against whole chains, tilts against closed forms."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from agents.diffusion import GaussianProcess, Preconditioning, ResidualVariance, StepTable
+from agents.diffusion.schedules import make_schedule
+from agents.planning import GradientPlanner, GreedyPlanner, PlanResult, TreeOverStepsPlanner
+from agents.planning.branches import Branches
+from agents.planning.gradient import Guidance, overlap
+from agents.priors.testing import tiny_prior
+from rewards import RewardContext, RewardOutput
+from scene_envs.envs import SearchEnv
+from scene_envs.errors import InvalidInputError, SceneEnvsError
+from scene_envs.scene import CATEGORY, TRANSLATION, SceneBatch
+from tests.helpers.toy_tree import ToyTree, scrambled
+
+SLOTS = 12
+PROCESSES = pytest.mark.parametrize("process", ["mixed", "continuous"])
+
+
+def near_middle(batch: SceneBatch, context: RewardContext) -> RewardOutput:
+    """Half of the free objects within 20 cm of the middle, so that Φ stays below 1; the others are to blame."""
+    central = batch.is_free & (batch.translations[..., :2].norm(dim=-1) < 0.2)
+    return RewardOutput(0.5 * central.sum(-1).float(), object_flags={"feasible": central})
+
+
+def plan(planner: Any, process: str = "mixed", budget: int = 14) -> tuple[PlanResult, SearchEnv]:
+    """A plan from nothing but the prior; the environment counts denoiser evaluations."""
+    prior = tiny_prior(process=process)
+    env = SearchEnv(prior=prior, objective=near_middle, branching=50, num_steps=4, max_depth=50, slots=SLOTS)
+    env.reset(seed=1, options={"scene": SceneBatch.empty(prior.scene_type, 1, SLOTS)})
+    return planner.plan(env, budget), env
+
+
+# -- trees over steps -----------------------------------------------------------------------------
+
+
+@PROCESSES
+def test_branches_begin_midway_and_count_the_steps_they_take(process: str) -> None:
+    planner = TreeOverStepsPlanner(children=2, stops=(0.5,), rounds=2)
+    result, env = plan(planner, process)
+    assert len(result.values) == 14
+    assert result.curve == sorted(result.curve)
+    assert result.best_value == near_middle(env.scene(result.best_state), RewardContext()).value / (SLOTS - 1)
+    # of two rounds of one state the second begins at step 2 of 4
+    assert 14 * 2 < env.nfe < 14 * 4
+    again, _ = plan(planner, process)
+    assert again.values == result.values
+
+
+@PROCESSES
+def test_a_chain_goes_on_from_where_it_was_kept(process: str) -> None:
+    prior = tiny_prior(process=process)
+    batch = prior.sample(2, num_steps=3, slots=SLOTS)
+    mask = torch.zeros(2, SLOTS, dtype=torch.bool)
+    mask[:, 4:] = True
+
+    def values(scenes: SceneBatch) -> Tensor:
+        return scenes.counts.double()
+
+    whole = Branches((0.25, 0.75), -1, None, values)
+    final = prior.inpaint(batch, mask, num_steps=4, watch=whole)
+    torch.testing.assert_close(final.tensor, prior.inpaint(batch, mask, num_steps=4).tensor, atol=0, rtol=0)
+    kept = whole.trace(1)
+    assert kept["x"].shape[0] == len(kept["promises"]) == 2
+    # the last step is certain, so all that begins at it ends as the scene that was kept, whatever its noise
+    last = Branches((0.25, 0.75), 1, kept["x"][1].expand(2, -1, -1), values)
+    both = SceneBatch(batch.tensor[[1, 1]], batch.scene_type)
+    ends = prior.inpaint(both, mask, num_steps=4, watch=last, seed=7)
+    same = final.tensor[1].expand_as(ends.tensor)
+    if process == "mixed":
+        torch.testing.assert_close(ends.tensor, same, atol=1e-5, rtol=0)
+    else:  # what is kept is seen with noise, which differs
+        assert torch.equal(ends.tensor[:, :4], same[:, :4])
+    assert last.trace(0) == {}
+    early = prior.inpaint(both, mask, num_steps=4, watch=Branches((0.25,), 0, kept["x"][0].expand(2, -1, -1), values))
+    assert not torch.equal(early.tensor[0], early.tensor[1])  # noise of their own
+
+
+def test_later_rounds_take_the_better_half_finished_scene() -> None:
+    """Of what begins at the stops most begins below the better of the first scenes."""
+    begun: list[tuple[Tensor, Any]] = []
+
+    class Recorded(TreeOverStepsPlanner):
+        def _branches(self, node: Any, pairs: Any, values: Any) -> Branches:
+            if node.level >= 0:
+                begun.append((node.x, [stop.total / stop.visits for stop in node.parent.children]))
+                assert node.total / node.visits == max(begun[-1][1])
+            return super()._branches(node, pairs, values)
+
+    plan(Recorded(children=3, stops=(0.5,), rounds=2, exploration=0.0), budget=30)
+    assert begun
+
+
+@pytest.mark.parametrize("stops", [(), (0.0,), (0.5, 0.5), (0.7, 0.5), (1.0,)])
+def test_stops_are_increasing_shares(stops: tuple[float, ...]) -> None:
+    with pytest.raises(InvalidInputError, match="no increasing shares"):
+        TreeOverStepsPlanner(stops=stops)
+
+
+# -- gradient guidance ----------------------------------------------------------------------------
+
+
+def exact_chain(strength: float, residual: bool) -> Tensor:
+    """(20000, 1) samples of N(0.2, 0.5²) tilted by exp(strength x), by 50 steps of its exact denoiser."""
+    mean, std, count = 0.2, 0.5, 20_000
+    schedule = make_schedule("cosine", 1000)
+    process = GaussianProcess(schedule, "edm", Preconditioning(torch.tensor([mean]), torch.tensor([std])))
+    table = StepTable.spaced(1000, 50)
+    alpha, sigma = process.alpha, process.sigma
+    errors = (sigma * std) ** 2 / ((alpha * std) ** 2 + sigma**2)  # of the denoised value
+    grid = torch.arange(1, 1001)
+    known = ResidualVariance(grid, errors[1:, None]) if residual else None
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(count, 1, 1, generator=generator)
+    for step in range(len(table)):
+        t, s = int(table.timesteps[step]), int(table.previous[step])
+        gain = alpha[t] * std**2 / ((alpha[t] * std) ** 2 + sigma[t] ** 2)
+        x0 = mean + gain * (x - alpha[t] * mean)
+        moved, noise = process.posterior(x, x0, t, s, ResidualVariance(grid, errors[1:, None]).at(t))
+        weight, deviation = process.estimate(t, s, known)
+        x = moved + weight * deviation**2 * strength + noise * torch.randn(x.shape, generator=generator)
+    return x.flatten()
+
+
+@pytest.mark.parametrize("residual", [True, False])
+def test_a_tilted_normal_distribution_is_sampled_exactly(residual: bool) -> None:
+    x = exact_chain(strength=1.5, residual=residual)
+    assert float(x.mean()) == pytest.approx(0.2 + 1.5 * 0.5**2, abs=0.015)  # N(m + λ v, v)
+    assert float(x.std()) == pytest.approx(0.5, abs=0.02)
+
+
+@PROCESSES
+def test_guidance_moves_what_is_regenerated_and_nothing_else(process: str) -> None:
+    prior = tiny_prior(process=process)
+    batch = prior.sample(3, num_steps=3, slots=SLOTS)
+    mask = torch.zeros(3, SLOTS, dtype=torch.bool)
+    mask[:, 4:] = True
+
+    def up(batch: SceneBatch, translations: Tensor) -> Tensor:
+        return translations[..., 0].sum(-1)
+
+    plain = prior.inpaint(batch, mask, num_steps=4)
+    none = prior.inpaint(batch, mask, num_steps=4, guide=Guidance(up, 0.0, 0.0))
+    torch.testing.assert_close(none.tensor, plain.tensor, atol=0, rtol=0)
+    moved = prior.inpaint(batch, mask, num_steps=4, guide=Guidance(up, 100.0, 0.5))
+    assert torch.equal(moved.tensor[:, :4], batch.tensor[:, :4])
+    there = ~moved.is_empty & ~plain.is_empty & mask
+    assert bool((moved.translations[..., 0] > plain.translations[..., 0])[there].all())
+    far = prior.inpaint(batch, mask, num_steps=4, guide=Guidance(up, 1e12, 0.5))  # limited by the deviation
+    assert bool(torch.isfinite(far.tensor).all())
+
+
+@PROCESSES
+def test_without_strength_gradient_is_greedy_repair(process: str) -> None:
+    guided, env = plan(GradientPlanner(children=3, strength=0.0), process)
+    greedy, _ = plan(GreedyPlanner(children=3), process)
+    assert guided.values == greedy.values
+    assert env.nfe == 14 * 4
+
+
+def test_overlap_is_half_the_square_of_the_smaller_depth() -> None:
+    batch = SceneBatch.empty("dimsum_table", 1, 4)
+    cup = next(i for i, asset in enumerate(batch.scene_type.library) if i not in batch.scene_type.welded_categories)
+    rows = batch.tensor[0, 1:3]
+    rows[:, CATEGORY] = 0
+    rows[:, CATEGORY.start + cup] = 1
+    corners = torch.from_numpy(
+        __import__("scene_envs.assets.shapes", fromlist=["x"]).hull_of(batch.scene_type.library[cup].fine).vertices
+    )
+    radius, height = float(corners[:, :2].norm(dim=-1).amax()), float(corners[:, 2].amax() - corners[:, 2].amin())
+    depth = 0.1 * min(radius, height)
+    rows[:, TRANSLATION] = torch.tensor([[0.0, 0.0, 5.0], [2 * radius - depth, 0.0, 5.0]])  # far above the table
+    translations = batch.translations.clone().requires_grad_()
+    value = overlap(batch, translations)
+    assert float(value.detach()) == pytest.approx(-0.5 * (1e3 * depth) ** 2, rel=1e-3)
+    (gradient,) = torch.autograd.grad(value.sum(), translations)
+    assert gradient[0, 1:3, 0].tolist() == pytest.approx([-1e6 * depth, 1e6 * depth], rel=1e-3)  # apart
+    assert float(gradient[0, [0, 3]].abs().max()) == 0
+    rows[1, 0] = 2 * radius + 1e-3
+    assert float(overlap(batch, batch.translations)) == 0
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: GradientPlanner(weight="overlaps"), "overlap"),
+        (lambda: GradientPlanner(begin=1.0), "begin=1.0"),
+        (lambda: GradientPlanner(strength=float("nan")), "strength"),
+        (lambda: GradientPlanner().plan(ToyTree(scrambled), budget=5), "takes no steering="),
+        (lambda: TreeOverStepsPlanner().plan(ToyTree(scrambled), budget=5), "takes no steering="),
+    ],
+)
+def test_bad_arguments_name_themselves(make: Any, message: str) -> None:
+    with pytest.raises(SceneEnvsError, match=message):
+        make()
