@@ -19,6 +19,7 @@ from types import ModuleType
 from typing import Any
 
 from agents.cli.commands import COMMANDS, RENAMED
+from agents.cli.early_checks import check_early
 from agents.cli.keys import Sources, compose, format_rows, help_text, keys_of
 from agents.cli.sweep import expand_sweeps
 from agents.configuration.tree import config_text
@@ -145,18 +146,19 @@ def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str
         return DONE
     if not sweep:
         settings = compose(command, keys, named, sources)
-        _check(settings, allow_local, bool(shown))
+        _check(settings, allow_local, bool(shown), config_dir)
         return _run(command, module, settings, bool(shown))
     runs = [(compose(command, keys, variant, sources), label) for variant, label in expand_sweeps(named)]
     for settings, _ in runs:
-        _check(settings, allow_local, bool(shown))
+        _check(settings, allow_local, bool(shown), config_dir)
     return _run_all(command, module, runs, bool(shown))
 
 
-def _check(settings: Any, allow_local: bool, only_show: bool) -> None:
+def _check(settings: Any, allow_local: bool, only_show: bool, config_dir: str) -> None:
     """Refuse what needs no more than a look; ask before a file of the user's is run."""
     if only_show:
         return
+    check_early(settings, config_dir)
     for key in ("reward", "objective"):
         if "/" in (text := str(getattr(settings, key, ""))) or ".py:" in text:
             _ask_for_files(key, getattr(settings, key), allow_local)

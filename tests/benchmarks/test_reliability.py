@@ -1,8 +1,6 @@
 """A reduced form of the reliability benchmark: nothing lost, nothing different, nothing silent.
 
-Its trials that kill commands or let two write into one folder take minutes. Other tests ask the same: exact resume of
-killed runs in ``tests/post_training``, ``tests/pretraining`` and ``tests/datasets``, one writer per folder in
-``tests/core`` and ``tests/cli``.
+Kills are in ``test_reliability_kills.py``; SIGTERM, full disks and two writers are asked by tests of the packages.
 """
 
 from collections.abc import Callable

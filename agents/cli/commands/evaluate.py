@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from scene_envs.errors import InvalidInputError
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -68,13 +70,20 @@ class EvaluateConfig:
     device: str = "cpu"
     output: str = ""
 
+    def __post_init__(self) -> None:
+        if self.count < 2 or self.training_scenes < 1:
+            raise InvalidInputError(
+                f"an evaluation needs count >= 2 and training_scenes >= 1, got count={self.count} and "
+                f"training_scenes={self.training_scenes}"
+            )
+
 
 def run(settings: EvaluateConfig, run: Run) -> None:
     """Sample, measure group by group, tabulate."""
     from agents.evaluation.measures import EvaluationInputs, choose_measures, compute_measure
     from agents.evaluation.real_scenes import RealScenes
     from agents.priors.base import ScenePrior
-    from scene_envs.errors import InvalidInputError, MissingDependencyError
+    from scene_envs.errors import MissingDependencyError
     from scene_envs.files import write_text
     from scene_envs.physics import PhysicsPool
 
