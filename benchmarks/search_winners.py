@@ -77,8 +77,8 @@ def curve(options: argparse.Namespace) -> None:
         curves = [
             np.array(r["curve"] + [r["curve"][-1]] * (r["scenes"] - len(r["curve"])), dtype=float)
             for r in records
-            if (r["prior"], r["mask"], r["planner"]) == (options.prior, options.mask, planner)
-            and r["scenes"] == options.scenes
+            if (r["prior"], r["planner"], r["scenes"]) == (options.prior, planner, options.scenes)
+            and (r["mask"] == options.mask or planner == "best_of")  # best of N masks nothing
         ]
         if not curves:
             continue
