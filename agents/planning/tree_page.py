@@ -6,15 +6,19 @@ import heapq
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from agents.planning.tree_file import SearchRecord, TreeNode
 from scene_envs.files import finite, write_text
 from scene_envs.scene import SceneBatch
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 LONGEST_PATH = 60
 """Scenes of the best path that are shown; a longer path has some of its steps left out."""
@@ -73,7 +77,6 @@ def write_tree_page(
         metrics: what ``metrics.json`` holds.
         returned: the scene that the search gave, where it is no node: a planner may mend the best one in the end.
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
     from jinja2.utils import htmlsafe_json_dumps
     from markupsafe import Markup
 
@@ -105,11 +108,8 @@ def write_tree_page(
         "baseline": _baseline(metrics),
         "nfe": record.settings["nfe_per_scene"],
     }
-    environment = Environment(
-        loader=PackageLoader("agents", "planning"), autoescape=True, undefined=StrictUndefined, trim_blocks=True
-    )
     style = "".join(_text(*place) for place in (("agents.utils", "report.css"), ("agents.planning", "tree.css")))
-    page = environment.get_template("tree.html").render(
+    page = _template().render(
         style=Markup(style),
         script=Markup(_text("agents.planning", "tree.js")),
         data=htmlsafe_json_dumps(finite(data), separators=(",", ":"), allow_nan=False),
@@ -127,6 +127,15 @@ def write_tree_page(
     )
     write_text(path, page)
     return path
+
+
+@cache
+def _template() -> Template:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    loader = PackageLoader("agents", "planning")
+    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    return environment.get_template("tree.html")
 
 
 def _cards(record: SearchRecord, shown: Sequence[int], way: Sequence[int]) -> list[Card]:

@@ -5,11 +5,15 @@ from __future__ import annotations
 import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from agents.post_training.run_files import write_text
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 
 @dataclass(frozen=True)
@@ -88,14 +92,20 @@ def render_page(page: Page) -> str:
     >>> "<h1>a &lt; b</h1>" in render_page(Page("a < b", ""))
     True
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
+
+    style = resources.files("agents.utils").joinpath("report.css").read_text(encoding="utf-8")
+    return _template().render(page=page, style=Markup(style))
+
+
+@cache
+def _template() -> Template:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
 
     loader = PackageLoader("agents", "post_training")
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, keep_trailing_newline=True)
     environment.filters["png"] = _png
-    style = resources.files("agents.utils").joinpath("report.css").read_text(encoding="utf-8")
-    return environment.get_template("report.html").render(page=page, style=Markup(style))
+    return environment.get_template("report.html")
 
 
 def _png(path: Path) -> str:

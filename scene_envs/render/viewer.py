@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -22,6 +22,9 @@ from scene_envs.render.stage import vertex_colors
 from scene_envs.rotations import matrix_to_quaternion
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 _SCRIPTS = ("math.js", "decode.js", "shaders.js", "targets.js", "renderer.js", "controls.js", "app.js")
 _FOV = 28.0
@@ -73,18 +76,24 @@ def viewer_page(batch: SceneBatch, *, captions: Sequence[str] | None = None, tit
 
 def _page(title: str, data: dict[str, Any]) -> str:
     """The template with everything filled in; nothing in the data can end the element that holds it."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
     from jinja2.utils import htmlsafe_json_dumps
     from markupsafe import Markup
 
-    loader = PackageLoader("scene_envs.render", "web")
-    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, keep_trailing_newline=True)
-    return environment.get_template("viewer.html").render(
+    return _template().render(
         title=title,
         style=Markup(_web("viewer.css")),
         scripts=Markup("\n".join(_web(name) for name in _SCRIPTS)),
         data=htmlsafe_json_dumps(data, separators=(",", ":"), allow_nan=False),
     )
+
+
+@cache
+def _template() -> Template:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    loader = PackageLoader("scene_envs.render", "web")
+    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, keep_trailing_newline=True)
+    return environment.get_template("viewer.html")
 
 
 @cache
