@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from functools import partialmethod
 from pathlib import Path
 from typing import Any
 
@@ -47,3 +49,15 @@ def blank_curves(monkeypatch: pytest.MonkeyPatch) -> None:
         Image.new("L", (1, 1)).save(path)
 
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", blank)
+
+
+@pytest.fixture(scope="module")
+def few_residual_levels() -> Iterator[None]:
+    """After pretraining, the error of the denoiser is measured at 3 timesteps and not at 40, as long as a small run."""
+    from agents.priors.continuous import ContinuousPrior
+    from agents.priors.mixed_training import TrainableMixedPrior
+
+    with pytest.MonkeyPatch.context() as patch:
+        for kind in (ContinuousPrior, TrainableMixedPrior):
+            patch.setattr(kind, "fit_residual", partialmethod(kind.fit_residual, levels=3))
+        yield

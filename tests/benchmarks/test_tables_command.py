@@ -16,7 +16,7 @@ from scene_envs.datasets import generate
 
 pytest.importorskip("pybullet")
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_residual_levels")]
 ROWS = ("flux_mixed", "flux_continuous")
 
 

@@ -25,6 +25,7 @@ def files(folder) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
+@pytest.mark.slow
 def test_sample_then_project(prior, tmp_path, capsys):
     drawn, ready = tmp_path / "drawn", tmp_path / "ready"
     small = ["count=3", "num_steps=2", "workers=0", "pictures=1"]
@@ -51,6 +52,7 @@ def test_the_same_seed_draws_the_same_scenes(prior, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_residual_levels")
 def test_generate_pretrain_post_train_and_sample_the_result(tmp_path, capsys):
     data, trained, steered = (tmp_path / name for name in ("data", "trained", "steered"))
     assert main(["generate", "count=8", "shard_size=8", "workers=0", "progress=false", f"output={data}"]) == 0
@@ -98,6 +100,7 @@ def test_search_writes_its_pictures_and_curve(prior, tmp_path, capsys):
     assert "by evolution with" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_listings_and_the_contract_check(capsys):
     assert main(["priors"]) == main(["rewards"]) == main(["check-reward", "reward=object_count"]) == 0
     printed = capsys.readouterr().out

@@ -61,6 +61,7 @@ def test_every_figure_stands_beside_its_floor(prior: Path, data: Path, tmp_path:
     assert len(SceneBatch.load(tmp_path / "scenes.safetensors")) == 3
 
 
+@pytest.mark.slow
 def test_what_is_measured_already_is_not_measured_again(
     prior: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

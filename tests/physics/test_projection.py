@@ -82,8 +82,8 @@ def heap(name: str, kind: str, asset: str | None = None) -> SceneBatch:
     return SceneBatch.from_parts(translations, rotations, categories, scene_type)
 
 
-def check_result(batch: SceneBatch) -> bool:
-    """Finite, an honest residual, what is fixed in place, what was inside inside, and the same again.
+def check_result(batch: SceneBatch, *, again: bool) -> bool:
+    """Finite, an honest residual, what is fixed in place, what was inside inside, and the same ``again`` if asked.
 
     Returns:
         Whether no overlap is left.
@@ -98,7 +98,8 @@ def check_result(batch: SceneBatch) -> bool:
     assert torch.equal(result.batch.translations[fixed], batch.translations[fixed])
     torch.testing.assert_close(result.batch.rotations, batch.rotations, atol=1e-5, rtol=0)
     assert bool((result.batch.in_workspace | ~batch.in_workspace)[batch.is_free].all())
-    assert torch.equal(project(batch).batch.translations, result.batch.translations)
+    if again:
+        assert torch.equal(project(batch).batch.translations, result.batch.translations)
     return bool(result.converged[0])
 
 
@@ -112,8 +113,12 @@ def check_result(batch: SceneBatch) -> bool:
     ],
 )
 def test_heaps_come_back_finite_and_honest(name: str, kind: str) -> None:
-    """At one point, inside or outside of the workspace, every type has room."""
-    assert check_result(heap(name, kind)) or kind not in ("point", "outside")
+    """At one point, inside or outside of the workspace, every type has room.
+
+    The same again is asked of each type once, and of each kind of heap of one type; of ordinary scenes it is elsewhere.
+    """
+    again = kind == "outside" or name == TYPE
+    assert check_result(heap(name, kind), again=again) or kind not in ("point", "outside")
 
 
 @pytest.mark.slow
@@ -128,7 +133,7 @@ def test_heaps_come_back_finite_and_honest(name: str, kind: str) -> None:
 )
 def test_heaps_of_one_asset_come_back_finite_and_honest(name: str, asset: str) -> None:
     """Sixty fruit bowls have no room in the shelf; all others have."""
-    assert check_result(heap(name, "point", asset)) == (name != "pantry_shelf")
+    assert check_result(heap(name, "point", asset), again=name == TYPE) == (name != "pantry_shelf")
 
 
 @pytest.mark.slow
@@ -288,6 +293,7 @@ def test_fruit_pushed_through_the_wall_of_its_bowl_stays_in_the_bowl() -> None:
     assert float(result.moved[0].norm()) < 0.03
 
 
+@pytest.mark.slow
 def test_more_volume_than_room_gives_the_best_effort_and_says_so() -> None:
     """Forty board games of 0.5 m x 0.25 m x 55 mm; the shelf holds four on each of three boards and some on top."""
     generator = np.random.default_rng(0)

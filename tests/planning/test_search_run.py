@@ -79,6 +79,7 @@ def test_the_same_seed_gives_the_same_tree_and_another_seed_another(run: Run) ->
     assert not torch.equal(other.best.tensor, run.outcome.best.tensor)
 
 
+@pytest.mark.slow
 def test_a_scene_depends_on_its_path_and_not_on_the_order_of_the_search(run: Run) -> None:
     settings = {key: SETTINGS[key] for key in ("branching", "num_steps", "max_depth", "mask")}
     settings |= {"objective": central_objects, "prior": run.prior}

@@ -167,6 +167,7 @@ def test_a_run_that_an_earlier_version_began_is_refused_in_plain_words(tmp_path:
         post_train(small_config(tmp_path), prior=tiny_prior())
 
 
+@pytest.mark.slow
 def test_full_disk_leaves_the_previous_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     save = torch.save
 
@@ -282,6 +283,7 @@ def test_more_slots_than_trained(tmp_path: Path) -> None:
     assert result.history[0]["objects"] <= 40
 
 
+@pytest.mark.slow
 def test_credit_per_object_needs_such_a_reward(tmp_path: Path) -> None:
     def plain(batch: SceneBatch, context: RewardContext) -> RewardOutput:
         return RewardOutput(count_objects(batch, context).value)

@@ -24,6 +24,8 @@ from scene_envs.errors import CorruptFileError, InvalidInputError, TrainingError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch
 
+pytestmark = pytest.mark.usefixtures("few_residual_levels")
+
 
 @pytest.fixture(scope="module")
 def raw() -> torch.Tensor:

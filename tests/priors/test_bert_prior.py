@@ -31,6 +31,8 @@ from tests.helpers.small_bert import write_bert
 
 pytest.importorskip("transformers")
 
+pytestmark = pytest.mark.usefixtures("few_residual_levels")
+
 PROMPTS = ["A scene with 12 objects.", "A scene with two cups and a table."]
 
 
