@@ -57,8 +57,10 @@ def package_prior(
     measures = {} if evaluation is None else read_measures(evaluation)
     prior = ScenePrior.load(source)
     told = {"data": data, "license": license or _license(prior.card), "machine": machine, "limits": limits}
-    trained = {} if isinstance(source, ScenePrior) else _training_of(Path(source))
     kept = prior.card
+    # the run of a post-trained prior says how it was steered; its card says how it was trained before
+    steered = bool(kept.get("post_training"))
+    trained = {} if isinstance(source, ScenePrior) or steered else _training_of(Path(source))
     prior.card = {**kept, **trained, **{key: text for key, text in told.items() if text}}
     if measures:
         prior.card["measures"] = measures
