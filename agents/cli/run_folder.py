@@ -158,7 +158,8 @@ class Run:
                     with suppress(OSError):
                         path.unlink()
                 with suppress(OSError):
-                    self._append(f"failed: {error or kind}")
+                    ended = isinstance(error, KeyboardInterrupt)
+                    self._append("ended by a signal" if ended else f"failed: {str(error) or type(error).__name__}")
         finally:
             for handler in self._handlers:
                 with suppress(OSError):
