@@ -35,7 +35,7 @@ def check_early(settings: Any, config_dir: str = "") -> None:
         _check_prior(prior)
     for key in ("reward", "objective"):
         _check_reward(getattr(settings, key, None), config_dir)
-    if (scenes := getattr(settings, "scenes", None)) and isinstance(scenes, str):
+    if (scenes := getattr(settings, "scenes", None)) and isinstance(scenes, str) and not prior:
         find_scenes(Path(scenes))
 
 

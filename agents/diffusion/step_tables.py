@@ -64,22 +64,23 @@ class StepTable:
 
     @classmethod
     def gradual(cls, masked: Tensor, slots: int, num_steps: int) -> StepTable:
-        """``num_steps`` steps of which the first half decide about one slot each; the rest is evenly spaced.
+        """``num_steps`` steps of which those beyond 25, at most half, come first and decide about one slot each.
 
         Slots that are unmasked in one step do not know of each other's categories. What the first of them hold says
-        what kind of scene it will be, so they are decided one after the other.
+        what kind of scene it will be, so they are decided one after the other. The other steps are evenly spaced.
 
         Args:
             masked: (T + 1,) share of masked slots at each timestep, non-decreasing, as of an absorbing chain.
             slots: N of a scene.
             num_steps: S, from 1 to T.
 
-        >>> StepTable.gradual(torch.linspace(0, 1, 1001), 100, 12).timesteps.tolist()
-        [1000, 990, 980, 970, 960, 823, 686, 549, 412, 275, 138, 1]
+        >>> StepTable.gradual(torch.linspace(0, 1, 1001), 100, 30).timesteps[:8].tolist()
+        [1000, 990, 980, 971, 961, 951, 911, 872]
         """
         num_timesteps = len(masked) - 1
         even = cls.spaced(num_timesteps, num_steps)
-        shares = 1.0 - torch.arange(num_steps // 2 + 1, dtype=torch.float64) / slots
+        single = max(0, min(num_steps // 2, num_steps - 25))
+        shares = 1.0 - torch.arange(single + 1, dtype=torch.float64) / slots
         first = torch.searchsorted(masked.double().cpu(), shares.clamp(min=0.0))  # the earliest level with that share
         first = first[(first >= even.timesteps[: len(first)])].unique().flip(0)
         rest = num_steps - len(first)

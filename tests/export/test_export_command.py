@@ -86,11 +86,11 @@ def test_sample_exports_what_it_made_ready(prior, tmp_path):
     ("words", "message"),
     [
         (["export"], "name either a scene file"),
-        (["export", "scenes=a", "prior=b"], "name either a scene file"),
+        (["export", "scenes=a", "prior=dimsum_table"], "name either a scene file"),
         (["export", "scenes=nowhere.safetensors"], "scenes='nowhere.safetensors': no scene file"),
         (["export", "scenes=OUT/..", "formats=npz"], "no parquet"),
-        (["export", "scenes=a", "formats=mjfc"], "did you mean 'mjcf'?"),
-        (["export", "scenes=a", "count=0"], "count must be at least 1"),
+        (["export", "scenes=OUT", "formats=mjfc"], "did you mean 'mjcf'?"),
+        (["export", "scenes=OUT", "count=0"], "count must be at least 1"),
         (["sample", "export=[drake, urfd]"], "did you mean 'urdf'?"),
     ],
 )
