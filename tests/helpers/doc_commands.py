@@ -60,8 +60,8 @@ def _keys(name: str) -> set[str]:
     """The keys of a command or of a program, and the names of its groups."""
     if "." in name:
         module = import_module(f"{name}.__main__")
-        if hasattr(module, "COUNTS"):  # each key says how often
-            return set(module.COUNTS)
+        if hasattr(module, "PARTS"):  # each key says how often
+            return {*module.PARTS, "rows", "seed"}
     else:
         module = import_module(f"agents.cli.commands.{name.replace('-', '_')}")
     keys = {key.name for key in describe_fields(keys_of(module))}
