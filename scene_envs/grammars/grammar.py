@@ -92,11 +92,10 @@ class Grammar:
             if poses is not None:
                 self._write(scene, poses)
                 return
-            self.reasons["no room"] += 1
             without_room += 1
         raise InvalidInputError(
             f"grammar {self.name!r} made no scene in {structures} structures; "
-            f"most frequent reasons: {dict(self.reasons.most_common(3))}"
+            f"most frequent reasons: {', '.join(f'{why} ({count})' for why, count in self.reasons.most_common(3))}"
         )
 
     def _place(self, towers: Sequence[Sequence[Tower]], rng: np.random.Generator) -> list[Pose] | None:

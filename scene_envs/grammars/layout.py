@@ -91,12 +91,22 @@ class Layout:
     ) -> list[Pose] | None:
         free = FreeSurface(surface.region)
         poses: list[Pose] = []
-        for tower in towers:
+        for count, tower in enumerate(towers):
+            noted = self.reasons.total()
             placed = self._add(free, surface, tower, frame, height, rng)
             if placed is None:
+                if self.reasons.total() == noted:  # nothing on it or in it was the cause
+                    self._note_failure(tower, towers[:count])
                 return None
             poses += placed
         return poses
+
+    def _note_failure(self, tower: Tower, standing: Sequence[Tower]) -> None:
+        """Count that ``tower`` has no room, and what stands on its surface most."""
+        name = tower.assets[0] if tower.assets else "what stands on a fixed object"
+        others = Counter(other.assets[0] for other in standing if other.assets).most_common(1)
+        where = f"beside {others[0][0]!r}" if others else "on its empty surface"
+        self.reasons[f"no room for {name!r} {where}"] += 1
 
     def _add(
         self, free: FreeSurface, surface: Surface, tower: Tower, frame: Frame, height: float, rng: np.random.Generator

@@ -130,5 +130,5 @@ def test_an_unknown_grammar_offers_the_nearest_name() -> None:
 def test_a_grammar_that_cannot_be_met_says_so() -> None:
     crowd = Surface([Group(*[Object("teacup", HERE)] * 5)], Region(0.05, 0.05), {"teacup": 0.07}, {"teacup": 0.07})
     grammar = Grammar("crowd", get_scene_type("dimsum_table"), [crowd])
-    with pytest.raises(InvalidInputError, match="no room"):
+    with pytest.raises(InvalidInputError, match=r"no room for 'teacup' beside 'teacup' \(\d+\)"):
         grammar.sample(np.random.default_rng(0))
