@@ -7,8 +7,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from agents.cli.commands.scenes import find_scenes
 from agents.configuration.compose import group_options
+from agents.utils.scene_sources import find_scenes
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.files import exists
 from scene_envs.plugins import plugin_entry_points

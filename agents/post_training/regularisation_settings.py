@@ -22,6 +22,9 @@ class RegularisationSettings:
         batch_size: real scenes per update.
         scenes: ``grammar``, or the directory of a dataset.
         bank_size: how many real scenes are drawn (grammar) or read (dataset), the held-out ones included.
+        replay: scenes that the pretraining loss sees beside the real ones, such as the winners of a search: the folder
+            of a run, a scene file or a dataset; null for none.
+        replay_share: of the scenes of each batch of the pretraining loss, if there is a replay.
     """
 
     weight: float | None = None
@@ -30,9 +33,13 @@ class RegularisationSettings:
     batch_size: int = 48
     scenes: str = "grammar"
     bank_size: int = 4096
+    replay: str | None = None
+    replay_share: float = 0.5
 
     def __post_init__(self) -> None:
         at_least(self, 1, "batch_size")
+        if not 0 < self.replay_share <= 1:
+            raise InvalidInputError(f"regularisation.replay_share={self.replay_share} must be in (0, 1]")
         if self.weight is not None and not self.weight >= 0:
             raise InvalidInputError(f"regularisation.weight={self.weight} must not be negative")
         if self.kl is not None and not self.kl >= 0:

@@ -20,6 +20,7 @@ CHECKPOINT_NAME = "checkpoint.pt"
 LOG_NAME = "log.csv"
 METRICS_NAME = "metrics.json"
 SCENES_NAME = "real_scenes.safetensors"
+REPLAY_NAME = "replay.safetensors"
 
 
 def write_text(path: Path, text: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +11,10 @@ from torch import Generator, Tensor
 
 from agents.post_training.config import RegularisationSettings
 from agents.post_training.prompts import PROMPTS_NAME, PromptSets, save_prompts
-from agents.post_training.run_files import SCENES_NAME, writing
+from agents.post_training.run_files import REPLAY_NAME, SCENES_NAME, writing
 from agents.priors.base import ScenePrior
 from agents.utils.process_group import ProcessGroup
+from agents.utils.scene_sources import find_scenes, load_scenes
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
@@ -29,11 +30,15 @@ class SceneBank:
         train: (M, N, D) for the regularisation.
         heldout: (K, N, D) for the guard.
         prompts: all prompts of scene i of both, the held-out ones being last; None when they are not asked for.
+        replay: (R, N, D) further scenes for the regularisation; None for none.
+        replay_share: of a batch that they take.
     """
 
     train: Tensor
     heldout: Tensor
     prompts: PromptSets | None = None
+    replay: Tensor | None = None
+    replay_share: float = 0.0
 
     @classmethod
     def split(cls, x0: Tensor, heldout: int, prompts: PromptSets | None = None) -> SceneBank:
@@ -42,20 +47,30 @@ class SceneBank:
             raise InvalidInputError(f"{len(x0)} real scenes cannot spare {heldout} for the guard; give more scenes")
         return cls(x0[:-heldout], x0[-heldout:], prompts)
 
+    def with_replay(self, scenes: Tensor, share: float) -> SceneBank:
+        """The same bank with ``scenes`` (R, N, D) as a share of each batch."""
+        return replace(self, replay=scenes.to(self.train.device), replay_share=share)
+
     def batch(self, count: int, generator: Generator) -> tuple[Tensor, list[str] | None]:
         """(count, N, D) training scenes, drawn with replacement, and one of each one's prompts.
 
-        As in pretraining, the prompt is withheld (``""``) from one scene in ten.
+        As in pretraining, the prompt is withheld (``""``) from one scene in ten. Replayed scenes come last and have no
+        prompt.
         """
         index = torch.randint(len(self.train), (count,), generator=generator)
-        if self.prompts is None:
-            return self.train[index], None
-        choice, withheld = torch.rand(2, count, generator=generator).tolist()
-        texts = [
-            "" if drop < _WITHHELD else (group := self.prompts(i))[int(pick * len(group))]
-            for i, pick, drop in zip(index.tolist(), choice, withheld, strict=True)
-        ]
-        return self.train[index], texts
+        x0, texts = self.train[index], None
+        if self.prompts is not None:
+            choice, withheld = torch.rand(2, count, generator=generator).tolist()
+            texts = [
+                "" if drop < _WITHHELD else (group := self.prompts(i))[int(pick * len(group))]
+                for i, pick, drop in zip(index.tolist(), choice, withheld, strict=True)
+            ]
+        if self.replay is not None:
+            replayed = round(self.replay_share * count)
+            chosen = torch.randint(len(self.replay), (replayed,), generator=generator)
+            x0 = torch.cat([x0[: count - replayed], self.replay[chosen]])
+            texts = None if texts is None else [*texts[: count - replayed], *[""] * replayed]
+        return x0, texts
 
     def heldout_prompts(self) -> list[str] | None:
         """One prompt of each held-out scene, of all kinds in turn; None when they are not asked for."""
@@ -85,6 +100,43 @@ def kept_scenes(
             writing(f"their prompts {str(texts)!r}", lambda: save_prompts(texts, found))
     processes.wait()
     return SceneBatch.load(path)
+
+
+def kept_replay(
+    directory: Path, prior: ScenePrior, settings: RegularisationSettings, slots: int, *, reuse: bool
+) -> Tensor | None:
+    """(R, N, D) normalised scenes that ``settings.replay`` names, kept in the run's folder; None without a replay.
+
+    Args:
+        directory: of the run.
+        prior: whose scene type the scenes must have.
+        settings: that name them.
+        slots: of the real scenes, which these are filled up to.
+        reuse: take those that are there, as a resumed run does.
+
+    Raises:
+        InvalidInputError: nothing is there, no scene, another scene type, or more objects than slots.
+    """
+    path, processes = directory / REPLAY_NAME, ProcessGroup.current()
+    if settings.replay is None:
+        return None
+    if processes.is_first and not (reuse and path.exists()):
+        batch = load_scenes(find_scenes(Path(settings.replay), "regularisation.replay"))
+        if batch.scene_type != prior.scene_type:
+            raise InvalidInputError(
+                f"regularisation.replay={settings.replay!r} holds scenes of {batch.scene_type.name}; "
+                f"give scenes of the prior's type, {prior.scene_type.name}"
+            )
+        if not len(batch):
+            raise InvalidInputError(f"regularisation.replay={settings.replay!r} holds no scene")
+        if batch.tensor.shape[1] > slots:
+            raise InvalidInputError(
+                f"regularisation.replay={settings.replay!r} has {batch.tensor.shape[1]} slots per scene, more than the "
+                f"{slots} of the run; give slots={batch.tensor.shape[1]}"
+            )
+        writing(f"the replayed scenes {str(path)!r}", lambda: batch.with_slots(slots).save(path))
+    processes.wait()
+    return prior.encode(SceneBatch.load(path))
 
 
 def real_scenes(

@@ -15,10 +15,10 @@ import pytest
 import torch
 
 from agents.cli import main
-from agents.cli.commands.scenes import load_scenes
 from agents.planning import PlanResult, Session, list_planners, run_search
 from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
+from agents.utils.scene_sources import load_scenes
 from rewards import RewardContext, RewardOutput, register_reward
 from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError
 from scene_envs.scene import SceneBatch

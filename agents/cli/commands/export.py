@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.cli.commands.scenes import load_scenes, make_ready
+from agents.cli.commands.scenes import make_ready
+from agents.utils.scene_sources import load_scenes
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from agents.cli.commands.scenes import draw_scenes, load_scenes
+from agents.cli.commands.scenes import draw_scenes
+from agents.utils.scene_sources import load_scenes
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.cli.commands.scenes import find_scenes
 from agents.configuration.fields import named
+from agents.utils.scene_sources import find_scenes
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
