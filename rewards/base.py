@@ -63,7 +63,8 @@ class Reward(Protocol):
 
     A scene scores the same alone and in any batch, unless the reward says otherwise by an attribute
     ``depends_on_batch`` that is True (see :func:`depends_on_batch`). It may declare the largest value it gives by an
-    attribute ``maximum`` (see :func:`declared_maximum`), which searches take for their scale.
+    attribute ``maximum`` (see :func:`declared_maximum`), which searches take for their scale. A mean over the objects
+    that gives credit per object says so by ``averages_objects = True`` (see :func:`averages_objects`).
     """
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput: ...
@@ -76,6 +77,18 @@ def depends_on_batch(*rewards: object) -> bool:
     False
     """
     return any(bool(getattr(reward, "depends_on_batch", False)) for reward in rewards)
+
+
+def averages_objects(*rewards: object) -> bool:
+    """Whether each of ``rewards`` is a mean over the objects of a scene, not a sum.
+
+    In a sum an empty slot contributes the 0 that its credit says. In a mean it contributes nothing: neither its
+    presence nor its absence is worth 0, so an empty slot has no credit at all.
+
+    >>> averages_objects(lambda batch: batch.counts)
+    False
+    """
+    return all(bool(getattr(reward, "averages_objects", False)) for reward in rewards)
 
 
 def declared_maximum(reward: object, slots: int, free_slots: int) -> float | None:

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from rewards.base import Reward, RewardContext, RewardOutput, declared_maximum, depends_on_batch
+from rewards.base import Reward, RewardContext, RewardOutput, averages_objects, declared_maximum, depends_on_batch
 from rewards.evaluation import evaluate_reward
 from rewards.registry import register_reward, resolve_reward, reward_name
 from scene_envs.errors import InvalidInputError
@@ -44,6 +44,7 @@ class WeightedSum:
         if len(self.weights) != len(self.rewards):
             raise InvalidInputError(f"weighted_sum: {len(self.rewards)} rewards need as many weights, got {weights!r}")
         self.depends_on_batch = depends_on_batch(*self.rewards)
+        self.averages_objects = averages_objects(*self.rewards)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score every part and add up."""
@@ -116,6 +117,11 @@ class Gate:
         """Whether ``reward`` or ``condition`` does."""
         return depends_on_batch(self.reward, self.condition)
 
+    @property
+    def averages_objects(self) -> bool:
+        """Whether ``reward`` does."""
+        return averages_objects(self.reward)
+
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score both; credit per object is that of ``reward`` where the gate is open, else 0."""
         outputs = _score_parts((self.reward, self.condition), batch, context)
@@ -156,6 +162,11 @@ class Clip:
     def depends_on_batch(self) -> bool:
         """Whether ``reward`` does."""
         return depends_on_batch(self.reward)
+
+    @property
+    def averages_objects(self) -> bool:
+        """Whether ``reward`` does."""
+        return averages_objects(self.reward)
 
     def maximum(self, slots: int, free_slots: int) -> float | None:
         """``high``, or the largest value of the reward where that is less."""

@@ -27,6 +27,7 @@ class FeasibleShare(FeasibleObjects):
     """
 
     name: ClassVar[str] = "feasible_share"
+    averages_objects: ClassVar[bool] = True
 
     def maximum(self, slots: int, free_slots: int) -> float:
         """The largest value: all are feasible."""

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from rewards.base import RewardContext, RewardOutput
+from rewards.base import RewardContext, RewardOutput, averages_objects, depends_on_batch
 from rewards.local_files import allowed_files, is_local, names_in
 from rewards.registry import (
     RewardInfo,
@@ -71,7 +71,7 @@ class IsolatedReward:
             raise InvalidInputError(f"only a reward given by name or as a mapping can be isolated, got {reward!r}")
         check_limits(timeout, memory)
         self.name = self.__name__ = reward_name(reward)
-        self.depends_on_batch = False
+        self.depends_on_batch = self.averages_objects = False
         self.seed = seed
         self.timeout, self.memory, self.workers = timeout, memory, workers
         self._reward = reward
@@ -114,7 +114,7 @@ class IsolatedReward:
             self._worker = _Worker(self.name, self.timeout, self.memory)
             try:
                 message = ("make", self._reward, allowed_targets(), allowed_files(), self.workers)
-                self.depends_on_batch = bool(self._worker.ask(message, self.timeout))
+                self.depends_on_batch, self.averages_objects = map(bool, self._worker.ask(message, self.timeout))
             except BaseException:
                 self.close()
                 raise
@@ -132,7 +132,8 @@ class SeededReward:
     def __init__(self, reward: Any, seed: int) -> None:
         self.reward = resolve_reward(reward)
         self.name = reward_name(self.reward)
-        self.depends_on_batch = bool(getattr(self.reward, "depends_on_batch", False))
+        self.depends_on_batch = depends_on_batch(self.reward)
+        self.averages_objects = averages_objects(self.reward)
         self.seed = seed
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import torch
 
-from rewards.base import RewardContext, RewardOutput, depends_on_batch
+from rewards.base import RewardContext, RewardOutput, averages_objects, depends_on_batch
 from rewards.evaluation import evaluate_reward
 from rewards.registry import register_reward, resolve_reward, reward_name
 from scene_envs.errors import InvalidInputError
@@ -47,6 +47,11 @@ class Normalised:
     def depends_on_batch(self) -> bool:
         """True unless mean and std are both given and ``reward`` does not depend on the batch either."""
         return self.mean is None or self.std is None or depends_on_batch(self.reward)
+
+    @property
+    def averages_objects(self) -> bool:
+        """Whether ``reward`` does."""
+        return averages_objects(self.reward)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score and normalise. Terms: the value before, under the reward's name, and the reward's own terms.

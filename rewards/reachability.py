@@ -38,6 +38,7 @@ class Reachability:
     """
 
     name: ClassVar[str] = "reachability"
+    averages_objects: ClassVar[bool] = True
     sides: str | Sequence[str] = SIDES
     opening: float = 0.08
     finger_length: float = 0.045

@@ -31,6 +31,7 @@ class Stability:
     """
 
     name: ClassVar[str] = "stability"
+    averages_objects: ClassVar[bool] = True
     scale: float = 0.01
     scale_rotation: float = 0.1
     max_penetration: float = 1e-3

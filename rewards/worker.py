@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from rewards.base import RewardContext, declared_maximum, depends_on_batch
+from rewards.base import RewardContext, averages_objects, declared_maximum, depends_on_batch
 from rewards.evaluation import describe_error, evaluate_reward
 from rewards.isolation import packed
 from rewards.local_files import allow_local_rewards
@@ -67,15 +67,15 @@ class _Answers:
         self.reward: Any = None
         self.pool: PhysicsPool | None = None
 
-    def make(self, reward: Any, targets: list[str], files: list[Any], workers: int) -> bool:
-        """Make the reward; returns whether it depends on the batch."""
+    def make(self, reward: Any, targets: list[str], files: list[Any], workers: int) -> tuple[bool, bool]:
+        """Make the reward; returns whether it depends on the batch, and whether it averages objects."""
         for target in targets:
             allow_reward_targets(target)
         for file in files:
             allow_local_rewards(file)
         self.reward = resolve_reward(reward)
         self.pool = PhysicsPool(workers=workers) if workers else None
-        return depends_on_batch(self.reward)
+        return depends_on_batch(self.reward), averages_objects(self.reward)
 
     def maximum(self, slots: int, free_slots: int) -> float | None:
         """The largest value that the reward declares."""

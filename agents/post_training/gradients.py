@@ -208,6 +208,8 @@ def gradient_norm(parameters: Iterable[nn.Parameter]) -> float:
 def credited_reward(rollout: Rollout, credit: str) -> tuple[Tensor, Tensor]:
     """Rewards and their validity, (B,) for credit ``"scene"`` and (B, N) for ``"object"``; ``"auto"`` is one of them.
 
+    Welded slots have no credit, nor have the empty slots of a reward that is a mean over the objects.
+
     Raises:
         InvalidInputError: credit per object is asked of a reward that has no ``per_object``.
     """
@@ -217,4 +219,6 @@ def credited_reward(rollout: Rollout, credit: str) -> tuple[Tensor, Tensor]:
         raise InvalidInputError("credit='object' needs a reward with per_object values; this one scores scenes only")
     free = torch.ones(rollout.per_object.shape, dtype=torch.bool, device=rollout.per_object.device)
     free[:, : len(rollout.batch.scene_type.fixed)] = False  # welded slots are not drawn
+    if rollout.averages:
+        free &= ~rollout.batch.is_empty.to(free.device)
     return rollout.per_object.float(), free & rollout.valid.unsqueeze(-1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from copy import deepcopy
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -26,7 +27,7 @@ from agents.priors.prompt_validation import no_text
 from agents.utils.checkpoints import check_tensors
 from agents.utils.process_group import ProcessGroup
 from agents.utils.weight_average import AveragedWeights, WeightAverage
-from rewards import depends_on_batch
+from rewards import averages_objects, depends_on_batch
 from rewards.isolation import close_reward, run_reward
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.envs.scoring import RewardScorer
@@ -122,7 +123,7 @@ class Learner:
         if self.deck is not None:
             dealt = self.deck.deal(branching.groups(batch), self._generator("prompts", iteration))
             prompts = [text for text in dealt for _ in range(branching.siblings)][self.processes.rows(batch)]
-        return collect(
+        rollout = collect(
             self.env,
             algorithm.sampling_policy,
             seed=self.config.seed,
@@ -130,6 +131,7 @@ class Learner:
             prompts=prompts,
             branching=branching,
         )
+        return replace(rollout, averages=averages_objects(self.reward))
 
     def accumulate(self, rollout: Rollout, advantage: Any, scenes: SceneBank, index: int) -> dict[str, float]:
         """Put both gradients, summed over all processes, into ``.grad`` and measure them apart.

@@ -33,6 +33,7 @@ class Rollout:
         reward: (B,); 0 where not valid.
         valid: (B,) bool.
         per_object: (B, N) credit per slot, or None.
+        averages: the reward is a mean over the objects, so that an empty slot has no credit.
         terms: named (B,) parts of the reward.
         batch: the finished scenes.
         prompts: one per scene, or None without prompts.
@@ -50,6 +51,7 @@ class Rollout:
     batch: SceneBatch
     prompts: tuple[str, ...] | None = None
     text: Text | None = None
+    averages: bool = False
 
     def transitions(self, step: int, advantage: Tensor, rows: slice = slice(None)) -> TensorDict:
         """The transitions of one step as ``DDPOSFLoss`` reads them."""

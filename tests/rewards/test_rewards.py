@@ -16,7 +16,7 @@ from rewards import (
     evaluate_reward,
     resolve_reward,
 )
-from rewards.base import declared_maximum
+from rewards.base import averages_objects, declared_maximum
 from scene_envs import SceneBatch
 from scene_envs.errors import InvalidInputError
 
@@ -158,6 +158,25 @@ def test_what_stands_outside_the_workspace_counts_for_nothing(table):
 )
 def test_the_largest_value_is_declared(reward, largest):
     assert declared_maximum(resolve_reward(reward), 40, 39) == largest
+
+
+@pytest.mark.parametrize(
+    ("reward", "averages"),
+    [
+        ("object_count", False),
+        ("feasible_objects", False),
+        ("feasible_share", True),
+        ("stability", True),
+        ("reachability", True),
+        ({"name": "clip", "reward": "feasible_share", "low": 0.5}, True),
+        ({"name": "gate", "reward": "feasible_share", "condition": "object_count", "threshold": 3}, True),
+        ({"name": "weighted_sum", "rewards": ["feasible_share", "stability"]}, True),
+        ({"name": "weighted_sum", "rewards": ["feasible_share", "object_count"]}, False),
+        (lambda batch: batch.counts, False),
+    ],
+)
+def test_means_over_objects_say_so(reward, averages):
+    assert averages_objects(resolve_reward(reward)) == averages
 
 
 def test_a_function_declares_its_largest_value_by_an_attribute():

@@ -1,0 +1,53 @@
+"""Credit per object: what an empty slot is worth under a sum and under a mean."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar
+
+import pytest
+
+from agents.post_training.learner import Learner
+from agents.priors.testing import tiny_prior
+from rewards.base import RewardContext, RewardOutput
+from scene_envs.scene import SceneBatch
+from tests.helpers.small_runs import small_config
+
+
+class LeftHalf:
+    """Objects on the left: their number, or their share of all."""
+
+    name: ClassVar[str] = "left_half"
+
+    def __init__(self, averages_objects: bool) -> None:
+        self.averages_objects = averages_objects
+
+    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        left = (batch.is_free & (batch.translations[..., 0] < 0)).float()
+        number = left.sum(dim=-1)
+        value = number / batch.is_free.sum(dim=-1).clamp(min=1) if self.averages_objects else number
+        return RewardOutput(value, per_object=left)
+
+
+@pytest.mark.parametrize("averages", [False, True])
+def test_an_empty_slot_has_credit_under_a_sum_alone(tmp_path: Path, averages: bool) -> None:
+    learner = Learner(small_config(tmp_path, reward=LeftHalf(averages), batch_size=12), tiny_prior())
+    try:
+        rollout = learner.rollout(0)
+        advantage = learner.algorithm.advantage(rollout)
+    finally:
+        learner.close()
+    welded = len(rollout.batch.scene_type.fixed)
+    credit, empty = rollout.per_object[:, welded:], rollout.batch.is_empty[:, welded:]
+    advantage = advantage[:, welded:]
+    assert empty.any()
+    assert (~empty).any()
+    if averages:
+        assert not advantage[empty].any()
+        assert float(advantage[~empty].sum()) == pytest.approx(0.0, abs=1e-4)
+    else:
+        assert bool((advantage[empty] == advantage[empty][0]).all())
+        assert float(advantage[empty][0]) < 0
+        assert float(advantage.sum()) == pytest.approx(0.0, abs=1e-4)
+    good = ~empty & (credit > 0)
+    assert bool((advantage[good] > 0).all())
