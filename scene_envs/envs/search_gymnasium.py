@@ -12,8 +12,9 @@ from torch import Tensor
 
 from scene_envs.envs.errors import ResetNeededError
 from scene_envs.envs.search import SearchProblem, SearchState, Steering
+from scene_envs.envs.search_rendering import SearchRendering
 from scene_envs.envs.settings import SearchSettings, takes
-from scene_envs.envs.spaces import STATE_BOUND, check_render_mode, occupied, picture, scene_box
+from scene_envs.envs.spaces import STATE_BOUND, occupied, scene_box
 from scene_envs.envs.specs import SpecMixin
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
@@ -93,7 +94,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     | `objective_scale` | `None` | objective at which Φ = 1; `None` is the largest it declares, else the free slots |
     | `max_nfe` | `None` | denoiser evaluations per episode; `None` is any number |
     | `workers` | `0` | worker processes for physics in the objective; 0 computes in the calling process |
-    | `render_mode` | `None` | `"rgb_array"` renders the current scene |
+    | `render_mode` | `None` | `"rgb_array"`: pictures, masked objects in red; `"human"`: a page in the browser |
     | `prompt` | `None` | text that all scenes should satisfy, for priors that read prompts; the objective gets it too |
     | `guidance` | `0.0` | weight of classifier-free guidance, which doubles the NFE; needs a prompt |
 
@@ -107,7 +108,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     * v0: initial version.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012  (declared so by gym.Env)
+    metadata = {"render_modes": list(SearchRendering.MODES), "render_fps": 2}  # noqa: RUF012  (declared so by gym.Env)
 
     @takes(SearchSettings)
     def __init__(self, *, render_mode: str | None = None, **settings: Any) -> None:
@@ -116,7 +117,8 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
 
     def _begin(self, problem: SearchProblem, render_mode: str | None, regenerate: spaces.MultiBinary) -> None:
         """Spaces and state of an environment over ``problem``; ``regenerate`` is what is observed of its masks."""
-        self.render_mode = check_render_mode(render_mode)
+        self.render_mode = render_mode
+        self._rendering = SearchRendering(render_mode)
         self.problem = problem
         slot_count = problem.slots
         self.observation_space = spaces.Dict(
@@ -158,6 +160,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         else:
             self._state = self.problem.root(tree_seed, options.get("scene"))
         self._best = self._state
+        self._rendering.show(self.scene(), self._state)
         return self._observe(self._state)
 
     def step(self, action: int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -171,6 +174,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         if why := self._end(parent):
             raise ResetNeededError(f"the episode ended, {why}; call reset() first")
         self._state = self._child(parent, action)
+        self._rendering.show(self.scene(), self._state)
         observation, info = self._observe(self._state)
         terminated = self.problem.is_solved(self._state)
         truncated = not terminated and bool(self._end(self._state))
@@ -191,12 +195,13 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         return ""
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """(H, W, 3) uint8 picture of the current scene, or None without a render mode."""
-        return picture(self.scene())[0] if self.render_mode else None
+        """(H, W, 3) uint8 picture of the current scene, masked objects in red; None with ``"human"`` or no mode."""
+        return self._rendering.picture(self.scene(), self.state)
 
     def close(self) -> None:
-        """Stop physics workers, if any."""
+        """Stop physics workers, if any, and let the viewer's page stay as it is."""
         self.problem.close()
+        self._rendering.close()
 
     # -- the planner's interface ----------------------------------------------------------------
 

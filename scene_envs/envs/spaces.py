@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -105,10 +105,11 @@ def check_action(action: Any, shape: tuple[int, ...], axes: tuple[str, ...]) -> 
     return tensor
 
 
-def check_render_mode(render_mode: str | None) -> str | None:
-    """``None`` or ``"rgb_array"``."""
-    if render_mode not in (None, "rgb_array"):
-        raise InvalidInputError(f"render_mode={render_mode!r} is not supported; use 'rgb_array' or None")
+def check_render_mode(render_mode: str | None, modes: Sequence[str] = ("rgb_array",)) -> str | None:
+    """``None`` or one of ``modes``."""
+    if render_mode is not None and render_mode not in modes:
+        known = ", ".join(map(repr, modes))
+        raise InvalidInputError(f"render_mode={render_mode!r} is not supported; use {known} or None")
     return render_mode
 
 
@@ -124,8 +125,8 @@ def check_reset_mask(options: dict[str, Any] | None, count: int) -> np.ndarray:
     return mask
 
 
-def picture(batch: SceneBatch) -> np.ndarray:
-    """(B, H, W, 3) uint8 pictures (loads the renderer)."""
+def picture(batch: SceneBatch, highlight: Tensor | None = None) -> np.ndarray:
+    """(B, H, W, 3) uint8 pictures, with the objects of ``highlight`` (B, N) bool in red (loads the renderer)."""
     from scene_envs.render import render
 
-    return render(batch, style="picture")
+    return render(batch, style="picture", highlight=highlight)

@@ -40,6 +40,7 @@ def write_viewer(
     *,
     captions: Sequence[str] | None = None,
     title: str | None = None,
+    refresh: float | None = None,
 ) -> Path:
     """Write scenes as one HTML file that any browser with WebGL 2 draws, without a network.
 
@@ -51,6 +52,8 @@ def write_viewer(
         path: the file to write; its folder is made.
         captions: one line per scene; the number of objects by default.
         title: heading of the page; the name of the scene type by default.
+        refresh: seconds after which the page reads its file again, for a file that is still being written; None for
+            never.
 
     Returns:
         The path.
@@ -58,11 +61,17 @@ def write_viewer(
     Raises:
         InvalidInputError: no scenes, or another number of captions.
     """
-    write_text(path, viewer_page(batch, captions=captions, title=title))
+    write_text(path, viewer_page(batch, captions=captions, title=title, refresh=refresh))
     return Path(path)
 
 
-def viewer_page(batch: SceneBatch, *, captions: Sequence[str] | None = None, title: str | None = None) -> str:
+def viewer_page(
+    batch: SceneBatch,
+    *,
+    captions: Sequence[str] | None = None,
+    title: str | None = None,
+    refresh: float | None = None,
+) -> str:
     """The page of :func:`write_viewer`; a script around its frame shows scene k with ``sceneViewer.showScene(k)``."""
     if len(batch) == 0:
         raise InvalidInputError("a viewer needs at least one scene; the batch is empty")
@@ -71,7 +80,7 @@ def viewer_page(batch: SceneBatch, *, captions: Sequence[str] | None = None, tit
     if len(captions) != len(batch):
         raise InvalidInputError(f"{len(batch)} scenes need {len(batch)} captions, got {len(captions)}")
     title = batch.scene_type.name.replace("_", " ") if title is None else title
-    return _page(title, _viewer_data(batch, captions))
+    return _page(title, {**_viewer_data(batch, captions), "refresh": refresh})
 
 
 def _page(title: str, data: dict[str, Any]) -> str:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import pickle
+import re
 import warnings
 from dataclasses import replace
+from pathlib import Path
+from urllib.parse import urlparse
 
 import gymnasium as gym
 import numpy as np
@@ -17,6 +21,7 @@ from rewards.base import RewardOutput
 from scene_envs.envs import ResetNeededError, SearchEnv
 from scene_envs.envs.search import NodeRandomness
 from scene_envs.errors import InvalidInputError, UnknownNameError
+from scene_envs.render import render
 from scene_envs.scene import SceneBatch
 
 ID = "scene_envs:SceneEnvs/Search-v0"
@@ -29,8 +34,9 @@ def env(prior, free_objects):
 
 @pytest.mark.slow
 def test_check_env_passes_with_warnings_as_errors(prior, free_objects, monkeypatch):
-    blank = lambda batch: np.zeros((len(batch), 12, 16, 3), np.uint8)  # noqa: E731
-    monkeypatch.setattr("scene_envs.envs.search_gymnasium.picture", blank)
+    blank = lambda batch, highlight: np.zeros((len(batch), 12, 16, 3), np.uint8)  # noqa: E731
+    monkeypatch.setattr("scene_envs.envs.search_rendering.picture", blank)
+    monkeypatch.setattr("webbrowser.open", lambda address: True)
     env = gym.make(ID, prior=prior, objective=free_objects, branching=3, max_depth=3, num_steps=2)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -282,3 +288,46 @@ def test_spec_goes_to_json_and_actions_are_checked(env, prior, free_objects, mon
         SearchEnv(prior=prior, objective=free_objects, branching=0)
     with pytest.raises(ResetNeededError):
         SearchEnv(prior=prior, objective=free_objects).clone_state()
+
+
+# -- rendering ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_pictures_show_the_masked_objects_in_red(prior, free_objects):
+    everything = lambda scene, reward, rng: scene.is_free[0]  # noqa: E731
+    env = SearchEnv(prior=prior, objective=free_objects, mask=everything, num_steps=2, render_mode="rgb_array")
+    env.reset(seed=0)
+    scene, mask = env.scene(), env.state.mask.unsqueeze(0)
+    assert bool(mask.any())
+    np.testing.assert_array_equal(env.render(), render(scene, highlight=mask)[0])
+    assert (env.render() != render(scene)[0]).any()
+
+
+def test_the_viewer_gets_each_state_and_opens_once(prior, free_objects, monkeypatch):
+    opened = []
+    monkeypatch.setattr("webbrowser.open", lambda address: opened.append(address) or True)
+    env = gym.make(ID, prior=prior, objective=free_objects, branching=3, max_depth=3, num_steps=2, render_mode="human")
+    env.reset(seed=0)
+    env.step(0)
+    env.step(1)
+    assert env.render() is None
+    (address,) = opened
+    path = Path(urlparse(address).path)
+    page = json.loads(re.search(r'id="data">(.*?)</script>', path.read_text(), re.DOTALL)[1])
+    assert [scene["caption"].split(":")[0] for scene in page["scenes"]] == ["depth 0", "depth 1", "depth 2"]
+    assert page["refresh"] == 2.0
+    env.close()
+    assert '"refresh":null' in path.read_text()
+
+
+def test_a_search_without_a_browser_says_where_the_page_is(prior, free_objects, monkeypatch):
+    monkeypatch.setattr("webbrowser.open", lambda address: False)
+    env = SearchEnv(prior=prior, objective=free_objects, num_steps=2, render_mode="human")
+    with pytest.warns(UserWarning, match=r"no browser was found; open .*viewer\.html"):
+        env.reset(seed=0)
+
+
+def test_an_unknown_render_mode_names_those_there_are(prior, free_objects):
+    with pytest.raises(InvalidInputError, match="use 'human', 'rgb_array' or None"):
+        SearchEnv(prior=prior, objective=free_objects, render_mode="ansi")
