@@ -302,9 +302,9 @@ else showText();
 
 // A file that is still being written is read again. Who looks at its last scene is shown the new last one.
 if (data.refresh) {
-  const seen = Number(window.sessionStorage.getItem("scenes"));
+  const seen = Number(window.name); // which outlives a reload, also of a file
   if (state.scene >= seen - 1) showScene(scenes.length - 1);
-  window.sessionStorage.setItem("scenes", scenes.length);
+  window.name = scenes.length;
   setTimeout(() => window.location.reload(), 1000 * data.refresh);
 }
 
