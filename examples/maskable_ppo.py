@@ -4,12 +4,12 @@
 
 A search regenerates some slots of a scene again and again. Which slots (the mask) is the agent's choice here: the
 faults of the scene, its empty slots, or more at once. An episode is a chain of `max_depth` inpaintings that starts
-from a sample of the prior. The reward of a step is what it adds to the objective, so the sum over an episode is the
-gain over the first sample. Masks without slots in the current scene are not legal: the environment says so in
-`action_masks()`, and MaskablePPO gives them no probability.
+from a sample of the prior. A search returns its best scene, so the reward of a step is what it adds to the best value
+so far; the sum over an episode is the gain over the first sample. Masks without slots in the current scene are not
+legal: the environment says so in `action_masks()`, and MaskablePPO gives them no probability.
 
-The agent sees a summary of the observation, since a few thousand steps are few: the value of the scene, the depth, the
-number of objects, and the number of slots that each mask would regenerate.
+The agent sees a summary of the observation, since a few thousand steps are few: the value of the scene and the best so
+far, the depth, the number of objects, and the number of slots that each mask would regenerate.
 
 After training the agent is compared with random masks and with each mask alone. All start from the same scenes and
 spend the same number of denoiser evaluations (NFE); an episode that comes to its end early spends less. A mask alone
@@ -57,9 +57,9 @@ class Args:
     """inpaintings per episode"""
     num_steps: int = 10
     """denoiser evaluations per scene"""
-    rollout: int = 240
+    rollout: int = 120
     """steps between two updates of PPO"""
-    learning_rate: float = 1e-3
+    learning_rate: float = 3e-3
     """of PPO"""
     seed: int = 0
     """of training; the comparison starts from other scenes"""
@@ -67,19 +67,34 @@ class Args:
     """a few steps of everything, to see that it runs"""
 
 
-class Summary(gym.ObservationWrapper[np.ndarray, int, dict[str, np.ndarray]]):
-    """A few numbers in place of the scene: value, depth, objects, and slots of each mask, all in [0, 1]."""
+class Summary(gym.Wrapper[np.ndarray, int, dict[str, np.ndarray], int]):
+    """A few numbers in place of the scene, all in [0, 1], and gains of the best scene so far as the reward.
+
+    The numbers are the value, the best value so far, the depth, the objects, and the slots of each mask.
+    """
 
     def __init__(self, env: gym.Env[dict[str, np.ndarray], int], max_depth: int) -> None:
         super().__init__(env)
-        self.max_depth = max_depth
+        self.max_depth, self.best = max_depth, 0.0
         masks = env.observation_space["regenerate"].shape[0]  # type: ignore[index]
-        self.observation_space = gym.spaces.Box(0.0, 1.0, (3 + masks,), np.float32)
+        self.observation_space = gym.spaces.Box(0.0, 1.0, (4 + masks,), np.float32)
 
-    def observation(self, observation: dict[str, np.ndarray]) -> np.ndarray:
-        """(3 + K,) float32."""
+    def reset(self, **arguments: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        """The first sample is the best so far."""
+        observation, info = self.env.reset(**arguments)
+        self.best = float(observation["value"][0])
+        return self.summary(observation), info
+
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """The reward is ten times what the step adds to the best value so far."""
+        observation, _, terminated, truncated, info = self.env.step(action)
+        before, self.best = self.best, max(self.best, float(observation["value"][0]))
+        return self.summary(observation), 10 * (self.best - before), terminated, truncated, info
+
+    def summary(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        """(4 + K,) float32."""
         slots = observation["object_mask"].size
-        numbers = [observation["value"][0], observation["depth"][0] / self.max_depth]
+        numbers = [observation["value"][0], self.best, observation["depth"][0] / self.max_depth]
         numbers += [observation["object_mask"].sum() / slots, *observation["regenerate"].sum(axis=1) / slots]
         return np.array(numbers, np.float32)
 
@@ -160,6 +175,7 @@ def main(args: Args) -> dict[str, dict[str, Any]]:
         batch_size=min(60, args.rollout),
         learning_rate=args.learning_rate,
         gamma=1.0,
+        gae_lambda=0.8,
         ent_coef=0.001,
         seed=args.seed,
         device="cpu",
