@@ -24,7 +24,8 @@ NAMES = [scene_type.name for scene_type in BUILT_IN]
 
 @pytest.fixture(scope="module")
 def pool() -> Iterator[PhysicsPool]:
-    with PhysicsPool(workers=2) as pool:
+    with PhysicsPool(workers=2) as pool, forked_workers():
+        settled(crowded("dimsum_table", (0.004, 0.03)), pool)  # both have started
         yield pool
 
 
