@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from collections.abc import Iterator
 from functools import partialmethod
@@ -34,6 +35,35 @@ def pytest_collection_finish() -> None:
         return low.clone(), high.clone(), tilted
 
     ranges._ranges = once
+
+
+@pytest.fixture(autouse=True)
+def _coarse_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures are drawn at a quarter of their width and height and enlarged, but where drawing itself is tested."""
+    pictures = sys.modules.get("scene_envs.render.pictures")
+    if pictures is None or request.path.parent.name == "render":
+        return
+    draw, lamp = pictures._picture, pictures.light_camera
+
+    def coarse(stage: Any, camera: Any, width: int, height: int, *scene: Any) -> Any:
+        small = draw(stage, camera, -(-width // 4), -(-height // 4), *scene)
+        return small.repeat(4, axis=0).repeat(4, axis=1)[:height, :width]
+
+    def coarse_lamp(scene_type: Any) -> Any:
+        camera = lamp(scene_type)
+        return dataclasses.replace(camera, width=camera.width // 4, height=camera.height // 4)
+
+    monkeypatch.setattr(pictures, "_picture", coarse)
+    monkeypatch.setattr(pictures, "light_camera", coarse_lamp)
+
+
+@pytest.fixture
+def copied_workers() -> Iterator[None]:
+    """Workers of physics and of rewards of files start as copies of this process, and import nothing again."""
+    from tests.helpers.forked import forked_workers
+
+    with forked_workers():
+        yield
 
 
 @pytest.fixture

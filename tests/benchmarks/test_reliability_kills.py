@@ -1,21 +1,17 @@
 """One SIGKILL for every family of commands that go on: nothing is lost, and nothing differs."""
 
-from dataclasses import replace
-
 import pytest
 
 from benchmarks.reliability.copies import Started, complete
-from benchmarks.reliability.small_commands import RESUMABLE, digests, undisturbed, words_of
+from benchmarks.reliability.small_commands import RESUMABLE, digests, shorter, undisturbed, words_of
 
-SHORTER = {"iterations": "iterations=3", "count": "count=4", "shard_size": "shard_size=1", "budget": "budget=6"}
 FAMILIES = ("generate", "pretrain", "post-train", "search", "search count")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FAMILIES)
 def test_a_killed_command_goes_on_to_the_result_of_an_undisturbed_one(name, tmp_path):
-    words = tuple(SHORTER.get(word.partition("=")[0], word) for word in RESUMABLE[name].words)
-    command = replace(RESUMABLE[name], words=words)
+    command = shorter(RESUMABLE[name])
     expected, words = undisturbed(command, runs=1), words_of(command, tmp_path / "run")
     killed = 0
     for share in (0.6, 0.3, 0.1, 0.02):  # the first runs in this process fill caches: later ones are faster

@@ -29,7 +29,7 @@ FOOD = ("apple_gala", "pear_bosc", "bread_slice")
 
 @pytest.fixture(scope="module")
 def arrays() -> NDArray[np.float32]:
-    return get_grammar(NAME).sample_array(np.random.default_rng(1), 250)
+    return get_grammar(NAME).sample_array(np.random.default_rng(1), 120)
 
 
 @pytest.fixture(scope="module")

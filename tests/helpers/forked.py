@@ -1,11 +1,21 @@
-"""A process that begins as a copy of the test's: what a test kills has not to import everything first."""
+"""Processes that begin as copies of the test's: what a test kills or replaces has not to import everything first."""
 
 from __future__ import annotations
 
+import contextlib
+import faulthandler
 import multiprocessing
-from collections.abc import Callable
+import os
+import runpy
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from multiprocessing.context import ForkProcess
+from types import SimpleNamespace
 from typing import Any
+
+import pytest
 
 
 def forked(function: Callable[..., Any], *args: Any) -> ForkProcess:
@@ -13,3 +23,83 @@ def forked(function: Callable[..., Any], *args: Any) -> ForkProcess:
     process = multiprocessing.get_context("fork").Process(target=function, args=args, daemon=True)
     process.start()
     return process
+
+
+class ForkedModule:
+    """``subprocess.Popen`` of ``python -m MODULE ...`` whose process is a copy of this one, and has its imports.
+
+    It has its own descriptors, session, signals, limits and memory. Its interpreter is not new: what this process
+    registered is known there, so a test that asks what a new one finds starts a real one.
+    """
+
+    def __init__(
+        self,
+        command: Sequence[str],
+        *,
+        pass_fds: Sequence[int],
+        env: Mapping[str, str],
+        start_new_session: bool = False,
+        stdout: int = subprocess.DEVNULL,
+        **_: Any,
+    ) -> None:
+        self.returncode: int | None = None
+        _, option, self._module, *self._words = command
+        assert option == "-m"
+        sys.stdout.flush()
+        sys.stderr.flush()
+        self.pid = os.fork()
+        if self.pid == 0:
+            try:
+                self._run(pass_fds, env, start_new_session, stdout)
+            except SystemExit as end:
+                os._exit(end.code if isinstance(end.code, int) else 0 if end.code is None else 1)
+            except BaseException:
+                os._exit(1)
+            os._exit(0)
+
+    def _run(self, kept: Sequence[int], env: Mapping[str, str], new_session: bool, stdout: int) -> None:
+        faulthandler.disable()
+        if new_session:
+            os.setsid()
+        nothing = os.open(os.devnull, os.O_RDWR)
+        os.dup2(nothing, 0)
+        os.dup2(nothing if stdout == subprocess.DEVNULL else stdout, 1)
+        for descriptor in map(int, os.listdir("/proc/self/fd")):
+            if descriptor > 2 and descriptor not in kept:
+                with contextlib.suppress(OSError):  # that of the listing is closed already
+                    os.close(descriptor)
+        os.environ.update(env)
+        sys.argv = [self._module, *self._words]
+        sys.modules.pop(self._module, None)
+        runpy.run_module(self._module, run_name="__main__")
+
+    def poll(self) -> int | None:
+        """The exit status, minus the signal that ended it; None while it runs."""
+        if self.returncode is None:
+            found, status = os.waitpid(self.pid, os.WNOHANG)
+            self.returncode = os.waitstatus_to_exitcode(status) if found else None
+        return self.returncode
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for the end; raises ``subprocess.TimeoutExpired``."""
+        limit = float("inf") if timeout is None else time.monotonic() + timeout
+        while (status := self.poll()) is None:
+            if time.monotonic() >= limit:
+                raise subprocess.TimeoutExpired(self._module, timeout or 0.0)
+            time.sleep(0.002)
+        return status
+
+    def kill(self) -> None:
+        """SIGKILL."""
+        if self.poll() is None:
+            os.kill(self.pid, 9)
+
+
+@contextlib.contextmanager
+def forked_workers() -> Iterator[None]:
+    """Workers of physics and of isolated rewards that start meanwhile are copies of this process."""
+    stand_in = SimpleNamespace(**{**vars(subprocess), "Popen": ForkedModule})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("scene_envs.physics.pool.subprocess", stand_in)
+        patch.setattr("rewards.isolation.subprocess", stand_in)
+        yield

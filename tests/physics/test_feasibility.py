@@ -173,7 +173,7 @@ def test_what_has_no_support_is_not_ready() -> None:
 
 @pytest.mark.slow
 def test_jittered_scenes_become_ready() -> None:
-    batch = jittered(dimsum(4, 10), 3)
+    batch = jittered(dimsum(2, 10), 3)
     raw, ready = feasibility(batch), make_ready(batch)
     free = int(batch.is_free.sum())
     assert int(raw.counts.sum()) < 0.6 * free

@@ -16,6 +16,7 @@ from scene_envs.errors import InvalidInputError, PhysicsError
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import FeasibilityResult, PhysicsPool, feasibility, penetration, project, settle
 from scene_envs.scene import SceneBatch
+from tests.helpers.forked import forked_workers
 from tests.helpers.simple_scenes import scene
 
 FIELDS = ("feasible", "depth", "displacement", "rotation", "valid", "counts")
@@ -47,13 +48,15 @@ def pool() -> Iterator[PhysicsPool]:
 def test_none_one_and_two_workers_agree_bit_for_bit(
     batch: SceneBatch, expected: FeasibilityResult, pool: PhysicsPool
 ) -> None:
-    with PhysicsPool(workers=1) as one:
+    with PhysicsPool(workers=1) as one:  # a new interpreter
         assert same(feasibility(batch, pool=one), expected)
-    assert same(feasibility(batch, pool=pool), expected)
+    with forked_workers():
+        assert same(feasibility(batch, pool=pool), expected)
     assert len(pool.process_ids) == 2
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("copied_workers")
 def test_every_function_runs_in_workers(batch: SceneBatch, pool: PhysicsPool) -> None:
     few = batch[:3]
     assert torch.equal(settle(few, duration=0.25, pool=pool).batch.tensor, settle(few, duration=0.25).batch.tensor)
@@ -62,6 +65,7 @@ def test_every_function_runs_in_workers(batch: SceneBatch, pool: PhysicsPool) ->
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("copied_workers")
 def test_a_scene_type_that_only_this_process_knows_works_in_workers(pool: PhysicsPool) -> None:
     """Its assets come from no recipe: geometry travels with it."""
     batch = SceneBatch.concatenate([scene(("cube", 0.1 * i, 0.0, 0.0)) for i in range(3)])
@@ -69,6 +73,7 @@ def test_a_scene_type_that_only_this_process_knows_works_in_workers(pool: Physic
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("copied_workers")
 def test_a_worker_killed_mid_run_costs_nothing(
     batch: SceneBatch, expected: FeasibilityResult, pool: PhysicsPool
 ) -> None:
@@ -86,6 +91,7 @@ def test_a_worker_killed_mid_run_costs_nothing(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("copied_workers")
 def test_a_scene_that_fails_twice_is_invalid_and_the_others_are_not(
     batch: SceneBatch, expected: FeasibilityResult
 ) -> None:
@@ -132,6 +138,7 @@ def test_wrong_arguments_and_a_closed_pool_are_refused(batch: SceneBatch) -> Non
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("copied_workers")
 def test_closing_ends_the_processes() -> None:
     pool = PhysicsPool(workers=1)
     feasibility(scene(("cube", 0.0, 0.0, 0.0)), pool=pool)

@@ -21,6 +21,7 @@ from rewards import (
 from rewards.isolation import SeededReward, is_foreign, run_reward
 from scene_envs.errors import InvalidInputError, RewardError
 from tests.helpers import hostile_rewards as hostile
+from tests.helpers.forked import forked_workers
 
 FILE = Path(hostile.__file__)
 
@@ -119,24 +120,27 @@ def test_limits_are_positive_numbers(limits):
 @pytest.mark.slow
 def test_scores_of_a_worker_are_those_of_this_process_bit_for_bit(cups):
     allow_local_rewards(FILE)
-    context = RewardContext(prompts=("a", "b"))
-    for name in ("honest", "noisy"):
-        with IsolatedReward(f"{FILE}:{name}", timeout=60, seed=5) as reward:
-            here = evaluate_reward(SeededReward(getattr(hostile, name), 5), cups, context)
+    with IsolatedReward(f"{FILE}:named", timeout=60, seed=5) as reward:
+        for name in ("honest", "noisy"):
+            context = RewardContext(prompts=(name, name))
+            here = evaluate_reward(SeededReward(hostile.named, 5), cups, context)
             there = [evaluate_reward(reward, cups, context) for _ in range(2)]
-        assert torch.equal(here.value, there[0].value)
-        assert torch.equal(here.value, there[1].value)
+            assert torch.equal(here.value, there[0].value)
+            assert torch.equal(here.value, there[1].value)
 
 
 @pytest.fixture(scope="module")
 def worker():
     """One process for all hostile rewards, until one of them ends it."""
     allow_local_rewards(FILE)
-    with IsolatedReward(f"{FILE}:named", timeout=20, memory=0.5) as reward:
+    with forked_workers():
+        reward = IsolatedReward(f"{FILE}:named", timeout=20, memory=0.5)
+    with reward:
         yield reward
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("copied_workers")
 @pytest.mark.parametrize(
     ("name", "message"),
     [
@@ -164,6 +168,7 @@ def test_a_hostile_reward_costs_its_scenes_and_nothing_else(name, message, cups,
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("copied_workers")
 @pytest.mark.parametrize(
     ("line", "message"),
     [("import sys; sys.exit(0)", "SystemExit"), ("import os; os._exit(0)", "ended its process"),
