@@ -14,38 +14,16 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from agents.configuration.prior_names import CONFIG_NAME, find_prior
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
-from scene_envs.files import is_file, write_json
+from scene_envs.files import write_json
 from scene_envs.tensor_files import read_tensors, write_tensors
 
-SHIPPED = Path(__file__).parent / "shipped"
-CONFIG_NAME = "config.json"
 WEIGHTS_NAME = "model.safetensors"
-_MOST_NAME = 1000
 RESIDUAL = "residual."
 """What the names of measured tensors, which are no weights, start with."""
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
 """Number formats of the weights in a file."""
-
-
-def list_priors() -> list[str]:
-    """Names of the priors that ship with the package."""
-    return sorted(path.parent.name for path in SHIPPED.glob(f"*/{CONFIG_NAME}"))
-
-
-def find_prior(name: str | os.PathLike[str]) -> Path:
-    """The directory of a prior: a shipped name, a prior directory, or a run directory that holds ``prior/``."""
-    path = Path(name)
-    if len(str(name)) > _MOST_NAME or "\0" in str(name):
-        raise InvalidInputError(
-            f"prior={str(name)[:60] + '...'!r} is neither a name nor a path ({len(str(name))} characters)"
-        )
-    for candidate in (SHIPPED / str(name), path, path / "prior"):
-        if is_file(candidate / CONFIG_NAME):
-            return candidate
-    if (len(str(name)) < _MOST_NAME // 4 and path.exists()) or os.sep in str(name):
-        raise InvalidInputError(f"{str(name)!r} holds no prior: neither it nor its prior/ folder has a {CONFIG_NAME}")
-    raise unknown_name("prior", str(name), list_priors())
 
 
 def to_precision(weights: Mapping[str, Tensor], precision: str) -> dict[str, Tensor]:

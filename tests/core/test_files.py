@@ -110,7 +110,7 @@ def test_a_checksum_beside_a_file_is_verified_and_goes_with_the_file(tmp_path):
 
 
 def test_every_shipped_prior_has_a_checksum():
-    from agents.priors.files import SHIPPED
+    from agents.configuration.prior_names import SHIPPED
 
     for weights in SHIPPED.glob("*/model.safetensors"):
         assert weights.with_name("model.safetensors.sha256").is_file() or b"sha256" in weights.read_bytes()[:100_000]

@@ -50,6 +50,19 @@ class ExportConfig:
     output: str = ""
 
 
+def check(settings: ExportConfig) -> None:
+    """Refuse what cannot be, before scenes are read."""
+    from scene_envs.errors import InvalidInputError
+    from scene_envs.export.formats import check_formats
+
+    if bool(settings.scenes) == bool(settings.prior):
+        raise InvalidInputError(
+            "export: name either a scene file, run or dataset, as in scenes=runs/mine, or a prior, as in "
+            "prior=dimsum_table"
+        )
+    check_formats(settings.formats)
+
+
 def run(settings: ExportConfig, run: Run) -> None:
     """Read or draw the scenes and write them."""
     from scene_envs.export.formats import resolve_formats
@@ -97,15 +110,6 @@ def export_scenes(
 
 def _scenes(settings: ExportConfig, run: Run) -> SceneBatch:
     """The scenes that ``scenes`` or ``prior`` names, at most ``count``."""
-    from scene_envs.errors import InvalidInputError
-
-    if bool(settings.scenes) == bool(settings.prior):
-        raise InvalidInputError(
-            "export: name either a scene file, run or dataset, as in scenes=runs/mine, or a prior, as in "
-            "prior=dimsum_table"
-        )
-    if settings.count is not None and settings.count < 1:
-        raise InvalidInputError(f"count must be at least 1, or null for all, got {settings.count}")
     if settings.prior:
         from agents.priors.base import ScenePrior
 

@@ -48,16 +48,20 @@ class InpaintingConfig:
     output: str = ""
 
 
+def check(settings: InpaintingConfig) -> None:
+    """Refuse to work on nothing."""
+    from scene_envs.errors import InvalidInputError
+
+    if not settings.scenes and not settings.prior:
+        raise InvalidInputError("name a scene file, run or dataset, as in scenes=runs/mine, or a prior= to sample from")
+
+
 def load_prior_and_scenes(command: str, settings: InpaintingConfig) -> tuple[ScenePrior, SceneBatch]:
     """The prior and the scenes that a command works on."""
     from agents.priors.base import ScenePrior
     from scene_envs.errors import InvalidInputError
 
     if not settings.scenes:
-        if not settings.prior:
-            raise InvalidInputError(
-                f"{command}: name a scene file, run or dataset, as in scenes=runs/mine, or a prior= to sample from"
-            )
         fresh = ScenePrior.load(settings.prior).to(settings.device)
         count = _FRESH if settings.count is None else settings.count
         return fresh, fresh.sample(count, num_steps=settings.num_steps, seed=settings.seed).to("cpu")

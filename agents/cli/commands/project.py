@@ -31,13 +31,18 @@ class ProjectConfig:
     output: str = ""
 
 
-def run(settings: ProjectConfig, run: Run) -> None:
-    """Project, settle, count what is ready."""
+def check(settings: ProjectConfig) -> None:
+    """Refuse to work on nothing."""
     from scene_envs.errors import InvalidInputError
-    from scene_envs.physics import PhysicsPool
 
     if not settings.scenes:
         raise InvalidInputError("project: name a scene file, run or dataset, as in scenes=runs/mine")
+
+
+def run(settings: ProjectConfig, run: Run) -> None:
+    """Project, settle, count what is ready."""
+    from scene_envs.physics import PhysicsPool
+
     batch = load_scenes(Path(settings.scenes), settings.count)
     with PhysicsPool(workers=settings.workers) as pool:
         draw_scenes(batch, settings.pictures, run, "before.png")
