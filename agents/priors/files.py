@@ -16,7 +16,7 @@ from torch import Tensor
 
 from agents.configuration.prior_names import CONFIG_NAME, find_prior
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
-from scene_envs.files import write_json
+from scene_envs.files import with_digest, without_digest, write_json
 from scene_envs.tensor_files import read_tensors, write_tensors
 
 WEIGHTS_NAME = "model.safetensors"
@@ -61,12 +61,12 @@ def write_prior(directory: str | os.PathLike[str], config: Mapping[str, Any], te
 
 
 def write_config(directory: Path, config: Mapping[str, Any]) -> None:
-    """Replace a prior's configuration atomically."""
-    write_json(directory / CONFIG_NAME, config)
+    """Replace a prior's configuration atomically; it carries a digest."""
+    write_json(directory / CONFIG_NAME, with_digest(config))
 
 
 def read_config(name: str | os.PathLike[str]) -> dict[str, Any]:
-    """Configuration of a prior; errors as for :func:`read_prior`."""
+    """Configuration of a prior, without the digest that it is compared with; errors as for :func:`read_prior`."""
     file = find_prior(name) / CONFIG_NAME
     try:
         config: dict[str, Any] = json.loads(file.read_text())
@@ -76,7 +76,7 @@ def read_config(name: str | os.PathLike[str]) -> dict[str, Any]:
         ) from error
     if not isinstance(config, dict):
         raise CorruptFileError(f"{str(file)!r} holds no mapping, so it is not the configuration of a prior")
-    return config
+    return without_digest(config, file)
 
 
 def count_parameters(name: str | os.PathLike[str]) -> int:

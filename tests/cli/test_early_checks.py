@@ -94,7 +94,7 @@ def test_the_names_that_are_known_without_torch_are_those_of_the_packages():
     assert len(list_priors()) > 8
     assert set(known_masks()) <= set(list_masks())
     assert {"culprits", "given", "region"} <= set(known_masks())
-    assert {name for name in known_scenes()} <= set(list_grammars())
+    assert set(known_scenes()) <= set(list_grammars())
 
 
 def test_words_of_groups_are_those_of_the_parts_they_are_for():
