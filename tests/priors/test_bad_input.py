@@ -230,7 +230,8 @@ def test_steps_outside_the_range(
         ["rearrange", f"scenes={folder / 'scenes.safetensors'}"],
         ["evaluate", "count=2", "workers=0", "project=false"],
     ):
-        assert f"num_steps={num_steps} is outside 1..1000" in refused(capsys, *words, *given)
+        told = "must be at least 1" if num_steps < 1 else "is outside 1..1000"
+        assert f"num_steps={num_steps} {told}" in refused(capsys, *words, *given)
 
 
 def test_steps_of_ones_own_outside_the_range() -> None:

@@ -82,6 +82,8 @@ class EvaluateConfig:
 def check(settings: EvaluateConfig) -> None:
     """Refuse what cannot be, before the prior is read."""
     groups = choose_measures(settings.measures, project=settings.project)
+    if settings.heldout and not settings.data:
+        raise InvalidInputError("heldout= needs data=, the dataset that the prior was trained on")
     if settings.prompt_count is not None and not 2 <= settings.prompt_count <= settings.count:
         raise InvalidInputError(
             f"prompt_count={settings.prompt_count} must be from 2 to count={settings.count}, whose scenes the prompts "

@@ -24,8 +24,8 @@ class ExportConfig:
     """Scenes for simulators and viewers.
 
     Attributes:
-        scenes: a scene file, the folder of a sample or project run (its simulation-ready scenes if it has any), or
-            a dataset.
+        scenes: a scene file or a folder of them, the folder of a sample or project run (its simulation-ready scenes if
+            it has any), or a dataset.
         prior: draw the scenes from this prior instead, a shipped name or a folder.
         formats: one or several of urdf, sdf, drake, mjcf, usd, glb, npz, pickle, as in [drake, mjcf]; all for all
             that can be written here.

@@ -23,8 +23,8 @@ class InpaintingConfig:
     """Scenes of which a prior generates a part anew.
 
     Attributes:
-        scenes: a scene file, the folder of a sample or project run (its simulation-ready scenes if it has any), or
-            a dataset; empty for fresh samples of ``prior``.
+        scenes: a scene file or a folder of them, the folder of a sample or project run (its simulation-ready scenes if
+            it has any), or a dataset; empty for fresh samples of ``prior``.
         prior: a shipped name, or the folder of a prior or a run; empty means the shipped prior of the scene type.
         count: how many of the scenes, from the first; null for all, or for 12 fresh samples.
         prompt: what the whole scenes should hold, for priors that read prompts; null for anything.

@@ -17,7 +17,7 @@ class ProjectConfig:
     """Scenes made simulation-ready.
 
     Attributes:
-        scenes: a scene file, the folder of a sample or search run, or a dataset.
+        scenes: a scene file or a folder of them, the folder of a sample or search run, or a dataset.
         count: how many of the scenes, from the first; null for all.
         pictures: how many scenes the galleries show; 0 draws none.
         workers: physics worker processes; 0 computes in this one.

@@ -25,8 +25,8 @@ class SearchKeys(SearchConfig):
     """What to search, and how.
 
     Attributes:
-        scenes: what the search starts from, one search per scene: a scene file, the folder of a run that holds scenes,
-            or a dataset; empty for fresh samples.
+        scenes: what the search starts from, one search per scene: a scene file or a folder of them, the folder of a run
+            that holds scenes, or a dataset; empty for fresh samples.
         prior: a shipped name, or the folder of a prior or a run; empty means the shipped prior of the scenes' type, and
             dimsum_table without scenes.
         objective: what the scene should score high on: any reward.

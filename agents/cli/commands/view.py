@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.cli.commands.scenes import find_scenes
+from agents.cli.commands.scenes import find_scenes, is_dataset, load_scenes
 from agents.configuration.fields import named
 
 if TYPE_CHECKING:
@@ -19,7 +19,8 @@ class ViewConfig:
     """Scenes in a browser.
 
     Attributes:
-        scenes: a scene file, the folder of a run that holds one, a dataset folder or a .parquet file.
+        scenes: a scene file, a folder of such files, the folder of a run that holds one, a dataset folder or a .parquet
+            file.
         prior: a shipped name, or the folder of a prior or a run, to draw samples from.
         scene: scene type to draw from its grammar; with scenes=, the type of a dataset that names none.
         count: scenes to show.
@@ -103,15 +104,12 @@ def _gather(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str]:
 def _read(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str]:
     """Scenes ``first`` to ``first + count`` of a scene file or a dataset, whose captions are its prompts."""
     from scene_envs.errors import InvalidInputError
-    from scene_envs.scene import SceneBatch
 
-    path = Path(settings.scenes)
+    path = find_scenes(Path(settings.scenes))
     chosen = slice(settings.first, settings.first + settings.count)
-    path = find_scenes(path)
-    if path.suffix == ".safetensors":
-        batch = SceneBatch.load(path)
-        total, captions = len(batch), None
-        batch = batch[chosen]
+    if not is_dataset(path):
+        everything, captions = load_scenes(path), None
+        total, batch = len(everything), everything[chosen]
     else:
         from scene_envs.datasets import SceneDataset
 
