@@ -15,6 +15,8 @@ from typing import Any
 
 from scene_envs.errors import CorruptFileError, StorageError
 
+DIGEST = "sha256"
+"""Key of a JSON file under which the digest of the others stands."""
 _SEAL = "# scene-envs, sha256 of the lines below: "
 
 
@@ -114,6 +116,31 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 def write_json(path: str | os.PathLike[str], content: Any, *, indent: int | None = 1) -> None:
     """Replace the file at ``path`` by ``content`` as JSON; numbers that JSON lacks become null."""
     write_text(path, json.dumps(finite(content), indent=indent, allow_nan=False) + "\n")
+
+
+def with_digest(content: Mapping[str, Any]) -> dict[str, Any]:
+    """``content`` as JSON holds it, with the digest of all of it under ``sha256``, the last key."""
+    plain = {key: value for key, value in finite(content).items() if key != DIGEST}
+    return {**plain, DIGEST: _digest_of(plain)}
+
+
+def without_digest(content: Mapping[str, Any], path: str | os.PathLike[str]) -> dict[str, Any]:
+    """What :func:`with_digest` was given; content without a digest as it is, for such a file may be written by hand.
+
+    Raises:
+        CorruptFileError: the content is not what was written; says how to accept an edit.
+    """
+    plain = {key: value for key, value in content.items() if key != DIGEST}
+    if DIGEST in content and content[DIGEST] != _digest_of(plain):
+        raise CorruptFileError(
+            f"{str(path)!r} was changed after it was written (checksum); copy it again, or if you edited it, remove "
+            f"its key {DIGEST!r} to have it read as it is"
+        )
+    return plain
+
+
+def _digest_of(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def finite(value: Any) -> Any:

@@ -146,19 +146,19 @@ def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str
         return DONE
     if not sweep:
         settings = compose(command, keys, named, sources)
-        _check(settings, allow_local, bool(shown), config_dir)
+        _check(settings, allow_local, bool(shown), config_dir, module)
         return _run(command, module, settings, bool(shown))
     runs = [(compose(command, keys, variant, sources), label) for variant, label in expand_sweeps(named)]
     for settings, _ in runs:
-        _check(settings, allow_local, bool(shown), config_dir)
+        _check(settings, allow_local, bool(shown), config_dir, module)
     return _run_all(command, module, runs, bool(shown))
 
 
-def _check(settings: Any, allow_local: bool, only_show: bool, config_dir: str) -> None:
+def _check(settings: Any, allow_local: bool, only_show: bool, config_dir: str, module: ModuleType) -> None:
     """Refuse what needs no more than a look; ask before a file of the user's is run."""
     if only_show:
         return
-    check_early(settings, config_dir)
+    check_early(settings, config_dir, module)
     for key in ("reward", "objective"):
         if "/" in (text := str(getattr(settings, key, ""))) or ".py:" in text:
             _ask_for_files(key, getattr(settings, key), allow_local)

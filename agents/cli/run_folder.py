@@ -90,7 +90,7 @@ class Run:
             self._is_repeated = self._check_folder()
             self._before = _empty_files(self.directory)
             if not self._is_repeated:
-                self._write_config()
+                self.write_config()
             self._start_logging()
             self.log(f"scene-envs {self.command}")
         except BaseException as error:
@@ -152,7 +152,7 @@ class Run:
     ) -> None:
         try:
             if error is None:
-                self._write_config()
+                self.write_config()
             elif self._is_first:
                 for path in _empty_files(self.directory) - self._before:
                     with suppress(OSError):
@@ -188,7 +188,8 @@ class Run:
         if self._is_first:
             write_json(self.directory / "metrics.json", metrics)
 
-    def _write_config(self) -> None:
+    def write_config(self) -> None:
+        """``config.yaml`` with every key."""
         if self._is_first:
             write_text(self.directory / "config.yaml", sealed(config_text(self.settings)))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,9 +10,9 @@ from scene_envs.errors import InvalidInputError, unknown_name
 
 
 def at_least(settings: Any, low: float, *names: str) -> None:
-    """Refuse numbers below ``low``."""
+    """Refuse numbers below ``low``, and NaN; None stands for no number."""
     for name in names:
-        if getattr(settings, name) < low:
+        if getattr(settings, name) is not None and not getattr(settings, name) >= low:
             raise InvalidInputError(f"{name}={getattr(settings, name)} must be at least {low}")
 
 
@@ -20,6 +21,13 @@ def positive(settings: Any, *names: str) -> None:
     for name in names:
         if not getattr(settings, name) > 0:
             raise InvalidInputError(f"{name}={getattr(settings, name)} must be positive")
+
+
+def finite(settings: Any, *names: str) -> None:
+    """Refuse infinite numbers and NaN."""
+    for name in names:
+        if not math.isfinite(getattr(settings, name)):
+            raise InvalidInputError(f"{name}={getattr(settings, name)} must be a finite number")
 
 
 def shares(settings: Any, *names: str) -> None:

@@ -1,9 +1,20 @@
-"""Names of priors that mention adapters, as ``dimsum_table with runs/a+0.5*runs/b``; imports no torch."""
+"""Names and places of priors; imports no torch.
+
+A name may mention adapters, as ``dimsum_table with runs/a+0.5*runs/b``.
+"""
 
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
+from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.files import exists, is_file
+
+SHIPPED = Path(__file__).parents[1] / "priors" / "shipped"
+"""Folder of the priors that ship with the package."""
+CONFIG_NAME = "config.json"
+_MOST_NAME = 1000
 _JOINT = " with "
 
 
@@ -24,3 +35,23 @@ def split_name(name: str | os.PathLike[str]) -> tuple[str | os.PathLike[str], st
     """
     prior, joint, adapter = str(name).partition(_JOINT)
     return (prior, adapter) if joint else (name, "")
+
+
+def list_priors() -> list[str]:
+    """Names of the priors that ship with the package."""
+    return sorted(path.parent.name for path in SHIPPED.glob(f"*/{CONFIG_NAME}"))
+
+
+def find_prior(name: str | os.PathLike[str]) -> Path:
+    """The directory of a prior: a shipped name, a prior directory, or a run directory that holds ``prior/``."""
+    path = Path(name)
+    if len(str(name)) > _MOST_NAME or "\0" in str(name):
+        raise InvalidInputError(
+            f"prior={str(name)[:60] + '...'!r} is neither a name nor a path ({len(str(name))} characters)"
+        )
+    for candidate in (SHIPPED / str(name), path, path / "prior"):
+        if is_file(candidate / CONFIG_NAME):
+            return candidate
+    if exists(path) or os.sep in str(name):
+        raise InvalidInputError(f"{str(name)!r} holds no prior: neither it nor its prior/ folder has a {CONFIG_NAME}")
+    raise unknown_name("prior", str(name), list_priors())

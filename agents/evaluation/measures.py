@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from agents.configuration.measure_names import MEASURE_NAMES
 from agents.evaluation.measure import FLOOR_PREFIX, layout_figures
 from agents.evaluation.novelty import Neighbors, nearest_scenes, novelty
 from agents.evaluation.physics_figures import physics_figures, ready_figures
@@ -56,30 +57,8 @@ def compute_measure(name: str, inputs: EvaluationInputs) -> Figures:
         MissingDependencyError: it needs a package that is not installed.
     """
     if name not in MEASURES:
-        raise unknown_name("measure", name, MEASURES)
+        raise unknown_name("measure", name, MEASURE_NAMES)
     return MEASURES[name](inputs)
-
-
-def choose_measures(measures: str | Iterable[str], *, project: bool = True) -> list[str]:
-    """Names of groups, in their order.
-
-    Args:
-        measures: ``"all"``, a name, names joined by commas, or a list of names.
-        project: whether ``"all"`` includes ``ready``.
-
-    Raises:
-        UnknownNameError: a name that is no group.
-
-    >>> choose_measures("novelty, layout")
-    ['layout', 'novelty']
-    """
-    names = [name.strip() for name in measures.split(",")] if isinstance(measures, str) else [*map(str, measures)]
-    if names == ["all"]:
-        return [name for name in MEASURES if project or name != "ready"]
-    for name in names:
-        if name not in MEASURES:
-            raise unknown_name("measure", name, ["all", *MEASURES])
-    return [name for name in MEASURES if name in names]
 
 
 def _beside_floor(measure: Callable[[SceneBatch], Figures], inputs: EvaluationInputs) -> Figures:

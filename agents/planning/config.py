@@ -23,10 +23,12 @@ class SearchConfig:
         max_nfe: denoiser evaluations of each search, where that is less than the budget's; null for no such limit.
         max_seconds: time after which the search ends with the best so far; null for no limit. The baseline comes
             after it.
-        count: searches, each with a seed of its own; each gives one scene.
+        count: searches, each with a seed of its own; each gives one scene. null for one, or where the search starts
+            from given scenes, for one from each of them.
         side_by_side: searches that run at once, in common batches of the denoiser; others follow when these are done.
         baseline: draw as many independent samples as well, and compare with their best.
-        branching: inpaintings per state; the first ``branching`` scenes are fresh samples of the prior.
+        branching: inpaintings per state; the first ``branching`` scenes are fresh samples of the prior, or inpaintings
+            of the given scene.
         max_depth: inpaintings in a row, the fresh sample included.
         num_steps: denoiser evaluations per scene.
         mask: which objects to regenerate: a registered name, or a mapping of it and its settings; in Python a function
@@ -48,7 +50,7 @@ class SearchConfig:
     budget: int = 64
     max_nfe: int | None = None
     max_seconds: float | None = None
-    count: int = 1
+    count: int | None = None
     side_by_side: int = 16
     baseline: bool = True
     branching: int = 4
@@ -72,20 +74,21 @@ class SearchConfig:
         return self.num_steps * (2 if self.guidance else 1)
 
     @property
-    def scenes(self) -> int:
+    def expansions(self) -> int:
         """Scenes that each search may generate."""
         return self.budget if self.max_nfe is None else min(self.budget, self.max_nfe // self.nfe_per_scene)
 
     @property
     def parts(self) -> list[range]:
         """The searches that run at once, by their numbers."""
-        starts = range(0, self.count, self.side_by_side)
-        return [range(start, min(start + self.side_by_side, self.count)) for start in starts]
+        count = self.count or 1
+        starts = range(0, count, self.side_by_side)
+        return [range(start, min(start + self.side_by_side, count)) for start in starts]
 
     def __post_init__(self) -> None:
         if self.branching < 1:
             raise InvalidInputError(f"branching={self.branching}: a state needs at least one inpainting")
-        if self.count < 1:
+        if self.count is not None and self.count < 1:
             raise InvalidInputError(f"count={self.count}: give the number of scenes to find, at least 1")
         if self.side_by_side < 1:
             raise InvalidInputError(f"side_by_side={self.side_by_side}: at least one search runs at a time")
@@ -97,7 +100,7 @@ class SearchConfig:
             raise InvalidInputError(
                 f"budget={self.budget} scenes do not cover the {self.branching} first samples (branching); raise it"
             )
-        if self.max_nfe is not None and self.scenes < self.branching:
+        if self.max_nfe is not None and self.expansions < self.branching:
             raise InvalidInputError(
                 f"max_nfe={self.max_nfe} does not cover the {self.branching} first samples (branching) of "
                 f"{self.nfe_per_scene} denoiser evaluations each; raise it to {self.branching * self.nfe_per_scene}"

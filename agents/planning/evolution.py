@@ -27,10 +27,11 @@ from scene_envs.errors import InvalidInputError
 class EvolutionPlanner(PlannerSettings):
     """Evolution with cut and splice as crossover (Deaven and Ho 1995).
 
-    The population begins with fresh samples. A round makes ``children`` offspring. A parent is the better of two
-    members at random. Offspring of one parent is an inpainting of it. Offspring of two is a splice of them
-    (:func:`~agents.planning.splice.spliced`), gets a mask of its own and is inpainted; the splice costs no denoiser
-    evaluation. The best different scenes, old and new, are the next population; of equal values the newer scene stays.
+    The population begins with fresh samples, or with the scene that the search starts from and inpaintings of it. A
+    round makes ``children`` offspring. A parent is the better of two members at random. Offspring of one parent is
+    an inpainting of it. Offspring of two is a splice of them (:func:`~agents.planning.splice.spliced`), gets a mask
+    of its own and is inpainted; the splice costs no denoiser evaluation. The best different scenes, old and new,
+    are the next population; of equal values the newer scene stays.
 
     Attributes:
         population: scenes that are kept, and fresh samples in the beginning.
@@ -76,6 +77,8 @@ class EvolutionPlanner(PlannerSettings):
             if not pairs:
                 break
             born = [(child, ledger.actions(child)) for child in reversed(ledger.expand(pairs)) if child.valid]
+            if ledger.root.valid and not members:
+                members, fresh = [(ledger.root, fresh)], []
             members = best_different([*born, *members], self.population)
         return ledger.result()
 

@@ -46,6 +46,6 @@ class GreedyPlanner(PlannerSettings):
             trail.append((state, actions[count:]))
             scored = [child for child in children if child.valid]
             best = max(scored, key=lambda child: child.value, default=None)
-            if best is not None and (state is ledger.root or best.value >= state.value):
+            if best is not None and not best.value < state.value:
                 trail.append((best, ledger.actions(best)))
         return ledger.result()

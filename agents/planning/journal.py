@@ -17,6 +17,7 @@ import torch
 
 from scene_envs.envs import MaskChoiceState, SearchState
 from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.scene import SceneBatch
 
 _MAGIC = b"scene-envs search 1\n"
 _HEAD = struct.Struct("<II")
@@ -138,6 +139,9 @@ def _described(value: Any) -> str:
         return "{" + ", ".join(f"{key}: {_described(value[key])}" for key in sorted(value)) + "}"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_described, value)) + "]"
+    if isinstance(value, SceneBatch):
+        content = value.tensor.contiguous().numpy().tobytes()
+        return f"{len(value)} scenes {hashlib.blake2b(content, digest_size=8).hexdigest()}"
     if hasattr(value, "weights"):
         digest = hashlib.blake2b(digest_size=8)
         for name, tensor in sorted(value.weights().items()):

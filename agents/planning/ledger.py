@@ -29,7 +29,8 @@ class Searchable(Protocol):
     """Protocol of the trees that a planner searches, such as ``scene_envs.envs.SearchEnv``.
 
     States are immutable. A state with an attribute ``valid`` that is False could not be scored: it is counted and
-    left out of the plan. Two states with equal attributes ``fingerprint`` hold the same scene.
+    left out of the plan. Two states with equal attributes ``fingerprint`` hold the same scene. Where an attribute
+    ``root_counts`` of the tree is True, its root is a scene that may be the best.
     """
 
     def clone_state(self) -> Any:
@@ -55,6 +56,7 @@ class PlanResult:
         best_path: the actions that lead to it from the root.
         values: objective of every expansion in the order they were made; NaN where it failed.
         tree: the search tree, for planners that keep one.
+        start: objective of the root where it may be the best scene; NaN otherwise.
     """
 
     best_state: Any
@@ -62,6 +64,7 @@ class PlanResult:
     best_path: tuple[int, ...]
     values: list[float]
     tree: Tree | None = field(default=None, repr=False)
+    start: float = math.nan
 
     @property
     def curve(self) -> list[float]:
@@ -69,7 +72,7 @@ class PlanResult:
 
         A better state that cost no expansion counts with the last one.
         """
-        best, curve = -math.inf, []
+        best, curve = self.start if math.isfinite(self.start) else -math.inf, []
         for value in self.values:
             best = max(best, value) if math.isfinite(value) else best
             curve.append(best)
@@ -137,7 +140,9 @@ class Ledger:
         if budget < 1:
             raise InvalidInputError(f"a plan needs a budget of at least 1 expansion, got {budget}")
         self.problem, self.budget, self.progress = problem, budget, progress
-        self.root = Candidate(problem.clone_state(), math.nan, ())
+        root = problem.clone_state()
+        value = state_value(problem, root) if getattr(problem, "root_counts", False) else math.nan
+        self.root = Candidate(root, value, ())
         self.values: list[float] = []
         self.best = self.root
         self._stopped = False
@@ -179,7 +184,7 @@ class Ledger:
 
     def result(self, tree: Tree | None = None) -> PlanResult:
         """The plan: the best state, the shallowest and then the first path among equals."""
-        return PlanResult(self.best.state, self.best.value, self.best.path, self.values, tree)
+        return PlanResult(self.best.state, self.best.value, self.best.path, self.values, tree, self.root.value)
 
 
 class Steered:

@@ -26,7 +26,7 @@ def draw_curve(
         curves: best Φ after each generated scene, by planner; values that are not finite are left out.
         path: where the picture goes.
         num_steps: denoiser evaluations per generated scene.
-        first: scenes that were fresh samples in the tree search; the end of them is marked.
+        first: scenes that were fresh samples in the tree search; the end of them is marked. 0 marks nothing.
         scale: raw objective at Φ = 1.
         label: name of the objective.
     """
@@ -39,14 +39,16 @@ def draw_curve(
         points = [(n * num_steps, scale * v) for n, v in enumerate(curve, start=1) if math.isfinite(v)]
         if points:
             axes.step(*zip(*points, strict=True), where="post", label=name, color=color, linewidth=2)
-    axes.axvline(first * num_steps, color="#9aa0a6", linewidth=1, linestyle=":", label="first samples")
+    if first:
+        axes.axvline(first * num_steps, color="#9aa0a6", linewidth=1, linestyle=":", label="first samples")
     axes.set_xlabel("denoiser evaluations (NFE)")
     axes.set_ylabel(f"best {label}")
     axes.set_xlim(left=0)
     if all(math.isclose(scale * v, round(scale * v)) for v in itertools.chain(*curves.values()) if math.isfinite(v)):
         axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, loc="lower right")
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(frameon=False, loc="lower right")
     figure.savefig(path)
     return path
 
@@ -66,6 +68,7 @@ def draw_scene(scene: SceneBatch, state: Any, path: Path, *, width: int = 640, h
     marked = state.mask.unsqueeze(0) & scene.is_free
     image = render(scene, width=width, height=height, highlight=marked)[0]
     objects = int(scene.is_free.sum())
-    caption = f"objective {state.objective:.4g} | {objects} free objects | {int(marked.sum())} to redo (red)"
+    objective = f"objective {state.objective:.4g}" if state.valid else "not scored"
+    caption = f"{objective} | {objects} free objects | {int(marked.sum())} to redo (red)"
     gallery([image], columns=1, captions=[caption]).save(path)
     return path

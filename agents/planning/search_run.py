@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from agents.planning.best_of import BestOfPlanner
 from agents.planning.config import SearchConfig
 from agents.planning.journal import Journal
 from agents.planning.ledger import PlanResult
+from agents.planning.search_metrics import loss_of, search_metrics
 from agents.planning.search_report import draw_curve, draw_scene
 from agents.planning.session import Session
 from agents.planning.tree_file import SearchRecord
@@ -24,7 +25,7 @@ from agents.planning.tree_page import shown_nodes, write_tree_page
 from scene_envs.envs import SearchEnv, SearchMaskEnv, SearchState
 from scene_envs.envs.resolvers import resolve_prior
 from scene_envs.errors import InvalidInputError, SceneEnvsError
-from scene_envs.files import finite, sealed, write_json, write_text
+from scene_envs.files import sealed, write_json, write_text
 from scene_envs.folders import claimed
 from scene_envs.scene import SceneBatch
 
@@ -44,10 +45,11 @@ class SearchOutcome:
 
     Attributes:
         search: the plan of the best search.
-        searches: the plans of all ``count`` searches that found a scene, the best first; without their trees where
-            there were more than ``side_by_side``.
+        searches: the plans of all ``count`` searches that found a scene, the best first, or in the order of the scenes
+            that they started from; without their trees where there were more than ``side_by_side``.
         best_of: best of as many independent samples, the baseline at equal NFE; None without one.
-        first: the best of the first ``branching`` samples of the best search, a batch of one.
+        first: the best of the first ``branching`` samples of the best search, or the scene it started from; a batch of
+            one.
         best: the best scene of each of ``searches``.
         metrics: what ``metrics.json`` holds.
     """
@@ -65,22 +67,26 @@ def run_search(
     objective: Any = "feasible_objects",
     *,
     config: SearchConfig | None = None,
+    scenes: SceneBatch | None = None,
     output: str | Path | None = None,
     progress: Progress | None = None,
     **settings: Any,
 ) -> SearchOutcome:
-    """Search for scenes that score high, starting from nothing but the prior.
+    """Search for scenes that score high, starting from nothing but the prior, or from given scenes.
 
     The root is the scene with fixed welded objects alone, so its children are fresh samples. From there the planner
-    regenerates what the objective blames (Pfaff et al. 2025, inference-time search). The same seed and settings give
-    the same scenes. An interrupt (Ctrl-C, SIGTERM) ends the search with the best so far, as does ``max_seconds``. With
-    an output folder, the same call goes on where an earlier one was killed or ended; a larger budget may be given. Of
-    more than ``side_by_side`` searches the scenes that are finished are in the folder at any time.
+    regenerates what the objective blames (Pfaff et al. 2025, inference-time search). With ``scenes`` there is one
+    search for each of them, up to ``count``: it regenerates what is blamed in that scene, and what it gives scores
+    no less. The same seed and settings give the same scenes. An interrupt (Ctrl-C, SIGTERM) ends the search with
+    the best so far, as does ``max_seconds``. With an output folder, the same call goes on where an earlier one was
+    killed or ended; a larger budget may be given. Of more than ``side_by_side`` searches the scenes that are
+    finished are in the folder at any time.
 
     Args:
         prior: a prior, or the name or path of one.
         objective: any reward: name, mapping, function or object.
         config: the settings; or give its fields as keywords.
+        scenes: what the searches start from, of the prior's scene type; None for fresh samples.
         output: folder for ``curve.png``, ``before.png``, ``after.png``, ``best.safetensors``, ``metrics.json``,
             ``tree.json``, ``tree.html``, the journals, and ``config.yaml``, in which functions and objects are left
             out; None writes nothing.
@@ -89,21 +95,28 @@ def run_search(
 
     Raises:
         SceneEnvsError: no scene could be scored.
-        InvalidInputError: another process writes into the folder, or it holds a search with other settings.
+        InvalidInputError: another process writes into the folder, or it holds a search with other settings; the scenes
+            are not of the prior's type, or have more slots than ``slots``.
     """
     if config is not None and settings:
         raise InvalidInputError(f"give config= or single settings, not both (got {', '.join(sorted(settings))})")
     config = SearchConfig(**settings) if config is None else config
+    if scenes is not None and len(scenes) == 0:
+        raise InvalidInputError("scenes holds no scene to start from")
+    if scenes is not None:
+        scenes = scenes.to("cpu")[: config.count]
+    config = replace(config, count=(config.count or 1) if scenes is None else len(scenes))
     named = {"prior": prior, "objective": objective, **plain_tree(config)}
     if output is None:
-        return _search(prior, objective, named, config, None, progress)
+        return _search(prior, objective, scenes, named, config, None, progress)
     with claimed(output, "run_search") as folder:
-        return _search(prior, objective, named, config, folder, progress)
+        return _search(prior, objective, scenes, named, config, folder, progress)
 
 
 def _search(
     prior: Any,
     objective: Any,
+    starts: SceneBatch | None,
     named: dict[str, Any],
     config: SearchConfig,
     folder: Path | None,
@@ -112,9 +125,11 @@ def _search(
     """:func:`run_search` with its settings resolved, in a folder that no other process writes into."""
     loaded = resolve_prior(prior)
     fixed = {key: value for key, value in named.items() if key not in _LIMITS} | {"prior": loaded}
-    run = _Run(loaded, objective, config, fixed, folder)
+    if starts is not None:
+        starts, fixed = _fitting(starts, loaded, config.slots), {**fixed, "scenes": starts}
+    run = _Run(loaded, objective, config, fixed, folder, starts)
     started = time.perf_counter()
-    planner, scenes = config.planner.make(config.branching), config.scenes
+    planner, scenes = config.planner.make(config.branching), config.expansions
     actions = max(scenes, config.branching) if config.planner.widens else config.branching
     searches: list[PlanResult] = []
     firsts: dict[int, SearchState] = {}
@@ -127,9 +142,14 @@ def _search(
         name = "search" if len(parts) == 1 else f"search_{part.start:06}"
         env, session, plans = run.plan(planner, actions, scenes, part, name, progress, max(left, 1e-9))
         spent, stopped = spent + sum(len(plan.values) for plan in plans), session.stopped
-        searches += [plan if len(parts) == 1 else replace(plan, tree=None) for plan in plans if plan.best_path]
-        searches.sort(key=lambda plan: -plan.best_value)
-        firsts |= {lane.root.seed: _best_first(lane.first[: config.branching]) for lane in session.lanes if lane.first}
+        found = plans if starts is not None else [plan for plan in plans if plan.best_path]
+        searches += found if len(parts) == 1 else [replace(plan, tree=None) for plan in found]
+        if starts is None:
+            searches.sort(key=loss_of)
+        for lane in session.lanes:
+            if starts is not None or lane.first:
+                first = _best_first(lane.first[: config.branching]) if starts is None else lane.root
+                firsts[lane.root.seed] = first
         if folder is not None and len(parts) > 1 and searches:
             _scenes(env, searches).save(folder / "best.safetensors")
         if stopped:
@@ -146,14 +166,14 @@ def _search(
             f"the objective {objective!r} is {root.objective:.4g} for the empty scene already, and the search ends at "
             f"objective_scale={env.problem.scale:.4g}; give a larger objective_scale"
         )
-    if not searches:
+    if not any(math.isfinite(plan.best_value) for plan in searches):
+        which = f"the first {config.branching} samples of the prior" if starts is None else "the scenes of the search"
         raise SceneEnvsError(
             f"the search was interrupted before its first {config.branching} scenes were there; call it again"
             if stopped and not spent
-            else f"the objective {objective!r} could not score any of the first {config.branching} samples of the "
-            "prior; the log above says why"
+            else f"the objective {objective!r} could not score any of {which}; the log above says why"
         )
-    best = searches[0]
+    best = min(searches, key=loss_of)
     first = firsts[best.best_state.seed]
     outcome = SearchOutcome(
         search=best,
@@ -161,10 +181,12 @@ def _search(
         best_of=best_of,
         first=env.scene(first),
         best=_scenes(env, searches),
-        metrics=_metrics(objective, env.problem.scale, config, searches, best_of, first, seconds, stopped, spent),
+        metrics=search_metrics(
+            objective, env.problem.scale, config, searches, best_of, firsts, seconds, stopped, spent, starts is not None
+        ),
     )
     if folder is not None:
-        _write(outcome, config, first, folder)
+        _write(outcome, config, env.scene(best.best_state), first, folder)
         if len(parts) == 1:
             _write_tree(outcome, env, session, folder)
         plain = {key: value for key, value in named.items() if isinstance(value, _PLAIN)}
@@ -181,6 +203,7 @@ class _Run:
     config: SearchConfig
     named: dict[str, Any]
     folder: Path | None
+    starts: SceneBatch | None = None
 
     def plan(
         self,
@@ -205,7 +228,7 @@ class _Run:
             max_depth=config.max_depth,
             num_steps=config.num_steps,
             prior=self.prior,
-            slots=config.slots,
+            slots=config.slots if self.starts is None else self.starts.tensor.shape[1],
             **masks,
             objective_scale=config.objective_scale,
             workers=config.workers,
@@ -216,16 +239,18 @@ class _Run:
         if self.folder is not None:
             journal = Journal(self.folder / f"{name.replace(' ', '_')}.journal", self.named)
         session = Session(env, max_seconds=max_seconds, journal=journal)
-        title, total = name.split("_")[0], budget * (config.count if name.startswith("search") else 1)
+        title, total = name.split("_")[0], budget * (config.count or 1 if name.startswith("search") else 1)
         before = part.start * budget
         told = None if progress is None else lambda done, best: progress(title, before + done, total, best)
         try:
             empty = SceneBatch.empty(self.prior.scene_type, 1, env.problem.slots)
             roots = []
             for search in part:
-                env.reset(seed=config.seed + search, options={"scene": empty})
+                root = empty if self.starts is None else self.starts[search : search + 1]
+                env.reset(seed=config.seed + search, options={"scene": root})
                 roots.append(env.clone_state())
-            return env, session, session.run(planner, roots, budget, told)
+            plans = session.run(planner, roots, budget, told, root_counts=self.starts is not None)
+            return env, session, plans
         finally:
             env.close()
 
@@ -235,54 +260,22 @@ def _scenes(env: SearchEnv, plans: Sequence[PlanResult]) -> SceneBatch:
     return SceneBatch.concatenate([env.scene(plan.best_state) for plan in plans])
 
 
+def _fitting(scenes: SceneBatch, prior: Any, slots: int | None) -> SceneBatch:
+    """Scenes to start from, with ``slots`` slots, or no fewer than those of the prior's scene type."""
+    if scenes.scene_type.name != prior.scene_type.name:
+        raise InvalidInputError(
+            f"the prior makes scenes of {prior.scene_type.name!r}, and the search would start from scenes of "
+            f"{scenes.scene_type.name!r}; give a prior of that type"
+        )
+    return scenes.with_slots(max(prior.scene_type.slots, scenes.tensor.shape[1]) if slots is None else slots)
+
+
 def _best_first(states: Sequence[SearchState]) -> SearchState:
     """The best of the first children of a root."""
     return max(states, key=lambda state: state.value if state.valid else -1.0)
 
 
-def _metrics(
-    objective: Any,
-    scale: float,
-    config: SearchConfig,
-    searches: Sequence[PlanResult],
-    best_of: PlanResult | None,
-    first: SearchState,
-    seconds: dict[str, float],
-    stopped: str,
-    spent: int,
-) -> dict[str, Any]:
-    search = searches[0]
-    metrics = {
-        "objective": objective if isinstance(objective, str) else getattr(objective, "__name__", repr(objective)),
-        "objective_scale": scale,
-        "saturated": search.best_state.objective > scale,
-        "below_zero": search.best_state.objective < 0,
-        "planner": config.planner.name,
-        "stopped": stopped or None,
-        "nfe": spent * config.nfe_per_scene,
-        "first_samples": {"value": first.value, "objective": first.objective},
-        "search": _of_plan(search),
-        "seconds": {name: round(value, 2) for name, value in seconds.items()},
-    }
-    if len(searches) > 1:
-        metrics["searches"] = [_of_plan(plan) for plan in searches]
-    if best_of is not None:
-        metrics["best_of"] = _of_plan(best_of)
-    return metrics
-
-
-def _of_plan(plan: PlanResult) -> dict[str, Any]:
-    return {
-        "value": plan.best_value,
-        "objective": plan.best_state.objective,
-        "path": list(plan.best_path),
-        "expansions": len(plan.values),
-        "invalid": sum(map(math.isnan, plan.values)),
-        "curve": finite(plan.curve),
-    }
-
-
-def _write(outcome: SearchOutcome, config: SearchConfig, first: SearchState, output: Path) -> None:
+def _write(outcome: SearchOutcome, config: SearchConfig, best: SceneBatch, first: SearchState, output: Path) -> None:
     write_json(output / "metrics.json", outcome.metrics, indent=2)
     outcome.best.save(output / "best.safetensors")
     curves = {config.planner.name: outcome.search.curve}
@@ -292,12 +285,12 @@ def _write(outcome: SearchOutcome, config: SearchConfig, first: SearchState, out
         curves,
         output / "curve.png",
         num_steps=config.nfe_per_scene,
-        first=config.branching,
+        first=0 if "start" in outcome.metrics else config.branching,
         scale=outcome.metrics["objective_scale"],
         label=str(outcome.metrics["objective"]).replace("_", " "),
     )
     draw_scene(outcome.first, first, output / "before.png")
-    draw_scene(outcome.best[0], outcome.search.best_state, output / "after.png")
+    draw_scene(best, outcome.search.best_state, output / "after.png")
 
 
 def _write_tree(outcome: SearchOutcome, env: SearchEnv, session: Session, output: Path) -> None:
@@ -308,12 +301,15 @@ def _write_tree(outcome: SearchOutcome, env: SearchEnv, session: Session, output
     metrics = outcome.metrics
     settings = {name: metrics[name] for name in ("planner", "objective", "objective_scale")}
     settings["nfe_per_scene"] = env.problem.nfe_per_scene
-    best = {plan.best_state.seed: tuple(plan.best_path) for plan in outcome.searches}
+    if "start" in metrics:
+        settings["from_scene"] = True
+    best = {plan.best_state.seed: tuple(plan.best_path) for plan in sorted(outcome.searches, key=loss_of)}
     record = SearchRecord.of(roots, islice(session.journal.states(), made), best, settings)
     record.save(output / "tree.json")
     shown = shown_nodes(record)
-    kept = {node: env.scene(s) for node, s in enumerate(session.journal.states(), start=len(roots)) if node in shown}
-    last = kept.get(record.searches[0]["best"])
-    returned = None if last is not None and torch.equal(last.tensor, outcome.best[0].tensor) else outcome.best[0]
+    made_states = chain(roots, session.journal.states())
+    kept = {node: env.scene(state) for node, state in enumerate(made_states) if node in shown}
+    last, best_scene = kept.get(record.searches[0]["best"]), env.scene(outcome.search.best_state)
+    returned = None if last is not None and torch.equal(last.tensor, best_scene.tensor) else best_scene
     scenes = {node: kept[node] for node in shown}
     write_tree_page(output / "tree.html", record, scenes, metrics, returned=returned)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import queue
 import threading
 import time
@@ -28,6 +29,7 @@ class Lane:
         root: state that the plan starts from.
         budget: expansions.
         ask: expands pairs for this lane.
+        root_counts: whether the root may be the best state.
 
     Attributes:
         values: objective of every expansion; NaN where it failed.
@@ -35,10 +37,11 @@ class Lane:
         first: children of the root, in the order they were made.
     """
 
-    def __init__(self, problem: Searchable, root: Any, budget: int, ask: Ask) -> None:
-        self.problem, self.root, self.budget, self.ask = problem, root, budget, ask
+    def __init__(self, problem: Searchable, root: Any, budget: int, ask: Ask, root_counts: bool = False) -> None:
+        self.problem, self.root, self.budget, self.ask, self.root_counts = problem, root, budget, ask, root_counts
         self.values: list[float] = []
-        self.best: tuple[float, Any] = (float("-inf"), root)
+        self.start = state_value(problem, root) if root_counts else math.nan
+        self.best: tuple[float, Any] = (self.start if math.isfinite(self.start) else -math.inf, root)
         self.first: list[Any] = []
 
     def clone_state(self) -> Any:
@@ -74,7 +77,7 @@ class Lane:
         """What is kept of a planner that did not return."""
         value, state = self.best
         path = getattr(state, "path", ()) if self.values else ()
-        return PlanResult(state, value if value > float("-inf") else float("nan"), path, self.values)
+        return PlanResult(state, value if value > -math.inf else math.nan, path, self.values, start=self.start)
 
 
 class Session:
@@ -106,7 +109,13 @@ class Session:
         self.lanes: list[Lane] = []
 
     def run(
-        self, planner: Any, roots: Sequence[Any], budget: int, progress: Progress | None = None
+        self,
+        planner: Any,
+        roots: Sequence[Any],
+        budget: int,
+        progress: Progress | None = None,
+        *,
+        root_counts: bool = False,
     ) -> list[PlanResult]:
         """One plan of ``budget`` expansions per root.
 
@@ -115,8 +124,9 @@ class Session:
             roots: states that the plans start from.
             budget: expansions of each plan.
             progress: told of the expansions of all plans together, and of the best value of the worst of them.
+            root_counts: whether a root may be the best state of its plan.
         """
-        lanes = self.lanes = [Lane(self.problem, root, budget, self._expand) for root in roots]
+        lanes = self.lanes = [Lane(self.problem, root, budget, self._expand, root_counts) for root in roots]
         told = None if progress is None else lambda *_: progress(*_overall(lanes))
         with terminable():
             if len(lanes) > 1:

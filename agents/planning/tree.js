@@ -3,6 +3,7 @@
 const element = (id) => document.getElementById(id);
 const data = JSON.parse(element("data").textContent);
 const count = data.parent.length - 1; // without the root, which is node 0
+const first = data.from_scene ? 0 : 1; // the root is drawn where the search started from a scene
 const viewer = element("viewer");
 
 // -- the 3-D view -------------------------------------------------------------------------------------------------
@@ -77,15 +78,15 @@ for (const card of document.querySelectorAll("button.card")) {
 const [LEFT, RIGHT, TOP, BOTTOM] = [46, 990, 12, 336];
 const plot = element("plot");
 const baseline = data.baseline.slice(0, count); // as many samples as this search made
-const values = [...data.objective.slice(1), ...baseline].filter((value) => value !== null);
-const [lowest, highest] = [Math.min, Math.max].map((pick) => values.reduce((a, b) => pick(a, b)));
+const values = [...data.objective.slice(first), ...baseline].filter((value) => value !== null);
+const [lowest, highest] = [Math.min, Math.max].map((pick) => values.reduce((a, b) => pick(a, b), values[0] ?? 0));
 const gap = tickSize(lowest, highest, 6);
 const [low, high] = [Math.floor(lowest / gap) * gap, Math.ceil(highest / gap) * gap];
 
 const x = (scene) => LEFT + ((RIGHT - LEFT) * scene) / Math.max(1, count);
 const y = (value) => BOTTOM - ((BOTTOM - TOP) * (value - low)) / (high - low || 1);
 const at = (scene) => `${x(scene).toFixed(1)} ${y(data.objective[scene]).toFixed(1)}`;
-const scored = (scene) => scene > 0 && data.objective[scene] !== null;
+const scored = (scene) => scene >= first && data.objective[scene] !== null;
 
 function draw(name, attributes, text) {
   const node = document.createElementNS("http://www.w3.org/2000/svg", name);
@@ -129,14 +130,15 @@ draw("path", { class: "edges", d: scenes.filter((s) => scored(data.parent[s])).m
 draw("path", { class: "dots", d: scenes.map((s) => `M${at(s)}h0`).join("") });
 if (baseline.length) draw("path", { class: "base", d: stairs(baseline) });
 draw("path", { class: "best", d: stairs(data.objective.slice(1)) });
-draw("path", { class: "way", d: `M${data.path.map(at).join("L")}` });
-draw("path", { class: "way dots", d: data.path.map((s) => `M${at(s)}h0`).join("") });
-for (const scene of Object.keys(data.frame)) draw("circle", { class: "rings", cx: x(scene), cy: y(data.objective[scene]), r: 5.5 });
+const way = data.path.filter(scored);
+if (way.length) draw("path", { class: "way", d: `M${way.map(at).join("L")}` });
+draw("path", { class: "way dots", d: way.map((s) => `M${at(s)}h0`).join("") });
+for (const scene of Object.keys(data.frame).map(Number).filter(scored)) draw("circle", { class: "rings", cx: x(scene), cy: y(data.objective[scene]), r: 5.5 });
 
 function nearest(event) {
   const box = plot.getBoundingClientRect();
   const [left, top] = [((event.clientX - box.left) * 1000) / box.width, ((event.clientY - box.top) * 380) / box.height];
-  let found = 0, least = 15 ** 2;
+  let found = null, least = 15 ** 2;
   for (const scene of scenes) {
     const away = (x(scene) - left) ** 2 + (y(data.objective[scene]) - top) ** 2;
     if (away < least) [found, least] = [scene, away];
@@ -145,7 +147,7 @@ function nearest(event) {
 }
 
 function facts(scene) {
-  const origin = data.parent[scene] ? `child ${data.action[scene]} of scene ${data.parent[scene]}` : "a first sample";
+  const origin = scene === 0 ? "the scene that the search started from" : data.parent[scene] >= first ? `child ${data.action[scene]} of scene ${data.parent[scene]}` : "a first sample";
   const below = data.below[scene] - 1;
   return [
     `scene ${scene}: ${data.name} ${Number(data.objective[scene].toPrecision(4))}`,
@@ -156,9 +158,9 @@ function facts(scene) {
 
 plot.addEventListener("mousemove", (event) => {
   const scene = nearest(event), tip = element("tip");
-  tip.hidden = !scene;
-  plot.style.cursor = scene in data.frame ? "pointer" : "";
-  if (!scene) return;
+  tip.hidden = scene === null;
+  plot.style.cursor = scene !== null && scene in data.frame ? "pointer" : "";
+  if (scene === null) return;
   tip.replaceChildren(...facts(scene).flatMap((line, k) => (k ? [document.createElement("br"), line] : [line])));
   tip.style.left = `${x(scene) / 10}%`;
   tip.style.top = `${(y(data.objective[scene]) * 100) / 380}%`;
@@ -166,7 +168,7 @@ plot.addEventListener("mousemove", (event) => {
 plot.addEventListener("mouseleave", () => (element("tip").hidden = true));
 plot.addEventListener("click", (event) => {
   const scene = nearest(event);
-  if (scene in data.frame) visit(data.frame[scene]);
+  if (scene !== null && scene in data.frame) visit(data.frame[scene]);
 });
 
 document.body.dataset.state = "ready";

@@ -98,7 +98,7 @@ class TreeOverStepsPlanner(PlannerSettings):
                     _grow(node, child)
                     if child.valid and (best is None or child.value > best.value):
                         best = child
-            if best is not None and (state is ledger.root or best.value >= state.value) and ledger.actions(best):
+            if best is not None and not best.value < state.value and ledger.actions(best):
                 state, actions, best, tree = best, ledger.actions(best), None, _Stop(-1)
         return ledger.result()
 

@@ -32,7 +32,7 @@ class Card:
 
     Attributes:
         node: the scene.
-        column: its depth, counted from 0 at the first samples.
+        column: its depth, counted from 0 at the first samples, or at the scene that the search started from.
         row: counted from 0; a first child is in the row of its parent.
         parent: index of the parent's card; None for a first sample.
         number: which scene of its search it is, counted from 1.
@@ -49,9 +49,19 @@ class Card:
     on_path: bool
 
 
+def best_path(record: SearchRecord) -> list[int]:
+    """Ids of the scenes that lead to the best one, from a first sample or the scene that the search started from."""
+    return record.path(record.searches[0]["best"])[_first(record) :]
+
+
+def _first(record: SearchRecord) -> int:
+    """1 where the root is an empty scene, which is not shown; 0 where the search started from it."""
+    return 0 if record.settings.get("from_scene") else 1
+
+
 def shown_nodes(record: SearchRecord) -> list[int]:
     """Ids of the scenes that the page shows: the best path of the first search, then its other best scenes."""
-    path = record.path(record.searches[0]["best"])[1:]
+    path = best_path(record)
     if len(path) > LONGEST_PATH:
         path = [path[step] for step in np.linspace(0, len(path) - 1, LONGEST_PATH).round().astype(int)]
     on_path = set(path)
@@ -83,7 +93,7 @@ def write_tree_page(
     from scene_envs.render import viewer_page
 
     shown = list(scenes)
-    way = record.path(record.searches[0]["best"])[1:]
+    way = best_path(record)
     batch = SceneBatch.concatenate([*scenes.values(), *([] if returned is None else [returned])])
     tree = record.tree_of(0)
     number = {node.id: k for k, node in enumerate(tree)}
@@ -107,6 +117,7 @@ def write_tree_page(
         "name": _words(metrics["objective"]),
         "baseline": _baseline(metrics),
         "nfe": record.settings["nfe_per_scene"],
+        "from_scene": not _first(record),
     }
     style = "".join(_text(*place) for place in (("agents.utils", "report.css"), ("agents.planning", "tree.css")))
     page = _template().render(
@@ -120,7 +131,8 @@ def write_tree_page(
         record=record,
         metrics=metrics,
         objective=_words(metrics["objective"]),
-        path_length=len(way),
+        path_length=record.nodes[record.searches[0]["best"]].depth,
+        from_scene=not _first(record),
         left_out=sum(node not in scenes for node in way),
         best_nodes=sum(node not in on_path for node in shown),
         scene_type=_words(batch.scene_type.name),
@@ -139,21 +151,23 @@ def _template() -> Template:
 
 
 def _cards(record: SearchRecord, shown: Sequence[int], way: Sequence[int]) -> list[Card]:
-    """The scenes that are shown and all their ancestors but the root, parents first; the best path in the first row.
+    """The scenes that are shown and all their ancestors but an empty root, parents first.
+
+    The best path is in the first row.
 
     A chain of first children takes the highest row that is free in all its columns.
     """
     frames, on_path = {node: frame for frame, node in enumerate(shown)}, set(way)
     number = {node.id: k for k, node in enumerate(record.tree_of(0))}
     children: dict[int | None, list[int]] = {}
-    for each in {ancestor for node in shown for ancestor in record.path(node)[1:]}:
+    for each in {ancestor for node in shown for ancestor in record.path(node)[_first(record) :]}:
         children.setdefault(record.nodes[each].parent, []).append(each)
     for siblings in children.values():
         siblings.sort(key=lambda each: (each not in on_path, -(record.nodes[each].value or 0.0), each))
     cards: list[Card] = []
     index: dict[int, int] = {}
     used: dict[int, int] = {}
-    chains = deque(children[record.searches[0]["root"]])
+    chains = deque(children.get(record.searches[0]["root"] if _first(record) else None, []))
     while chains:
         chain = [record.nodes[chains.popleft()]]
         while below := children.get(chain[-1].id):
@@ -170,7 +184,9 @@ def _cards(record: SearchRecord, shown: Sequence[int], way: Sequence[int]) -> li
 
 def _caption(node: TreeNode, number: Mapping[int, int], way: Sequence[int]) -> str:
     place = f"step {way.index(node.id) + 1} of {len(way)} to the best" if node.id in way else "another good scene"
-    return f"{place} · made as no. {number[node.id]} · objective {node.objective:.4g} · {len(node.mask)} slots to redo"
+    made = "where the search started" if node.parent is None else f"made as no. {number[node.id]}"
+    objective = "not scored" if node.objective is None else f"objective {node.objective:.4g}"
+    return f"{place} · {made} · {objective} · {len(node.mask)} slots to redo"
 
 
 def _baseline(metrics: Mapping[str, Any]) -> list[float | None]:

@@ -16,6 +16,8 @@ ENTRY_POINT_GROUP = "scene_envs.algorithms"
 CREDITS = ("auto", "scene", "object")
 CATEGORY_CREDITS = ("auto", "scene", "none")
 BASELINES = ("leave_one_out", "mean")
+STEP_WEIGHTINGS = ("uniform", "std", "variance")
+LOG_PROB_REDUCTIONS = ("mean", "sum")
 
 Algorithm = TypeVar("Algorithm", bound=type)
 
@@ -82,6 +84,8 @@ class DDPOSFSettings(AlgorithmSettings):
             raise InvalidInputError(f"skip_first={self.skip_first} must lie in [0, 1)")
         one_of(self, "credit", CREDITS)
         one_of(self, "baseline", BASELINES)
+        one_of(self, "step_weighting", STEP_WEIGHTINGS)
+        one_of(self, "log_prob_reduction", LOG_PROB_REDUCTIONS)
 
 
 @dataclass

@@ -37,6 +37,7 @@ class PostTrainOptimizerSettings(OptimizerSettings):
     chunk: int | None = None
 
     def __post_init__(self) -> None:
+        at_least(self, 1, "chunk")
         if self.lr is not None:
             super().__post_init__()
 
@@ -80,7 +81,7 @@ class GuardSettings:
         at_least(self, 1, "every", "scenes", "max_invalid", "samples_every")
         positive(self, "limit")
         one_of(self, "action", ("report", "stop", "rollback"))
-        at_least(self, 0, "samples")
+        at_least(self, 0, "samples", "count_limit", "category_limit", "classifier_limit")
 
     @property
     def sampled(self) -> int:
@@ -203,7 +204,7 @@ class PostTrainConfig:
     logger: PostTrainLoggerSettings = nested(PostTrainLoggerSettings, folder="logger", option="csv")
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "iterations", "num_steps")
+        at_least(self, 1, "iterations", "num_steps", "slots")
         at_least(self, 2, "batch_size")
         positive(self, "reward_timeout", "reward_memory")
         self.prompt = list(self.prompt) if isinstance(self.prompt, tuple) else self.prompt

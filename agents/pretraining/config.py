@@ -89,6 +89,7 @@ class PretrainConfig:
 
     def __post_init__(self) -> None:
         at_least(self, 1, "batch_size")
+        at_least(self, 0, "iterations")
 
     @property
     def directory(self) -> Path:

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-from agents.configuration.checks import at_least, one_of, shares
+from agents.configuration.checks import at_least, finite, one_of, positive, shares
 from agents.configuration.fields import nested
 from agents.configuration.settings import LoggerSettings, OptimizerSettings
+from scene_envs.errors import InvalidInputError
 
 
 @dataclass
@@ -80,6 +81,9 @@ class NetworkSettings:
     def __post_init__(self) -> None:
         at_least(self, 1, "hidden", "depth", "heads")
         at_least(self, 0, "frequencies")
+        at_least(self, 1, "pose_head", "double_blocks", "embedding")
+        positive(self, "time_scale")
+        one_of(self, "text_reach", ("double", "all"), "reach of text")
 
 
 @dataclass
@@ -117,6 +121,25 @@ class ProcessSettings:
     unmasking: str = "even"
     denoised_clip: float = 0.0
 
+    def __post_init__(self) -> None:
+        one_of(self, "name", ("mixed", "continuous"), "process")
+        if self.prediction == "karras":
+            raise InvalidInputError("prediction='karras' has another name now: prediction='edm'")
+        one_of(self, "prediction", ("edm", "epsilon", "x0", "v"))
+        one_of(self, "schedule", ("karras", "linear", "cosine"), "noise schedule")
+        one_of(self, "moments", ("category", "feature", "scene"))
+        one_of(self, "rotation", ("matrix", "quaternion", "axis_angle"))
+        kernels = ("mask_and_replace", "absorbing", "early_absorbing", "squared_absorbing", "uniform")
+        one_of(self, "kernel", kernels, "categorical kernel")
+        one_of(self, "empty_slots", ("attended", "dropped"), "treatment of empty slots")
+        one_of(self, "unmasking", ("even", "independent"))
+        positive(self, "noise_floor", "noise_ceiling")
+        at_least(self, 0, "denoised_clip")
+        if not self.noise_floor < self.noise_ceiling:
+            raise InvalidInputError(
+                f"noise_floor={self.noise_floor} must be less than noise_ceiling={self.noise_ceiling}"
+            )
+
 
 @dataclass
 class LossSettings:
@@ -146,6 +169,15 @@ class LossSettings:
     category: str = "cross_entropy"
     category_weight: float = 2.0
     observed_share: float = 0.3
+
+    def __post_init__(self) -> None:
+        one_of(self, "timesteps", ("lognormal", "uniform", "both"), "distribution of timesteps")
+        one_of(self, "weighting", ("none", "min_snr"), "loss weighting")
+        one_of(self, "category", ("cross_entropy", "bound"), "category loss")
+        finite(self, "noise_mean")
+        positive(self, "noise_std")
+        at_least(self, 0, "translation_weight", "category_weight")
+        shares(self, "observed_share")
 
 
 @dataclass
@@ -180,6 +212,11 @@ class TextSettings:
     warmup: int = 400
     numbers: bool = True
     dropout: float = 0.1
+
+    def __post_init__(self) -> None:
+        at_least(self, 1, "width", "depth", "window")
+        at_least(self, 0, "latents", "lr_share", "warmup")
+        shares(self, "dropout")
 
     @property
     def is_read(self) -> bool:

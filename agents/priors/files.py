@@ -14,38 +14,16 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from agents.configuration.prior_names import CONFIG_NAME, find_prior
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
-from scene_envs.files import is_file, write_json
+from scene_envs.files import with_digest, without_digest, write_json
 from scene_envs.tensor_files import read_tensors, write_tensors
 
-SHIPPED = Path(__file__).parent / "shipped"
-CONFIG_NAME = "config.json"
 WEIGHTS_NAME = "model.safetensors"
-_MOST_NAME = 1000
 RESIDUAL = "residual."
 """What the names of measured tensors, which are no weights, start with."""
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
 """Number formats of the weights in a file."""
-
-
-def list_priors() -> list[str]:
-    """Names of the priors that ship with the package."""
-    return sorted(path.parent.name for path in SHIPPED.glob(f"*/{CONFIG_NAME}"))
-
-
-def find_prior(name: str | os.PathLike[str]) -> Path:
-    """The directory of a prior: a shipped name, a prior directory, or a run directory that holds ``prior/``."""
-    path = Path(name)
-    if len(str(name)) > _MOST_NAME or "\0" in str(name):
-        raise InvalidInputError(
-            f"prior={str(name)[:60] + '...'!r} is neither a name nor a path ({len(str(name))} characters)"
-        )
-    for candidate in (SHIPPED / str(name), path, path / "prior"):
-        if is_file(candidate / CONFIG_NAME):
-            return candidate
-    if (len(str(name)) < _MOST_NAME // 4 and path.exists()) or os.sep in str(name):
-        raise InvalidInputError(f"{str(name)!r} holds no prior: neither it nor its prior/ folder has a {CONFIG_NAME}")
-    raise unknown_name("prior", str(name), list_priors())
 
 
 def to_precision(weights: Mapping[str, Tensor], precision: str) -> dict[str, Tensor]:
@@ -83,12 +61,12 @@ def write_prior(directory: str | os.PathLike[str], config: Mapping[str, Any], te
 
 
 def write_config(directory: Path, config: Mapping[str, Any]) -> None:
-    """Replace a prior's configuration atomically."""
-    write_json(directory / CONFIG_NAME, config)
+    """Replace a prior's configuration atomically; it carries a digest."""
+    write_json(directory / CONFIG_NAME, with_digest(config))
 
 
 def read_config(name: str | os.PathLike[str]) -> dict[str, Any]:
-    """Configuration of a prior; errors as for :func:`read_prior`."""
+    """Configuration of a prior, without the digest that it is compared with; errors as for :func:`read_prior`."""
     file = find_prior(name) / CONFIG_NAME
     try:
         config: dict[str, Any] = json.loads(file.read_text())
@@ -98,7 +76,7 @@ def read_config(name: str | os.PathLike[str]) -> dict[str, Any]:
         ) from error
     if not isinstance(config, dict):
         raise CorruptFileError(f"{str(file)!r} holds no mapping, so it is not the configuration of a prior")
-    return config
+    return without_digest(config, file)
 
 
 def count_parameters(name: str | os.PathLike[str]) -> int:

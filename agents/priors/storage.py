@@ -12,8 +12,9 @@ from typing import Any
 
 from torch import Tensor
 
+from agents.configuration.prior_names import find_prior
 from agents.diffusion import Preconditioning, ResidualVariance
-from agents.priors.files import find_prior, read_prior, to_precision, write_prior
+from agents.priors.files import read_prior, to_precision, write_prior
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene_types import SceneType, get_scene_type, register_scene_type

@@ -10,13 +10,15 @@ if TYPE_CHECKING:
 
 SCENE_FILES = ("ready.safetensors", "scenes.safetensors", "best.safetensors")
 """What is taken from the folder of a run, the first that is there."""
+_PRIORS = ("prior/config.json", "config.json")
+"""Where a folder has the configuration of a prior."""
 
 
 def find_scenes(path: Path, key: str = "scenes") -> Path:
-    """The file or dataset folder that a key such as ``scenes=`` names: a run's folder stands for the scenes it holds.
+    """The file or folder that a key such as ``scenes=`` names: a run's folder stands for the scenes it holds.
 
     Raises:
-        InvalidInputError: there is nothing.
+        InvalidInputError: there is nothing, or a prior and no scenes.
     """
     from scene_envs.errors import InvalidInputError
     from scene_envs.files import exists
@@ -27,18 +29,29 @@ def find_scenes(path: Path, key: str = "scenes") -> Path:
         )
     if not path.is_dir():
         return path
-    return next((path / name for name in SCENE_FILES if (path / name).is_file()), path)
+    found = next((path / name for name in SCENE_FILES if (path / name).is_file()), path)
+    if found == path and any((path / place).is_file() for place in _PRIORS):
+        raise InvalidInputError(
+            f"{key}={str(path)!r} holds a prior and no scenes; draw some, as with scene-envs sample prior={path}"
+        )
+    return found
+
+
+def is_dataset(path: Path) -> bool:
+    """Whether what :func:`find_scenes` gave is a dataset or one of its files, and neither scene file nor a folder of
+    scene files."""
+    return not _scene_files(path) if path.is_dir() else path.suffix in (".parquet", ".arrow")
 
 
 def load_scenes(path: Path, count: int | None = None) -> SceneBatch:
-    """Scenes from a scene file, the folder of a run that has one, a dataset folder or a parquet file.
+    """Scenes from a scene file, a folder of such files, the folder of a run that has one, a dataset or a file of one.
 
     Args:
         path: file or folder.
-        count: at most so many, the first ones; None for all.
+        count: at most so many, the first ones; None for all. The files of a folder follow each other by name.
 
     Raises:
-        InvalidInputError: ``count`` below 1, or nothing there.
+        InvalidInputError: ``count`` below 1, nothing there, or files of several scene types.
     """
     from scene_envs.datasets import SceneDataset
     from scene_envs.errors import InvalidInputError
@@ -47,7 +60,21 @@ def load_scenes(path: Path, count: int | None = None) -> SceneBatch:
     if count is not None and count < 1:
         raise InvalidInputError(f"count must be at least 1, or null for all, got {count}")
     path = find_scenes(path)
-    if path.is_dir() or path.suffix in (".parquet", ".arrow"):
+    if is_dataset(path):
         return SceneDataset.load(path, limit=count).batch()
-    batch = SceneBatch.load(path)
-    return batch if count is None else batch[:count]
+    files = _scene_files(path) if path.is_dir() else [path]
+    batches = [SceneBatch.load(file) for file in files]
+    names = sorted({batch.scene_type.name for batch in batches})
+    if len(names) > 1:
+        raise InvalidInputError(
+            f"the scene files of {str(path)!r} are of several scene types, {', '.join(names)}; name one of the files"
+        )
+    slots = max(batch.tensor.shape[1] for batch in batches)
+    return SceneBatch.concatenate([batch.with_slots(slots) for batch in batches])[:count]
+
+
+def _scene_files(folder: Path) -> list[Path]:
+    """Scene files of a folder that holds no dataset, by name."""
+    if any(folder.glob("*.parquet")) or any(folder.glob("*.arrow")):
+        return []
+    return sorted(path for path in folder.glob("[!.]*.safetensors") if path.is_file())

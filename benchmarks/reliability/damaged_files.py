@@ -110,8 +110,8 @@ def _kinds(folder: Path) -> list[_Kind]:
         ),
         _Kind(folder / "data/scenes-00000.parquet", data, True),
         _Kind(folder / "tree.json", lambda: repr(SearchRecord.load(folder / "tree.json")).encode(), True),
-        _Kind(folder / "prior/config.json", prior, False),
-        _Kind(folder / "data/metadata.json", data, False),
+        _Kind(folder / "prior/config.json", prior, True),
+        _Kind(folder / "data/metadata.json", data, True),
         _Kind(folder / "assets/cube.obj", assets("assets"), False),
         _Kind(folder / "models/cube.urdf", assets("models"), False),
     ]

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from scene_envs.datasets.store import METADATA
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
+from scene_envs.files import without_digest
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene_types import SceneType
 
@@ -32,7 +33,7 @@ class DatasetInfo:
         slots: N, slots per scene; None when it is not said.
         scene_type: name of the scene type; None in datasets of others.
         count: scenes that were asked for; None when it is not said.
-        metadata: all keys, as they stand in the file.
+        metadata: all keys but the digest, as they stand in the file.
     """
 
     path: Path
@@ -81,7 +82,8 @@ def read_metadata(path: str | os.PathLike[str]) -> DatasetInfo:
 
     Raises:
         InvalidInputError: there is no such file.
-        CorruptFileError: it is not JSON, lacks keys (they are named), or its lengths contradict each other.
+        CorruptFileError: it is not JSON, is not what its digest says, lacks keys (they are named), or its lengths
+            contradict each other.
     """
     file = Path(path) / METADATA if Path(path).is_dir() else Path(path)
     if not file.is_file():
@@ -90,6 +92,8 @@ def read_metadata(path: str | os.PathLike[str]) -> DatasetInfo:
         metadata = json.loads(file.read_text())
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise CorruptFileError(f"{str(file)!r} is not valid JSON: {error}") from error
+    if isinstance(metadata, dict):
+        metadata = without_digest(metadata, file)
     needed = ("model_paths", "normalizer_state")
     missing = [key for key in needed if not isinstance(metadata, dict) or key not in metadata]
     if missing:

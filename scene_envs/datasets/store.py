@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from scene_envs.errors import CorruptFileError, InvalidInputError
-from scene_envs.files import replacing
+from scene_envs.files import replacing, with_digest, without_digest
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene_types import SceneType
 
@@ -94,7 +94,8 @@ def encode_shard(
     }
     if any(len(prompts) > 1 for prompts in prompt_sets):
         columns[PROMPT_SETS] = pa.array([list(prompts) for prompts in prompt_sets], pa.list_(pa.string()))
-    table = pa.table(columns).replace_schema_metadata({_NOTES: json.dumps(notes, sort_keys=True).encode()})
+    kept = json.dumps(with_digest({**notes, "rows": count}), sort_keys=True)
+    table = pa.table(columns).replace_schema_metadata({_NOTES: kept.encode()})
     sink = pa.BufferOutputStream()
     pq.write_table(table, sink, compression="zstd", row_group_size=_ROW_GROUP, write_page_checksum=True)
     return bytes(sink.getvalue().to_pybytes())
@@ -105,8 +106,12 @@ def read_notes(path: Path) -> dict[str, Any]:
     file = open_parquet(path)
     footer = file.schema_arrow.metadata or {}
     try:
-        return {**json.loads(footer.get(_NOTES, b"{}")), "rows": file.metadata.num_rows}
-    except (ValueError, TypeError) as error:
+        notes = without_digest(json.loads(footer.get(_NOTES, b"{}")), path)
+        rows = file.metadata.num_rows
+        if notes.get("rows", rows) != rows:
+            raise ValueError(f"{notes['rows']} rows were written, {rows} are there")
+        return {**notes, "rows": rows}
+    except (ValueError, TypeError, AttributeError, CorruptFileError) as error:
         raise CorruptFileError(
             f"{str(path)!r} has a damaged footer; delete it and generate again to remake it"
         ) from error

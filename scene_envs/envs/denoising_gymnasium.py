@@ -101,7 +101,7 @@ class DenoisingEnv(SpecMixin, gym.Env[Any, np.ndarray]):
 
     | argument | default | meaning |
     |---|---|---|
-    | `scene` | `"dimsum_table"` | scene type |
+    | `scene` | `None` | scene type; `None` is that of the prior, `"dimsum_table"` without one |
     | `reward` | `"object_count"` | name, mapping with settings, function or reward object |
     | `num_steps` | `50` | denoising steps per episode |
     | `prior` | `None` | name, path or prior; `None` is the shipped prior of the scene type |

@@ -83,7 +83,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
 
     | argument | default | meaning |
     |---|---|---|
-    | `scene` | `"dimsum_table"` | scene type |
+    | `scene` | `None` | scene type; `None` is that of the prior, `"dimsum_table"` without one |
     | `objective` | `"feasible_objects"` | any reward: name, mapping, function or object |
     | `branching` | `4` | inpaintings to choose from |
     | `max_depth` | `10` | actions per episode |

@@ -80,7 +80,7 @@ class SearchMaskEnv(SearchEnv):
     | argument | default | meaning |
     |---|---|---|
     | `masks` | `('culprits', 'infeasible', 'empty', 'infeasible_or_empty')` | the K [masks](../search.md#masks): names, mappings with settings, functions |
-    | `scene` | `"dimsum_table"` | scene type |
+    | `scene` | `None` | scene type; `None` is that of the prior, `"dimsum_table"` without one |
     | `objective` | `"feasible_objects"` | any reward: name, mapping, function or object |
     | `branching` | `4` | inpaintings of each mask to choose from |
     | `max_depth` | `10` | actions per episode |

@@ -24,7 +24,7 @@ class EnvSettings:
     """Settings of every environment.
 
     Attributes:
-        scene: scene type or its name.
+        scene: scene type or its name; None means that of the prior, and ``dimsum_table`` without one.
         prior: name, path or prior; None means the shipped prior of the scene type.
         num_steps: denoising steps: of an episode of denoising, of each scene of a search.
         slots: N, slots per scene; None means the scene type's.
@@ -36,7 +36,7 @@ class EnvSettings:
         InvalidInputError: a number is outside what is accepted.
     """
 
-    scene: str | SceneType = "dimsum_table"
+    scene: str | SceneType | None = None
     prior: Any = None
     num_steps: int = 50
     slots: int | None = None

@@ -16,16 +16,23 @@ from scene_envs.protocols import EncodedPriorLike, PriorLike
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
+DEFAULT_SCENE = "dimsum_table"
 STATE_BOUND = 10.0
 """Normalised scenes are kept within ±10. Data lies in [-1, 1] and no float32 normal draw exceeds 6.8."""
 
 
-def resolve_scene_and_prior(scene: str | SceneType, prior: Any) -> tuple[SceneType, PriorLike]:
-    """The scene type, and its prior: the given one, or the shipped one of the scene type's name."""
-    scene_type = get_scene_type(scene)
-    resolved = resolve_prior(scene_type.name if prior is None else prior)
+def resolve_scene_and_prior(scene: str | SceneType | None, prior: Any) -> tuple[SceneType, PriorLike]:
+    """The scene type, and its prior: the given one, or the shipped one of the scene type's name.
+
+    Without a scene type it is that of the prior, and without either ``dimsum_table``.
+    """
+    if scene is None and prior is None:
+        scene = DEFAULT_SCENE
+    named = None if scene is None else get_scene_type(scene)
+    resolved = resolve_prior(named.name if prior is None and named is not None else prior)
     if not isinstance(resolved, PriorLike):
         raise InvalidInputError(f"prior={prior!r} is not a prior; give a name, a path or a prior object")
+    scene_type = resolved.scene_type if named is None else named
     if resolved.scene_type.name != scene_type.name:
         raise InvalidInputError(
             f"the prior makes scenes of {resolved.scene_type.name!r}, the environment asks for {scene_type.name!r}; "

@@ -1,9 +1,14 @@
 """Export of scenes to simulators and viewers: URDF, SDF, Drake, MJCF, USD, GLB, arrays, and formats of your own."""
 
-from scene_envs.export.api import ExportReport, export
-from scene_envs.export.asset_files import AssetFiles
-from scene_envs.export.formats import ExportFormat, list_formats, register_format
-from scene_envs.export.placed import PlacedObject, PlacedScene, place
+from typing import TYPE_CHECKING
+
+from scene_envs.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from scene_envs.export.api import ExportReport, export
+    from scene_envs.export.asset_files import AssetFiles
+    from scene_envs.export.formats import ExportFormat, list_formats, register_format
+    from scene_envs.export.placed import PlacedObject, PlacedScene, place
 
 __all__ = [
     "AssetFiles",
@@ -16,3 +21,5 @@ __all__ = [
     "place",
     "register_format",
 ]
+
+__getattr__ = lazy_names(__name__, __file__)

@@ -41,13 +41,17 @@ class ExportFormat:
     requires: str = ""
     install: str = ""
 
-    def writer(self) -> SceneWriter:
-        """The writer, imported; raises MissingDependencyError where what it needs is not installed."""
+    def check(self) -> None:
+        """Raise MissingDependencyError where what it needs is not installed."""
         if self.requires and find_spec(self.requires) is None:
             raise MissingDependencyError(
                 f"format {self.name!r} needs {self.install}, which is not installed; "
                 f"install it with `pip install {self.install}`, or leave {self.name!r} out of formats="
             )
+
+    def writer(self) -> SceneWriter:
+        """The writer, imported; raises MissingDependencyError where what it needs is not installed."""
+        self.check()
         if not isinstance(self.write, str):
             return self.write
         module, _, function = self.write.partition(":")
@@ -122,6 +126,14 @@ def resolve_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
     >>> resolve_formats(["mjcf", "npz", "mjcf"])
     ('mjcf', 'npz')
     """
+    names = check_formats(formats)
+    for name in names:
+        get_format(name).writer()
+    return names
+
+
+def check_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
+    """As :func:`resolve_formats`, without an import of the writers."""
     if formats == "all":
         return tuple(f.name for f in _FORMATS.values() if not f.requires or find_spec(f.requires) is not None)
     if not isinstance(formats, Sequence) or not all(isinstance(name, str) for name in formats):
@@ -130,5 +142,5 @@ def resolve_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
     if not names:
         raise InvalidInputError(f"formats is empty; give at least one of {', '.join(list_formats())}")
     for name in names:
-        get_format(name).writer()
+        get_format(name).check()
     return names

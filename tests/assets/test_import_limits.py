@@ -12,8 +12,9 @@ import pytest
 import trimesh
 
 from scene_envs.assets import import_report, load_library
-from scene_envs.assets.importing import decomposition
-from scene_envs.errors import InvalidInputError
+from scene_envs.assets.importing import decomposition, user_library
+from scene_envs.assets.importing.limits import READ_HERE
+from scene_envs.errors import InvalidInputError, SceneEnvsError
 
 
 @pytest.fixture(autouse=True)
@@ -84,6 +85,51 @@ def test_coacd_is_ended_when_the_time_of_the_file_is_over(tmp_path: Path, monkey
     monkeypatch.setattr(decomposition, "coacd_settings", lambda threshold: settings | {"mcts_iterations": 10**6})
     text = refused(tmp_path, "took longer than 1 s, CoACD decomposing .*`decomposition: convex`.*IMPORT_SECONDS")
     assert "knotty.stl" in text
+
+
+def sphere(folder: Path, name: str, subdivisions: int) -> Path:
+    path = listed(folder, name)
+    trimesh.creation.icosphere(subdivisions, 0.1).export(path)
+    return path
+
+
+def test_a_stage_is_ended_when_the_time_of_the_file_is_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = sphere(tmp_path, "sphere.stl", 5)
+    assert path.stat().st_size > READ_HERE
+    # A stage that never ends, in the process of the import: the module that Python imports first there.
+    (tmp_path / "sitecustomize.py").write_text("import time\ntime.sleep(1000)\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("SCENE_ENVS_IMPORT_SECONDS", "1")
+    text = refused(tmp_path, r"sphere.stl: the import took longer than 1 s; .*SCENE_ENVS_IMPORT_SECONDS")
+    assert "\n" not in text
+
+
+def test_a_process_of_an_import_that_crashes_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sphere(tmp_path, "sphere.stl", 5)
+    (tmp_path / "sitecustomize.py").write_text("import os\nos._exit(7)\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    refused(tmp_path, "sphere.stl: the import ended with status 7; simplify the file")
+
+
+def test_a_large_file_is_imported_as_a_small_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sphere(tmp_path, "sphere.stl", 5)
+    apart, report = load_library(tmp_path).assets[0], import_report(tmp_path)["sphere"]
+    monkeypatch.setattr(user_library, "READ_HERE", 10**9)
+    user_library._built.cache_clear()
+    here = load_library(tmp_path).assets[0]
+    assert apart is not here
+    assert (apart.mass, len(apart.fine)) == (here.mass, len(here.fine))
+    for name in ("inertia", "center_of_mass"):
+        np.testing.assert_array_equal(getattr(apart, name), getattr(here, name))
+    np.testing.assert_array_equal(apart.visual.vertices, here.visual.vertices)
+    np.testing.assert_array_equal(apart.fine[0].vertices, here.fine[0].vertices)
+    assert str(report) == str(import_report(tmp_path)["sphere"])
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    listed(broken, "noise.stl").write_bytes(bytes(80) + struct.pack("<I", 10_000) + bytes(400_000))
+    monkeypatch.undo()
+    with pytest.raises(SceneEnvsError, match=r"noise\.stl"):
+        load_library(broken)
 
 
 @pytest.mark.parametrize("text", ["a lot", "0", "-1", "nan"])

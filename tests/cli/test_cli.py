@@ -226,7 +226,7 @@ def test_text_that_looks_like_an_interpolation_is_text(text, echo, tmp_path):
         (["sample", "count=" + "9" * 5000], "cannot be read"),
         (["sample", "seed=" + "9" * 30], "whole numbers end at 2^63"),
         (["sample", "seed=-1"], "seed=-1 must be from 0"),
-        (["sample", "device=banana"], "device='banana' is not a torch device of this machine"),
+        (["sample", "device=banana"], "device='banana' is no torch device"),
         (["view", "scene=1e999"], "is neither a name nor a mapping"),
         (["project", "scenes=" + "a" * 300], "no scene file, run or dataset is there"),
         (["sample", "reward=./mine.py:few"], "add --allow-local if you trust it"),

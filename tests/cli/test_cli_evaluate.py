@@ -136,7 +136,7 @@ def test_all_leaves_out_what_cannot_be_measured_and_says_why(
         (["measures=prompts"], "needs a prior that reads prompts"),
         (["measures=fid"], "FID needs fid_weights="),
         (["measures=noveltie"], "did you mean 'novelty'"),
-        (["data=nowhere", "measures=layout"], "no dataset at 'nowhere'"),
+        (["data=nowhere", "measures=layout"], "data='nowhere': nothing is at 'nowhere'"),
         (["heldout=somewhere", "measures=layout"], "needs data="),
         (["count=1", "measures=layout"], "count >= 2"),
         (["prompt_count=1"], "prompt_count=1 must be from 2 to count="),

@@ -1,6 +1,7 @@
 """Files are whole or absent, name themselves when they are damaged, and folders have one writer."""
 
 import errno
+import json
 import multiprocessing
 import os
 import subprocess
@@ -8,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -17,7 +19,7 @@ from agents.utils.checkpoints import load_checkpoint, save_checkpoint
 from scene_envs import SceneBatch
 from scene_envs.datasets.store import read_notes
 from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError, StorageError
-from scene_envs.files import read_sealed, replacing, sealed, write_text
+from scene_envs.files import read_sealed, replacing, sealed, without_digest, write_text
 from scene_envs.folders import LOCK, claimed, sweep
 from scene_envs.tensor_files import read_tensors, write_tensors
 
@@ -110,10 +112,51 @@ def test_a_checksum_beside_a_file_is_verified_and_goes_with_the_file(tmp_path):
 
 
 def test_every_shipped_prior_has_a_checksum():
-    from agents.priors.files import SHIPPED
+    from agents.configuration.prior_names import SHIPPED
 
     for weights in SHIPPED.glob("*/model.safetensors"):
         assert weights.with_name("model.safetensors.sha256").is_file() or b"sha256" in weights.read_bytes()[:100_000]
+
+
+def test_an_edited_configuration_is_told_and_accepted_without_its_digest(tmp_path):
+    path = tiny_prior().save(tmp_path) / "config.json"
+    config = json.loads(path.read_text())
+    path.write_text(json.dumps(config))  # other white space is no change
+    ScenePrior.load(tmp_path)
+    config["prior"]["noise_ceiling"] *= 2
+    path.write_text(json.dumps(config))
+    with pytest.raises(CorruptFileError, match=r"config\.json' was changed .*remove its key 'sha256'"):
+        ScenePrior.load(tmp_path)
+    del config["sha256"]
+    path.write_text(json.dumps(config))
+    assert ScenePrior.load(tmp_path).config.noise_ceiling == config["prior"]["noise_ceiling"]
+
+
+def test_every_shipped_configuration_has_a_digest():
+    from agents.configuration.prior_names import SHIPPED
+
+    for path in SHIPPED.glob("*/config.json"):
+        content = json.loads(path.read_text())
+        assert len(content["sha256"]) == 64
+        assert "sha256" not in without_digest(content, path)  # and it is the digest of the others
+
+
+def test_a_changed_footer_of_a_shard_is_found(tmp_path):
+    import pyarrow.parquet as pq
+
+    from scene_envs.datasets.store import write_shard
+
+    path = tmp_path / "scenes-00000.parquet"
+    write_shard(path, np.zeros((3, 2, 16), np.float32), [("A scene.",)] * 3, {"tried": 5, "reasons": {}})
+    assert read_notes(path) == {"tried": 5, "reasons": {}, "rows": 3}
+    table = pq.read_table(path)
+    notes = {key: value.replace(b'"tried": 5', b'"tried": 6') for key, value in table.schema.metadata.items()}
+    pq.write_table(table.replace_schema_metadata(notes), path)
+    with pytest.raises(CorruptFileError, match="damaged footer"):
+        read_notes(path)
+    pq.write_table(table.slice(0, 2), path)
+    with pytest.raises(CorruptFileError, match="damaged footer"):
+        read_notes(path)
 
 
 @pytest.mark.slow

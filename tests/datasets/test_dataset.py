@@ -154,7 +154,11 @@ def test_broken_metadata_is_named(folder: Path, content: str) -> None:
 )
 def test_contradicting_metadata_is_named(folder: Path, key: str, value: object, words: str) -> None:
     path = folder / "metadata.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
+    content = json.loads(path.read_text()) | {key: value}
+    path.write_text(json.dumps(content))
+    with pytest.raises(CorruptFileError, match=r"metadata\.json.* was changed after it was written .*remove its key"):
+        read_metadata(folder)
+    path.write_text(json.dumps({name: entry for name, entry in content.items() if name != "sha256"}))
     with pytest.raises(CorruptFileError, match=words):
         read_metadata(folder)
 

@@ -8,9 +8,11 @@ from pathlib import Path
 import gymnasium as gym
 import pytest
 
+from agents.priors.testing import tiny_prior
 from scene_envs import plugins
 from scene_envs.envs import resolvers
-from scene_envs.errors import MissingDependencyError, UnknownNameError
+from scene_envs.errors import InvalidInputError, MissingDependencyError, UnknownNameError
+from scene_envs.scene_types import get_scene_type
 
 ID = "scene_envs:SceneEnvs/Denoising-v0"
 
@@ -41,3 +43,16 @@ def test_without_a_resolver_the_error_says_how_to_get_one(monkeypatch: pytest.Mo
     with pytest.raises(MissingDependencyError, match=r"resolves a reward.*pip install -e"):
         resolvers.resolve_reward("object_count")
     resolvers._resolver.cache_clear()
+
+
+@pytest.mark.parametrize("name", ["Denoising-v0", "Search-v0", "SearchMask-v0"])
+def test_the_scene_type_is_that_of_the_prior(name: str, tmp_path: Path) -> None:
+    own = tiny_prior("pantry_shelf").save(tmp_path)
+    goal = "reward" if name == "Denoising-v0" else "objective"
+    made = {goal: "object_count", "num_steps": 2, "prior": str(own)}
+    env = gym.make(f"scene_envs:SceneEnvs/{name}", **made)
+    pantry = get_scene_type("pantry_shelf")
+    assert env.observation_space["object_mask"].n == pantry.slots
+    assert "scene" not in env.spec.kwargs
+    with pytest.raises(InvalidInputError, match="makes scenes of 'pantry_shelf', the environment asks for"):
+        gym.make(f"scene_envs:SceneEnvs/{name}", scene="dimsum_table", **made)

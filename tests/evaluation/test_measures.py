@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from agents.configuration.measure_names import choose_measures
 from agents.evaluation import grammar_scenes
-from agents.evaluation.measures import MEASURES, EvaluationInputs, choose_measures, compute_measure
+from agents.evaluation.measures import MEASURES, EvaluationInputs, compute_measure
 from agents.evaluation.real_scenes import RealScenes
 from scene_envs.datasets import SceneDataset
 from scene_envs.errors import InvalidInputError, UnknownNameError

@@ -90,7 +90,7 @@ def test_sample_exports_what_it_made_ready(prior, tmp_path):
         (["export", "scenes=nowhere.safetensors"], "scenes='nowhere.safetensors': no scene file"),
         (["export", "scenes=OUT/..", "formats=npz"], "no parquet"),
         (["export", "scenes=OUT", "formats=mjfc"], "did you mean 'mjcf'?"),
-        (["export", "scenes=OUT", "count=0"], "count must be at least 1"),
+        (["export", "scenes=OUT", "count=0"], "count=0 must be at least 1"),
         (["sample", "export=[drake, urfd]"], "did you mean 'urdf'?"),
     ],
 )

@@ -11,6 +11,7 @@ import torch
 from safetensors.torch import load_file
 
 from agents import PretrainConfig
+from agents.configuration.prior_names import SHIPPED, list_priors
 from agents.diffusion.gaussian import check_prediction
 from agents.networks import MixedFlux, MixedFluxConfig, build_network, network_config
 from agents.networks.contacts import ContactsConfig
@@ -19,7 +20,6 @@ from agents.networks.observed_flags import ObservedFlagsConfig
 from agents.networks.registry import config_from_state, config_state
 from agents.networks.relations import RelationsConfig
 from agents.priors.base import ScenePrior
-from agents.priors.files import SHIPPED, list_priors
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 SIZES: dict[str, Any] = {"features": 20, "categories": 8, "hidden": 16, "depth": 2, "heads": 2}

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from agents.configuration.prior_names import SHIPPED, list_priors
 from agents.priors.base import ScenePrior
 from agents.priors.facts import PriorFacts
-from agents.priors.files import SHIPPED, list_priors
 
 READERS = [name for name in list_priors() if PriorFacts.of(name).text]
 

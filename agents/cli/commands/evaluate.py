@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from agents.configuration.measure_names import choose_measures
 from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -78,9 +79,25 @@ class EvaluateConfig:
             )
 
 
+def check(settings: EvaluateConfig) -> None:
+    """Refuse what cannot be, before the prior is read."""
+    groups = choose_measures(settings.measures, project=settings.project)
+    if settings.heldout and not settings.data:
+        raise InvalidInputError("heldout= needs data=, the dataset that the prior was trained on")
+    if settings.prompt_count is not None and not 2 <= settings.prompt_count <= settings.count:
+        raise InvalidInputError(
+            f"prompt_count={settings.prompt_count} must be from 2 to count={settings.count}, whose scenes the prompts "
+            "are of; null takes all of them"
+        )
+    if settings.fid_weights and "fid" in groups:
+        from agents.cli.early_checks import check_files
+
+        check_files(settings.fid_weights)
+
+
 def run(settings: EvaluateConfig, run: Run) -> None:
     """Sample, measure group by group, tabulate."""
-    from agents.evaluation.measures import EvaluationInputs, choose_measures, compute_measure
+    from agents.evaluation.measures import EvaluationInputs, compute_measure
     from agents.evaluation.real_scenes import RealScenes
     from agents.priors.base import ScenePrior
     from scene_envs.errors import MissingDependencyError
@@ -88,11 +105,6 @@ def run(settings: EvaluateConfig, run: Run) -> None:
     from scene_envs.physics import PhysicsPool
 
     groups = choose_measures(settings.measures, project=settings.project)
-    if settings.prompt_count is not None and not 2 <= settings.prompt_count <= settings.count:
-        raise InvalidInputError(
-            f"prompt_count={settings.prompt_count} must be from 2 to count={settings.count}, whose scenes the prompts "
-            "are of; null takes all of them"
-        )
     prior = ScenePrior.load(settings.prior).to(settings.device)
     results = _Results.of(run, _identity(settings, prior))
     missing = [name for name in groups if name not in results.groups]

@@ -25,8 +25,8 @@ class ExportConfig:
     """Scenes for simulators and viewers.
 
     Attributes:
-        scenes: a scene file, the folder of a sample or project run (its simulation-ready scenes if it has any), or
-            a dataset.
+        scenes: a scene file or a folder of them, the folder of a sample or project run (its simulation-ready scenes if
+            it has any), or a dataset.
         prior: draw the scenes from this prior instead, a shipped name or a folder.
         formats: one or several of urdf, sdf, drake, mjcf, usd, glb, npz, pickle, as in [drake, mjcf]; all for all
             that can be written here.
@@ -49,6 +49,19 @@ class ExportConfig:
     seed: int = 0
     workers: int = 2
     output: str = ""
+
+
+def check(settings: ExportConfig) -> None:
+    """Refuse what cannot be, before scenes are read."""
+    from scene_envs.errors import InvalidInputError
+    from scene_envs.export.formats import check_formats
+
+    if bool(settings.scenes) == bool(settings.prior):
+        raise InvalidInputError(
+            "export: name either a scene file, run or dataset, as in scenes=runs/mine, or a prior, as in "
+            "prior=dimsum_table"
+        )
+    check_formats(settings.formats)
 
 
 def run(settings: ExportConfig, run: Run) -> None:
@@ -98,15 +111,6 @@ def export_scenes(
 
 def _scenes(settings: ExportConfig, run: Run) -> SceneBatch:
     """The scenes that ``scenes`` or ``prior`` names, at most ``count``."""
-    from scene_envs.errors import InvalidInputError
-
-    if bool(settings.scenes) == bool(settings.prior):
-        raise InvalidInputError(
-            "export: name either a scene file, run or dataset, as in scenes=runs/mine, or a prior, as in "
-            "prior=dimsum_table"
-        )
-    if settings.count is not None and settings.count < 1:
-        raise InvalidInputError(f"count must be at least 1, or null for all, got {settings.count}")
     if settings.prior:
         from agents.priors.base import ScenePrior
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
+from agents.configuration.checks import one_of
 from agents.configuration.fields import named
 
 if TYPE_CHECKING:
@@ -38,6 +39,11 @@ class GenerateConfig:
     backend: str = "processes"
     address: str | None = None
     output: str = ""
+
+
+def check(settings: GenerateConfig) -> None:
+    """Refuse what cannot be, before anything is imported."""
+    one_of(settings, "backend", ("processes", "ray"))
 
 
 def run(settings: GenerateConfig, run: Run) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from agents.configuration.fields import named
 
@@ -31,6 +32,9 @@ class ImportCheckpointConfig:
         output: folder for prior/ and, with a trial, scenes.safetensors.
     """
 
+    LEAST: ClassVar[Mapping[str, int]] = {"count": 0}
+    """Numbers that may be less here than in other commands."""
+
     checkpoint: str = ""
     metadata: str = ""
     scene: Any = named("", "scene")
@@ -42,13 +46,20 @@ class ImportCheckpointConfig:
     output: str = ""
 
 
-def run(settings: ImportCheckpointConfig, run: Run) -> None:
-    """Read, save, try."""
-    from agents.priors.checkpoint_import import import_checkpoint
+def check(settings: ImportCheckpointConfig) -> None:
+    """Refuse files that are not there."""
+    from agents.cli.early_checks import check_files
     from scene_envs.errors import InvalidInputError
 
     if not settings.checkpoint or not settings.metadata:
         raise InvalidInputError("name the two files: scene-envs import-checkpoint FILE metadata.json")
+    check_files(settings.checkpoint, settings.metadata)
+
+
+def run(settings: ImportCheckpointConfig, run: Run) -> None:
+    """Read, save, try."""
+    from agents.priors.checkpoint_import import import_checkpoint
+
     prior = import_checkpoint(
         settings.checkpoint,
         settings.metadata,

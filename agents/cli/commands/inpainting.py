@@ -24,8 +24,8 @@ class InpaintingConfig:
     """Scenes of which a prior generates a part anew.
 
     Attributes:
-        scenes: a scene file, the folder of a sample or project run (its simulation-ready scenes if it has any), or
-            a dataset; empty for fresh samples of ``prior``.
+        scenes: a scene file or a folder of them, the folder of a sample or project run (its simulation-ready scenes if
+            it has any), or a dataset; empty for fresh samples of ``prior``.
         prior: a shipped name, or the folder of a prior or a run; empty means the shipped prior of the scene type.
         count: how many of the scenes, from the first; null for all, or for 12 fresh samples.
         prompt: what the whole scenes should hold, for priors that read prompts; null for anything.
@@ -49,16 +49,20 @@ class InpaintingConfig:
     output: str = ""
 
 
+def check(settings: InpaintingConfig) -> None:
+    """Refuse to work on nothing."""
+    from scene_envs.errors import InvalidInputError
+
+    if not settings.scenes and not settings.prior:
+        raise InvalidInputError("name a scene file, run or dataset, as in scenes=runs/mine, or a prior= to sample from")
+
+
 def load_prior_and_scenes(command: str, settings: InpaintingConfig) -> tuple[ScenePrior, SceneBatch]:
     """The prior and the scenes that a command works on."""
     from agents.priors.base import ScenePrior
     from scene_envs.errors import InvalidInputError
 
     if not settings.scenes:
-        if not settings.prior:
-            raise InvalidInputError(
-                f"{command}: name a scene file, run or dataset, as in scenes=runs/mine, or a prior= to sample from"
-            )
         fresh = ScenePrior.load(settings.prior).to(settings.device)
         count = _FRESH if settings.count is None else settings.count
         return fresh, fresh.sample(count, num_steps=settings.num_steps, seed=settings.seed).to("cpu")

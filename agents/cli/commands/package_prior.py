@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 WRITES = False
 
@@ -22,6 +24,9 @@ class PackagePriorConfig:
         limits: what it is not good at, for the card.
     """
 
+    NO_PATHS: ClassVar[Sequence[str]] = ("data",)
+    """Keys that are words here, and paths in other commands."""
+
     prior: str = ""
     output: str = ""
     evaluation: str = ""
@@ -32,16 +37,23 @@ class PackagePriorConfig:
     limits: str = ""
 
 
-def run(settings: PackagePriorConfig) -> None:
-    """Write the folder; it is the prior itself, so that no log goes into it."""
-    from agents.priors.card import package_prior
-    from agents.priors.facts import PriorFacts
+def check(settings: PackagePriorConfig) -> None:
+    """Refuse what cannot be, before the prior is read."""
+    from agents.configuration.checks import one_of
     from scene_envs.errors import InvalidInputError
 
     if not settings.prior or not settings.output:
         raise InvalidInputError(
             "package-prior: name the prior and its new folder, as in prior=runs/mine output=priors/mine"
         )
+    one_of(settings, "precision", ("float16", "float32"))
+
+
+def run(settings: PackagePriorConfig) -> None:
+    """Write the folder; it is the prior itself, so that no log goes into it."""
+    from agents.priors.card import package_prior
+    from agents.priors.facts import PriorFacts
+
     folder = package_prior(
         settings.prior,
         settings.output,

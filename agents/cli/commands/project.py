@@ -18,7 +18,7 @@ class ProjectConfig:
     """Scenes made simulation-ready.
 
     Attributes:
-        scenes: a scene file, the folder of a sample or search run, or a dataset.
+        scenes: a scene file or a folder of them, the folder of a sample or search run, or a dataset.
         count: how many of the scenes, from the first; null for all.
         pictures: how many scenes the galleries show; 0 draws none.
         workers: physics worker processes; 0 computes in this one.
@@ -32,13 +32,18 @@ class ProjectConfig:
     output: str = ""
 
 
-def run(settings: ProjectConfig, run: Run) -> None:
-    """Project, settle, count what is ready."""
+def check(settings: ProjectConfig) -> None:
+    """Refuse to work on nothing."""
     from scene_envs.errors import InvalidInputError
-    from scene_envs.physics import PhysicsPool
 
     if not settings.scenes:
         raise InvalidInputError("project: name a scene file, run or dataset, as in scenes=runs/mine")
+
+
+def run(settings: ProjectConfig, run: Run) -> None:
+    """Project, settle, count what is ready."""
+    from scene_envs.physics import PhysicsPool
+
     batch = load_scenes(Path(settings.scenes), settings.count)
     with PhysicsPool(workers=settings.workers) as pool:
         draw_scenes(batch, settings.pictures, run, "before.png")

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from agents.cli.commands.inpainting import InpaintingConfig, load_prior_and_scenes, save_scenes
+from agents.cli.commands.inpainting import InpaintingConfig, check, load_prior_and_scenes, save_scenes
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
+
+__all__ = ["check", "run"]
 
 
 def run(settings: InpaintingConfig, run: Run) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from agents.cli.commands.export import export_scenes
 from agents.cli.commands.scenes import draw_scenes, make_ready, reward_figures
+from agents.configuration.checks import one_of
 from agents.configuration.fields import named
 
 if TYPE_CHECKING:
@@ -60,6 +61,15 @@ class SampleConfig:
     workers: int = 2
     device: str = "cpu"
     output: str = ""
+
+
+def check(settings: SampleConfig) -> None:
+    """Refuse what cannot be, before a prior is loaded."""
+    from scene_envs.export.formats import check_formats
+
+    one_of(settings, "union", ("one_type", "any"))
+    if settings.export is not None:
+        check_formats(settings.export)
 
 
 def run(settings: SampleConfig, run: Run) -> None:

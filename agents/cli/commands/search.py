@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.configuration.fields import composed, named
 from agents.planning.config import SearchConfig
+from agents.utils.scene_sources import load_scenes
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from agents.cli.run_folder import Run
+
+FRESH_PRIOR = "dimsum_table"
+"""The prior of a search that starts from fresh samples."""
 
 
 @composed
@@ -18,7 +25,10 @@ class SearchKeys(SearchConfig):
     """What to search, and how.
 
     Attributes:
-        prior: a shipped name, or the folder of a prior or a run.
+        scenes: what the search starts from, one search per scene: a scene file or a folder of them, the folder of a run
+            that holds scenes, or a dataset; empty for fresh samples.
+        prior: a shipped name, or the folder of a prior or a run; empty means the shipped prior of the scenes' type, and
+            dimsum_table without scenes.
         objective: what the scene should score high on: any reward.
         reward_timeout: seconds that an objective from outside this package, which runs in a process of its own, may
             take for a batch; then its scenes are invalid.
@@ -26,7 +36,8 @@ class SearchKeys(SearchConfig):
         output: folder for best.safetensors, tree.html, tree.json and pictures; the same command goes on there.
     """
 
-    prior: str = "dimsum_table"
+    scenes: str = ""
+    prior: str = ""
     objective: Any = named("feasible_objects", "reward")
     reward_timeout: float = 60.0
     reward_memory: float = 1.0
@@ -44,6 +55,8 @@ def run(settings: SearchKeys, run: Run) -> None:
 
     search = SearchConfig(**{field.name: getattr(settings, field.name) for field in fields(SearchConfig)})
     limits = {"timeout": settings.reward_timeout, "memory": settings.reward_memory}
+    scenes = load_scenes(Path(settings.scenes), settings.count) if settings.scenes else None
+    prior = settings.prior or (FRESH_PRIOR if scenes is None else scenes.scene_type.name)
     objective = settings.objective
     if is_foreign(objective):
         objective = run_reward(objective, seed=settings.seed, workers=settings.workers, **limits)
@@ -57,20 +70,15 @@ def run(settings: SearchKeys, run: Run) -> None:
             bar.update(tasks[planner], completed=done, description=f"{planner}, best {best:.3f}, {nfe}")
 
         try:
-            outcome = run_search(settings.prior, objective, config=search, output=settings.output, progress=show)
+            outcome = run_search(prior, objective, config=search, scenes=scenes, output=settings.output, progress=show)
         finally:
             close_reward(objective)
     metrics = outcome.metrics
-    found, first = (metrics[key]["objective"] for key in ("search", "first_samples"))
-    best_of = "" if outcome.best_of is None else f"{metrics['best_of']['objective']:.4g} by as many samples, "
-    run.say(
-        f"{metrics['objective']}: {found:.4g} by {metrics['planner']} with {metrics['nfe']} denoiser evaluations, "
-        f"{best_of}{first:.4g} by the best of the first {search.branching}"
-    )
+    run.say(_summary(metrics, search.branching))
     if len(outcome.searches) > 1:
-        found = [plan.best_state.objective for plan in outcome.searches]
-        each = ", ".join(f"{objective:.4g}" for objective in found[:16])
-        run.say(f"best scenes of {len(found)} searches: {each}" + (f", ..., {found[-1]:.4g}" if found[16:] else ""))
+        run.say(f"best scenes of {len(outcome.searches)} searches: {_listed(metrics['searches'])}")
+    if len(outcome.searches) > 1 and "start" in metrics:
+        run.say(f"they started from: {_listed([plan['start'] for plan in metrics['searches']])}")
     if metrics["saturated"]:
         run.say(
             f"that is beyond objective_scale={metrics['objective_scale']:.4g}, where the search takes a scene for "
@@ -87,4 +95,28 @@ def run(settings: SearchKeys, run: Run) -> None:
         run.say(f"ended after max_seconds={search.max_seconds:g}; the same command with more time goes on")
     run.say(f"written to {run.directory}")
     if metrics["stopped"] in ("interrupt", "terminated"):
+        run.write_config()
         raise Terminated if metrics["stopped"] == "terminated" else KeyboardInterrupt
+
+
+def _summary(metrics: Mapping[str, Any], branching: int) -> str:
+    """What was found, beside the baseline and what there was at first."""
+    best_of = f"{_figure(metrics['best_of'])} by as many samples, " if "best_of" in metrics else ""
+    first = (
+        f"{_figure(metrics['start'])} at the start"
+        if "start" in metrics
+        else f"{_figure(metrics['first_samples'])} by the best of the first {branching}"
+    )
+    return (
+        f"{metrics['objective']}: {_figure(metrics['search'])} by {metrics['planner']} with {metrics['nfe']} denoiser "
+        f"evaluations, {best_of}{first}"
+    )
+
+
+def _listed(plans: list[Mapping[str, Any]]) -> str:
+    """The objective of the first sixteen plans and of the last one."""
+    return ", ".join(map(_figure, plans[:16])) + (f", ..., {_figure(plans[-1])}" if plans[16:] else "")
+
+
+def _figure(of: Mapping[str, Any]) -> str:
+    return "not scored" if of["objective"] is None else f"{of['objective']:.4g}"

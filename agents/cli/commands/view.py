@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.configuration.fields import named
-from agents.utils.scene_sources import find_scenes
+from agents.utils.scene_sources import find_scenes, is_dataset, load_scenes
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
@@ -19,7 +19,8 @@ class ViewConfig:
     """Scenes in a browser.
 
     Attributes:
-        scenes: a scene file, the folder of a run that holds one, a dataset folder or a .parquet file.
+        scenes: a scene file, a folder of such files, the folder of a run that holds one, a dataset folder or a .parquet
+            file.
         prior: a shipped name, or the folder of a prior or a run, to draw samples from.
         scene: scene type to draw from its grammar; with scenes=, the type of a dataset that names none.
         count: scenes to show.
@@ -47,6 +48,20 @@ class ViewConfig:
     output: str = ""
 
 
+def check(settings: ViewConfig) -> None:
+    """Refuse to show nothing, or two things at once."""
+    from scene_envs.errors import InvalidInputError
+
+    if settings.scenes and settings.prior:
+        raise InvalidInputError("view: give either scenes= or prior=, not both")
+    if settings.prior and settings.scene:
+        raise InvalidInputError("view: give either prior= or scene=, not both; a prior knows its scene type")
+    if not (settings.scenes or settings.prior or settings.scene):
+        raise InvalidInputError(
+            "view: say what to show: scenes=FILE or FOLDER, prior=NAME, or scene=TYPE, as in view prior=dimsum_table"
+        )
+
+
 def run(settings: ViewConfig, run: Run) -> None:
     """Write the page, and say where it is."""
     from agents.cli.commands.scenes import draw_scenes
@@ -70,48 +85,31 @@ def run(settings: ViewConfig, run: Run) -> None:
 
 def _gather(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str]:
     """The scenes to show, their captions if they have any, and a title."""
-    from scene_envs.errors import InvalidInputError
-
-    if settings.count < 1 or settings.first < 0:
-        raise InvalidInputError(
-            f"view: count must be at least 1 and first at least 0, got count={settings.count}, first={settings.first}"
-        )
-    if settings.scenes and settings.prior:
-        raise InvalidInputError("view: give either scenes= or prior=, not both")
     if settings.scenes:
         return _read(settings)
-    if settings.prior and settings.scene:
-        raise InvalidInputError("view: give either prior= or scene=, not both; a prior knows its scene type")
     if settings.prior:
         from agents.priors.base import ScenePrior
 
         prior = ScenePrior.load(settings.prior).to(settings.device)
         batch = prior.sample(settings.count, num_steps=settings.num_steps, seed=settings.seed).to("cpu")
         return batch, None, f"Samples of {Path(settings.prior).name}"
-    if settings.scene:
-        import numpy as np
+    import numpy as np
 
-        from scene_envs.grammars import get_grammar
+    from scene_envs.grammars import get_grammar
 
-        batch = get_grammar(settings.scene).sample(np.random.default_rng(settings.seed), settings.count)
-        return batch, None, f"Grammar {settings.scene}"
-    raise InvalidInputError(
-        "view: say what to show: scenes=FILE or FOLDER, prior=NAME, or scene=TYPE, as in view prior=dimsum_table"
-    )
+    batch = get_grammar(settings.scene).sample(np.random.default_rng(settings.seed), settings.count)
+    return batch, None, f"Grammar {settings.scene}"
 
 
 def _read(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str]:
     """Scenes ``first`` to ``first + count`` of a scene file or a dataset, whose captions are its prompts."""
     from scene_envs.errors import InvalidInputError
-    from scene_envs.scene import SceneBatch
 
-    path = Path(settings.scenes)
+    path = find_scenes(Path(settings.scenes))
     chosen = slice(settings.first, settings.first + settings.count)
-    path = find_scenes(path)
-    if path.suffix == ".safetensors":
-        batch = SceneBatch.load(path)
-        total, captions = len(batch), None
-        batch = batch[chosen]
+    if not is_dataset(path):
+        everything, captions = load_scenes(path), None
+        total, batch = len(everything), everything[chosen]
     else:
         from scene_envs.datasets import SceneDataset
 

@@ -19,8 +19,33 @@ from scene_envs.errors import InvalidInputError
 _PREFIX = "SCENE_ENVS_IMPORT_"
 _HEAD = 1 << 16
 """Bytes in which the header of a mesh file ends."""
-_Clock = tuple[Path, float, float]
-"""A file, the time at which its import must be done, and the seconds it was given."""
+READ_HERE = 300_000
+"""Bytes of files that are imported in the calling process, where the time is checked between stages: no stage of so
+little takes long. More is imported in a process that is ended when the time is over."""
+_BYTES_PER_TRIANGLE = 36
+
+
+class LargeImportError(BaseException):
+    """An import reads more than :data:`READ_HERE`; no error of the file, so that nothing takes it for one."""
+
+
+@dataclass
+class _Clock:
+    """The import of one asset.
+
+    Attributes:
+        path: its file.
+        end: when it must be done.
+        seconds: that it was given.
+        room: bytes that it may still read in this process.
+    """
+
+    path: Path
+    end: float
+    seconds: float
+    room: float
+
+
 _clock: ContextVar[_Clock | None] = ContextVar("import_clock", default=None)
 
 
@@ -34,7 +59,7 @@ class ImportLimits:
     Attributes:
         megabytes: size of a file, 10⁶ bytes.
         triangles: triangles (or corners) of a mesh file, as its header or its content says.
-        seconds: time for reading, decomposing and weighing one asset; CoACD is ended in the middle of its work.
+        seconds: time for reading, decomposing and weighing one asset; what takes longer is ended in the middle of it.
     """
 
     megabytes: float = 256.0
@@ -67,6 +92,7 @@ def check_file(path: Path) -> None:
 
     Raises:
         InvalidInputError: it is; names the file, the limit and the variable that raises it.
+        LargeImportError: the import that runs belongs in a process of its own.
     """
     limits = ImportLimits.current()
     try:
@@ -78,7 +104,12 @@ def check_file(path: Path) -> None:
             f"{path} has {size / 1e6:,.0f} MB, more than the {limits.megabytes:g} MB that one file of an asset may "
             f"have; simplify it, or set {_PREFIX}MEGABYTES"
         )
-    check_triangles(path, _promised(path, size))
+    promised = _promised(path, size)
+    check_triangles(path, promised)
+    if (clock := _clock.get()) is not None:
+        clock.room -= max(size, _BYTES_PER_TRIANGLE * promised)
+        if clock.room < 0:
+            raise LargeImportError
 
 
 def check_triangles(path: Path, count: int) -> None:
@@ -92,10 +123,15 @@ def check_triangles(path: Path, count: int) -> None:
 
 
 @contextmanager
-def timed(path: Path) -> Iterator[None]:
-    """Context of the import of one asset, whose time runs; :func:`seconds_left` tells how much is left."""
+def timed(path: Path, room: float = math.inf) -> Iterator[None]:
+    """Context of the import of one asset, whose time runs; :func:`seconds_left` tells how much is left.
+
+    Args:
+        path: its file.
+        room: bytes of files beyond which :func:`check_file` raises LargeImportError.
+    """
     seconds = ImportLimits.current().seconds
-    token = _clock.set((path, time.monotonic() + seconds, seconds))
+    token = _clock.set(_Clock(path, time.monotonic() + seconds, seconds, room))
     try:
         yield
     finally:
@@ -111,7 +147,7 @@ def seconds_left() -> float | None:
     clock = _clock.get()
     if clock is None:
         return None
-    left = clock[1] - time.monotonic()
+    left = clock.end - time.monotonic()
     if left <= 0:
         raise too_slow("")
     return left
@@ -119,7 +155,9 @@ def seconds_left() -> float | None:
 
 def too_slow(doing: str) -> InvalidInputError:
     """The error for an import that took too long, ``doing`` something at the end."""
-    path, _, seconds = _clock.get() or (Path("the mesh"), 0.0, ImportLimits.current().seconds)
+    clock = _clock.get()
+    path = Path("the mesh") if clock is None else clock.path
+    seconds = ImportLimits.current().seconds if clock is None else clock.seconds
     return InvalidInputError(
         f"{path}: the import took longer than {seconds:g} s{doing and ', '}{doing}; simplify the mesh, set "
         f"`decomposition: convex` for it, or set {_PREFIX}SECONDS"

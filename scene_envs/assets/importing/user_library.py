@@ -22,8 +22,9 @@ from scene_envs.assets.importing.entries import (
     default_entry,
     read_entries,
 )
-from scene_envs.assets.importing.limits import check_file, timed
+from scene_envs.assets.importing.limits import READ_HERE, LargeImportError, check_file, timed
 from scene_envs.assets.importing.model import Color
+from scene_envs.assets.importing.process import build_apart
 from scene_envs.assets.importing.report import AssetReport, ImportReport
 from scene_envs.errors import InvalidInputError, SceneEnvsError, unknown_name
 
@@ -190,8 +191,12 @@ def _colored(entries: list[AssetEntry]) -> tuple[AssetEntry, ...]:
 def _built(folder: Path, entry: AssetEntry, stamp: tuple[int, int]) -> tuple[Asset, AssetReport]:
     from scene_envs.assets.importing.build import build_asset  # with trimesh, which the import of this package spares
 
-    with timed(folder / entry.file):
-        asset, report = build_asset(folder / entry.file, entry)
+    try:
+        with timed(folder / entry.file, READ_HERE):
+            asset, report = build_asset(folder / entry.file, entry)
+    except LargeImportError:
+        with timed(folder / entry.file):
+            asset, report = build_apart(folder / entry.file, entry)
     level = logging.WARNING if report.warnings else logging.INFO
     _LOGGER.log(level, "%s", report)
     return asset, report
