@@ -14,6 +14,7 @@ from agents.configuration.prior_names import split_name
 from agents.configuration.settings import LoggerSettings, OptimizerSettings
 from agents.configuration.tree import plain_tree
 from agents.post_training.algorithms import AlgorithmSettings, DDPOSFSettings, algorithm_settings, list_algorithms
+from agents.post_training.inpaint_settings import InpaintSettings
 from agents.post_training.regularisation_settings import AdapterSettings, RegularisationSettings
 from scene_envs.envs.settings import PROMPT_SOURCES
 from scene_envs.errors import InvalidInputError
@@ -160,6 +161,7 @@ class PostTrainConfig:
         regularisation: on real scenes.
         guard: held-out real scenes.
         adapter: low-rank updates, off by default.
+        inpaint: observed parts of scenes, off by default.
         logger: files and screen.
     """
 
@@ -200,6 +202,7 @@ class PostTrainConfig:
     regularisation: RegularisationSettings = nested(RegularisationSettings)
     guard: GuardSettings = nested(GuardSettings)
     adapter: AdapterSettings = nested(AdapterSettings)
+    inpaint: InpaintSettings = nested(InpaintSettings)
     logger: PostTrainLoggerSettings = nested(PostTrainLoggerSettings, folder="logger", option="csv")
 
     def __post_init__(self) -> None:

@@ -217,4 +217,6 @@ def credited_reward(rollout: Rollout, credit: str) -> tuple[Tensor, Tensor]:
         raise InvalidInputError("credit='object' needs a reward with per_object values; this one scores scenes only")
     free = torch.ones(rollout.per_object.shape, dtype=torch.bool, device=rollout.per_object.device)
     free[:, : len(rollout.batch.scene_type.fixed)] = False  # welded slots are not drawn
+    if rollout.observed is not None:
+        free &= ~rollout.observed.all(dim=-1)  # nor is what is observed
     return rollout.per_object.float(), free & rollout.valid.unsqueeze(-1)

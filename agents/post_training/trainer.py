@@ -190,6 +190,7 @@ class PostTrainer:
             self._probe(batch[:_PROBED])
         self.guard = make_guard(config, self.learner, self.scenes)
         self.learner.deal_prompts(self.scenes)
+        self.learner.deal_parts(batch[: len(self.scenes.train)], prompts)
 
     def step(self) -> tuple[Rollout, dict[str, float]]:
         """One iteration: a batch of fresh scenes and its updates. Returns the scenes and the row for the log."""
