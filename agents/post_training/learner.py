@@ -32,7 +32,7 @@ from rewards.isolation import close_reward, run_reward
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.envs.masks import resolve_mask
 from scene_envs.envs.scoring import RewardScorer
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import InvalidInputError, RewardError
 from scene_envs.scene import SceneBatch
 
 
@@ -162,6 +162,13 @@ class Learner:
             observed=observed,
             groups=groups,
         )
+
+    def largest_reward(self) -> float | None:
+        """The largest value that the reward declares for scenes of this run, None where it declares none."""
+        try:
+            return self.scorer.maximum(self.slots, self.slots - len(self.prior.scene_type.fixed))
+        except RewardError:  # its process cannot be asked any more
+            return None
 
     def accumulate(self, rollout: Rollout, advantage: Any, scenes: SceneBank, index: int) -> dict[str, float]:
         """Put both gradients, summed over all processes, into ``.grad`` and measure them apart.

@@ -312,5 +312,6 @@ class PostTrainer:
                 reward_name=f"mean {reward_name(self.config.reward).replace('_', ' ')}",
                 limit=self.config.guard.limit,
                 beyond=self.guard.over_limit_at,
+                highest=self.learner.largest_reward(),
             )
         return PostTrainResult(self.files.best(), self.history, metrics, self.directory, self.config)
