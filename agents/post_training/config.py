@@ -149,7 +149,8 @@ class PostTrainConfig:
         slots: slots per scene; null means as many as the prior was trained on.
         seed: of x_T, the chain's noise, the steps drawn and the real scenes.
         device: torch device.
-        workers: physics worker processes; 0 computes physics in this process.
+        workers: physics worker processes; 0 computes physics in this process, ``ray`` on a Ray cluster, with as many
+            as that has CPUs.
         reward_timeout: seconds that a reward from outside this package, which runs in a process of its own, may take
             for a batch; then its scenes are invalid.
         reward_memory: GiB that such a reward may allocate.
@@ -189,7 +190,7 @@ class PostTrainConfig:
     slots: int | None = None
     seed: int = 0
     device: str = "cpu"
-    workers: int = 0
+    workers: Any = 0
     reward_timeout: float = 60.0
     reward_memory: float = 1.0
     batch_size: int = 48
@@ -209,6 +210,10 @@ class PostTrainConfig:
         at_least(self, 1, "iterations", "num_steps")
         at_least(self, 2, "batch_size")
         positive(self, "reward_timeout", "reward_memory")
+        if not (isinstance(self.workers, int) and self.workers >= 0) and self.workers != "ray":
+            raise InvalidInputError(
+                f"workers={self.workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"
+            )
         self.prompt = list(self.prompt) if isinstance(self.prompt, tuple) else self.prompt
         check_prompt(self.prompt, self.guidance)
         if self.optimizer.lr is None:

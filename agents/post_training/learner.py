@@ -77,7 +77,7 @@ class Learner:
             seed=config.seed,
             timeout=config.reward_timeout,
             memory=config.reward_memory,
-            workers=config.workers,
+            workers=0 if config.workers == "ray" else config.workers,
         )
         shared = self.processes.size > 1 and depends_on_batch(self.reward)
         self.env = DenoisingTorchRLEnv(
