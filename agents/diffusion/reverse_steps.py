@@ -20,15 +20,18 @@ class ReverseStep(Protocol):
 
     @property
     def std(self) -> Tensor:
-        """(N, D) standard deviation of continuous entries; 0 where an entry is certain or discrete."""
+        """(N, D) standard deviation of continuous entries; 0 where an entry is certain or discrete.
+
+        (B, N, D) where scenes have different observed entries.
+        """
 
     @property
     def denoised(self) -> Tensor | None:
         """(B, N, D) the denoiser's estimate of x_0, where it is known."""
 
     @property
-    def entries(self) -> int:
-        """Number of random variables of the step of each scene."""
+    def entries(self) -> int | Tensor:
+        """Number of random variables of the step of each scene; (B,) where scenes have different observed entries."""
 
     def take(self, rows: Tensor) -> ReverseStep:
         """The step of scenes ``rows`` (K,), which may come more than once."""
@@ -50,7 +53,8 @@ def gaussian_log_prob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
     Args:
         x: (B, N, D) where it is evaluated.
         mean: (B, N, D).
-        std: (N, D), not negative. An entry with std 0 is certain: it carries no probability and no gradient.
+        std: (N, D) or (B, N, D), not negative. An entry with std 0 is certain: it carries no probability and no
+            gradient.
 
     Returns:
         (B, N) nats, one sum per slot.
@@ -71,7 +75,7 @@ class GaussianStep(NamedTuple):
 
     Attributes:
         mean: (B, N, D).
-        std: (N, D); 0 marks a certain entry.
+        std: (N, D), or (B, N, D); 0 marks a certain entry.
         denoised: (B, N, D) the denoiser's estimate of x_0, where it is known.
 
     >>> step = GaussianStep(torch.zeros(1, 1, 2), torch.tensor([[1.0, 0.0]]))
@@ -85,16 +89,21 @@ class GaussianStep(NamedTuple):
 
     def take(self, rows: Tensor) -> GaussianStep:
         """The step of scenes ``rows`` (K,), which may come more than once."""
-        return self._replace(mean=self.mean[rows], denoised=None)
+        return self._replace(mean=self.mean[rows], std=_of_rows(self.std, rows, 3), denoised=None)
+
+    def observing(self, entries: Tensor, x: Tensor) -> GaussianStep:
+        """The step whose ``entries`` (B, N, D) bool are certain to be as in ``x`` (B, N, D)."""
+        std = torch.where(entries, torch.zeros_like(self.std), self.std)
+        return self._replace(mean=torch.where(entries, x, self.mean), std=std)
 
     def shifted(self, shift: Tensor) -> GaussianStep:
         """The step with the means of the first features moved by ``shift`` (B, N, F)."""
         return self._replace(mean=_shifted(self.mean, shift))
 
     @property
-    def entries(self) -> int:
-        """Random entries of a scene."""
-        return int((self.std > 0).sum())
+    def entries(self) -> int | Tensor:
+        """Random entries of a scene; (B,) where scenes have different observed entries."""
+        return _count(self.std > 0, 3)
 
     def from_noise(self, noise: Tensor) -> Tensor:
         """``mean + std * noise``."""
@@ -112,9 +121,9 @@ class MixedStep(NamedTuple):
 
     Attributes:
         mean: (B, N, P) of the pose.
-        pose_std: (N, P); 0 marks a certain entry.
+        pose_std: (N, P), or (B, N, P); 0 marks a certain entry.
         probs: (B, N, K + 1) of the state, the mask token last.
-        random: (N,) bool, slots whose state is drawn; in the others the likeliest one is taken.
+        random: (N,) bool, or (B, N), slots whose state is drawn; in the others the likeliest one is taken.
         masked: (B, N) bool, slots of which as many as expected are unmasked together
             (:mod:`agents.diffusion.unmasking`); None unmasks each by its own chance.
         denoised: (B, N, P + K) the denoiser's estimate of x_0, categories by arg-max, where it is known.
@@ -135,7 +144,26 @@ class MixedStep(NamedTuple):
     def take(self, rows: Tensor) -> MixedStep:
         """The step of scenes ``rows`` (K,), which may come more than once."""
         masked = None if self.masked is None else self.masked[rows]
-        return self._replace(mean=self.mean[rows], probs=self.probs[rows], masked=masked, denoised=None)
+        pose_std, random = _of_rows(self.pose_std, rows, 3), _of_rows(self.random, rows, 2)
+        return MixedStep(self.mean[rows], pose_std, self.probs[rows], random, masked)
+
+    def observing(self, pose: Tensor, category: Tensor, x: Tensor) -> MixedStep:
+        """The step in which some slots are certain to be as in ``x`` (B, N, P + K).
+
+        Args:
+            pose: (B, N) bool, where the pose is.
+            category: (B, N) bool, where the state is.
+            x: scenes.
+        """
+        width = self.mean.shape[-1]
+        certain = F.one_hot(state_of(x[..., width:]), self.probs.shape[-1]).to(self.probs)
+        return self._replace(
+            mean=torch.where(pose[..., None], x[..., :width], self.mean),
+            pose_std=torch.where(pose[..., None], torch.zeros_like(self.pose_std), self.pose_std),
+            probs=torch.where(category[..., None], certain, self.probs),
+            random=self.random & ~category,
+            masked=None if self.masked is None else self.masked & ~category,
+        )
 
     def shifted(self, shift: Tensor) -> MixedStep:
         """The step with the means of the first features moved by ``shift`` (B, N, F)."""
@@ -143,13 +171,13 @@ class MixedStep(NamedTuple):
 
     @property
     def std(self) -> Tensor:
-        """(N, P + K) standard deviation; 0 for the entries of the state."""
+        """(N, P + K), or (B, N, P + K), standard deviation; 0 for the entries of the state."""
         return F.pad(self.pose_std, (0, self.probs.shape[-1] - 1))
 
     @property
-    def entries(self) -> int:
-        """Random pose entries and states of a scene."""
-        return int((self.pose_std > 0).sum() + self.random.sum())
+    def entries(self) -> int | Tensor:
+        """Random pose entries and states of a scene; (B,) where scenes have different observed entries."""
+        return _count(self.pose_std > 0, 3) + _count(self.random, 2)
 
     def from_noise(self, noise: Tensor) -> Tensor:
         """Poses shifted and scaled; states by inverting their distribution function at Phi of one noise entry.
@@ -189,6 +217,16 @@ class MixedStep(NamedTuple):
         return continuous + torch.where(self.random, discrete, torch.zeros_like(discrete))
 
 
+def _count(random: Tensor, dims: int) -> int | Tensor:
+    """Number of True entries, of each scene where ``random`` has as many dimensions as ``dims``."""
+    return random.flatten(1).sum(dim=1) if random.ndim == dims else int(random.sum())
+
+
+def _of_rows(x: Tensor, rows: Tensor, dims: int) -> Tensor:
+    """``x[rows]`` where ``x`` differs among scenes, which it does if it has as many dimensions as ``dims``."""
+    return x[rows] if x.ndim == dims else x
+
+
 def _shifted(mean: Tensor, shift: Tensor) -> Tensor:
     return mean + F.pad(shift, (0, mean.shape[-1] - shift.shape[-1]))
 
@@ -216,10 +254,17 @@ def concatenate_steps(parts: Sequence[ReverseStep]) -> ReverseStep:
     if len(parts) == 1:
         return first
     if isinstance(first, GaussianStep):
-        return GaussianStep(torch.cat([part.mean for part in parts if isinstance(part, GaussianStep)]), first.std)
+        normal = [part for part in parts if isinstance(part, GaussianStep)]
+        return GaussianStep(torch.cat([part.mean for part in normal]), _joined([part.std for part in normal], 3))
     if isinstance(first, MixedStep):
         mixed = [part for part in parts if isinstance(part, MixedStep)]
         mean, probs = (torch.cat([getattr(part, name) for part in mixed]) for name in ("mean", "probs"))
         masked = None if first.masked is None else torch.cat([part.masked for part in mixed if part.masked is not None])
-        return MixedStep(mean, first.pose_std, probs, first.random, masked)
+        pose_std, random = _joined([part.pose_std for part in mixed], 3), _joined([part.random for part in mixed], 2)
+        return MixedStep(mean, pose_std, probs, random, masked)
     raise TypeError(f"cannot concatenate steps of type {type(first).__name__}")
+
+
+def _joined(parts: Sequence[Tensor], dims: int) -> Tensor:
+    """Parts that differ among scenes, one after another; the first of parts that are all equal."""
+    return torch.cat(list(parts)) if parts[0].ndim == dims else parts[0]

@@ -48,11 +48,11 @@ class Observed:
         """(B, N) int64 as the network reads them."""
         return self.pose.long() + 2 * self.category.long()
 
-    def entries(self) -> Tensor:
-        """(B, N, D) bool."""
-        categories = self.x.shape[-1] - POSE_FEATURES
+    def entries(self, pose_width: int = POSE_FEATURES) -> Tensor:
+        """(B, N, D) bool; the first ``pose_width`` features are the pose."""
+        categories = self.x.shape[-1] - pose_width
         return torch.cat(
-            [self.pose[..., None].expand(-1, -1, POSE_FEATURES), self.category[..., None].expand(-1, -1, categories)],
+            [self.pose[..., None].expand(-1, -1, pose_width), self.category[..., None].expand(-1, -1, categories)],
             dim=-1,
         )
 

@@ -28,7 +28,8 @@ class AlgorithmSettings:
 
     Attributes:
         name: the algorithm, a registered name.
-        scenes_per_prompt: scenes of a batch that share a prompt; advantages are taken among them.
+        scenes_per_prompt: scenes of a batch that share a prompt, and the observed part of an inpainting; advantages are
+            taken among them.
     """
 
     learning_rate: ClassVar[float] = 5e-5

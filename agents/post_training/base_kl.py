@@ -42,10 +42,15 @@ def chain_kl(
     for step in steps:
         for rows in torch.randperm(batch, generator=generator)[:drawn].split(policy.chunk or drawn):
             x_t, text = rollout.scenes[step][rows], _rows(rollout.text, rows)
+            observed = None if rollout.observed is None else rollout.observed[rows]
             with torch.no_grad():
-                then = first.distribution(x_t, step, text)
-            now = policy.distribution(x_t, step, text)
-            yield step_kl(now, then).sum() / (drawn * now.entries)
+                then = first.distribution(x_t, step, text, observed)
+            now = policy.distribution(x_t, step, text, observed)
+            entries = now.entries
+            if isinstance(entries, Tensor):  # of each scene
+                yield (step_kl(now, then).sum(dim=1) / entries.clamp(min=1)).sum() / drawn
+            else:
+                yield step_kl(now, then).sum() / (drawn * entries)
 
 
 def forward_kl(
@@ -68,7 +73,9 @@ def forward_kl(
     order = torch.randperm(len(everything), generator=generator)
     even = (order + torch.rand((), generator=generator)) / len(everything)
     timesteps = (2 + even * (total - 1)).long().clamp(max=total).to(x0.device)  # the last step, t = 1, is certain
-    noised = prior.noised(everything, generator, timesteps, prior.observed_entries(everything))
+    seen = None if rollout.observed is None else gather_rows(rollout.observed)
+    observed = prior.observed_entries(everything, prior.observed_by_mask(everything, seen))
+    noised = prior.noised(everything, generator, timesteps, observed)
     noised = noised.rows(ProcessGroup.current().rows(len(everything)))
     size = chunk or count
     for start in range(0, count, size):

@@ -45,7 +45,7 @@ def post_train_and_compare(
         ``ready_objects``, and ``prompt_match`` with prompts), ``change``, ``guard``, ``seconds`` of each part, and the
         run's own; of several processes the first alone measures, the others return the run's own.
     """
-    from scene_envs.physics import PhysicsPool
+    from scene_envs.physics import make_pool
 
     started = time.perf_counter()
     base = ScenePrior.load(config.prior if prior is None else prior)
@@ -55,7 +55,7 @@ def post_train_and_compare(
     trained = time.perf_counter()
     seed = config.seed + SAMPLE_SEED
     asked = _measured_prompts(config, base, scenes)
-    with PhysicsPool(workers=config.workers, timeout=PHYSICS_TIMEOUT) as pool:
+    with make_pool(config.workers, PHYSICS_TIMEOUT) as pool:
 
         def measure(prior: ScenePrior) -> Measured:
             return measure_prior(

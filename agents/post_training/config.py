@@ -14,6 +14,7 @@ from agents.configuration.prior_names import split_name
 from agents.configuration.settings import LoggerSettings, OptimizerSettings
 from agents.configuration.tree import plain_tree
 from agents.post_training.algorithms import AlgorithmSettings, DDPOSFSettings, algorithm_settings, list_algorithms
+from agents.post_training.inpaint_settings import InpaintSettings
 from agents.post_training.regularisation_settings import AdapterSettings, RegularisationSettings
 from scene_envs.envs.settings import PROMPT_SOURCES
 from scene_envs.errors import InvalidInputError
@@ -149,7 +150,8 @@ class PostTrainConfig:
         slots: slots per scene; null means as many as the prior was trained on.
         seed: of x_T, the chain's noise, the steps drawn and the real scenes.
         device: torch device.
-        workers: physics worker processes; 0 computes physics in this process.
+        workers: physics worker processes; 0 computes physics in this process, ``ray`` on a Ray cluster, with as many
+            as that has CPUs.
         reward_timeout: seconds that a reward from outside this package, which runs in a process of its own, may take
             for a batch; then its scenes are invalid.
         reward_memory: GiB that such a reward may allocate.
@@ -161,6 +163,7 @@ class PostTrainConfig:
         regularisation: on real scenes.
         guard: held-out real scenes.
         adapter: low-rank updates, off by default.
+        inpaint: observed parts of scenes, off by default.
         logger: files and screen.
     """
 
@@ -188,7 +191,7 @@ class PostTrainConfig:
     slots: int | None = None
     seed: int = 0
     device: str = "cpu"
-    workers: int = 0
+    workers: Any = 0
     reward_timeout: float = 60.0
     reward_memory: float = 1.0
     batch_size: int = 48
@@ -201,12 +204,17 @@ class PostTrainConfig:
     regularisation: RegularisationSettings = nested(RegularisationSettings)
     guard: GuardSettings = nested(GuardSettings)
     adapter: AdapterSettings = nested(AdapterSettings)
+    inpaint: InpaintSettings = nested(InpaintSettings)
     logger: PostTrainLoggerSettings = nested(PostTrainLoggerSettings, folder="logger", option="csv")
 
     def __post_init__(self) -> None:
         at_least(self, 1, "iterations", "num_steps", "slots")
         at_least(self, 2, "batch_size")
         positive(self, "reward_timeout", "reward_memory")
+        if not (isinstance(self.workers, int) and self.workers >= 0) and self.workers != "ray":
+            raise InvalidInputError(
+                f"workers={self.workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"
+            )
         self.prompt = list(self.prompt) if isinstance(self.prompt, tuple) else self.prompt
         check_prompt(self.prompt, self.guidance)
         if self.optimizer.lr is None:

@@ -17,6 +17,7 @@ def draw_curve(
     reward_name: str,
     limit: float | None = None,
     beyond: int | None = None,
+    highest: float | None = None,
 ) -> Path:
     """Reward and guard over iterations, as a PNG; the reward of the guard's samples is dots.
 
@@ -26,6 +27,7 @@ def draw_curve(
         reward_name: label of the upper axis.
         limit: of the guard's loss, drawn as a line.
         beyond: iteration from which the run is over-optimised; shaded from there.
+        highest: largest reward there is, which the band of the standard deviation does not exceed; None for no bound.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -38,7 +40,7 @@ def draw_curve(
     figure = Figure(figsize=(8.4, 5.2), dpi=130, layout="constrained")
     FigureCanvasAgg(figure)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.4, 1.0))
-    upper.fill_between(iteration, reward - spread, reward + spread, color=REWARD_COLOR, alpha=0.12, linewidth=0)
+    upper.fill_between(iteration, *band(reward, spread, highest), color=REWARD_COLOR, alpha=0.12, linewidth=0)
     upper.plot(iteration, reward, color=REWARD_COLOR, alpha=0.35, linewidth=1, label="a batch ± std")
     upper.plot(iteration, smooth(reward), color=REWARD_COLOR, linewidth=2.2, label="smoothed")
     sampled = [(row["iteration"], row["guard_sample_reward"]) for row in history if "guard_sample_reward" in row]
@@ -65,6 +67,16 @@ def draw_curve(
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
     return path
+
+
+def band(reward: np.ndarray, spread: np.ndarray, highest: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Reward minus and plus its standard deviation, the latter at most the largest reward there is.
+
+    >>> low, high = band(np.array([0.9, 0.5]), np.array([0.2, 0.3]), highest=1.0)
+    >>> low.round(2).tolist(), high.round(2).tolist()
+    ([0.7, 0.2], [1.0, 0.8])
+    """
+    return reward - spread, np.clip(reward + spread, None, highest)
 
 
 def smooth(values: np.ndarray, window: int = 9) -> np.ndarray:

@@ -13,8 +13,7 @@ from agents.post_training.base_kl import chain_kl
 from agents.post_training.gradients import PolicyGradient, accumulate_policy_gradient, credited_reward, draw_steps
 from agents.post_training.losses import DDPOSFLoss
 from agents.post_training.policy import DenoisingPolicy, gradient_weights
-from agents.post_training.prompts import prompt_groups
-from agents.post_training.rollouts import Rollout
+from agents.post_training.rollouts import Rollout, rollout_groups
 from agents.priors.base import ScenePrior
 
 
@@ -43,10 +42,10 @@ class DDPO(Algorithm[Tensor]):
         ).to(next(policy.parameters()).device)
 
     def advantage(self, rollout: Rollout) -> Tensor:
-        """(B,) or (B, N), as ``credit`` says; among the scenes of the same prompt where there are prompts."""
+        """(B,) or (B, N), as ``credit`` says; among the scenes of the same prompt, or of the same observed part."""
         settings = self.settings
         reward, valid = credited_reward(rollout, settings.credit)
-        groups = None if rollout.prompts is None else prompt_groups(rollout.prompts).to(reward.device)
+        groups = rollout_groups(rollout)
         return compute_advantages(
             reward, valid, baseline=settings.baseline, clip=settings.advantage_clip, groups=groups
         )

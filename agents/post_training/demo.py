@@ -79,11 +79,11 @@ def _measure(
     results: Mapping[str, PostTrainResult], base: ScenePrior, scenes: int, num_steps: int
 ) -> dict[str, Measured]:
     """Fresh samples of the base prior and of each result, all from the same noise."""
-    from scene_envs.physics import PhysicsPool
+    from scene_envs.physics import make_pool
 
     config = next(iter(results.values())).config
     measured = {}
-    with PhysicsPool(workers=config.workers, timeout=PHYSICS_TIMEOUT) as pool:
+    with make_pool(config.workers, PHYSICS_TIMEOUT) as pool:
         for name, prior in {"base": base, **{name: result.prior for name, result in results.items()}}.items():
             _say(config, f"measuring {scenes} samples of the prior {name!r}")
             measured[name] = measure_prior(

@@ -20,8 +20,7 @@ from agents.post_training.forward_losses import AWMLoss, NFTLoss, RewardWeighted
 from agents.post_training.forward_process_loss import ForwardProcessLoss
 from agents.post_training.gradients import GradientSum, credited_reward
 from agents.post_training.policy import DenoisingPolicy
-from agents.post_training.prompts import prompt_groups
-from agents.post_training.rollouts import Branching, Rollout
+from agents.post_training.rollouts import Branching, Rollout, rollout_groups
 from agents.priors.base import ScenePrior
 from agents.utils.process_group import ProcessGroup, gather_rows
 from agents.utils.weight_average import WeightAverage
@@ -118,14 +117,14 @@ class ForwardProcess(Algorithm[TensorDict]):
         valid = valid & ~rollout.batch.is_empty.to(valid.device)
         siblings = self.settings.siblings
         if siblings == 1:
-            return compute_advantages(reward, valid, clip=math.inf, groups=_groups(rollout))
+            return compute_advantages(reward, valid, clip=math.inf, groups=rollout_groups(rollout))
         categories = rollout.batch.categories.to(valid.device).unflatten(0, (-1, siblings))
         same = (categories == categories[:, :1]).all(dim=1)
         return sibling_advantages(reward, valid & same.repeat_interleave(siblings, dim=0), siblings)
 
     def _scene_advantages(self, rollout: Rollout) -> Tensor:
         """(B, 1), among siblings where there are any."""
-        groups = _groups(rollout)
+        groups = rollout_groups(rollout)
         if self.settings.siblings > 1:
             first = ProcessGroup.current().rank * len(rollout.reward)
             rows = torch.arange(first, first + len(rollout.reward), device=rollout.reward.device)
@@ -145,7 +144,11 @@ class ForwardProcess(Algorithm[TensorDict]):
         size, processes = self.policy.chunk or len(x0), ProcessGroup.current()
         valid = max(1.0, processes.sum_numbers(int(rollout.valid.sum()))[0])
         everything, own = gather_rows(x0), processes.rows(processes.size * len(x0))
-        draws = [self.prior.noised(everything, generator).rows(own) for _ in range(self.settings.draws)]
+        seen = None if rollout.observed is None else gather_rows(rollout.observed)
+        observed = self.prior.observed_by_mask(everything, seen)
+        draws = [
+            self.prior.noised(everything, generator, observed=observed).rows(own) for _ in range(self.settings.draws)
+        ]
         total, distance, limited = 0.0, 0.0, 0.0
         learned = [] if self.expectation is None else self.expectation.trained
         gradient = GradientSum([*self.prior.parameters(), *learned])
@@ -188,8 +191,3 @@ class ForwardProcess(Algorithm[TensorDict]):
         self._average.copy_to(self.sampler)
         if self.expectation is not None:
             self.expectation.restore(state["expectation"])
-
-
-def _groups(rollout: Rollout) -> Tensor | None:
-    """(B,) int64 that tell prompts apart; None without prompts."""
-    return None if rollout.prompts is None else prompt_groups(rollout.prompts).to(rollout.reward.device)

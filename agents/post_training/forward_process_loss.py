@@ -44,6 +44,8 @@ class ForwardProcessLoss(LossModule):
         timestep: (B,) or (B, 1) int64, optional; drawn as in pretraining without. Default ``"timestep"``.
         valid: (B,) or (B, 1) bool, optional; False rows are left out of the mean. Default ``"valid"``.
         text, text_mask: (B, L, W) tokens and (B, L) their mask, optional. Default ``"text"`` and ``"text_mask"``.
+        observed: (B, N, 2) bool, optional, True where the pose, or the category, of a slot is observed: in an
+            inpainting the other entries alone have a loss. Default ``"observed"``.
 
     Args:
         prior: what is trained.
@@ -68,6 +70,7 @@ class ForwardProcessLoss(LossModule):
         valid: NestedKey = "valid"
         text: NestedKey = "text"
         text_mask: NestedKey = "text_mask"
+        observed: NestedKey = "observed"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -150,7 +153,9 @@ class ForwardProcessLoss(LossModule):
         flat = tensordict.reshape(-1)
         timestep = flat.get(self.tensor_keys.timestep, None)
         scene = flat.get(self.tensor_keys.scene).detach()
-        noised = self.prior.noised(scene, self.generator, None if timestep is None else timestep.reshape(-1))
+        observed = self.prior.observed_by_mask(scene, flat.get(self.tensor_keys.observed, None))
+        t = None if timestep is None else timestep.reshape(-1)
+        noised = self.prior.noised(scene, self.generator, t, observed)
         return self.of_noised(noised, flat)
 
     def of_noised(self, noised: NoisedScenes, flat: TensorDictBase) -> TensorDict:

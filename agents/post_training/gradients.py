@@ -221,4 +221,6 @@ def credited_reward(rollout: Rollout, credit: str) -> tuple[Tensor, Tensor]:
     free[:, : len(rollout.batch.scene_type.fixed)] = False  # welded slots are not drawn
     if rollout.averages:
         free &= ~rollout.batch.is_empty.to(free.device)
+    if rollout.observed is not None:
+        free &= ~rollout.observed.all(dim=-1)  # nor is what is observed
     return rollout.per_object.float(), free & rollout.valid.unsqueeze(-1)

@@ -14,9 +14,10 @@ from agents.post_training.algorithms import make_algorithm
 from agents.post_training.base import Algorithm
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.gradients import add_regularisation_gradient, gradient_norm
+from agents.post_training.inpaint_deck import InpaintDeck, real_parts, sampled_parts
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.processes import WholeBatchReward
-from agents.post_training.prompts import PromptDeck
+from agents.post_training.prompts import PromptDeck, PromptSets
 from agents.post_training.regularisation import Regularisation
 from agents.post_training.rollouts import Rollout, collect, stream_seed
 from agents.post_training.run_files import CHECKPOINT_NAME
@@ -30,8 +31,10 @@ from agents.utils.weight_average import AveragedWeights, WeightAverage
 from rewards import averages_objects, depends_on_batch
 from rewards.isolation import close_reward, run_reward
 from scene_envs.envs import DenoisingTorchRLEnv
+from scene_envs.envs.masks import resolve_mask
 from scene_envs.envs.scoring import RewardScorer
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import InvalidInputError, RewardError
+from scene_envs.scene import SceneBatch
 
 
 class NonFiniteGradient(Exception):
@@ -53,6 +56,8 @@ class Learner:
     def __init__(self, config: PostTrainConfig, prior: ScenePrior) -> None:
         self.config = config
         self.prior = deepcopy(prior).to(config.device).eval()
+        if config.inpaint.mask is not None:
+            resolve_mask(config.inpaint.mask)  # says now, not later, that there is no such mask
         if config.prompt is not None and not self.prior.conditional:
             raise no_text(self.prior.scene_type, str(config.prompt))
         self.prior.freeze_text()
@@ -73,7 +78,7 @@ class Learner:
             seed=config.seed,
             timeout=config.reward_timeout,
             memory=config.reward_memory,
-            workers=config.workers,
+            workers=0 if config.workers == "ray" else config.workers,
         )
         shared = self.processes.size > 1 and depends_on_batch(self.reward)
         self.env = DenoisingTorchRLEnv(
@@ -88,6 +93,7 @@ class Learner:
         )
         self.scorer = RewardScorer(self.reward, config.workers) if shared else self.env.core.scorer
         self.deck: PromptDeck | None = None
+        self.inpaint_deck: InpaintDeck | None = None
         self.parameters = [p for p in self.prior.parameters() if p.requires_grad]
         self.lr = config.optimizer.lr or config.algorithm.learning_rate
         self.optimizer = torch.optim.AdamW(
@@ -115,14 +121,38 @@ class Learner:
                 self.prior, config.prompt, together, self.slots, scenes.prompts, len(scenes.train)
             )
 
+    def deal_parts(self, real: SceneBatch, prompts: PromptSets | None) -> None:
+        """Make the deck from which the observed parts of batches come; nothing where whole scenes are sampled.
+
+        Args:
+            real: real scenes that training may see.
+            prompts: of each of them; None for a prior that reads none.
+        """
+        config, settings = self.config, self.config.inpaint
+        if settings.mask is None:
+            return
+        if settings.scenes == "real":
+            source = real_parts(real, self.slots, prompts if config.prompt == "data" else None)
+        else:
+            sampler: Any = self.algorithm.sampling_policy.prior
+            source = sampled_parts(sampler, config.num_steps, self.slots, config.guidance)
+        self.inpaint_deck = InpaintDeck(settings, source, self.scorer, config.algorithm.scenes_per_prompt)
+
     def rollout(self, iteration: int) -> Rollout:
         """A batch of fresh scenes, or this process's share of it."""
         algorithm, batch = self.algorithm, self.config.batch_size
-        branching = algorithm.branching
-        prompts = None
+        branching, own = algorithm.branching, self.processes.rows(batch)
+        prompts, observed, groups = None, None, None
+        units = branching.groups(batch)
         if self.deck is not None:
-            dealt = self.deck.deal(branching.groups(batch), self._generator("prompts", iteration))
-            prompts = [text for text in dealt for _ in range(branching.siblings)][self.processes.rows(batch)]
+            prompts = self.deck.deal(units, self._generator("prompts", iteration))
+        if self.inpaint_deck is not None:
+            parts = self.inpaint_deck.deal(units, prompts, stream_seed(self.config.seed, "inpaint", iteration))
+            prompts = parts.prompts
+            parts = parts.take(torch.arange(units).repeat_interleave(branching.siblings)[own])
+            observed, groups = self.prior.observe(parts.scenes, parts.mask), parts.groups
+        if prompts is not None:
+            prompts = [text for text in prompts for _ in range(branching.siblings)][own]
         rollout = collect(
             self.env,
             algorithm.sampling_policy,
@@ -130,8 +160,17 @@ class Learner:
             iteration=iteration,
             prompts=prompts,
             branching=branching,
+            observed=observed,
+            groups=groups,
         )
         return replace(rollout, averages=averages_objects(self.reward))
+
+    def largest_reward(self) -> float | None:
+        """The largest value that the reward declares for scenes of this run, None where it declares none."""
+        try:
+            return self.scorer.maximum(self.slots, self.slots - len(self.prior.scene_type.fixed))
+        except RewardError:  # its process cannot be asked any more
+            return None
 
     def accumulate(self, rollout: Rollout, advantage: Any, scenes: SceneBank, index: int) -> dict[str, float]:
         """Put both gradients, summed over all processes, into ``.grad`` and measure them apart.

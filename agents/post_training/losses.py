@@ -48,6 +48,8 @@ class DDPOSFLoss(LossModule):
         text, text_mask: (B, L, W) tokens and (B, L) their mask, optional, as the policy saw them. Default ``"text"``
             and ``"text_mask"``.
         prompt: (B, L) int64 token indices, optional, read where ``text`` is missing. Default ``"prompt"``.
+        observed: (B, N, 2) bool, optional, True where the pose, or the category, of a slot is observed: in an
+            inpainting only the other entries are actions. Default ``"observed"``.
 
     Args:
         policy: what is optimised.
@@ -81,6 +83,7 @@ class DDPOSFLoss(LossModule):
         text: NestedKey = "text"
         text_mask: NestedKey = "text_mask"
         prompt: NestedKey = "prompt"
+        observed: NestedKey = "observed"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -141,18 +144,19 @@ class DDPOSFLoss(LossModule):
         if old is None and self.clip_epsilon is not None:
             raise InvalidInputError(f"clipping needs the log-probabilities at sampling under {keys.sample_log_prob!r}")
         kept = self._kept(tensordict)
-        text = self._text(flat)
+        text, observed = self._text(flat), flat.get(keys.observed, None)
         total = scene.new_zeros(())
         largest, clipped = scene.new_zeros(()), scene.new_zeros(())
         for t in timestep.unique().tolist():
             rows = timestep == t
             step = self.policy.step_of(int(t))
             asked = None if text is None else (text[0][rows], text[1][rows])
-            log_prob = self.policy.log_prob(scene[rows], step, action[rows], asked)  # (b, N)
+            seen = None if observed is None else observed[rows]
+            log_prob = self.policy.log_prob(scene[rows], step, action[rows], asked, seen)  # (b, N)
             earlier = None if old is None else old[rows].detach()
             if earlier is not None:
                 largest = torch.maximum(largest, (log_prob.detach() - earlier).sum(dim=-1).abs().max())
-            objective, beyond = self._objective(log_prob, advantage[rows], earlier)
+            objective, beyond = self._objective(log_prob, advantage[rows], earlier, self._count_entries(log_prob, seen))
             total = total + self.step_weights[step] * torch.where(kept[rows], objective, 0.0).sum()
             clipped = clipped + torch.where(kept[rows], beyond, 0.0).sum()
         count = kept.sum().clamp(min=1)
@@ -160,9 +164,10 @@ class DDPOSFLoss(LossModule):
             {"loss_objective": -total / count, "log_ratio": largest, "clip_fraction": clipped / count}, []
         )
 
-    def _objective(self, log_prob: Tensor, advantage: Tensor, old: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _objective(
+        self, log_prob: Tensor, advantage: Tensor, old: Tensor | None, entries: int | Tensor
+    ) -> tuple[Tensor, Tensor]:
         """(b,) objective and (b,) share of clipped terms, from (b, N) log-probabilities and advantages."""
-        entries = self._count_entries(log_prob.shape[1]) if self.reduction == "mean" else 1
         if advantage.shape[1] == 1:  # credit per scene
             log_prob = log_prob.sum(dim=1, keepdim=True)
             old = None if old is None else old.sum(dim=1, keepdim=True)
@@ -208,7 +213,13 @@ class DDPOSFLoss(LossModule):
             )
         return advantage
 
-    def _count_entries(self, slots: int) -> int:
+    def _count_entries(self, log_prob: Tensor, observed: Tensor | None) -> int | Tensor:
+        """What (b, N) log-probabilities are divided by, (b, 1) where scenes have different observed entries."""
+        if self.reduction != "mean":
+            return 1
+        if observed is not None:
+            return self.policy.unobserved_entries(observed).clamp(min=1).to(log_prob)[:, None]
+        slots = log_prob.shape[1]
         if slots not in self._entries:
             self._entries[slots] = self.policy.random_entries(slots)
         return self._entries[slots]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -13,7 +13,8 @@ from agents.diffusion import ReverseStep
 from agents.diffusion.reverse_steps import concatenate_steps
 from agents.networks.text import Text
 from scene_envs.errors import InvalidInputError
-from scene_envs.protocols import PriorLike, PromptedPriorLike, StepTableLike
+from scene_envs.protocols import InpaintingPriorLike, PriorLike, PromptedPriorLike, StepTableLike
+from scene_envs.scene import POSE_FEATURES
 
 
 class DenoisingPolicy(TensorDictModuleBase):
@@ -74,19 +75,34 @@ class DenoisingPolicy(TensorDictModuleBase):
         parts = [reader.encode_tokens(part) for part in prompt.split(size)]
         return torch.cat([tokens for tokens, _ in parts]), torch.cat([mask for _, mask in parts])
 
-    def distribution(self, x_t: Tensor, step: int, text: Text | None = None) -> ReverseStep:
-        """p(x_{t-1} | x_t) of ``x_t`` (B, N, D) given ``text``; differentiable in the prior's parameters."""
+    def distribution(
+        self, x_t: Tensor, step: int, text: Text | None = None, observed: Tensor | None = None
+    ) -> ReverseStep:
+        """p(x_{t-1} | x_t) of ``x_t`` (B, N, D) given ``text``; differentiable in the prior's parameters.
+
+        Entries that are ``observed`` (B, N, 2), the pose or the category of a slot, are certain: no actions.
+        """
         size = self.chunk or x_t.shape[0]
         return concatenate_steps(
             [
-                self._transition(x_t[rows], step, None if text is None else (text[0][rows], text[1][rows]))
+                self._transition(
+                    x_t[rows],
+                    step,
+                    None if text is None else (text[0][rows], text[1][rows]),
+                    None if observed is None else observed[rows],
+                )
                 for rows in (slice(start, start + size) for start in range(0, x_t.shape[0], size))
             ]
         )
 
-    def _transition(self, x_t: Tensor, step: int, text: Text | None) -> ReverseStep:
+    def _transition(self, x_t: Tensor, step: int, text: Text | None, observed: Tensor | None) -> ReverseStep:
         reverse: ReverseStep
-        if text is None:
+        if observed is not None:
+            inpainting = cast(InpaintingPriorLike, self.prior)
+            reverse = inpainting.observed_transition(
+                x_t, step, self.table, observed, text=text, guidance=0.0 if text is None else self.guidance
+            )
+        elif text is None:
             reverse = self.prior.transition(x_t, step, self.table)
         else:
             prior = cast(PromptedPriorLike, self.prior)
@@ -101,24 +117,41 @@ class DenoisingPolicy(TensorDictModuleBase):
         generator: Generator | None = None,
         text: Text | None = None,
         noise: Tensor | None = None,
+        observed: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """An action (B, N, D) and its log-probability per slot (B, N), without gradients.
 
         The action is made of standard normal ``noise`` (B, N, D), which is drawn from ``generator`` where it is None.
         """
-        reverse = self.distribution(x_t, step, text)
+        reverse = self.distribution(x_t, step, text, observed)
         if noise is None:
             noise = torch.randn(x_t.shape, generator=generator, device=x_t.device)
         action = reverse.from_noise(noise)
         return action, reverse.log_prob(action)
 
-    def log_prob(self, x_t: Tensor, step: int, action: Tensor, text: Text | None = None) -> Tensor:
-        """(B, N) log-probability per slot of ``action``; states and actions are taken as constants."""
-        return self.distribution(x_t.detach(), step, text).log_prob(action.detach())
+    def log_prob(
+        self, x_t: Tensor, step: int, action: Tensor, text: Text | None = None, observed: Tensor | None = None
+    ) -> Tensor:
+        """(B, N) log-probability per slot of ``action``; states and actions are taken as constants.
+
+        Entries that are ``observed`` (B, N, 2) have no part in it.
+        """
+        return self.distribution(x_t.detach(), step, text, observed).log_prob(action.detach())
 
     def random_entries(self, slots: int) -> int:
         """Number of random variables that a step of the chain draws for a scene; the other entries are known."""
-        return self._steps(slots)[0].entries
+        return int(self._steps(slots)[0].entries)
+
+    @torch.no_grad()
+    def unobserved_entries(self, observed: Tensor) -> Tensor:
+        """(B,) random variables that a step draws for scenes whose entries ``observed`` (B, N, 2) are not drawn."""
+        first: Any = self._steps(observed.shape[1])[0]
+        poses = first.std > 0  # (N, D), of a mixed prior no categories
+        width = getattr(self.prior, "pose_width", POSE_FEATURES)
+        count = (poses[:, :width] & ~observed[..., :1]).sum(dim=(1, 2))
+        count = count + (poses[:, width:] & ~observed[..., 1:]).sum(dim=(1, 2))
+        states = getattr(first, "random", None)
+        return count if states is None else count + (states & ~observed[..., 1]).sum(dim=1)
 
     def stds(self, slots: int) -> Tensor:
         """(S,) smallest sigma of every step over its random entries, normalised units; 0 where none is random."""

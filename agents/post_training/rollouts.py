@@ -12,13 +12,15 @@ from torch import Generator, Tensor
 
 from agents.networks.text import Text
 from agents.post_training.policy import DenoisingPolicy
+from agents.post_training.prompts import prompt_groups
+from agents.priors.observed_scenes import ObservedScenes
 from agents.utils.process_group import ProcessGroup, gather_rows
 from agents.utils.seeds import derived_seed
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.errors import InvalidInputError, TrainingError
 from scene_envs.scene import SceneBatch
 
-STREAMS = ("start", "noise", "steps", "real", "bank", "guard", "prompts", "samples", "kl")
+STREAMS = ("start", "noise", "steps", "real", "bank", "guard", "prompts", "samples", "kl", "inpaint")
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,8 @@ class Rollout:
         batch: the finished scenes.
         prompts: one per scene, or None without prompts.
         text: what the network attended to, tokens (B, L, W) and mask (B, L); None when the prior reads no prompts.
+        observed: (B, N, 2) bool, the poses and categories that were observed, of an inpainting; None of whole scenes.
+        groups: (B,) int64, equal for scenes with the same observed part, over all processes; None of whole scenes.
     """
 
     scenes: Tensor
@@ -52,6 +56,8 @@ class Rollout:
     prompts: tuple[str, ...] | None = None
     text: Text | None = None
     averages: bool = False
+    observed: Tensor | None = None
+    groups: Tensor | None = None
 
     def transitions(self, step: int, advantage: Tensor, rows: slice = slice(None)) -> TensorDict:
         """The transitions of one step as ``DDPOSFLoss`` reads them."""
@@ -66,7 +72,16 @@ class Rollout:
         }
         if self.text is not None:
             fields |= {"text": self.text[0][rows], "text_mask": self.text[1][rows]}
+        if self.observed is not None:
+            fields["observed"] = self.observed[rows]
         return TensorDict(fields, [scene.shape[0]])
+
+
+def rollout_groups(rollout: Rollout) -> Tensor | None:
+    """(B,) int64 that tell apart what scenes are compared within: observed parts, or else prompts; None for neither."""
+    if rollout.groups is not None:
+        return rollout.groups
+    return None if rollout.prompts is None else prompt_groups(rollout.prompts).to(rollout.reward.device)
 
 
 def stream_seed(seed: int, stream: str, iteration: int = 0) -> int:
@@ -108,6 +123,8 @@ def collect(
     iteration: int = 0,
     prompts: Sequence[str] | None = None,
     branching: Branching = Branching(),
+    observed: ObservedScenes | None = None,
+    groups: Tensor | None = None,
 ) -> Rollout:
     """Run ``policy`` to the end of one episode in each of the environment's rows.
 
@@ -122,6 +139,8 @@ def collect(
         prompts: one per row, equal among siblings; None draws them as the environment was told. Text is encoded once,
             at the start.
         branching: which episodes share their first steps.
+        observed: one scene per row of which a part is observed, equal among siblings; None for whole scenes.
+        groups: (rows,) int64, equal for rows with the same observed part.
     """
     branching.groups(env.core.num_envs)
     together = branching.siblings
@@ -130,6 +149,7 @@ def collect(
     first_row = processes.rank * env.core.num_envs
     rngs = [seeding.np_random(start + (first_row + row) // together)[0] for row in range(env.core.num_envs)]
     generator = Generator(device).manual_seed(stream_seed(seed, "noise", iteration))
+    entries = None if observed is None else observed.entries.to(device)
     log_probs: list[Tensor] = []
     texts: list[Text] = []
 
@@ -143,11 +163,11 @@ def collect(
         text = texts[0] if texts else None
         if together > 1 and step < branching.steps:
             first = None if text is None else (text[0][::together], text[1][::together])
-            x_t = x_t[::together]
-            drawn = policy.draw(x_t, step, text=first, noise=noise(x_t))
+            x_t, seen = x_t[::together], None if entries is None else entries[::together]
+            drawn = policy.draw(x_t, step, text=first, noise=noise(x_t), observed=seen)
             action, log_prob = (part.repeat_interleave(together, dim=0) for part in drawn)
         else:
-            action, log_prob = policy.draw(x_t, step, text=text, noise=noise(x_t))
+            action, log_prob = policy.draw(x_t, step, text=text, noise=noise(x_t), observed=entries)
         if not bool(torch.isfinite(log_prob).all()):
             raise TrainingError(
                 f"the prior gave values that are not finite at step {step} of iteration {iteration + 1}; "
@@ -156,7 +176,7 @@ def collect(
         log_probs.append(log_prob)
         return action
 
-    result = env.core.collect(act, rngs, prompts)
+    result = env.core.collect(act, rngs, prompts, observed)
     rollout = Rollout(
         scenes=result.scenes,
         actions=result.actions,
@@ -169,6 +189,8 @@ def collect(
         batch=result.batch,
         prompts=result.prompts,
         text=texts[0] if texts else None,
+        observed=entries,
+        groups=None if groups is None else groups.to(device),
     )
     return _with_equal_parts(rollout, processes)
 

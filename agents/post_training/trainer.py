@@ -192,6 +192,7 @@ class PostTrainer:
             self._probe(batch[:_PROBED])
         self.guard = make_guard(config, self.learner, self.scenes)
         self.learner.deal_prompts(self.scenes)
+        self.learner.deal_parts(batch[: len(self.scenes.train)], prompts)
 
     def step(self) -> tuple[Rollout, dict[str, float]]:
         """One iteration: a batch of fresh scenes and its updates. Returns the scenes and the row for the log."""
@@ -313,5 +314,6 @@ class PostTrainer:
                 reward_name=f"mean {reward_name(self.config.reward).replace('_', ' ')}",
                 limit=self.config.guard.limit,
                 beyond=self.guard.over_limit_at,
+                highest=self.learner.largest_reward(),
             )
         return PostTrainResult(self.files.best(), self.history, metrics, self.directory, self.config)

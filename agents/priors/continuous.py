@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -161,6 +161,30 @@ class ContinuousPrior(ScenePrior):
         std_map = std * (~self.known(x_t.shape[1])).to(x_t.dtype)
         return GaussianStep(self.clamp(mean), std_map, x0.detach())
 
+    def observed_transition(
+        self, x_t: Tensor, step: int, table: StepTableLike, observed: Tensor, *,
+        text: Text | None = None, guidance: float = 0.0,
+    ) -> GaussianStep:  # fmt: skip
+        """p(x_{t-1} | x_t) of scenes whose observed entries are certain; :class:`Inpainting` says more.
+
+        They have the noise of their level: :meth:`write_observed` replaces them by those of the next.
+        """
+        return self._reverse(x_t, step, table, 1.0).observing(self._entries(observed), x_t)
+
+    def write_observed(
+        self, x: Tensor, x0: Tensor, observed: Tensor, level: int, noise: Callable[[], Tensor] | None = None
+    ) -> Tensor:
+        """States with the observed entries of ``x0``, which have the noise of ``level``."""
+        if level > 0:
+            drawn = torch.randn_like(x0) if noise is None else noise()
+            x0 = self.process.add_noise(x0, torch.tensor(level), drawn)
+        return self.clamp(torch.where(self._entries(observed), x0, x))
+
+    def _entries(self, observed: Tensor) -> Tensor:
+        """(B, N, D) bool of (B, N, 2) for pose and category."""
+        widths = torch.tensor([self.pose_width, self.features - self.pose_width], device=observed.device)
+        return observed.repeat_interleave(widths, dim=-1)
+
     def regenerate(
         self,
         batch: SceneBatch,
@@ -175,9 +199,7 @@ class ContinuousPrior(ScenePrior):
     ) -> Tensor:
         """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; used by :meth:`inpaint`."""
         x0 = self.encode(batch)
-        widths = torch.tensor([self.code.pose_width, x0.shape[-1] - self.code.pose_width], device=mask.device)
-        keep = ~mask.repeat_interleave(widths, dim=-1)
-        return self._chain_with_noised(x0, keep, table, generators, resample, hook, start)
+        return self._chain_with_noised(x0, self._entries(~mask), table, generators, resample, hook, start)
 
     def estimate(self, step: int, table: StepTable) -> tuple[float, Tensor]:
         """Weight of the denoised translations in x_{t-1}, and their standard deviation (3,), normalised."""
@@ -217,26 +239,28 @@ class ContinuousPrior(ScenePrior):
         Scenes are weighted by their timestep as ``config.loss_weighting`` says; ``text`` must be None.
         """
         error = self.output(noised, text).continuous - noised.target
+        if noised.observed is not None:
+            weight = noised.weight
+            total = weight.sum(dim=(1, 2)).clamp(min=1.0)
+            return (error.square() * weight).sum(dim=(1, 2)) / total * noised.scale
         weight = noised.weight[0]
         return (error.square() * weight).sum(dim=(1, 2)) / weight.sum() * noised.scale
 
     def noised(
         self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None, observed: Observed | None = None
     ) -> NoisedScenes:
-        """Noised scenes, their targets and weights; see :meth:`ScenePrior.noised`."""
-        if observed is not None:
-            raise InvalidInputError(
-                "a continuous prior sees everything with noise; take a mixed prior, or observed=None"
-            )
+        """Noised scenes, their targets and weights; observed entries have noise as well, and weight 0."""
         if t is None:
             t = self.draw_timesteps(x0.shape[0], generator).to(x0.device)
         noise = torch.randn(x0.shape, generator=generator).to(x0.device)
         x_t = self.clamp(self.process.add_noise(x0, t, noise))
         target = self.process.target(x0, x_t, t, noise)
         weight = self.loss_weight(x0.shape[1]).to(x0.device).expand(len(x0), -1, -1)
+        if observed is not None:
+            weight = weight * ~observed.entries(self.pose_width)
         scale = loss_weights(self.process.schedule, t, self.config.prediction, self.config.loss_weighting)
         category = x0[..., self.code.pose_width :].argmax(dim=-1)
-        return NoisedScenes(x_t, t, target, weight, scale.to(x0.device), category)
+        return NoisedScenes(x_t, t, target, weight, scale.to(x0.device), category, observed=observed)
 
     def output(self, noised: NoisedScenes, text: Text | None = None) -> DenoiserOutput:
         """The output (B, N, D) of noised scenes; ``text`` must be None."""

@@ -20,14 +20,14 @@ class NoisedScenes:
     """B scenes of N slots at timesteps of the forward process, with the training targets of the denoiser.
 
     Attributes:
-        x_t: (B, N, D) noised scenes; observed and known entries carry no noise.
+        x_t: (B, N, D) noised scenes; known entries carry no noise, nor do observed ones of a mixed prior.
         t: (B,) int64 timesteps.
         target: (B, N, F) of the continuous output; F is 12 (poses) for a mixed prior and D for a continuous one.
         weight: (B, N, F) weights of its squared errors; 0 on known and on observed entries.
         scale: (B,) weight of the timestep in the loss.
         category: (B, N) int64, the clean categories.
         drawn: (B, N) weights of the category losses, 0 where the category is seen; None for a continuous prior.
-        observed: entries that the denoiser sees without noise; None where there are none.
+        observed: entries that are observed; None where there are none.
     """
 
     x_t: Tensor
@@ -114,7 +114,8 @@ class Trainable(ABC):
             x0: normalised scenes.
             generator: source of timesteps, noise and observed entries (CPU).
             t: (B,) timesteps, drawn when None.
-            observed: entries without noise; None draws them as in pretraining.
+            observed: entries that have no part in the loss; None draws them as in pretraining, which a continuous
+                prior does not.
         """
 
     @abstractmethod
@@ -141,6 +142,10 @@ class Trainable(ABC):
         ``None`` where categories are a part of the continuous output.
         """
         return None
+
+    def observed_by_mask(self, x: Tensor, observed: Tensor | None) -> Observed | None:
+        """Observed entries of scenes ``x`` (B, N, D) from flags (B, N, 2) for pose and category; None of None."""
+        return None if observed is None else Observed(x, observed[..., 0], observed[..., 1])
 
     @property
     def pose_width(self) -> int:

@@ -10,10 +10,13 @@ from torch import Generator, Tensor
 
 from agents.diffusion.reverse_steps import ReverseStep
 from agents.diffusion.step_tables import StepTable
+from agents.networks.text import Text
+from agents.priors.observed_scenes import ObservedScenes, check_mask, merge
 from agents.priors.prompt_validation import check_prompts
 from scene_envs.errors import InvalidInputError
 from scene_envs.normalizer import Normalizer
-from scene_envs.scene import CATEGORY, POSE, TRANSLATION, SceneBatch
+from scene_envs.protocols import StepTableLike
+from scene_envs.scene import TRANSLATION, SceneBatch
 from scene_envs.scene_types import SceneType
 
 Hook = Callable[[int, Tensor, ReverseStep], ReverseStep]
@@ -83,6 +86,49 @@ class Inpainting(ABC):
     @abstractmethod
     def estimate(self, step: int, table: StepTable) -> tuple[float, Tensor]:
         """Weight of the denoised translations in x_{t-1}, and their standard deviation (3,), normalised."""
+
+    @abstractmethod
+    def observed_transition(
+        self,
+        x_t: Tensor,
+        step: int,
+        table: StepTableLike,
+        observed: Tensor,
+        *,
+        text: Text | None = None,
+        guidance: float = 0.0,
+    ) -> ReverseStep:
+        """p(x_{t-1} | x_t) of scenes (B, N, D) whose observed entries are certain, and so no part of log p.
+
+        Args:
+            x_t: scenes with the observed entries in place, see :meth:`observe`.
+            step: index in the table.
+            table: the chain.
+            observed: (B, N, 2) bool, True where the pose, or the category, of a slot is observed.
+            text, guidance: of a prompt, for priors that read some.
+        """
+
+    @abstractmethod
+    def write_observed(
+        self, x: Tensor, x0: Tensor, observed: Tensor, level: int, noise: Callable[[], Tensor] | None = None
+    ) -> Tensor:
+        """States ``x`` (B, N, D) at timestep ``level`` with the entries ``observed`` (B, N, 2) of ``x0`` in place."""
+
+    @abstractmethod
+    def encode(self, batch: SceneBatch) -> Tensor:
+        """Normalised x_0 (B, N, D) of scenes."""
+
+    def observe(self, batch: SceneBatch, mask: Tensor) -> ObservedScenes:
+        """Scenes that are regenerated where ``mask`` (B, N), or (B, N, 2) for pose and category, is True.
+
+        Fixed welded slots are always observed.
+
+        Raises:
+            InvalidInputError: the mask does not fit the batch.
+        """
+        both = check_mask(batch, mask).to(self.device)
+        both[:, : len(self.scene_type.fixed)] = False
+        return ObservedScenes(self, batch, both.to(batch.tensor.device), self.encode(batch.to(self.device)))
 
     @torch.no_grad()
     def inpaint(
@@ -221,33 +267,6 @@ class Inpainting(ABC):
         free = batch.is_free
         mask = torch.stack([free, torch.zeros_like(free)], dim=-1)
         return self.inpaint(batch, mask, prompt=prompt, guidance=guidance, num_steps=num_steps, seed=seed)
-
-
-def check_mask(
-    batch: SceneBatch, mask: Tensor, generators: Sequence[Generator] | None = None, resample: int = 1
-) -> Tensor:
-    """The mask as (B, N, 2), a copy; raises InvalidInputError when an argument does not fit ``batch``."""
-    expected = tuple(batch.tensor.shape[:2])
-    if tuple(mask.shape) not in (expected, (*expected, 2)) or mask.dtype != torch.bool:
-        raise InvalidInputError(
-            f"mask must be bool of shape {expected}, or {(*expected, 2)} for pose and category, "
-            f"got {mask.dtype} {tuple(mask.shape)}"
-        )
-    if generators is not None and len(generators) != len(batch):
-        raise InvalidInputError(f"{len(generators)} generators for {len(batch)} scenes; give one per scene")
-    if resample < 1:
-        raise InvalidInputError(f"resample={resample}: every step is taken at least once")
-    return (mask if mask.ndim == 3 else torch.stack([mask, mask], dim=-1)).clone()
-
-
-def merge(batch: SceneBatch, new: SceneBatch, mask: Tensor) -> SceneBatch:
-    """``batch`` with the poses and categories of ``new`` where ``mask`` (B, N, 2) says so."""
-    empty = batch.scene_type.num_assets
-    taken = mask[..., 1] & (mask[..., 0] | (new.is_empty == batch.is_empty))  # a kept pose, or none, stays one
-    category = torch.where(taken[..., None], new.tensor[..., CATEGORY], batch.tensor[..., CATEGORY])
-    pose = torch.where(mask[..., :1], new.tensor[..., POSE], batch.tensor[..., POSE])
-    gone = category.argmax(dim=-1, keepdim=True) == empty
-    return SceneBatch(torch.cat([torch.where(gone, torch.zeros_like(pose), pose), category], dim=-1), batch.scene_type)
 
 
 def draw_noise(like: Tensor, generators: Sequence[Generator] | Generator | None) -> Tensor:

@@ -6,7 +6,7 @@ While a category is masked its K entries are zeros. (Pfaff et al., CoRL 2025; Hu
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -195,6 +195,21 @@ class MixedPrior(TrainableMixedPrior):
             category = torch.where(state < self.num_categories, state, category)
         estimate = torch.cat([pose, F.one_hot(category, self.num_categories).to(pose)], dim=-1).detach()
         return MixedStep(clamped[..., :POSE_FEATURES], std * (~known).to(mean.dtype), probs, random, masked, estimate)
+
+    def observed_transition(
+        self, x_t: Tensor, step: int, table: StepTableLike, observed: Tensor, *,
+        text: Text | None = None, guidance: float = 0.0,
+    ) -> MixedStep:  # fmt: skip
+        """p(x_{t-1} | x_t) of scenes whose observed entries are certain; see :class:`Inpainting`."""
+        seen = Observed(x_t, observed[..., 0], observed[..., 1])
+        reverse = self.transition(x_t, step, table, observed=seen, text=text, guidance=guidance)
+        return reverse.observing(seen.pose, seen.category, x_t)
+
+    def write_observed(
+        self, x: Tensor, x0: Tensor, observed: Tensor, level: int, noise: Callable[[], Tensor] | None = None
+    ) -> Tensor:
+        """States with the observed entries of ``x0``, without noise at every level."""
+        return Observed(x0, observed[..., 0], observed[..., 1]).write(x)
 
     def regenerate(
         self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int,

@@ -1,4 +1,4 @@
-"""Process group of a training run on several processes, as ``torchrun`` starts them."""
+"""Process group of a training run on several processes, as ``torchrun``, Accelerate or MPI starts them."""
 
 from __future__ import annotations
 
@@ -16,6 +16,12 @@ from scene_envs.errors import InvalidInputError, TrainingError
 
 Value = TypeVar("Value")
 
+_LAUNCHERS = {
+    "WORLD_SIZE": ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_SIZE"),
+    "RANK": ("PMI_RANK", "OMPI_COMM_WORLD_RANK", "MV2_COMM_WORLD_RANK"),
+    "LOCAL_RANK": ("MPI_LOCALRANKID", "OMPI_COMM_WORLD_LOCAL_RANK", "MV2_COMM_WORLD_LOCAL_RANK"),
+}
+"""Variables of ``torchrun``, and what Intel MPI, Open MPI and MVAPICH call them."""
 _PATIENCE = 600.0
 """Seconds that a process waits for the others."""
 
@@ -51,8 +57,12 @@ class ProcessGroup:
             TrainingError: the others do not come.
         """
         size = launched_processes()
+        _check_accelerate()
         if size == 1:
             return cls()
+        for name in _LAUNCHERS:  # torch reads the first names alone
+            if (value := _launched_as(name)) is not None:
+                os.environ.setdefault(name, value)
         if device == "cuda":  # each process on a GPU of its own
             torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
         if not distributed.is_initialized():
@@ -165,12 +175,27 @@ def gather_rows(x: Tensor) -> Tensor:
 
 def launched_processes() -> int:
     """How many processes the launcher of this one started; 1 without a launcher."""
-    return int(os.environ.get("WORLD_SIZE", "1"))
+    return int(_launched_as("WORLD_SIZE") or "1")
 
 
 def is_first_process() -> bool:
     """Whether this process, of those that a launcher started, is the one that writes files and speaks."""
-    return int(os.environ.get("RANK", "0")) == 0
+    return int(_launched_as("RANK") or "0") == 0
+
+
+def _launched_as(name: str) -> str | None:
+    """The value of a variable of ``torchrun``, or of its like under MPI."""
+    return next((os.environ[known] for known in (name, *_LAUNCHERS[name]) if known in os.environ), None)
+
+
+def _check_accelerate() -> None:
+    """Refuse to run alone where Accelerate was asked for several processes on a CPU, of which it starts one."""
+    asked = os.environ.get("ACCELERATE_USE_CPU", "").lower() == "true" and "MASTER_ADDR" in os.environ
+    if asked and _launched_as("WORLD_SIZE") is None:
+        raise InvalidInputError(
+            "accelerate launch --cpu starts one process, whatever --num_processes says; for several on a CPU give "
+            "--multi_gpu in place of --cpu, and device=cpu to the command, or use torchrun"
+        )
 
 
 @contextmanager

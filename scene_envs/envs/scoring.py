@@ -59,16 +59,20 @@ class RewardScorer:
 
     Args:
         reward: a registered name, a mapping with its settings, a function or a reward object.
-        workers: physics worker processes; 0 computes in this process. Started at the first scoring.
+        workers: physics worker processes; 0 computes in this process, ``"ray"`` on a Ray cluster. Started at the first
+            scoring.
 
     >>> scorer = RewardScorer("object_count")
     >>> scorer(SceneBatch.empty("dimsum_table", 2)).valid.tolist()
     [True, True]
     """
 
-    def __init__(self, reward: Any, workers: int = 0) -> None:
-        if not isinstance(workers, int) or workers < 0:
-            raise InvalidInputError(f"workers={workers!r}: give a number of processes, 0 for none")
+    def __init__(self, reward: Any, workers: int | str = 0) -> None:
+        number = isinstance(workers, int) and workers >= 0
+        if not number and workers != "ray":
+            raise InvalidInputError(
+                f"workers={workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"
+            )
         self._score = resolve_reward(reward)
         self.workers = workers
         self._pool: Any = None
@@ -92,10 +96,10 @@ class RewardScorer:
         return tuple(sorted(output.terms))
 
     def _physics_pool(self) -> Any:
-        if self._pool is None and self.workers > 0:
-            from scene_envs.physics import PhysicsPool
+        if self._pool is None and self.workers != 0:
+            from scene_envs.physics import make_pool
 
-            self._pool = PhysicsPool(workers=self.workers)
+            self._pool = make_pool(self.workers)
         return self._pool
 
     def close(self) -> None:

@@ -28,7 +28,7 @@ class EnvSettings:
         prior: name, path or prior; None means the shipped prior of the scene type.
         num_steps: denoising steps: of an episode of denoising, of each scene of a search.
         slots: N, slots per scene; None means the scene type's.
-        workers: physics worker processes; 0 computes in this process.
+        workers: physics worker processes; 0 computes in this process, ``"ray"`` on a Ray cluster.
         prompt: what scenes should hold, for priors that read prompts; None for none.
         guidance: weight of classifier-free guidance in the prior's own steps; needs a prompt.
 
@@ -40,7 +40,7 @@ class EnvSettings:
     prior: Any = None
     num_steps: int = 50
     slots: int | None = None
-    workers: int = 0
+    workers: int | str = 0
     prompt: Any = None
     guidance: float = 0.0
 

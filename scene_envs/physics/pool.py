@@ -22,7 +22,7 @@ from scene_envs.scene_types import SceneType
 _LOGGER = logging.getLogger(__name__)
 _NO_MESH: Any = None
 """Workers draw nothing, so the meshes stay here."""
-_START_UP = 120.0
+START_UP = 120.0
 """Seconds that a worker may take to start, or to build the geometry of a scene type."""
 _MOST_FAILED_STARTS = 3
 _SINGLE_THREADED = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -61,7 +61,27 @@ class _Worker:
         self.known: set[int] = set()
         self.is_ready = False
         self.task: _Task | None = None
-        self.deadline = time.monotonic() + _START_UP
+        self.deadline = time.monotonic() + START_UP
+
+    def send(self, message: tuple[Any, ...]) -> None:
+        """Give the process a message; one that died is noticed by :meth:`receive`."""
+        with contextlib.suppress(OSError):
+            self.outbox.send(message)
+
+    def receive(self) -> tuple[str, Any]:
+        """The reply to the last message; raises EOFError or OSError when the process died."""
+        reply: tuple[str, Any] = self.inbox.recv()
+        return reply
+
+    @property
+    def process_id(self) -> int:
+        """Of the operating system."""
+        return self.process.pid
+
+    @property
+    def end(self) -> str:
+        """How the process ended."""
+        return f"exit status {self.process.returncode}"
 
     def stop(self) -> None:
         """End the process and close the pipes."""
@@ -95,7 +115,7 @@ class PhysicsPool:
             raise InvalidInputError(f"timeout must be a positive number of seconds, got {timeout}")
         self.workers = workers
         self.timeout = timeout
-        self._live: list[_Worker] = []
+        self._live: list[Any] = []  # of _Worker, or of what a subclass starts
         self._scene_types: dict[SceneType, int] = {}
         self._lock = threading.Lock()
         self._closed = False
@@ -121,7 +141,7 @@ class PhysicsPool:
     @property
     def process_ids(self) -> list[int]:
         """Operating-system ids of the running workers."""
-        return [worker.process.pid for worker in self._live]
+        return [worker.process_id for worker in self._live]
 
     def run(self, kernel: str, chunks: Sequence[Chunk], options: Mapping[str, Any]) -> list[dict[str, Any] | None]:
         """Run a kernel on every chunk.
@@ -163,13 +183,13 @@ class PhysicsPool:
     ) -> None:
         while tasks or any(worker.task for worker in self._live):
             while len(self._live) < min(self.workers, len(tasks) + sum(w.task is not None for w in self._live)):
-                self._live.append(_Worker())
+                self._live.append(self._start())
             for worker in self._live:
                 if worker.is_ready and worker.task is None and tasks:
                     self._next(worker, tasks, kernel, options)
             self._collect(tasks, results)
 
-    def _next(self, worker: _Worker, tasks: deque[_Task], kernel: str, options: dict[str, Any]) -> None:
+    def _next(self, worker: Any, tasks: deque[_Task], kernel: str, options: dict[str, Any]) -> None:
         """Give an idle worker the scene type it lacks, or its next task."""
         scene_type = tasks[0].chunk.scene_type
         key = self._scene_types.setdefault(scene_type, len(self._scene_types))
@@ -178,7 +198,7 @@ class PhysicsPool:
             assets = tuple(dataclasses.replace(asset, visual=_NO_MESH) for asset in scene_type.library)
             message = ("scene_type", key, dataclasses.replace(scene_type), assets)
             worker.known.add(key)
-            worker.is_ready, worker.deadline = False, time.monotonic() + _START_UP
+            worker.is_ready, worker.deadline = False, time.monotonic() + START_UP
         else:
             worker.task = tasks.popleft()
             chunk = worker.task.chunk
@@ -190,8 +210,16 @@ class PhysicsPool:
                 options,
             )
             worker.deadline = time.monotonic() + self.timeout
-        with contextlib.suppress(OSError):  # a dead worker is noticed by _collect, which sees the end of its pipe
-            worker.outbox.send(message)
+        worker.send(message)
+
+    def _start(self) -> Any:
+        """A new worker."""
+        return _Worker()
+
+    def _answering(self, waiting: Sequence[Any], timeout: float) -> list[Any]:
+        """The workers that replied or died, as soon as there are some, or none after ``timeout`` seconds."""
+        ready = wait([worker.inbox for worker in waiting], timeout=timeout)
+        return [worker for worker in waiting if worker.inbox in ready]
 
     def _collect(self, tasks: deque[_Task], results: list[dict[str, Any] | None]) -> None:
         """Wait for the next message, death or deadline."""
@@ -199,16 +227,16 @@ class PhysicsPool:
         if not waiting:
             return
         nearest = min(worker.deadline for worker in waiting) - time.monotonic()
-        ready = wait([worker.inbox for worker in waiting], timeout=max(0.0, nearest))
+        ready = self._answering(waiting, max(0.0, nearest))
         for worker in waiting:
-            if worker.inbox in ready:
+            if worker in ready:
                 self._receive(worker, tasks, results)
             elif time.monotonic() > worker.deadline:
                 self._lose(worker, tasks, f"took longer than {self.timeout:g} s")
 
-    def _receive(self, worker: _Worker, tasks: deque[_Task], results: list[dict[str, Any] | None]) -> None:
+    def _receive(self, worker: Any, tasks: deque[_Task], results: list[dict[str, Any] | None]) -> None:
         try:
-            kind, body = worker.inbox.recv()
+            kind, body = worker.receive()
         except (EOFError, OSError):
             self._lose(worker, tasks, "died")
             return
@@ -225,7 +253,7 @@ class PhysicsPool:
         else:
             _retry(task, tasks, f"failed ({body})")
 
-    def _lose(self, worker: _Worker, tasks: deque[_Task], how: str) -> None:
+    def _lose(self, worker: Any, tasks: deque[_Task], how: str) -> None:
         task, started = worker.task, worker.is_ready
         self._live.remove(worker)
         worker.stop()
@@ -236,13 +264,37 @@ class PhysicsPool:
             if self._failed_starts >= _MOST_FAILED_STARTS:
                 raise PhysicsError(
                     f"{self._failed_starts} physics workers in a row {how} while starting "
-                    f"(exit status {worker.process.returncode}); their own message is on stderr"
+                    f"({worker.end}); their own message is on stderr"
                 )
 
     def _discard_busy(self) -> None:
         for worker in [w for w in self._live if w.task is not None or not w.is_ready]:
             self._live.remove(worker)
             worker.stop()
+
+
+def make_pool(workers: int | str, timeout: float = 60.0) -> PhysicsPool:
+    """A pool of processes of this machine, or with ``"ray"`` of a Ray cluster.
+
+    Args:
+        workers: number of processes, 0 for this one alone; ``"ray"`` for as many as the cluster has CPUs.
+        timeout: as for :class:`PhysicsPool`.
+
+    Raises:
+        InvalidInputError: neither.
+
+    >>> make_pool(0).workers
+    0
+    """
+    if workers == "ray":
+        from scene_envs.physics.ray_pool import RayPhysicsPool
+
+        return RayPhysicsPool(timeout)
+    if not isinstance(workers, int):
+        raise InvalidInputError(
+            f"workers={workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"
+        )
+    return PhysicsPool(workers, timeout)
 
 
 def run_here(

@@ -24,22 +24,27 @@ def serve(inbox: Connection, outbox: Connection) -> None:
     outbox.send(("ready", None))
     while True:
         try:
-            kind, *body = inbox.recv()
+            message = inbox.recv()
         except EOFError:
             return
-        if kind == "scene_type":
-            key, scene_type, assets = body
-            scene_type.__dict__["library"] = AssetLibrary(assets)  # what the cached property would hold
-            scene_types[key] = scene_type
-            physics_of(scene_type)  # geometry is built before the first chunk's clock starts
-            outbox.send(("ready", None))
-            continue
-        try:
-            outbox.send(("done", _run(scene_types, *body)))
-        except SceneEnvsError as error:
-            outbox.send(("refused", error))
-        except Exception as error:
-            outbox.send(("failed", f"{type(error).__name__}: {error}"))
+        outbox.send(answer(scene_types, message))
+
+
+def answer(scene_types: dict[int, SceneType], message: tuple[Any, ...]) -> tuple[str, Any]:
+    """The reply to one message; ``scene_types`` are those received so far, to which it may add."""
+    kind, *body = message
+    if kind == "scene_type":
+        key, scene_type, assets = body
+        scene_type.__dict__["library"] = AssetLibrary(assets)  # what the cached property would hold
+        scene_types[key] = scene_type
+        physics_of(scene_type)  # geometry is built before the first chunk's clock starts
+        return "ready", None
+    try:
+        return "done", _run(scene_types, *body)
+    except SceneEnvsError as error:
+        return "refused", error
+    except Exception as error:
+        return "failed", f"{type(error).__name__}: {error}"
 
 
 def _run(scene_types: dict[int, SceneType], kernel: str, key: int, arrays: Any, options: dict[str, Any]) -> Any:

@@ -1,0 +1,161 @@
+"""Observed parts of the scenes of a batch: where they come from, and their assignment to the episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Generator, Tensor
+
+from agents.post_training.inpaint_settings import InpaintSettings
+from agents.post_training.prompts import PromptSets
+from agents.priors.base import ScenePrior
+from agents.utils.seeds import derived_seed
+from scene_envs.envs.mask_generators import OffPromptMask
+from scene_envs.envs.masks import MaskGenerator, resolve_mask
+from scene_envs.envs.scoring import RewardScorer, Score
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import SceneBatch
+
+_ROUNDS = 4
+"""Times that other scenes are drawn where a mask leaves nothing to regenerate."""
+
+Source = Callable[[int, Sequence[str] | None, int], tuple[SceneBatch, Sequence[str] | None]]
+"""``(count, prompts, seed) -> (scenes, prompts)``: scenes on the CPU, one per prompt if there are any."""
+
+
+@dataclass(frozen=True)
+class Parts:
+    """One observed part per episode.
+
+    Attributes:
+        scenes: B scenes, on the CPU.
+        mask: (B, N, 2) bool, True where the pose, or the category, of a slot is regenerated.
+        groups: (B,) int64, equal for episodes with the same part.
+        prompts: one per episode; None without prompts.
+    """
+
+    scenes: SceneBatch
+    mask: Tensor
+    groups: Tensor
+    prompts: list[str] | None
+
+    def take(self, rows: Tensor) -> Parts:
+        """Those of ``rows`` (K,), which may come more than once."""
+        prompts = None if self.prompts is None else [self.prompts[row] for row in rows.tolist()]
+        return Parts(self.scenes[rows], self.mask[rows], self.groups[rows], prompts)
+
+
+class InpaintDeck:
+    """Deals the observed parts of batches.
+
+    Neighbouring episodes share a part, so that they can be compared. A scene whose mask leaves nothing to regenerate is
+    replaced by another one.
+
+    Args:
+        settings: which slots are regenerated.
+        source: of the scenes.
+        scorer: of the run's reward, whose verdict on the scenes masks may read.
+        share: episodes of a batch that share a part.
+    """
+
+    def __init__(self, settings: InpaintSettings, source: Source, scorer: RewardScorer, share: int) -> None:
+        self.settings, self.share = settings, share
+        self.generator: MaskGenerator = resolve_mask(settings.mask)
+        self._source, self._scorer = source, scorer
+
+    def deal(self, count: int, prompts: Sequence[str] | None, seed: int) -> Parts:
+        """The parts of ``count`` episodes, whose ``prompts`` are equal within each group; all hangs on ``seed``.
+
+        Raises:
+            InvalidInputError: the mask leaves nothing to regenerate in any scene.
+        """
+        groups = max(1, count // self.share)
+        of_row = torch.tensor([row * groups // count for row in range(count)])
+        first = [int(torch.nonzero(of_row == group)[0]) for group in range(groups)]
+        asked = None if prompts is None else [prompts[row] for row in first]
+        found: dict[int, Parts] = {}
+        for again in range(_ROUNDS):
+            for group, part in self._candidates(asked, groups, derived_seed(seed, again)):
+                found.setdefault(group, part)
+            if len(found) == groups:
+                break
+        if not found:
+            raise InvalidInputError(
+                f"inpaint.mask={self.settings.mask!r} leaves nothing to regenerate in {_ROUNDS * groups} scenes of "
+                f"inpaint.scenes={self.settings.scenes}; choose another mask, or other scenes"
+            )
+        some = list(found.values())
+        parts = [found.get(group, some[group % len(some)]) for group in range(groups)]
+        texts = None if parts[0].prompts is None else [text for part in parts for text in part.prompts or []]
+        scenes = SceneBatch(torch.cat([part.scenes.tensor for part in parts]), parts[0].scenes.scene_type)
+        return Parts(scenes, torch.cat([part.mask for part in parts]), torch.arange(groups), texts).take(of_row)
+
+    def _candidates(self, prompts: Sequence[str] | None, groups: int, seed: int) -> list[tuple[int, Parts]]:
+        """Parts in which something is regenerated, with the number of their group."""
+        scenes, texts = self._source(groups, prompts, seed)
+        score = self._scorer(scenes, texts)
+        result = []
+        for group in range(groups):
+            text = None if texts is None else texts[group]
+            mask = self._mask(scenes[group], score.row(group), text, np.random.default_rng([seed, group]))
+            if bool(mask.any()) and bool(score.valid[group]):
+                one = None if text is None else [text]
+                result.append((group, Parts(scenes[group], mask[None], torch.zeros(1, dtype=torch.int64), one)))
+        return result
+
+    def _mask(self, scene: SceneBatch, score: Score, prompt: str | None, rng: np.random.Generator) -> Tensor:
+        """(N, 2) bool of a batch of one; welded objects are never regenerated."""
+        generator = self.generator
+        if isinstance(generator, OffPromptMask) and generator.prompt is None:
+            generator = OffPromptMask(prompt)
+        changeable = ~scene.is_welded[0]
+        changeable[: len(scene.scene_type.fixed)] = False
+        slots = changeable & generator(scene, score, rng).to(changeable.device)
+        poses_alone = self.settings.entries == "poses"
+        poses = slots & scene.is_free[0] if poses_alone else slots
+        return torch.stack([poses, torch.zeros_like(slots) if poses_alone else slots], dim=-1)
+
+
+def real_parts(scenes: SceneBatch, slots: int, prompts: PromptSets | None = None) -> Source:
+    """Real scenes, drawn without repetition while there are enough.
+
+    Args:
+        scenes: all of them.
+        slots: per scene; scenes with objects in further slots are left out.
+        prompts: of each scene by its index, one of which takes the place of the prompt that was dealt; None keeps that.
+
+    Raises:
+        InvalidInputError: no scene has so few slots.
+    """
+    fitting = torch.nonzero(scenes.is_empty[:, slots:].all(dim=1))[:, 0]
+    if not len(fitting):
+        raise InvalidInputError(
+            f"none of {len(scenes)} real scenes fits into slots={slots}, so that no part of one can be observed; give "
+            "more slots, or inpaint.scenes=samples"
+        )
+
+    def draw(count: int, asked: Sequence[str] | None, seed: int) -> tuple[SceneBatch, Sequence[str] | None]:
+        generator = Generator().manual_seed(seed)
+        rounds = [torch.randperm(len(fitting), generator=generator) for _ in range(-(-count // len(fitting)))]
+        rows = fitting[torch.cat(rounds)[:count]]
+        texts = asked
+        if asked is not None and prompts is not None:
+            sets = [prompts(row) for row in rows.tolist()]
+            texts = [own[int(torch.randint(len(own), (), generator=generator))] for own in sets]
+        return scenes[rows].with_slots(slots), texts
+
+    return draw
+
+
+def sampled_parts(prior: ScenePrior, num_steps: int, slots: int, guidance: float = 0.0) -> Source:
+    """Fresh samples of ``prior``, as it is when they are drawn."""
+
+    def draw(count: int, asked: Sequence[str] | None, seed: int) -> tuple[SceneBatch, Sequence[str] | None]:
+        weight = 0.0 if asked is None else guidance
+        batch = prior.sample(count, prompt=asked, guidance=weight, num_steps=num_steps, slots=slots, seed=seed)
+        return batch.to("cpu"), asked
+
+    return draw

@@ -1,0 +1,89 @@
+"""Scenes of which a part is observed: the mask of the rest, and what a chain of states holds of the observed part."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Generator, Tensor
+
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import CATEGORY, POSE, SceneBatch
+
+if TYPE_CHECKING:
+    from agents.priors.inpainting import Inpainting
+
+
+@dataclass(frozen=True)
+class ObservedScenes:
+    """B scenes whose observed entries every state and every result of a chain has.
+
+    Made by :meth:`ScenePrior.observe`; environments take it for the episodes of an inpainting.
+
+    Attributes:
+        prior: that denoises the rest.
+        batch: the scenes.
+        mask: (B, N, 2) bool, True where the pose, or the category, of a slot is regenerated.
+        x0: (B, N, D) the scenes as the prior encodes them.
+
+    >>> from agents.priors.testing import tiny_prior
+    >>> prior = tiny_prior("dimsum_table", process="mixed")
+    >>> observed = prior.observe(prior.sample(2, num_steps=3), torch.zeros(2, 34, dtype=torch.bool))
+    >>> x = observed.write(prior.initial(2, 34), 0)
+    >>> bool((x == observed.x0).all()), bool(observed.entries.all())
+    (True, True)
+    """
+
+    prior: Inpainting
+    batch: SceneBatch
+    mask: Tensor
+    x0: Tensor
+
+    @property
+    def entries(self) -> Tensor:
+        """(B, N, 2) bool, True where the pose, or the category, of a slot is observed."""
+        return ~self.mask
+
+    def write(self, x: Tensor, level: int, noise: Callable[[], Tensor] | None = None) -> Tensor:
+        """``x`` (B, N, D) at timestep ``level`` with the observed entries in place.
+
+        Args:
+            x: states.
+            level: timestep, 0 for finished scenes.
+            noise: gives standard normal noise (B, N, D) for priors that see observed entries with the noise of every
+                level; torch's own without.
+        """
+        return self.prior.write_observed(x, self.x0, self.entries.to(x.device), level, noise)
+
+    def merge(self, scenes: SceneBatch) -> SceneBatch:
+        """``scenes`` with the observed entries of the batch, bit for bit."""
+        return merge(self.batch, scenes, self.mask)
+
+
+def check_mask(
+    batch: SceneBatch, mask: Tensor, generators: Sequence[Generator] | None = None, resample: int = 1
+) -> Tensor:
+    """The mask as (B, N, 2), a copy; raises InvalidInputError when an argument does not fit ``batch``."""
+    expected = tuple(batch.tensor.shape[:2])
+    if tuple(mask.shape) not in (expected, (*expected, 2)) or mask.dtype != torch.bool:
+        raise InvalidInputError(
+            f"mask must be bool of shape {expected}, or {(*expected, 2)} for pose and category, "
+            f"got {mask.dtype} {tuple(mask.shape)}"
+        )
+    if generators is not None and len(generators) != len(batch):
+        raise InvalidInputError(f"{len(generators)} generators for {len(batch)} scenes; give one per scene")
+    if resample < 1:
+        raise InvalidInputError(f"resample={resample}: every step is taken at least once")
+    return (mask if mask.ndim == 3 else torch.stack([mask, mask], dim=-1)).clone()
+
+
+def merge(batch: SceneBatch, new: SceneBatch, mask: Tensor) -> SceneBatch:
+    """``batch`` with the poses and categories of ``new`` where ``mask`` (B, N, 2) says so."""
+    empty = batch.scene_type.num_assets
+    taken = mask[..., 1] & (mask[..., 0] | (new.is_empty == batch.is_empty))  # a kept pose, or none, stays one
+    category = torch.where(taken[..., None], new.tensor[..., CATEGORY], batch.tensor[..., CATEGORY])
+    pose = torch.where(mask[..., :1], new.tensor[..., POSE], batch.tensor[..., POSE])
+    gone = category.argmax(dim=-1, keepdim=True) == empty
+    return SceneBatch(torch.cat([torch.where(gone, torch.zeros_like(pose), pose), category], dim=-1), batch.scene_type)

@@ -1,0 +1,69 @@
+"""Launchers of several processes: Accelerate's beside torchrun, and the variables of MPI."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from agents.post_training.run_files import CHECKPOINT_NAME
+from agents.utils.process_group import ProcessGroup, is_first_process, launched_processes
+from scene_envs.errors import InvalidInputError
+from tests.helpers.processes import in_processes
+
+KEYS = (
+    "-m agents.cli post-train prior=dimsum_table_continuous reward=object_count iterations=1 batch_size=4 num_steps=4 "
+    "algorithm.gradient_steps=2 regularisation.bank_size=20 regularisation.batch_size=4 guard.scenes=8 guard.samples=0 "
+    "logger.progress=none logger.report_scenes=0 device=cpu"
+)
+LAUNCHERS = {
+    "torchrun": "torch.distributed.run --nproc_per_node 2 --master_port 29611",
+    "accelerate": "accelerate.commands.launch --multi_gpu --num_processes 2 --num_machines 1 --mixed_precision no "
+    "--dynamo_backend no --main_process_port 29612",
+}
+
+
+@pytest.mark.slow
+def test_accelerate_gives_the_run_of_torchrun(tmp_path: Path) -> None:
+    pytest.importorskip("accelerate")
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
+    for name, launcher in LAUNCHERS.items():
+        command = [sys.executable, "-m", *launcher.split(), *KEYS.split(), f"output={tmp_path / name}"]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert "sample it: scene-envs sample" in done.stdout
+        assert done.stdout.count("sample it") == 1  # one writer, one speaker
+    one, other = (
+        torch.load(tmp_path / name / CHECKPOINT_NAME, weights_only=False)["learner"]["prior"] for name in LAUNCHERS
+    )
+    assert one.keys() == other.keys()
+    assert all(torch.equal(one[key], other[key]) for key in one)
+
+
+def test_accelerate_on_a_cpu_that_starts_one_process_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("WORLD_SIZE", raising=False)
+    monkeypatch.setenv("ACCELERATE_USE_CPU", "True")
+    assert ProcessGroup.join().size == 1  # one was asked for
+    monkeypatch.setenv("MASTER_ADDR", "127.0.0.1")
+    with pytest.raises(InvalidInputError, match="give --multi_gpu in place of --cpu"):
+        ProcessGroup.join()
+
+
+def join_as_open_mpi_does(folder: Path) -> None:
+    for name, known in (("WORLD_SIZE", "SIZE"), ("RANK", "RANK")):
+        os.environ[f"OMPI_COMM_WORLD_{known}"] = os.environ.pop(name)
+    first = is_first_process()
+    assert launched_processes() == 2
+    group = ProcessGroup.join(patience=60.0)
+    assert group.is_first == first
+    (folder / str(group.rank)).write_text(str(group.sum(torch.tensor([10.0**group.rank])).tolist()))
+
+
+@pytest.mark.slow
+def test_processes_of_open_mpi_find_each_other(tmp_path: Path) -> None:
+    assert in_processes(join_as_open_mpi_does, tmp_path) == [0, 0]
+    assert [(tmp_path / str(rank)).read_text() for rank in (0, 1)] == ["[11.0]", "[11.0]"]
