@@ -16,10 +16,10 @@ from typing import Any
 
 from agents.configuration.compose import group_options
 from agents.configuration.prior_names import find_prior, split_name
-from agents.utils.scene_sources import find_scenes
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.files import exists, is_file
 from scene_envs.plugins import plugin_entry_points
+from scene_envs.scene_sources import find_scenes
 
 COMPOSITES = ("clip", "gate", "normalised", "product", "weighted_sum")
 """Rewards that need settings, so that no option of the group ``reward`` is called like them."""

@@ -14,9 +14,9 @@ from agents.post_training.prompts import PROMPTS_NAME, PromptSets, save_prompts
 from agents.post_training.run_files import REPLAY_NAME, SCENES_NAME, writing
 from agents.priors.base import ScenePrior
 from agents.utils.process_group import ProcessGroup
-from agents.utils.scene_sources import find_scenes, load_scenes
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
+from scene_envs.scene_sources import find_scenes, load_scenes
 
 _WITHHELD = 0.1
 """Share of real scenes whose prompt is withheld, as in pretraining."""

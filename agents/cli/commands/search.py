@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from agents.configuration.fields import composed, named
 from agents.planning.config import SearchConfig
-from agents.utils.scene_sources import load_scenes
+from scene_envs.scene_sources import load_scenes
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

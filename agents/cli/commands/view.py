@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.configuration.fields import named
-from agents.utils.scene_sources import find_scenes, is_dataset, load_scenes
+from scene_envs.scene_sources import find_scenes, is_dataset, load_scenes
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
