@@ -205,6 +205,14 @@ def gradient_norm(parameters: Iterable[nn.Parameter]) -> float:
     return float(torch.stack(norms).norm()) if norms else 0.0
 
 
+def no_credit_per_object() -> InvalidInputError:
+    """The error where credit per object is asked of a reward that gives none."""
+    return InvalidInputError(
+        "algorithm.credit=object (credit='object') needs a reward with per_object values, and this one scores scenes "
+        "only; take algorithm.credit=scene, or auto"
+    )
+
+
 def credited_reward(rollout: Rollout, credit: str) -> tuple[Tensor, Tensor]:
     """Rewards and their validity, (B,) for credit ``"scene"`` and (B, N) for ``"object"``; ``"auto"`` is one of them.
 
@@ -216,7 +224,7 @@ def credited_reward(rollout: Rollout, credit: str) -> tuple[Tensor, Tensor]:
     if credit == "scene" or (credit == "auto" and rollout.per_object is None):
         return rollout.reward, rollout.valid
     if rollout.per_object is None:
-        raise InvalidInputError("credit='object' needs a reward with per_object values; this one scores scenes only")
+        raise no_credit_per_object()
     free = torch.ones(rollout.per_object.shape, dtype=torch.bool, device=rollout.per_object.device)
     free[:, : len(rollout.batch.scene_type.fixed)] = False  # welded slots are not drawn
     if rollout.averages:

@@ -14,6 +14,8 @@ LOWEST, HIGHEST = 0.01, 100.0
 GAIN = 0.05
 """Change of the factor's logarithm per iteration, for a figure whose excess is twice that of the target."""
 LARGEST_ERROR = 3.0
+FAR = 0.5
+"""Error of the last measurement from which a target counts as not held at the end."""
 PATIENCE = 3
 """Measurements in a row above the target, with the factor at its bound, after which it counts as not held."""
 

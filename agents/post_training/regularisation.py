@@ -13,7 +13,7 @@ from torch import Generator
 
 from agents.post_training.base import Algorithm
 from agents.post_training.gradients import add_gradient
-from agents.post_training.hold import HIGHEST, HoldState, adjust
+from agents.post_training.hold import FAR, HIGHEST, HoldState, adjust
 from agents.post_training.regularisation_settings import RegularisationSettings
 from agents.post_training.rollouts import Rollout
 from agents.priors.base import ScenePrior
@@ -76,6 +76,12 @@ class Regularisation:
         state, settings = self.state, self.settings
         if self.target is None or state.measured is None:
             return ""
+        if state.lost_at is None and self.target.error(state.measured) > FAR:
+            return (
+                f"hold={settings.hold} was not held at the end: {self.target.figure} {state.measured:.4g} at the last "
+                f"measurement, when the weights of the regularisation were {state.factor:.3g} times the first ones and "
+                "still rising; measure more often (guard.every), raise the weights, or lower optimizer.lr"
+            )
         if state.lost_at is None:
             return f"hold={settings.hold} was held: {self.target.figure} {state.measured:.4g} at the last measurement."
         return (

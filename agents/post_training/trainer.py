@@ -13,6 +13,7 @@ import torch
 
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.curves import draw_curve
+from agents.post_training.gradients import no_credit_per_object
 from agents.post_training.guard import Guard, realism
 from agents.post_training.guard_files import GuardFiles, make_guard
 from agents.post_training.learner import Learner, NonFiniteGradient
@@ -246,8 +247,12 @@ class PostTrainer:
             self.learner.return_to(self.files.best(self.prior))
 
     def _probe(self, scenes: SceneBatch) -> None:
-        """End a run whose reward scores no real scene, before anything is sampled."""
-        if not self.processes.any(bool(self.learner.scorer(scenes, None).valid.any())):
+        """End a run whose reward scores no real scene, or lacks the credit asked for, before anything is sampled."""
+        score = self.learner.scorer(scenes, None)
+        valid = bool(score.valid.any())
+        if valid and score.per_object is None and getattr(self.config.algorithm, "credit", "") == "object":
+            raise no_credit_per_object()
+        if not self.processes.any(valid):
             raise self._nothing_scored(f"none of {len(scenes)} real scenes, so that nothing was sampled")
 
     def _count_invalid(self) -> None:

@@ -9,6 +9,8 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.physics.pool import START_UP, PhysicsPool
 from scene_envs.physics.worker import answer
@@ -107,10 +109,12 @@ class _RayWorker:
     def receive(self) -> tuple[str, Any]:
         """The reply to the last message; raises EOFError when the actor died."""
         try:
-            reply: tuple[str, Any] = self._ray.get(self.reply)
+            kind, body = self._ray.get(self.reply)
         except self._ray.exceptions.RayError as error:
             raise EOFError(str(error)) from error
-        return reply
+        if kind == "done":  # arrays of the object store cannot be written
+            body = {name: part.copy() if isinstance(part, np.ndarray) else part for name, part in body.items()}
+        return kind, body
 
     def stop(self) -> None:
         """End the actor, whatever it does."""

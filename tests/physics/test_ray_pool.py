@@ -77,8 +77,9 @@ def test_a_reward_is_scored_on_ray_and_kept_by_content(
     forget_verdicts()
     scorer = RewardScorer("feasible_objects", workers="ray")
     first = scorer(batch)
-    monkeypatch.setattr(PhysicsPool, "run", None)  # nothing is simulated a second time
-    assert torch.equal(scorer(batch).value, first.value)
+    with monkeypatch.context() as patch:
+        patch.setattr(PhysicsPool, "run", None)  # nothing is simulated a second time
+        assert torch.equal(scorer(batch).value, first.value)
     scorer.close()
     assert first.value.tolist() == feasibility_counts(batch)
 

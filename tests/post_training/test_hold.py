@@ -21,6 +21,8 @@ from agents.post_training import DenoisingPolicy, PostTrainConfig, post_train, p
 from agents.post_training.algorithms import algorithm_settings
 from agents.post_training.base_kl import chain_kl, forward_kl, noised_kl
 from agents.post_training.hold import HIGHEST, LOWEST, HoldState, Target, adjust
+from agents.post_training.regularisation import Regularisation
+from agents.post_training.regularisation_settings import RegularisationSettings
 from agents.post_training.rollouts import collect
 from agents.post_training.trainer import PostTrainer
 from agents.priors import ScenePrior
@@ -210,3 +212,11 @@ def test_a_target_that_cannot_be_held_is_said_in_log_metrics_and_report(
     assert "What was held" in page
     assert "could not be held" in page
     assert (tmp_path / "prior" / "model.safetensors").exists()
+
+
+def test_a_target_that_was_not_reached_at_the_end_does_not_count_as_held() -> None:
+    regularisation = Regularisation(RegularisationSettings(weight=1.0, hold="guard:1.05"), tiny_prior())
+    regularisation.observe("guard", 1.2, iteration=5)  # the bound of the weights is far away
+    assert "was not held at the end: guard 1.2" in regularisation.verdict()
+    regularisation.observe("guard", 1.06, iteration=10)  # 0.2 of the way beyond
+    assert regularisation.verdict() == "hold=guard:1.05 was held: guard 1.06 at the last measurement."

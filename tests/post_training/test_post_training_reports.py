@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 from rich.console import Console
 
+from agents.post_training.curves import draw_curve
 from agents.post_training.demo import run_demo
 from agents.post_training.doctor import diagnose
 from agents.post_training.report import Page, Picture, Section, Tile, write_report
@@ -87,3 +89,21 @@ def test_demonstration_end_to_end(tmp_path: Path) -> None:
         assert on_disk[name]["objects"] == pytest.approx(float(counts.mean()))
     for name in ("report.html", "samples.png", "ready.png", "clutter/curve.png", "feasible/log.csv"):
         assert (folder / name).stat().st_size > 0
+
+
+def test_the_band_of_a_share_ends_at_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from matplotlib.axes import Axes
+
+    bands: list[tuple[list[float], list[float]]] = []
+
+    def noted(self: Axes, x: Any, low: Any, high: Any, **_: Any) -> None:
+        bands.append((low.tolist(), high.tolist()))
+
+    monkeypatch.setattr(Axes, "fill_between", noted)
+    history = [
+        {"iteration": 1.0, "reward": 0.75, "reward_std": 0.5},
+        {"iteration": 2.0, "reward": 0.5, "reward_std": 0.25},
+    ]
+    draw_curve(history, tmp_path / "curve.png", reward_name="share", highest=1.0)
+    draw_curve(history, tmp_path / "curve.png", reward_name="sum")
+    assert bands == [([0.25, 0.25], [1.0, 0.75]), ([0.25, 0.25], [1.25, 0.75])]

@@ -309,3 +309,11 @@ def test_credit_per_object_needs_such_a_reward(tmp_path: Path) -> None:
 def test_wrong_settings_are_named(tmp_path: Path, changes: dict) -> None:
     with pytest.raises((InvalidInputError, UnknownNameError), match=next(iter(changes))):
         small_config(tmp_path, **changes)
+
+
+def test_credit_that_a_reward_lacks_is_refused_before_sampling(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(learner_module.Learner, "rollout", None)  # nothing is sampled
+    config = changed(small_config(tmp_path, reward="diversity"), {"algorithm.credit": "object"})
+    with pytest.raises(InvalidInputError, match=r"this one scores scenes only; take algorithm\.credit=scene, or auto"):
+        post_train(config, prior=tiny_prior())
+    assert not (tmp_path / "prior").exists()
