@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 from torch import Generator, Tensor
@@ -12,8 +12,14 @@ from torch import Generator, Tensor
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import CATEGORY, POSE, SceneBatch
 
-if TYPE_CHECKING:
-    from agents.priors.inpainting import Inpainting
+Noise = Callable[[], Tensor]
+
+
+class Writer(Protocol):
+    """A prior that writes observed entries into states."""
+
+    def write_observed(self, x: Tensor, x0: Tensor, observed: Tensor, level: int, noise: Noise | None) -> Tensor:
+        """``x`` at timestep ``level`` with the ``observed`` entries of ``x0``."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +42,7 @@ class ObservedScenes:
     (True, True)
     """
 
-    prior: Inpainting
+    prior: Writer
     batch: SceneBatch
     mask: Tensor
     x0: Tensor
@@ -46,7 +52,7 @@ class ObservedScenes:
         """(B, N, 2) bool, True where the pose, or the category, of a slot is observed."""
         return ~self.mask
 
-    def write(self, x: Tensor, level: int, noise: Callable[[], Tensor] | None = None) -> Tensor:
+    def write(self, x: Tensor, level: int, noise: Noise | None = None) -> Tensor:
         """``x`` (B, N, D) at timestep ``level`` with the observed entries in place.
 
         Args:

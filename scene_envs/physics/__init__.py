@@ -11,7 +11,8 @@ from scene_envs.lazy import lazy_names
 
 if TYPE_CHECKING:
     from scene_envs.physics.api import equilibrium, feasibility, penetration, project, settle
-    from scene_envs.physics.pool import PhysicsPool, make_pool
+    from scene_envs.physics.pool import PhysicsPool
+    from scene_envs.physics.pools import make_pool
     from scene_envs.physics.ray_pool import RayPhysicsPool
     from scene_envs.physics.readiness import make_ready
     from scene_envs.physics.results import (
