@@ -77,6 +77,7 @@ def test_both_planners_spend_the_same_and_begin_with_the_same_samples(run: Run) 
     assert max(search.values[:3]) == metrics["first_samples"]["value"]
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_tree_and_another_seed_another(run: Run) -> None:
     again = run_search(run.prior, central_objects, **SETTINGS)
     other = run_search(run.prior, central_objects, **{**SETTINGS, "seed": 4})
@@ -86,7 +87,6 @@ def test_the_same_seed_gives_the_same_tree_and_another_seed_another(run: Run) ->
     assert not torch.equal(other.best.tensor, run.outcome.best.tensor)
 
 
-@pytest.mark.slow
 def test_a_scene_depends_on_its_path_and_not_on_the_order_of_the_search(run: Run) -> None:
     settings = {key: SETTINGS[key] for key in ("branching", "num_steps", "max_depth", "mask")}
     settings |= {"objective": central_objects, "prior": run.prior}
