@@ -111,6 +111,7 @@ def test_a_process_of_an_import_that_crashes_is_told(tmp_path: Path, monkeypatch
     refused(tmp_path, "sphere.stl: the import ended with status 7; simplify the file")
 
 
+@pytest.mark.slow
 def test_a_large_file_is_imported_as_a_small_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sphere(tmp_path, "sphere.stl", 5)
     apart, report = load_library(tmp_path).assets[0], import_report(tmp_path)["sphere"]

@@ -52,6 +52,7 @@ def test_the_angle_iron_is_one_closed_body() -> None:
     assert angle_iron().volume == pytest.approx(0.06 * (0.1 * 0.02 + 0.08 * 0.02))
 
 
+@pytest.mark.slow
 def test_a_concave_mesh_keeps_its_hollow(tmp_path: Path) -> None:
     pytest.importorskip("coacd")
     asset = load(tmp_path, angle_iron(), ", density: 1000")
@@ -94,6 +95,7 @@ def test_a_decomposition_is_computed_once_and_kept(
     assert len(calls) == 3
 
 
+@pytest.mark.slow
 def test_a_cache_that_cannot_be_written_costs_nothing_but_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

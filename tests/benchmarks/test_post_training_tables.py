@@ -14,6 +14,7 @@ from benchmarks.post_training.runs import training_figures
 from rewards.registry import resolve_reward
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("table", sorted(TABLES))
 def test_every_kind_of_row_is_a_valid_run(table: str) -> None:
     names = [row.name for row in TABLES[table].rows]

@@ -199,6 +199,7 @@ def test_a_docstring_over_two_lines_is_one_sentence():
     assert "goes on over two lines." in {key.name: key.meaning for key in describe_fields(EchoConfig)}["text"]
 
 
+@pytest.mark.slow
 def test_wrong_keys_are_told_before_anything_heavy_is_loaded():
     lines = [
         ["post-train", "iterations=a"],

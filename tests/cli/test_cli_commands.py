@@ -100,7 +100,6 @@ def test_search_writes_its_pictures_and_curve(prior, tmp_path, capsys):
     assert "by evolution with" in capsys.readouterr().out
 
 
-@pytest.mark.slow
 def test_listings_and_the_contract_check(capsys):
     assert main(["priors"]) == main(["rewards"]) == main(["check-reward", "reward=object_count"]) == 0
     printed = capsys.readouterr().out

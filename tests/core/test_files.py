@@ -159,7 +159,6 @@ def test_a_changed_footer_of_a_shard_is_found(tmp_path):
         read_notes(path)
 
 
-@pytest.mark.slow
 def test_a_flipped_bit_in_the_pages_of_a_shard_is_found(tmp_path):
     from scene_envs.datasets import SceneDataset, generate
 

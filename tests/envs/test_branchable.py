@@ -56,7 +56,6 @@ class PathEnv:
         return self.value(state)
 
 
-@pytest.mark.slow
 def test_the_search_environment_is_branchable(free_objects: Any) -> None:
     check_branchable(gym.make("scene_envs:SceneEnvs/Search-v0", prior=ToyPrior(), objective=free_objects, num_steps=2))
     check_branchable(

@@ -38,7 +38,6 @@ def env(kwargs: dict[str, Any]) -> SearchMaskEnv:
     return env
 
 
-@pytest.mark.slow
 def test_check_env_passes_with_warnings_as_errors(kwargs: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     blank = lambda batch, highlight: np.zeros((len(batch), 12, 16, 3), np.uint8)  # noqa: E731
     monkeypatch.setattr("scene_envs.envs.search_rendering.picture", blank)

@@ -38,6 +38,14 @@ def tea_house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield site
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _ranges_of_a_tenth() -> Iterator[None]:
+    """Ranges come from a tenth of the objects, as those of built-in grammars in ``tests/conftest.py``."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("scene_envs.datasets.ranges._OBJECTS", 1000)
+        yield
+
+
 @pytest.fixture(scope="module")
 def folder(tea_house: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset of ten scenes, made by a spawned process that finds the package by itself."""

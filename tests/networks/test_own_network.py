@@ -30,7 +30,6 @@ def test_it_is_listed_without_an_import_of_its_package() -> None:
         match_parameters("deep_set", "mixed", 1000)
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("few_grammar_scenes")
 def test_two_steps_train_it_and_its_files_give_it_back(tmp_path: Path) -> None:
     config = PretrainConfig(
@@ -53,7 +52,6 @@ def test_its_size_is_matched_like_any_other() -> None:
     assert abs(parameter_count(found) / 30_000 - 1) < 0.1
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("few_grammar_scenes")
 def test_slots_that_it_cannot_ignore_are_refused(tmp_path: Path) -> None:
     config = PretrainConfig(data="grammar", output=str(tmp_path), iterations=1, network="deep_sets", process="mixed")

@@ -29,7 +29,7 @@ PHYSICS: dict[str, Callable[[SceneBatch], object]] = {
     "project": project,
     "make_ready": lambda batch: make_ready(batch, duration=0.25, rounds=1),
 }
-COUNT = 8
+COUNT = 6
 
 
 def full(name: str, count: int = COUNT, seed: int = 0) -> SceneBatch:

@@ -131,6 +131,7 @@ def test_coarse_shapes_give_the_verdict_of_fine_ones(monkeypatch: pytest.MonkeyP
     assert int((mixed.feasible != fine.feasible).sum()) <= 0.01 * int(batch.is_free.sum())
 
 
+@pytest.mark.slow
 def test_a_result_depends_on_its_scene_alone() -> None:
     """Bit-identical in any order, in any company, in a fresh world, and for any order of slots."""
     batch = SceneBatch.concatenate([dimsum(4, 8), jittered(dimsum(4, 9), 2)])
@@ -241,6 +242,7 @@ def test_projection_before_simulation_keeps_objects_closer_to_what_was_asked(nam
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("copied_workers")
 def test_an_object_at_rest_outside_the_workspace_is_not_feasible() -> None:
     """Standing on the floor 2 m across, 1 cm within and 1 cm beyond the edge of a workspace 1 m from the middle."""
     batch = scene(("cube", 0.99, 0.0, 0.0), ("cube", 1.01, 0.5, 0.0))

@@ -50,6 +50,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return Run(prior, run_search(prior, central_objects, output=output, **SETTINGS), output)
 
 
+@pytest.fixture
+def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of the run above are looked at; those of others would take most of their time."""
+    for name in ("draw_curve", "draw_scene"):
+        monkeypatch.setattr(f"agents.planning.search_run.{name}", lambda *_, **__: None)
+
+
 def fresh_root(env: SearchEnv, seed: int) -> SearchEnv:
     env.reset(seed=seed, options={"scene": SceneBatch.empty(env.problem.scene_type, 1)})
     return env
@@ -70,6 +77,7 @@ def test_both_planners_spend_the_same_and_begin_with_the_same_samples(run: Run) 
     assert max(search.values[:3]) == metrics["first_samples"]["value"]
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_tree_and_another_seed_another(run: Run) -> None:
     again = run_search(run.prior, central_objects, **SETTINGS)
     other = run_search(run.prior, central_objects, **{**SETTINGS, "seed": 4})
@@ -79,7 +87,6 @@ def test_the_same_seed_gives_the_same_tree_and_another_seed_another(run: Run) ->
     assert not torch.equal(other.best.tensor, run.outcome.best.tensor)
 
 
-@pytest.mark.slow
 def test_a_scene_depends_on_its_path_and_not_on_the_order_of_the_search(run: Run) -> None:
     settings = {key: SETTINGS[key] for key in ("branching", "num_steps", "max_depth", "mask")}
     settings |= {"objective": central_objects, "prior": run.prior}
@@ -134,12 +141,10 @@ def test_an_objective_that_never_scores_is_an_error(run: Run) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_pictures")
 def test_an_objective_beyond_its_scale_is_reported_with_its_raw_value(
-    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for name in ("draw_curve", "draw_scene"):
-        monkeypatch.setattr(f"agents.planning.search_run.{name}", lambda *_, **__: None)
-
     @register_reward("far_beyond")
     def far_beyond(batch: SceneBatch, context: RewardContext) -> RewardOutput:
         return RewardOutput(torch.where(batch.is_free.any(-1), 50.0 + batch.is_free.sum(-1), 0.0))
@@ -168,6 +173,8 @@ def test_an_objective_that_is_beyond_its_scale_without_objects_says_so(run: Run)
         run_search(run.prior, beyond, **SETTINGS)
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_pictures")
 def test_an_objective_below_zero_is_said_with_a_shift_that_works(
     run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -186,6 +193,8 @@ def test_an_objective_below_zero_is_said_with_a_shift_that_works(
     assert 0 < metrics["search"]["value"] < 1
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_pictures")
 @pytest.mark.parametrize("planner", ["greedy", "uct", "evolution"])
 def test_an_action_may_choose_among_masks(run: Run, tmp_path: Path, planner: str) -> None:
     settings = {**SETTINGS, "planner": planner, "masks": ["culprits", {"name": "empty", "count": 2}]}

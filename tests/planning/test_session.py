@@ -158,6 +158,7 @@ def test_searches_side_by_side_are_those_alone(prior: ScenePrior) -> None:
     assert sorted(plan.values for plan in alone) == sorted(plan.values for plan in together.searches)
 
 
+@pytest.mark.slow
 def test_many_searches_run_in_parts_whose_scenes_are_kept_after_a_kill(prior: ScenePrior, tmp_path: Path) -> None:
     settings = {**SETTINGS, "budget": 6, "count": 5, "side_by_side": 2, "planner": "greedy"}
     sizes: list[int] = []

@@ -78,6 +78,7 @@ def test_every_planner_leaves_its_tree(planner: str, tmp_path: Path, monkeypatch
     assert page.count("<canvas width") == len(shown_nodes(record))
 
 
+@pytest.mark.slow
 def test_searches_side_by_side_are_trees_of_their_own(run: tuple[SearchOutcome, Path]) -> None:
     outcome, output = run
     record = SearchRecord.load(output / "tree.json")

@@ -60,6 +60,7 @@ def test_the_step_is_the_covariance_wherever_the_sampling_policy_stands(
         assert float(output.grad) == pytest.approx(-factor * covariance, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_bad_samples_alone_do_not_push_once_it_knows_their_mean() -> None:
     """All samples bad, as at little noise around a bad object: the push shrinks by much when the mean is learned."""
     prior = tiny_prior()

@@ -124,6 +124,7 @@ def test_kl_of_noised_scenes_is_that_of_the_step_below_them(process: str, tolera
         assert torch.allclose(noised_kl(prior, base, noised), expected, rtol=tolerance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("process", ["continuous", "mixed"])
 def test_both_estimates_of_the_kl_agree_on_long_chains(process: str) -> None:
     base = tiny_prior(process=process)

@@ -44,7 +44,6 @@ def test_the_base_prior_is_left_as_it_was(tmp_path: Path) -> None:
     assert all(torch.equal(before[name], tensor) for name, tensor in prior.state_dict().items())
 
 
-@pytest.mark.slow
 def test_chunks_do_not_change_the_gradient(tmp_path: Path) -> None:
     rows = []
     for chunk in (None, 2):
@@ -147,7 +146,6 @@ def test_other_settings_do_not_continue_a_run(tmp_path: Path) -> None:
         post_train(small_config(tmp_path, learning_rate=0.5), prior=tiny_prior())
 
 
-@pytest.mark.slow
 def test_truncated_checkpoint_is_named(tmp_path: Path) -> None:
     post_train(small_config(tmp_path, iterations=2), prior=tiny_prior())
     path = tmp_path / "checkpoint.pt"
@@ -262,7 +260,6 @@ def test_some_invalid_scenes_leave_the_statistics(tmp_path: Path) -> None:
     assert row["reward"] <= 34
 
 
-@pytest.mark.slow
 def test_guard_keeps_the_best_within_its_limit_and_stops(tmp_path: Path) -> None:
     config = small_config(
         tmp_path, iterations=40, regularisation=0.0, learning_rate=3e-2, guard_limit=1.2, guard_action="stop"

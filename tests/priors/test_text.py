@@ -159,8 +159,8 @@ def test_a_short_training_teaches_what_prompts_say() -> None:
     assert isinstance(made, MixedPrior)
     x0 = made.encode(SceneBatch(raw, made.scene_type))
     optimizer, generator = torch.optim.Adam(made.parameters(), lr=3e-3), torch.Generator().manual_seed(0)
-    for _ in range(60):
-        rows = torch.randint(128, (32,), generator=generator)
+    for _ in range(30):
+        rows = torch.randint(128, (16,), generator=generator)
         text = made.encode_prompts([prompts[row][0] for row in rows])
         optimizer.zero_grad()
         made.pretraining_loss(x0[rows], generator, text=text).backward()

@@ -7,7 +7,7 @@ from agents.cli import main
 from rewards import RewardContext, check_reward, list_rewards, make_reward, resolve_reward
 from scene_envs.errors import RewardError, UnknownNameError
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("plugin")]  # pip installs a package
 
 
 def test_an_installed_reward_class_is_used_by_name(cups):
@@ -24,7 +24,6 @@ def test_installed_rewards_are_listed_and_keep_the_contract():
     assert len(check_reward("open_space")) == 6
 
 
-@pytest.mark.slow
 def test_a_target_in_an_installed_reward_package_is_allowed(cups):
     reward = resolve_reward({"_target_": "open_space_rewards.open_space.OpenSpace", "scale": 1.0})
     torch.testing.assert_close(reward(cups, RewardContext()).value, torch.tensor([0.2, 0.4]))
