@@ -70,7 +70,11 @@ def check_early(settings: Any, config_dir: str = "", module: ModuleType | None =
         _check_device(device)
     if (scenes := getattr(settings, "scenes", None)) and isinstance(scenes, str):
         find_scenes(Path(scenes))
-    for key in set(_DATASETS) - set(getattr(settings, "NO_PATHS", ())):
+    resumed = exists(Path(str(getattr(settings, "output", "") or "."), "checkpoint.pt"))
+    kept = ("regularisation.scenes",) if resumed else ()  # a run that goes on has them in its folder
+    if not resumed and isinstance(replay := _dotted(settings, "regularisation.replay"), str):
+        find_scenes(Path(replay), "regularisation.replay")
+    for key in set(_DATASETS) - set(kept) - set(getattr(settings, "NO_PATHS", ())):
         _check_dataset(key, _dotted(settings, key))
     _check_prompt(settings)
 
