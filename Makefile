@@ -13,7 +13,7 @@
 JOBS ?= 2
 SEED ?= $(shell date +%s)
 ENV := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=
-PIP := .venv/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt
+PIP := .venv/bin/python -m pip install --disable-pip-version-check -c constraints.txt
 
 PYTEST := $(ENV) .venv/bin/python -m pytest --randomly-seed=$(SEED) -n $(JOBS) --dist worksteal
 PAGES := tests/docs/test_pages.py tests/integration/test_notebooks.py

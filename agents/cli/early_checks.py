@@ -62,6 +62,8 @@ def check_early(settings: Any, config_dir: str = "", module: ModuleType | None =
         _check_prior(prior)
     for key in ("reward", "objective"):
         _check_name("reward", getattr(settings, key, None), known_rewards, "rewards.registry", config_dir)
+    if isinstance(scene := getattr(settings, "scene", None), list):
+        raise InvalidInputError(f"scene={str(scene)[:200]}: give the name of one scene type, or several joined by +")
     for scene in str(getattr(settings, "scene", "") or "").split("+"):
         _check_name("scene type", scene, known_scenes, "scene_envs.grammars", config_dir)
     for mask in [getattr(settings, "mask", None), *(getattr(settings, "masks", None) or [])]:
@@ -70,7 +72,11 @@ def check_early(settings: Any, config_dir: str = "", module: ModuleType | None =
         _check_device(device)
     if (scenes := getattr(settings, "scenes", None)) and isinstance(scenes, str):
         find_scenes(Path(scenes))
-    for key in set(_DATASETS) - set(getattr(settings, "NO_PATHS", ())):
+    resumed = exists(Path(str(getattr(settings, "output", "") or "."), "checkpoint.pt"))
+    kept = ("regularisation.scenes",) if resumed else ()  # a run that goes on has them in its folder
+    if not resumed and isinstance(replay := _dotted(settings, "regularisation.replay"), str):
+        find_scenes(Path(replay), "regularisation.replay")
+    for key in set(_DATASETS) - set(kept) - set(getattr(settings, "NO_PATHS", ())):
         _check_dataset(key, _dotted(settings, key))
     _check_prompt(settings)
 
@@ -147,7 +153,10 @@ def _check_device(device: str) -> None:
 def _check_dataset(key: str, value: Any) -> None:
     if not isinstance(value, str):
         return
-    for part in filter(None, (part.strip() for part in value.split(","))):
+    parts = [part.strip() for part in value.split(",")]
+    if value and not any(parts):
+        raise InvalidInputError(f"{key}={value[:200]!r} names no dataset; scene-envs generate makes one")
+    for part in filter(None, parts):
         if part != _GRAMMAR and not exists(Path(part)):
             raise InvalidInputError(
                 f"{key}={value[:200]!r}: nothing is at {part[:200]!r}; name a dataset, as scene-envs generate makes one"

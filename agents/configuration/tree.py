@@ -189,7 +189,7 @@ def _scalar(hint: Any, value: Any, path: str) -> Any:
     if hint is float and isinstance(value, int | float | str) and not isinstance(value, bool):
         try:
             return float(value)  # YAML reads 1e-4 as a text
-        except ValueError:
+        except (ValueError, OverflowError):
             _refuse(hint, value, path)
     if hint is str and isinstance(value, int | float) and not isinstance(value, bool):
         return str(value)

@@ -16,6 +16,10 @@ from scene_envs import list_masks
 from scene_envs.grammars import list_grammars
 
 LINES = {
+    "view scene=[1,2]": "give the name of one scene type",
+    "evaluate data=,": "names no dataset",
+    f"sample guidance={'9' * 400}": "guidance=",
+    f"pretrain loss.noise_mean={'9' * 400}": "noise_mean=",
     "evaluate workers=-1": "workers=-1: give a number of processes",
     "evaluate prior=dimsum_tabel": "did you mean 'dimsum_table'",
     "evaluate prior=runs/nowhere": "'runs/nowhere' holds no prior",
