@@ -160,6 +160,7 @@ PREPARED: dict[str, tuple[str, ...]] = {
     "docs/priors.md": ("data/dimsum_table", "runs/mine", "FILE.ckpt"),
     "docs/render.md": ("runs/mine", "data/dimsum_table"),
     "docs/rewards/prompt_match.md": ("runs/mixed",),
+    "docs/search.md": ("runs/mine",),
     "docs/tables.md": ("data/dimsum_table",),
     "docs/user_assets.md": ("my_assets",),
 }
