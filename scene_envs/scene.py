@@ -177,7 +177,10 @@ class SceneBatch(AssetFacts):
         """The same scenes with more (empty) slots, or with fewer when the dropped ones are empty."""
         if slots < self._tensor.shape[1]:
             if bool((~self.is_empty[:, slots:]).any()):
-                raise InvalidInputError(f"cannot drop to {slots} slots: objects are in the dropped ones")
+                needed = 1 + int(torch.nonzero(~self.is_empty)[:, 1].max())
+                raise InvalidInputError(
+                    f"slots={slots}: the scenes have an object in slot {needed - 1}; at least {needed} slots hold them"
+                )
             return SceneBatch(self._tensor[:, :slots], self.scene_type)
         extra = torch.zeros(len(self), slots - self._tensor.shape[1], self.scene_type.features)
         extra[..., -1] = 1.0

@@ -74,6 +74,7 @@ def _small(name: str, words: list[str]) -> list[str]:
     sizes = {key: value for key, value in SMALL_KEYS.get(name, {}).items() if key in keys}
     if "scenes" in {word.partition("=")[0] for word in words} and name != "view":
         sizes.pop("count", None)
+        sizes.pop("slots", None)  # the scenes have their own
     if name == "post-train" and any(word.startswith("algorithm=") for word in words):
         sizes.pop("algorithm.gradient_steps", None)  # of DDPO alone
     if name == "post-train" and any(word.startswith("prompt=") for word in words):

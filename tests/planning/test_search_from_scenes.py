@@ -152,7 +152,7 @@ def test_scenes_of_another_type_or_too_wide_are_refused(prior: ScenePrior, scene
     other = get_grammar("pantry_shelf").sample(np.random.default_rng(0), 1)
     with pytest.raises(InvalidInputError, match=r"makes scenes of 'dimsum_table'.*scenes of 'pantry_shelf'"):
         run_search(prior, near_middle, scenes=other, **SMALL)
-    with pytest.raises(InvalidInputError, match="cannot drop to 3 slots"):
+    with pytest.raises(InvalidInputError, match="slots=3: the scenes have an object in slot"):
         run_search(prior, near_middle, scenes=scenes, slots=3, **SMALL)
     with pytest.raises(InvalidInputError, match="no scene to start from"):
         run_search(prior, near_middle, scenes=scenes[:0], **SMALL)
