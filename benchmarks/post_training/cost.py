@@ -25,7 +25,8 @@ from agents.post_training.algorithms import list_algorithms
 from agents.priors.base import ScenePrior
 from scene_envs.envs.scoring import RewardScorer
 
-PARTS = ("reward", "rollout", "policy gradient", "regularisation", "iteration")
+DEFAULTS = {"prior": "dimsum_table", "reward": "feasible_share", "iterations": "3"}
+COUNTED = ("reward", "rollout", "policy gradient", "regularisation", "iteration")
 
 
 class Clock:
@@ -69,13 +70,12 @@ def iteration_seconds(config: PostTrainConfig, prior: ScenePrior) -> dict[str, f
                     step()
         finally:
             trainer.close()
-    return {part: clock.seconds[part] / config.iterations for part in PARTS}
+    return {part: clock.seconds[part] / config.iterations for part in COUNTED}
 
 
 def main(words: list[str]) -> None:
     """Print a row for every algorithm."""
-    given = {"prior": "dimsum_table", "reward": "feasible_share", "iterations": "3"}
-    given |= dict(word.split("=", 1) for word in words)
+    given = DEFAULTS | dict(word.split("=", 1) for word in words)
     prior = ScenePrior.load(given["prior"])
     print("| algorithm | denoising | reward | policy gradient | regularisation | the rest | seconds per iteration "
           "| scenes per second |\n|---|---|---|---|---|---|---|---|")  # fmt: skip

@@ -53,15 +53,23 @@ def _program(words: list[str]) -> tuple[str, ModuleType | None, list[str]]:
     start = words.index("-m") + 1  # of python or torchrun
     if words[start] == "agents.cli":
         return words[start + 1], cli, words[start + 2 :]
-    return words[start], import_module(f"{words[start]}.__main__"), words[start + 1 :]
+    return words[start], _run_by_python(words[start]), words[start + 1 :]
+
+
+def _run_by_python(name: str) -> ModuleType:
+    """What ``python -m NAME`` runs: a module, or the ``__main__`` of a package."""
+    module = import_module(name)
+    return import_module(f"{name}.__main__") if hasattr(module, "__path__") else module
 
 
 def _keys(name: str) -> set[str]:
     """The keys of a command or of a program, and the names of its groups."""
     if "." in name:
-        module = import_module(f"{name}.__main__")
+        module = _run_by_python(name)
         if hasattr(module, "PARTS"):  # each key says how often
             return {*module.PARTS, "rows", "seed"}
+        if hasattr(module, "DEFAULTS"):
+            return set(module.DEFAULTS)
     else:
         module = import_module(f"agents.cli.commands.{name.replace('-', '_')}")
     keys = {key.name for key in describe_fields(keys_of(module))}
