@@ -1,5 +1,6 @@
 """The command line as a user meets it: help, values, errors, exit status. No work is done here."""
 
+import os
 import subprocess
 import sys
 from dataclasses import dataclass, field
@@ -19,6 +20,19 @@ def test_without_a_command_it_lists_all_of_them(capsys):
     assert main(["--help"]) == 0
     printed = capsys.readouterr().out
     assert all(f"\n  {command}" in printed for command in COMMANDS)
+
+
+@pytest.mark.parametrize(
+    ("given", "spins"), [({}, "3000"), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "active"}, None)]
+)
+def test_idle_threads_sleep_unless_the_environment_says_otherwise(given, spins, monkeypatch):
+    for name in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("os.environ", {**os.environ, **given})
+    monkeypatch.setattr(parser, "main", lambda: 3)
+    with pytest.raises(SystemExit) as ended:
+        parser.entry_point()
+    assert (ended.value.code, os.environ.get("GOMP_SPINCOUNT")) == (3, spins)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
