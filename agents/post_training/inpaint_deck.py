@@ -13,8 +13,7 @@ from agents.post_training.inpaint_settings import InpaintSettings
 from agents.post_training.prompts import PromptSets
 from agents.priors.base import ScenePrior
 from agents.utils.seeds import derived_seed
-from scene_envs.envs.mask_generators import OffPromptMask
-from scene_envs.envs.masks import MaskGenerator, resolve_mask
+from scene_envs.envs.masks import MaskGenerator, mask_for_prompt, resolve_mask
 from scene_envs.envs.scoring import RewardScorer, Score
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
@@ -93,6 +92,17 @@ class InpaintDeck:
         scenes = SceneBatch(torch.cat([part.scenes.tensor for part in parts]), parts[0].scenes.scene_type)
         return Parts(scenes, torch.cat([part.mask for part in parts]), torch.arange(groups), texts).take(of_row)
 
+    def check(self, scenes: SceneBatch, prompts: Sequence[str] | None) -> None:
+        """Try the mask on ``scenes``, made for ``prompts`` if any.
+
+        Raises:
+            InvalidInputError: the mask needs what it does not get, such as credit per object, or a prompt.
+        """
+        score = self._scorer(scenes, prompts)
+        for row in range(len(scenes)):
+            text = None if prompts is None else prompts[row]
+            self._mask(scenes[row], score.row(row), text, np.random.default_rng(row))
+
     def _candidates(self, prompts: Sequence[str] | None, groups: int, seed: int) -> list[tuple[int, Parts]]:
         """Parts in which something is regenerated, with the number of their group."""
         scenes, texts = self._source(groups, prompts, seed)
@@ -108,9 +118,7 @@ class InpaintDeck:
 
     def _mask(self, scene: SceneBatch, score: Score, prompt: str | None, rng: np.random.Generator) -> Tensor:
         """(N, 2) bool of a batch of one; welded objects are never regenerated."""
-        generator = self.generator
-        if isinstance(generator, OffPromptMask) and generator.prompt is None:
-            generator = OffPromptMask(prompt)
+        generator = mask_for_prompt(self.generator, prompt)
         changeable = ~scene.is_welded[0]
         changeable[: len(scene.scene_type.fixed)] = False
         slots = changeable & generator(scene, score, rng).to(changeable.device)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any
@@ -14,7 +15,7 @@ from agents.post_training.algorithms import make_algorithm
 from agents.post_training.base import Algorithm
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.gradients import add_regularisation_gradient, gradient_norm
-from agents.post_training.inpaint_deck import InpaintDeck, real_parts, sampled_parts
+from agents.post_training.inpaint_deck import InpaintDeck, Parts, real_parts, sampled_parts
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.processes import WholeBatchReward
 from agents.post_training.prompts import PromptDeck, PromptSets
@@ -138,17 +139,29 @@ class Learner:
             source = sampled_parts(sampler, config.num_steps, self.slots, config.guidance)
         self.inpaint_deck = InpaintDeck(settings, source, self.scorer, config.algorithm.scenes_per_prompt)
 
+    def deal(self, iteration: int) -> tuple[Sequence[str] | None, Parts | None]:
+        """Prompts and observed parts of a batch, one for each of its trunks; None for what the run has none of.
+
+        Raises:
+            InvalidInputError: the mask leaves nothing to regenerate in any scene.
+        """
+        units = self.algorithm.branching.groups(self.config.batch_size)
+        prompts: Sequence[str] | None = None
+        if self.deck is not None:
+            prompts = self.deck.deal(units, self._generator("prompts", iteration))
+        if self.inpaint_deck is None:
+            return prompts, None
+        parts = self.inpaint_deck.deal(units, prompts, stream_seed(self.config.seed, "inpaint", iteration))
+        return parts.prompts, parts
+
     def rollout(self, iteration: int) -> Rollout:
         """A batch of fresh scenes, or this process's share of it."""
         algorithm, batch = self.algorithm, self.config.batch_size
         branching, own = algorithm.branching, self.processes.rows(batch)
-        prompts, observed, groups = None, None, None
-        units = branching.groups(batch)
-        if self.deck is not None:
-            prompts = self.deck.deal(units, self._generator("prompts", iteration))
-        if self.inpaint_deck is not None:
-            parts = self.inpaint_deck.deal(units, prompts, stream_seed(self.config.seed, "inpaint", iteration))
-            prompts = parts.prompts
+        observed, groups = None, None
+        prompts, parts = self.deal(iteration)
+        if parts is not None:
+            units = branching.groups(batch)
             parts = parts.take(torch.arange(units).repeat_interleave(branching.siblings)[own])
             observed, groups = self.prior.observe(parts.scenes, parts.mask), parts.groups
         if prompts is not None:

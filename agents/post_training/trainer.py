@@ -13,7 +13,7 @@ import torch
 
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.curves import draw_curve
-from agents.post_training.gradients import no_credit_per_object
+from agents.post_training.early_refusals import check_it_can_learn, nothing_scored
 from agents.post_training.guard import Guard, realism
 from agents.post_training.guard_files import GuardFiles, make_guard
 from agents.post_training.learner import Learner, NonFiniteGradient
@@ -39,10 +39,7 @@ from agents.utils.process_group import ProcessGroup, launched_processes
 from rewards import reward_name
 from scene_envs.errors import TrainingError
 from scene_envs.folders import claimed
-from scene_envs.scene import SceneBatch
 
-_PROBED = 2
-"""Real scenes that a reward has to score before a run begins."""
 _MOST_ROLLBACKS = 3
 """Returns to the best checkpoint after which a run ends."""
 
@@ -189,11 +186,11 @@ class PostTrainer:
         bank = SceneBank.split(x0, config.guard.scenes, prompts)
         replay = kept_replay(self.directory, self.prior, config.regularisation, x0.shape[1], reuse=reuse_scenes)
         self.scenes = bank if replay is None else bank.with_replay(replay, config.regularisation.replay_share)
-        if config.prompt is None and not reuse_scenes:
-            self._probe(batch[:_PROBED])
-        self.guard = make_guard(config, self.learner, self.scenes)
         self.learner.deal_prompts(self.scenes)
         self.learner.deal_parts(batch[: len(self.scenes.train)], prompts)
+        if not reuse_scenes:
+            check_it_can_learn(self.learner, batch, prompts)
+        self.guard = make_guard(config, self.learner, self.scenes)
 
     def step(self) -> tuple[Rollout, dict[str, float]]:
         """One iteration: a batch of fresh scenes and its updates. Returns the scenes and the row for the log."""
@@ -246,29 +243,15 @@ class PostTrainer:
             self.rollbacks += 1
             self.learner.return_to(self.files.best(self.prior))
 
-    def _probe(self, scenes: SceneBatch) -> None:
-        """End a run whose reward scores no real scene, or lacks the credit asked for, before anything is sampled."""
-        score = self.learner.scorer(scenes, None)
-        valid = bool(score.valid.any())
-        if valid and score.per_object is None and getattr(self.config.algorithm, "credit", "") == "object":
-            raise no_credit_per_object()
-        if not self.processes.any(valid):
-            raise self._nothing_scored(f"none of {len(scenes)} real scenes, so that nothing was sampled")
-
     def _count_invalid(self) -> None:
         self.invalid_streak += 1
         if self.iteration == 0:
-            raise self._nothing_scored("no scene of the first batch")
+            raise nothing_scored(self.config, "no scene of the first batch")
         if self.invalid_streak >= self.config.guard.max_invalid:
-            raise self._nothing_scored(
-                f"no scene in {self.invalid_streak} batches in a row, the last at iteration {self.iteration + 1}"
+            raise nothing_scored(
+                self.config,
+                f"no scene in {self.invalid_streak} batches in a row, the last at iteration {self.iteration + 1}",
             )
-
-    def _nothing_scored(self, what: str) -> TrainingError:
-        return TrainingError(
-            f"the reward {self.config.plain()['reward']!r} scored {what}; the warnings above say why, and "
-            "`scene-envs check-reward` tries a reward on its own"
-        )
 
     def _not_finite(self, figures: dict[str, float]) -> TrainingError:
         numbers = ", ".join(f"{name} {figures[name]:.3g}" for name in ("policy_loss", "pretraining_loss"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Generator, Tensor, nn
@@ -22,11 +22,16 @@ from agents.priors.forward import Trainable
 from agents.priors.inpainting import Inpainting
 from agents.priors.loading import Loadable
 from agents.priors.prompt_validation import check_prompts, no_text
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
+
+UNIONS = ("one_type", "any")
+"""What a scene of a union of scene types may hold."""
+
+Prior = TypeVar("Prior", bound="ScenePrior")
 
 
 class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
@@ -121,6 +126,18 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
         if count:
             x = torch.cat([self._fixed[:count].to(x).expand(x.shape[0], -1, -1), x[:, count:]], dim=1)
         return x
+
+    def with_union(self: Prior, union: str) -> Prior:
+        """This prior, for scenes of ``"one_type"`` of a union of scene types or of ``"any"`` of its assets.
+
+        A prior whose categories are continuous has no such choice, and stays as it is.
+
+        Raises:
+            UnknownNameError: another word.
+        """
+        if union not in UNIONS:
+            raise unknown_name("union", union, UNIONS)
+        return self
 
     def initial(self, count: int, slots: int, generator: Generator | None = None) -> Tensor:
         """x_T (count, slots, D): standard normal with the known entries clamped."""

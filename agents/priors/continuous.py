@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -20,6 +20,7 @@ from agents.priors.base import ScenePrior
 from agents.priors.config import PriorConfig, current_names
 from agents.priors.forward import DenoiserOutput, NoisedScenes
 from agents.priors.inpainting import Hook, Start, draw_noise
+from agents.priors.observed_scenes import Noise
 from agents.priors.prompt_validation import no_text
 from agents.priors.rotation_codes import SceneCode
 from scene_envs.errors import InvalidInputError, unknown_name
@@ -171,9 +172,7 @@ class ContinuousPrior(ScenePrior):
         """
         return self._reverse(x_t, step, table, 1.0).observing(self._entries(observed), x_t)
 
-    def write_observed(
-        self, x: Tensor, x0: Tensor, observed: Tensor, level: int, noise: Callable[[], Tensor] | None = None
-    ) -> Tensor:
+    def write_observed(self, x: Tensor, x0: Tensor, observed: Tensor, level: int, noise: Noise | None = None) -> Tensor:
         """States with the observed entries of ``x0``, which have the noise of ``level``."""
         if level > 0:
             drawn = torch.randn_like(x0) if noise is None else noise()

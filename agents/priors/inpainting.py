@@ -11,7 +11,7 @@ from torch import Generator, Tensor
 from agents.diffusion.reverse_steps import ReverseStep
 from agents.diffusion.step_tables import StepTable
 from agents.networks.text import Text
-from agents.priors.observed_scenes import ObservedScenes, check_mask, merge
+from agents.priors.observed_scenes import Noise, ObservedScenes, check_mask, merge
 from agents.priors.prompt_validation import check_prompts
 from scene_envs.errors import InvalidInputError
 from scene_envs.normalizer import Normalizer
@@ -109,9 +109,7 @@ class Inpainting(ABC):
         """
 
     @abstractmethod
-    def write_observed(
-        self, x: Tensor, x0: Tensor, observed: Tensor, level: int, noise: Callable[[], Tensor] | None = None
-    ) -> Tensor:
+    def write_observed(self, x: Tensor, x0: Tensor, observed: Tensor, level: int, noise: Noise | None = None) -> Tensor:
         """States ``x`` (B, N, D) at timestep ``level`` with the entries ``observed`` (B, N, 2) of ``x0`` in place."""
 
     @abstractmethod

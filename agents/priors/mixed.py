@@ -6,7 +6,7 @@ While a category is masked its K entries are zeros. (Pfaff et al., CoRL 2025; Hu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -31,10 +31,11 @@ from agents.networks.mixed_denoiser import MixedDenoiser, Observed
 from agents.networks.registry import build_network, config_from_state
 from agents.networks.text import Text
 from agents.networks.text_encoders import text_config_from_state, text_encoder
+from agents.priors.base import UNIONS
 from agents.priors.config import MixedPriorConfig, current_names
 from agents.priors.inpainting import Hook, Start, draw_noise
-from agents.priors.mixed_states import UNIONS
 from agents.priors.mixed_training import TrainableMixedPrior
+from agents.priors.observed_scenes import Noise
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
@@ -205,9 +206,7 @@ class MixedPrior(TrainableMixedPrior):
         reverse = self.transition(x_t, step, table, observed=seen, text=text, guidance=guidance)
         return reverse.observing(seen.pose, seen.category, x_t)
 
-    def write_observed(
-        self, x: Tensor, x0: Tensor, observed: Tensor, level: int, noise: Callable[[], Tensor] | None = None
-    ) -> Tensor:
+    def write_observed(self, x: Tensor, x0: Tensor, observed: Tensor, level: int, noise: Noise | None = None) -> Tensor:
         """States with the observed entries of ``x0``, without noise at every level."""
         return Observed(x0, observed[..., 0], observed[..., 1]).write(x)
 

@@ -15,12 +15,8 @@ from agents.networks.mixed_denoiser import MixedDenoiser, Observed
 from agents.priors.base import ScenePrior
 from agents.priors.config import MixedPriorConfig
 from agents.priors.text import PromptReader
-from scene_envs.errors import unknown_name
 from scene_envs.scene import POSE_FEATURES, SceneBatch
 from scene_envs.scene_types import members_of
-
-UNIONS = ("one_type", "any")
-"""What a scene of a union of scene types may hold."""
 
 Prior = TypeVar("Prior", bound="MixedStates")
 
@@ -45,13 +41,8 @@ class MixedStates(PromptReader, ScenePrior):
         return Observed(x, fixed, fixed)
 
     def with_union(self: Prior, union: str) -> Prior:
-        """This prior, for scenes of ``"one_type"`` of a union of scene types or of ``"any"`` of its assets.
-
-        Raises:
-            UnknownNameError: another word.
-        """
-        if union not in UNIONS:
-            raise unknown_name("union", union, UNIONS)
+        """As :meth:`ScenePrior.with_union`."""
+        super().with_union(union)
         self.mixed = self.config = replace(self.mixed, union=union)
         return self
 

@@ -13,6 +13,7 @@ from scene_envs.errors import InvalidInputError
 from scene_envs.scene import CATEGORY, POSE, SceneBatch
 
 Noise = Callable[[], Tensor]
+"""``() -> (B, N, D)``: standard normal noise."""
 
 
 class Writer(Protocol):

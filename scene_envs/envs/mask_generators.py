@@ -180,6 +180,10 @@ class OffPromptMask:
 
     prompt: str | None = None
 
+    def for_prompt(self, prompt: str | None) -> OffPromptMask:
+        """The mask for scenes of ``prompt``; a text of its own stays."""
+        return self if self.prompt is not None else OffPromptMask(prompt)
+
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
         """(N,) bool, True where a slot is regenerated; none when the scene is as the prompt says.
 

@@ -20,7 +20,8 @@ MaskGenerator = Callable[[SceneBatch, Score, np.random.Generator], Tensor]
 """``(scene, score, rng) -> (N,) bool``, True where a slot is regenerated.
 
 ``scene`` is a batch of one, ``score`` the objective's verdict on it with its credit and flags per object, and ``rng``
-the only source of randomness. Slots of welded objects are taken out afterwards.
+the only source of randomness. Slots of welded objects are taken out afterwards. A generator that reads the prompt has a
+method ``for_prompt(prompt) -> MaskGenerator`` as well; see :func:`mask_for_prompt`.
 """
 
 ENTRY_POINT_GROUP = "scene_envs.masks"
@@ -97,6 +98,16 @@ def resolve_mask(mask: Any) -> MaskGenerator:
     if callable(mask):
         return mask  # type: ignore[no-any-return]
     raise InvalidInputError(f"mask={mask!r}: give a name ({', '.join(list_masks())}) or a function")
+
+
+def mask_for_prompt(generator: MaskGenerator, prompt: str | None) -> MaskGenerator:
+    """The generator for scenes of ``prompt``: what its method ``for_prompt`` gives, or itself without one.
+
+    >>> mask_for_prompt(resolve_mask("off_prompt"), "A scene with two cups.")
+    OffPromptMask(prompt='A scene with two cups.')
+    """
+    bind: Callable[[str | None], MaskGenerator] | None = getattr(generator, "for_prompt", None)
+    return generator if bind is None else bind(prompt)
 
 
 def _with_settings(generator: MaskGenerator, settings: Mapping[str, Any], mask: Mapping[str, Any]) -> MaskGenerator:

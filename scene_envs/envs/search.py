@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scene_envs.envs.mask_generators import OffPromptMask
-from scene_envs.envs.masks import MaskGenerator, resolve_mask
+from scene_envs.envs.masks import MaskGenerator, mask_for_prompt, resolve_mask
 from scene_envs.envs.prompts import EnvPrompts
 from scene_envs.envs.scoring import RewardScorer, Score
 from scene_envs.envs.settings import SearchSettings, TreeSettings, takes
@@ -152,10 +151,7 @@ class SearchProblem:
         self._told_of_scale = self._told_of_zero = False
 
     def _resolve_mask(self, mask: Any) -> MaskGenerator:
-        generator = resolve_mask(mask)
-        if isinstance(generator, OffPromptMask) and generator.prompt is None:
-            return OffPromptMask(self.prompt)
-        return generator
+        return mask_for_prompt(resolve_mask(mask), self.prompt)
 
     # -- states ---------------------------------------------------------------------------------
 

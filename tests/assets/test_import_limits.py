@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import struct
 import time
 from pathlib import Path
@@ -101,6 +102,20 @@ def test_a_stage_is_ended_when_the_time_of_the_file_is_over(tmp_path: Path, monk
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv("SCENE_ENVS_IMPORT_SECONDS", "1")
     text = refused(tmp_path, r"sphere.stl: the import took longer than 1 s; .*SCENE_ENVS_IMPORT_SECONDS")
+    assert "\n" not in text
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes are a thing of POSIX")
+def test_a_small_file_that_never_ends_is_ended_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+    listed(tmp_path, "box.obj").write_text(f"mtllib pipe.mtl\n{corners}usemtl a\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n")
+    pipe = tmp_path / "pipe.mtl"
+    os.mkfifo(pipe)  # whoever reads it waits for somebody who writes
+    monkeypatch.setenv("SCENE_ENVS_IMPORT_SECONDS", "1")
+    try:
+        text = refused(tmp_path, r"box\.obj: the import took longer than 1 s; .*SCENE_ENVS_IMPORT_SECONDS")
+    finally:
+        os.close(os.open(pipe, os.O_WRONLY | os.O_NONBLOCK))  # the reader that was left reads its end
     assert "\n" not in text
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from typing import Any
 
@@ -12,8 +13,11 @@ import pytest
 import torch
 
 from agents.planning.search_run import SearchConfig
+from agents.post_training.inpaint_deck import InpaintDeck
+from agents.post_training.inpaint_settings import InpaintSettings
+from agents.priors.testing import tiny_prior
 from rewards import RewardOutput
-from scene_envs.envs import register_mask
+from scene_envs.envs import SearchProblem, register_mask
 from scene_envs.envs.mask_generators import (
     BalancedMask,
     CulpritsMask,
@@ -29,7 +33,7 @@ from scene_envs.envs.mask_generators import (
     penetrating_mask,
     unstable_mask,
 )
-from scene_envs.envs.masks import MaskGenerator, list_masks, resolve_mask
+from scene_envs.envs.masks import MaskGenerator, list_masks, mask_for_prompt, resolve_mask
 from scene_envs.envs.scoring import RewardScorer, Score
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.scene import SceneBatch
@@ -185,6 +189,34 @@ def test_what_the_prompt_does_not_ask_for_is_off_prompt() -> None:
     assert masked(scene, OffPromptMask("A scene with three cups.")) == ([], 0)
     with pytest.raises(InvalidInputError, match="no prompt"):
         masked(scene, OffPromptMask())
+
+
+@dataclass(frozen=True)
+class FirstWordMask:
+    """A mask of somebody else's that reads the prompt: as many slots as its first word has letters."""
+
+    letters: int = 0
+
+    def for_prompt(self, prompt: str | None) -> FirstWordMask:
+        return FirstWordMask(len((prompt or "").split(" ")[0]))
+
+    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> torch.Tensor:
+        return torch.arange(scene.tensor.shape[1]) < 3 + self.letters
+
+
+def test_a_mask_that_reads_the_prompt_gets_that_of_the_search_and_of_the_run() -> None:
+    prior = tiny_prior("dimsum_table", process="mixed", text=True)
+    problem = SearchProblem(
+        prior=prior, objective="object_count", num_steps=2, prompt="Three cups.", mask=FirstWordMask(), max_depth=1
+    )
+    assert int(problem.root(seed=0).mask.sum()) == 3 + len("Three") - len(problem.scene_type.fixed)
+    scenes = table_with(("teacup", 0.2, 0, 0))
+    settings = InpaintSettings(mask={"name": "off_prompt"})
+    deck = InpaintDeck(settings, lambda count, prompts, seed: (scenes, prompts), RewardScorer("object_count"), 1)
+    parts = deck.deal(1, ["A scene with five cups."], seed=0)
+    assert parts.mask[0, :, 0].sum() == 4
+    own = mask_for_prompt(OffPromptMask("A scene with two cups."), "A scene with five cups.")
+    assert own == OffPromptMask("A scene with two cups.")
 
 
 def test_the_default_mask_has_what_the_objective_blames_and_all_empty_slots() -> None:

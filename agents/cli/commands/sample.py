@@ -75,7 +75,6 @@ def check(settings: SampleConfig) -> None:
 def run(settings: SampleConfig, run: Run) -> None:
     """Draw, score, save and picture the scenes."""
     from agents.priors.base import ScenePrior
-    from agents.priors.mixed import MixedPrior
     from rewards.isolation import close_reward, run_reward
     from scene_envs.export.formats import resolve_formats
     from scene_envs.physics import PhysicsPool
@@ -87,12 +86,10 @@ def run(settings: SampleConfig, run: Run) -> None:
         reward = run_reward(
             settings.reward, seed=settings.seed, timeout=settings.reward_timeout, workers=settings.workers
         )
-    prior = ScenePrior.load(settings.prior).to(settings.device)
+    prior = ScenePrior.load(settings.prior).to(settings.device).with_union(settings.union)
     if not prior.scene_type.has_geometry:
         settings = _without_geometry(settings, prior.scene_type, run)
         reward = None if settings.reward is None else reward
-    if isinstance(prior, MixedPrior):
-        prior.with_union(settings.union)
     started = time.perf_counter()
     batch = prior.sample(
         settings.count,

@@ -8,20 +8,24 @@ import os
 import re
 import struct
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, wait
 from contextlib import contextmanager
-from contextvars import ContextVar
+from contextvars import ContextVar, copy_context
 from dataclasses import dataclass, fields
 from pathlib import Path
+from threading import Thread
+from typing import TypeVar
 
 from scene_envs.errors import InvalidInputError
 
+Result = TypeVar("Result")
 _PREFIX = "SCENE_ENVS_IMPORT_"
 _HEAD = 1 << 16
 """Bytes in which the header of a mesh file ends."""
 READ_HERE = 300_000
-"""Bytes of files that are imported in the calling process, where the time is checked between stages: no stage of so
-little takes long. More is imported in a process that is ended when the time is over."""
+"""Bytes of files that are imported in the calling process, in a thread that is left when the time is over. More is
+imported in a process that is ended then."""
 _BYTES_PER_TRIANGLE = 36
 
 
@@ -59,7 +63,7 @@ class ImportLimits:
     Attributes:
         megabytes: size of a file, 10⁶ bytes.
         triangles: triangles (or corners) of a mesh file, as its header or its content says.
-        seconds: time for reading, decomposing and weighing one asset; what takes longer is ended in the middle of it.
+        seconds: time for reading, decomposing and weighing one asset; what takes longer is not waited for.
     """
 
     megabytes: float = 256.0
@@ -151,6 +155,31 @@ def seconds_left() -> float | None:
     if left <= 0:
         raise too_slow("")
     return left
+
+
+def in_time(work: Callable[[], Result]) -> Result:
+    """The result of ``work``, if it comes before the import that runs has to be done.
+
+    Work that takes longer goes on in a thread of its own, which ends at the next :func:`seconds_left`.
+
+    Raises:
+        InvalidInputError: the time is over.
+        BaseException: what ``work`` raises.
+    """
+    outcome: Future[Result] = Future()
+    context = copy_context()
+
+    def run() -> None:
+        try:
+            outcome.set_result(context.run(work))
+        except BaseException as error:
+            outcome.set_exception(error)
+
+    left = seconds_left()
+    Thread(target=run, name="asset import", daemon=True).start()
+    if not wait([outcome], left).done:
+        raise too_slow("")
+    return outcome.result()
 
 
 def too_slow(doing: str) -> InvalidInputError:

@@ -22,7 +22,7 @@ from scene_envs.assets.importing.entries import (
     default_entry,
     read_entries,
 )
-from scene_envs.assets.importing.limits import READ_HERE, LargeImportError, check_file, timed
+from scene_envs.assets.importing.limits import READ_HERE, LargeImportError, check_file, in_time, timed
 from scene_envs.assets.importing.model import Color
 from scene_envs.assets.importing.process import build_apart
 from scene_envs.assets.importing.report import AssetReport, ImportReport
@@ -193,7 +193,7 @@ def _built(folder: Path, entry: AssetEntry, stamp: tuple[int, int]) -> tuple[Ass
 
     try:
         with timed(folder / entry.file, READ_HERE):
-            asset, report = build_asset(folder / entry.file, entry)
+            asset, report = in_time(lambda: build_asset(folder / entry.file, entry))
     except LargeImportError:
         with timed(folder / entry.file):
             asset, report = build_apart(folder / entry.file, entry)

@@ -1,0 +1,62 @@
+"""Refusals of post-training runs that cannot learn, before anything is sampled."""
+
+from __future__ import annotations
+
+from torch import Generator
+
+from agents.post_training.config import PostTrainConfig
+from agents.post_training.gradients import no_credit_per_object
+from agents.post_training.learner import Learner
+from agents.post_training.prompts import PromptSets
+from scene_envs.errors import TrainingError
+from scene_envs.scene import SceneBatch
+
+_PROBED = 2
+"""Real scenes on which the reward and the mask of a run are tried."""
+
+
+def check_it_can_learn(learner: Learner, real: SceneBatch, prompts: PromptSets | None) -> None:
+    """Score real scenes as the scenes of the run will be scored, and try the mask of ``inpaint.mask`` on them.
+
+    Real scenes are scored with their own prompts where the run takes these, and with prompts of the run otherwise. A
+    prompt of the run may be one that no real scene can be scored by; then the reward decides nothing here.
+
+    Args:
+        learner: of the run, whose prompts and observed parts can be dealt.
+        real: real scenes.
+        prompts: of each of them; None for a prior that reads none.
+
+    Raises:
+        InvalidInputError: credit per object is asked of a reward that gives none, or the mask cannot be made, or leaves
+            nothing to regenerate in any scene.
+        TrainingError: the reward scores none of the real scenes.
+    """
+    config, scenes = learner.config, real[:_PROBED]
+    texts = _texts(learner, len(scenes), prompts)
+    score = learner.scorer(scenes, texts)
+    valid = bool(score.valid.any())
+    if valid and score.per_object is None and getattr(config.algorithm, "credit", "") == "object":
+        raise no_credit_per_object()
+    if config.prompt in (None, "data") and not learner.processes.any(valid):
+        raise nothing_scored(config, f"none of {len(scenes)} real scenes, so that nothing was sampled")
+    if learner.inpaint_deck is None:
+        return
+    if config.inpaint.scenes == "real":
+        learner.deal(0)
+    else:
+        learner.inpaint_deck.check(scenes, texts)
+
+
+def nothing_scored(config: PostTrainConfig, what: str) -> TrainingError:
+    """The error for a run whose reward scored ``what``."""
+    return TrainingError(
+        f"the reward {config.plain()['reward']!r} scored {what}; the warnings above say why, and "
+        "`scene-envs check-reward` tries a reward on its own"
+    )
+
+
+def _texts(learner: Learner, count: int, prompts: PromptSets | None) -> list[str] | None:
+    """One prompt for each of the first ``count`` real scenes; None in a run without prompts."""
+    if learner.config.prompt == "data" and prompts is not None:
+        return [prompts(row)[0] for row in range(count)]
+    return None if learner.deck is None else learner.deck.deal(count, Generator().manual_seed(learner.config.seed))

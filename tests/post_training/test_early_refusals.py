@@ -1,0 +1,73 @@
+"""Runs that cannot learn end before anything is sampled."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from agents.configuration.tree import changed
+from agents.post_training import learner as learner_module
+from agents.post_training import post_train
+from agents.post_training.run_files import SCENES_NAME
+from agents.priors.testing import tiny_prior
+from rewards.base import RewardContext, RewardOutput
+from scene_envs.datasets import parse_prompt, scene_facts
+from scene_envs.errors import InvalidInputError, TrainingError
+from scene_envs.scene import SceneBatch
+from tests.helpers.small_runs import small_config
+
+
+def test_prompt_match_without_a_prompt_ends_before_anything_is_sampled(tmp_path: Path) -> None:
+    with pytest.raises(TrainingError, match="'prompt_match' scored none of 2 real scenes"):
+        post_train(small_config(tmp_path, reward="prompt_match"), prior=tiny_prior())
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"reward": "diversity", "algorithm.credit": "object"}, r"take algorithm\.credit=scene, or auto"),
+        (
+            {"reward": "diversity", "algorithm.credit": "object", "prompt": "A scene with two cups."},
+            r"take algorithm\.credit=scene, or auto",
+        ),
+        ({"reward": "diversity", "inpaint": {"mask": "lowest_scoring"}}, "needs an objective with credit per object"),
+        (
+            {"reward": "diversity", "inpaint": {"mask": "lowest_scoring", "scenes": "samples"}},
+            "needs an objective with credit per object",
+        ),
+        ({"inpaint": {"mask": "off_prompt", "scenes": "samples"}}, "mask=off_prompt has no prompt"),
+        ({"inpaint": {"mask": {"name": "region", "low": [9, 9, 9], "high": [9, 9, 9], "empty": 0}}}, "leaves nothing"),
+    ],
+)
+def test_what_a_run_lacks_is_told_before_anything_is_sampled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any], message: str
+) -> None:
+    prior = tiny_prior(process="mixed", text=True)
+    monkeypatch.setattr(type(prior), "sample", None)
+    monkeypatch.setattr(learner_module, "collect", None)
+    config = changed(small_config(tmp_path), changes)
+    with pytest.raises(InvalidInputError, match=message):
+        post_train(config, prior=prior)
+    assert not (tmp_path / "prior").exists()
+
+
+def test_real_scenes_are_scored_with_their_own_prompts_before_anything_is_sampled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Any] = []
+
+    def no_scene(batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        asked.append(context.prompts)
+        return RewardOutput(batch.counts.float(), valid=torch.zeros(len(batch), dtype=torch.bool))
+
+    monkeypatch.setattr(learner_module.Learner, "rollout", None)  # nothing is sampled
+    config = changed(small_config(tmp_path, reward=no_scene), {"prompt": "data", "guard.samples": 0})
+    with pytest.raises(TrainingError, match="scored none of 2 real scenes, so that nothing was sampled"):
+        post_train(config, prior=tiny_prior(process="mixed", text=True))
+    texts = asked[-1]
+    batch = SceneBatch.load(tmp_path / SCENES_NAME)[:2]
+    for text, facts in zip(texts, scene_facts(batch), strict=True):
+        assert all(check.holds for check in parse_prompt(text, batch.scene_type).check(facts))
