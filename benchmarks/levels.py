@@ -1,4 +1,4 @@
-"""Do the short cuts of feasibility change verdicts: coarse parts, and objects that need no simulation?
+"""Verdicts of feasibility with and without its short cuts: coarse parts, and objects that need no simulation.
 
     python benchmarks/levels.py [--scenes 1000] [--seed 0] [--types ...]
 

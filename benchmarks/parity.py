@@ -1,4 +1,4 @@
-"""Whether feasibility gives the verdicts of Drake, computed there with the same definition on the same convex parts.
+"""Verdicts of feasibility here and in Drake, by the same definition on the same convex parts.
 
     python benchmarks/parity.py [TYPE ...] [--scenes 10] [--kinds raw "2 mm" "10 mm" prior] [--seed 0]
                                 [--friction 0.6] [--contact hydroelastic]

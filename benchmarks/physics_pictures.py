@@ -1,4 +1,4 @@
-"""The pictures of docs/physics.md: what each function of the physics sees.
+"""Pictures of docs/physics.md: one scene for each function of the physics.
 
 python benchmarks/physics_pictures.py [--output docs/images]
 """

@@ -1,4 +1,4 @@
-"""Projection: how many scenes come free of overlap, how fast, and how far objects move beside a general NLP solver.
+"""Projection beside a general NLP solver: scenes free of overlap, time per scene, and distances that objects move.
 
     python benchmarks/projection.py [--count 40] [--small 20] [--starts 6] [--seed 0] [--types ...] [--heaps]
 

@@ -1,4 +1,4 @@
-"""Ready objects in another simulator: whether they stand still, and how much they still overlap.
+"""Ready objects in another simulator: their motion, and the overlaps that are left.
 
     python benchmarks/ready.py [TYPE ...] [--count 30] [--seed 0] [--noise 0 0.004 0.015] [--simulator MuJoCo]
                                [--duration 2] [--others drop] [--scenes FILE | --ready FILE] [--save FOLDER] [--details]

@@ -1,4 +1,4 @@
-"""Whether physics gives the same bits whatever ran before, in whichever process, with however many workers.
+"""Bits of the results of physics after other scenes, in other processes, and with other numbers of workers.
 
     python benchmarks/reproducibility.py [TYPE ...] [--noise 0.004 0.015 0.03] [--seed 5]
 

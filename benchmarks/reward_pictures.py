@@ -1,4 +1,4 @@
-"""The pictures of docs/rewards: two scenes that each reward tells apart.
+"""Pictures of docs/rewards: for each reward, two scenes with different values.
 
 python benchmarks/reward_pictures.py [--output docs/images] [REWARD ...]
 

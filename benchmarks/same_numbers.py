@@ -1,4 +1,4 @@
-"""Digests of seeded results: whether a change of the code changed a number.
+"""Digests of seeded results, compared with those that an earlier state of the code gave.
 
     python benchmarks/same_numbers.py [--write] [--only NAME]
 

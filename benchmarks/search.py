@@ -1,4 +1,4 @@
-"""Planners of the search at equal NFE, their winners in another simulator, and what the search itself costs.
+"""Planners of the search at equal NFE, their winners in another simulator, and the cost of the search itself.
 
     python benchmarks/search.py compare [--planners NAME[:key=value,...] ...] [--seeds 0 1 2] [--scenes 300]
                                         [--at 64 300] [--prior dimsum_table] [--objective feasible_objects]

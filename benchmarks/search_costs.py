@@ -1,4 +1,4 @@
-"""What a search costs beside the denoiser, and what inpaintings of many slots do; commands of search.py."""
+"""Cost of a search beside the denoiser, and results of inpaintings of many slots; commands of search.py."""
 
 from __future__ import annotations
 

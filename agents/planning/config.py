@@ -1,4 +1,4 @@
-"""All knobs of a search run; imports no torch."""
+"""Configuration of one search run; imports no torch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""All knobs of one pretraining run; imports no torch."""
+"""Configuration of one pretraining run; imports no torch."""
 
 from __future__ import annotations
 

@@ -90,7 +90,6 @@ class MixedPrior(TrainableMixedPrior):
         check_weighting(config.loss_weighting, config.prediction)
         if config.empty_slots == "dropped" and not getattr(config.network, "reads_slot_mask", False):
             raise InvalidInputError("empty_slots='dropped' needs network='flux'; others take empty_slots='attended'")
-        self.mixed = config
         self._keep(config, normalizer, preconditioning, card, residual)
         schedule = make_schedule(config.schedule, config.num_timesteps, config.noise_floor, config.noise_ceiling)
         self.process = GaussianProcess(schedule, config.prediction, preconditioning)
@@ -173,8 +172,8 @@ class MixedPrior(TrainableMixedPrior):
             free_pose, free_logits = self.denoiser(x_t, levels, observed, free)
             pose = (1 + guidance) * pose - guidance * free_pose
             logits = (1 + guidance) * logits.log_softmax(-1) - guidance * free_logits.log_softmax(-1)
-        if self.mixed.clip:
-            pose = pose.clamp(-self.mixed.clip, self.mixed.clip)
+        if self.config.clip:
+            pose = pose.clamp(-self.config.clip, self.config.clip)
         residual = None if self.residual is None else self.residual.at(t)
         mean, std = self.process.posterior(x_t[..., :POSE_FEATURES], pose, t, previous, residual, eta)
         states = x_t[..., POSE_FEATURES:]
@@ -283,5 +282,5 @@ class MixedPrior(TrainableMixedPrior):
         eta: float,
     ) -> Tensor:
         text = None if prompts is None else self.encode_prompts(prompts)
-        start = self.initial(count, self.mixed.slots if slots is None else slots, generator)
+        start = self.initial(count, self.config.slots if slots is None else slots, generator)
         return self.run_chain(start, self.step_table(num_steps), generator, text=text, guidance=guidance, eta=eta)

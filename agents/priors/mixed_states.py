@@ -24,7 +24,7 @@ Prior = TypeVar("Prior", bound="MixedStates")
 class MixedStates(PromptReader, ScenePrior):
     """The part of :class:`~agents.priors.mixed.MixedPrior` that defines its scenes x (B, N, 12 + K)."""
 
-    mixed: MixedPriorConfig
+    config: MixedPriorConfig
     denoiser: MixedDenoiser
     categories: CategoricalProcess
     """The process of the categories."""
@@ -34,7 +34,7 @@ class MixedStates(PromptReader, ScenePrior):
 
         A prior trained with observed entries has always been told of its fixed objects; one trained without is not.
         """
-        if observed is not None or self.mixed.observed_share <= 0:
+        if observed is not None or self.config.observed_share <= 0:
             return observed
         fixed = torch.zeros(x.shape[:2], dtype=torch.bool, device=x.device)
         fixed[:, : len(self.scene_type.fixed)] = True
@@ -43,13 +43,13 @@ class MixedStates(PromptReader, ScenePrior):
     def with_union(self: Prior, union: str) -> Prior:
         """As :meth:`ScenePrior.with_union`."""
         super().with_union(union)
-        self.mixed = self.config = replace(self.mixed, union=union)
+        self.config = replace(self.config, union=union)
         return self
 
     @property
     def num_categories(self) -> int:
         """K = C + 1."""
-        return self.mixed.network.categories
+        return self.config.network.categories
 
     @property
     def is_constant(self) -> Tensor:
@@ -107,13 +107,13 @@ class MixedStates(PromptReader, ScenePrior):
         Where scenes are those of one member of a union, the first steps decide about one slot each.
         """
         if self._separates_members:
-            return StepTable.gradual(self.categories.schedule.mask, self.mixed.slots, num_steps)
+            return StepTable.gradual(self.categories.schedule.mask, self.config.slots, num_steps)
         return super().step_table(num_steps)
 
     @property
     def _separates_members(self) -> bool:
         """Whether a scene holds the assets of one member of a union only."""
-        return self.mixed.union == "one_type" and len(self._members) > 1 and self.categories.only_absorbs
+        return self.config.union == "one_type" and len(self._members) > 1 and self.categories.only_absorbs
 
     @cached_property
     def _members(self) -> Tensor:

@@ -31,7 +31,7 @@ class TrainableMixedPrior(MixedStates):
 
     def noised_loss(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
         """(B,) mean squares of the pose output plus ``category_weight`` times the category loss, where unobserved."""
-        config = self.mixed
+        config = self.config
         text = self.unconditional(len(noised.t)) if text is None else text
         output = self.output(noised, text)
         logits, drawn, weight = output.logits, noised.drawn, noised.weight
@@ -56,7 +56,7 @@ class TrainableMixedPrior(MixedStates):
         self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None, observed: Observed | None = None
     ) -> NoisedScenes:
         """Noised scenes, their targets and weights; see :meth:`ScenePrior.noised`."""
-        config, device = self.mixed, x0.device
+        config, device = self.config, x0.device
         if t is None:
             t = self.draw_timesteps(x0.shape[0], generator).to(device)
         noise = torch.randn(x0.shape, generator=generator).to(device)
@@ -108,7 +108,7 @@ class TrainableMixedPrior(MixedStates):
         """Random observed entries: slots (completion), all categories (rearrangement), or any attribute of any slot."""
         batch, slots = x0.shape[:2]
         kind, share = torch.rand(2, batch, 1, generator=generator)
-        kind = kind / max(self.mixed.observed_share, 1e-9)  # above 1: nothing is observed
+        kind = kind / max(self.config.observed_share, 1e-9)  # above 1: nothing is observed
         picks = torch.rand(2, batch, slots, generator=generator) < share
         whole, rearrange, free = kind < 0.5, (kind >= 0.5) & (kind < 0.75), (kind >= 0.75) & (kind < 1.0)
         pose = (whole & picks[0]) | (rearrange & picks[0] & (share < 0.5)) | (free & picks[0])
@@ -121,7 +121,7 @@ class TrainableMixedPrior(MixedStates):
     def fit_residual(self, x0: Tensor, levels: int = 40, seed: int = 0) -> ResidualVariance:
         """Measure the error of the denoised pose on scenes ``x0`` (B, N, D) at ``levels`` timesteps, and keep it."""
         generator = Generator().manual_seed(seed)
-        timesteps = StepTable.spaced(self.mixed.num_timesteps, levels).timesteps.flip(0)
+        timesteps = StepTable.spaced(self.config.num_timesteps, levels).timesteps.flip(0)
         present = (x0[..., POSE_FEATURES:].argmax(dim=-1) != self.num_categories - 1).float()
         present[:, : len(self.scene_type.fixed)] = 0.0
         rows = []

@@ -1,4 +1,4 @@
-"""More coloured surfaces: boxes with patterns on their faces, lofts through sections, and meshes moved about.
+"""Coloured surfaces: boxes with patterns on their faces, lofts through sections, and moved meshes.
 
 A pattern is a list of patches; the face is cut along their edges, so nothing overlaps and nothing flickers.
 """

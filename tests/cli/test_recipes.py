@@ -22,13 +22,13 @@ def test_the_paper_s_recipe_is_its_setting() -> None:
     raw = torch.from_numpy(get_grammar("dimsum_table").sample_array(np.random.default_rng(0), 40))
     prior = build_prior(config, raw, Normalizer.fit(raw), [["A scene with 8 objects."]])
     assert isinstance(prior, MixedPrior)
-    network = prior.mixed.network
+    network = prior.config.network
     assert (network.hidden, network.heads, network.double_blocks, network.single_blocks) == (512, 16, 5, 10)  # type: ignore[union-attr]
     assert parameter_count(network) == pytest.approx(88.3e6, rel=0.05)  # of text 768 wide; ours is narrower
     beta = 1 - prior.process.schedule.alpha_bar[1:] / prior.process.schedule.alpha_bar[:-1]
     assert (float(beta[0]), float(beta[-1])) == pytest.approx((1e-4, 0.02))
     assert prior.categories.schedule.keep[1] == pytest.approx(0.99999)
-    assert (prior.mixed.prediction, prior.mixed.category_loss, prior.mixed.clip) == ("epsilon", "bound", 1.0)
+    assert (prior.config.prediction, prior.config.category_loss, prior.config.clip) == ("epsilon", "bound", 1.0)
 
 
 def test_keys_given_beside_a_recipe_win() -> None:

@@ -80,6 +80,33 @@ def test_the_committed_drawing_is_that_of_the_script() -> None:
     assert ARCHITECTURE.FILE.read_text(encoding="utf-8") == ARCHITECTURE.drawing()
 
 
+def headings_of(page: Path) -> set[str]:
+    """Anchors of a page, as code hosts and the site make them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    anchors: set[str] = set()
+    for heading in re.findall(r"^#+ (.+)$", text, re.MULTILINE):
+        words = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", heading).replace("`", "").replace("*", "").strip().lower()
+        anchor = re.sub(r"[^\w\- ]", "", words).replace(" ", "-")
+        anchors.add(anchor if anchor not in anchors else f"{anchor}-1")
+    return anchors
+
+
+def test_every_link_between_pages_leads_to_a_heading() -> None:
+    pages = [
+        path for top in ("*.md", "docs/**/*.md", "benchmarks/**/*.md", "agents/**/README.md") for path in ROOT.glob(top)
+    ]
+    assert len(pages) > 50
+    broken = []
+    for page in pages:
+        prose = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+        for link in re.findall(r"\]\((?!https?:|mailto:)([^)\s]+)\)", prose):
+            name, _, anchor = link.partition("#")
+            target = (page.parent / name).resolve() if name else page
+            if not target.exists() or (anchor and target.suffix == ".md" and anchor not in headings_of(target)):
+                broken.append(f"{page.relative_to(ROOT)}: {link}")
+    assert broken == []
+
+
 def test_make_help_lists_every_target() -> None:
     listed = set(re.findall(r"^make ([\w-]+)  ", subprocess.run(
         ["make", "--no-print-directory", "help"], cwd=ROOT, capture_output=True, text=True, check=True

@@ -125,11 +125,11 @@ def test_unknown_schedule_names_the_nearest() -> None:
         make_schedule("karas")
 
 
-def test_half_of_both_laws_of_timesteps_is_uniform() -> None:
+def test_half_of_both_distributions_of_timesteps_is_uniform() -> None:
     schedule = make_schedule("karras", num_timesteps=100)
-    laws = [timestep_weights(law, schedule, -1.2, 1.0) for law in ("both", "lognormal", "uniform")]
-    torch.testing.assert_close(laws[0], (laws[1] + laws[2]) / 2)
-    assert float(laws[0].sum()) == pytest.approx(1.0)
+    weights = [timestep_weights(name, schedule, -1.2, 1.0) for name in ("both", "lognormal", "uniform")]
+    torch.testing.assert_close(weights[0], (weights[1] + weights[2]) / 2)
+    assert float(weights[0].sum()) == pytest.approx(1.0)
 
 
 def test_training_timesteps_follow_the_lognormal_law() -> None:

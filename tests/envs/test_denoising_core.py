@@ -1,4 +1,4 @@
-"""The core MDP: transitions, clamping, the reward's timing, and the law of the noise mode."""
+"""The core MDP: transitions, clamping, the reward's timing, and the distribution of the noise mode."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A classifier of scenes is a competent judge: blind to what does not matter, sharp for what does."""
+"""Classifier two-sample test: near chance on equal distributions, above it where scenes differ."""
 
 from __future__ import annotations
 

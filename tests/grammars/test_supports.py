@@ -1,4 +1,4 @@
-"""Things on things and in things: frames of carriers, piles, containers, and a user's own scene type."""
+"""Objects on and in other objects: frames of carriers, piles, containers, and a user's own scene type."""
 
 from __future__ import annotations
 

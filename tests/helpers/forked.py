@@ -1,4 +1,4 @@
-"""Processes that begin as copies of the test's: what a test kills or replaces has not to import everything first."""
+"""Processes that begin as copies of the process of the test, with all that it has imported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a network is told of the gaps between objects, and where that moves them."""
+"""Pairwise contacts: the gaps between objects that a network reads, and the displacements along them."""
 
 from __future__ import annotations
 

@@ -19,10 +19,10 @@ from scene_envs.errors import InvalidInputError
 def _prior(attention: str = "relative", kernel: str = "early_absorbing") -> MixedPrior:
     tiny = tiny_prior("dimsum_table", process="mixed")
     assert isinstance(tiny, MixedPrior)
-    assert isinstance(tiny.mixed.network, MixedFluxConfig)
+    assert isinstance(tiny.config.network, MixedFluxConfig)
     added = (RelationsConfig(),) if attention == "relative" else ()
-    network = replace(tiny.mixed.network, modules=(*tiny.mixed.network.modules, *added))
-    config = replace(tiny.mixed, kernel=kernel, empty_slots="dropped", network=network)
+    network = replace(tiny.config.network, modules=(*tiny.config.network.modules, *added))
+    config = replace(tiny.config, kernel=kernel, empty_slots="dropped", network=network)
     torch.manual_seed(0)
     prior = MixedPrior(config, tiny.normalizer, tiny.preconditioning)
     for parameter in prior.parameters():
@@ -57,7 +57,7 @@ def test_pack_keeps_every_scene_once_and_its_active_slots_first() -> None:
 def test_known_empty_slots_change_nothing(attention: str) -> None:
     """With every category known, a scene and the same scene with more empty slots are denoised alike."""
     prior = _prior(attention)
-    level = prior.mixed.num_timesteps // 4
+    level = prior.config.num_timesteps // 4
     x = _noised(prior, 20, level)
     t = torch.full((len(x),), level)
     pose, _ = prior.denoiser(x, t)
@@ -69,9 +69,9 @@ def test_known_empty_slots_change_nothing(attention: str) -> None:
 
 def test_a_seen_category_is_certain_and_a_masked_one_is_not() -> None:
     prior = _prior()
-    x = _noised(prior, 20, 3 * prior.mixed.num_timesteps // 4)
+    x = _noised(prior, 20, 3 * prior.config.num_timesteps // 4)
     with torch.no_grad():
-        _, logits = prior.denoiser(x, torch.full((len(x),), 3 * prior.mixed.num_timesteps // 4))
+        _, logits = prior.denoiser(x, torch.full((len(x),), 3 * prior.config.num_timesteps // 4))
     states = x[..., 12:].argmax(dim=-1)
     masked = x[..., 12:].sum(dim=-1) == 0
     assert bool(masked.any())
@@ -83,7 +83,7 @@ def test_a_seen_category_is_certain_and_a_masked_one_is_not() -> None:
 
 def test_slots_may_be_permuted() -> None:
     prior = _prior()
-    level = 3 * prior.mixed.num_timesteps // 4
+    level = 3 * prior.config.num_timesteps // 4
     x = _noised(prior, 20, level)
     t = torch.full((len(x),), level)
     order = torch.randperm(x.shape[1], generator=torch.Generator().manual_seed(3))

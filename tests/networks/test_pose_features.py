@@ -1,4 +1,4 @@
-"""What the mixed network is told of noisy poses beside the poses themselves."""
+"""Features of noisy poses that the mixed network reads beside the poses themselves."""
 
 from __future__ import annotations
 

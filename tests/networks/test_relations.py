@@ -1,4 +1,4 @@
-"""What slots see of each other."""
+"""Relations of pairs of slots: biases of attention, and the features that attention gathers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What needs no simulation is what simulation would leave in place, and nothing reaches it unseen."""
+"""Objects at rest without simulation: the same objects stay in place when they are simulated."""
 
 from __future__ import annotations
 

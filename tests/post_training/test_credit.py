@@ -1,4 +1,4 @@
-"""Credit per object: what an empty slot is worth under a sum and under a mean."""
+"""Credit per object of empty slots, under a sum and under a mean."""
 
 from __future__ import annotations
 

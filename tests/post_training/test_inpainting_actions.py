@@ -172,7 +172,7 @@ def observing(prior: ScenePrior) -> ScenePrior:
     """A prior that is told of its fixed objects in any case, as those that ship are."""
     copy = deepcopy(prior)
     if prior.process_name == "mixed":
-        copy.mixed = copy.config = replace(copy.mixed, observed_share=0.5)
+        copy.config = replace(copy.config, observed_share=0.5)
     return copy
 
 

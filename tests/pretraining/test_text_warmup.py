@@ -1,4 +1,4 @@
-"""What a text encoder learns of numbers before a run."""
+"""Text warm-up: numbers of objects that a text encoder learns before a run."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ def prior(bert: Path) -> MixedPrior:
 
 def test_prompts_condition_the_network_and_bert_is_not_saved(prior: MixedPrior, tmp_path: Path) -> None:
     assert prior.conditional
-    assert prior.mixed.network.text_width == 24
+    assert prior.config.network.text_width == 24
     folder = prior.save(tmp_path)
     assert PriorFacts.of(folder).text.startswith("BERT")
     assert {name for name in prior.weights() if name.startswith("text_encoder.")} == {"text_encoder.nothing"}

@@ -35,7 +35,7 @@ class WantsTables(torch.nn.Module):
 def mixed(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> MixedPrior:
     prior = tiny_prior(process="mixed")
     assert isinstance(prior, MixedPrior)
-    schedule = make_categorical_schedule(request.param, prior.mixed.num_timesteps)
+    schedule = make_categorical_schedule(request.param, prior.config.num_timesteps)
     monkeypatch.setattr(prior, "categories", CategoricalProcess(schedule, KINDS))
     prior._together = prior._together and prior.categories.only_absorbs
     prior.denoiser = WantsTables()

@@ -37,7 +37,7 @@ def union_prior() -> MixedPrior:
     prior = tiny_prior(UNION, process="mixed", slots=20)
     assert isinstance(prior, MixedPrior)
     kinds = prior.num_categories
-    prior.categories = CategoricalProcess(make_categorical_schedule("absorbing", prior.mixed.num_timesteps), kinds)
+    prior.categories = CategoricalProcess(make_categorical_schedule("absorbing", prior.config.num_timesteps), kinds)
     prior._together = True
     prior.denoiser = EveryAssetAlike(kinds)
     return prior
@@ -68,7 +68,7 @@ def test_an_unknown_rule_names_the_known_ones(union_prior: MixedPrior) -> None:
     with pytest.raises(UnknownNameError, match="one_type"):
         union_prior.with_union("one")
     with pytest.raises(UnknownNameError, match="one_type"):
-        MixedPrior(replace(union_prior.mixed, union="one"), union_prior.normalizer, union_prior.preconditioning)
+        MixedPrior(replace(union_prior.config, union="one"), union_prior.normalizer, union_prior.preconditioning)
 
 
 def test_probabilities_leave_out_what_does_not_fit_and_add_up_to_one(union_prior: MixedPrior) -> None:

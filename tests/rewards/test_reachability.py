@@ -1,4 +1,4 @@
-"""The reward of what a gripper can reach."""
+"""The reward for objects that a gripper can reach."""
 
 from __future__ import annotations
 
