@@ -2,21 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-import pickle
-import signal
-import subprocess
-import sys
 import threading
-import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from multiprocessing.connection import Connection
 from typing import Any
-
-import numpy as np
-import torch
 
 from rewards.base import RewardContext, RewardOutput, averages_objects, depends_on_batch
 from rewards.local_files import allowed_files, is_local, names_in
@@ -30,15 +19,10 @@ from rewards.registry import (
     reward_info,
     reward_name,
 )
+from rewards.reward_process import RewardProcess, unpacked
 from rewards.seeding import current_draw
-from scene_envs.errors import InvalidInputError, RewardError, SceneEnvsError, UnknownNameError
+from scene_envs.errors import InvalidInputError, SceneEnvsError
 from scene_envs.scene import SceneBatch
-
-_START_UP = 120.0
-"""Seconds that an empty worker may take to start."""
-_ERRORS: dict[str, type[SceneEnvsError]] = {
-    kind.__name__: kind for kind in (InvalidInputError, UnknownNameError, RewardError)
-}
 
 
 class IsolatedReward:
@@ -75,7 +59,7 @@ class IsolatedReward:
         self.seed = seed
         self.timeout, self.memory, self.workers = timeout, memory, workers
         self._reward = reward
-        self._worker: _Worker | None = None
+        self._worker: RewardProcess | None = None
         self._lock = threading.Lock()
         self._started()
 
@@ -95,7 +79,7 @@ class IsolatedReward:
         message = ("score", replace(batch.scene_type), scenes, (context.prompts, seed, current_draw()))
         with self._lock:
             body = self._started().ask(message, self.timeout)
-        return _unpacked(body, batch.tensor.device)
+        return unpacked(body, batch.tensor.device)
 
     def maximum(self, slots: int, free_slots: int) -> float | None:
         """The largest value that the reward declares; see :func:`rewards.base.declared_maximum`."""
@@ -109,9 +93,9 @@ class IsolatedReward:
             self._worker.stop()
             self._worker = None
 
-    def _started(self) -> _Worker:
+    def _started(self) -> RewardProcess:
         if self._worker is None or not self._worker.alive:
-            self._worker = _Worker(self.name, self.timeout, self.memory)
+            self._worker = RewardProcess(self.name, self.timeout, self.memory)
             try:
                 message = ("make", self._reward, allowed_targets(), allowed_files(), self.workers)
                 self.depends_on_batch, self.averages_objects = map(bool, self._worker.ask(message, self.timeout))
@@ -178,7 +162,7 @@ def describe_rewards(
         timeout: seconds that an import may take.
         memory: GiB that an import may allocate.
     """
-    worker: _Worker | None = None
+    worker: RewardProcess | None = None
     try:
         for name in names:
             try:
@@ -186,7 +170,7 @@ def describe_rewards(
                     yield name, reward_info(name), ""
                     continue
                 if worker is None or not worker.alive:
-                    worker = _Worker(name, timeout, memory)
+                    worker = RewardProcess(name, timeout, memory)
                 worker.name = name
                 yield name, worker.ask(("describe", name), timeout), ""
             except SceneEnvsError as error:
@@ -231,115 +215,3 @@ def _parts(reward: Any) -> list[Any]:
     if isinstance(reward, Mapping):
         return [*names_in([reward.get("name", "")]), *(v for k, v in reward.items() if k != "name")]
     return list(reward) if isinstance(reward, list | tuple) else []
-
-
-class _Worker:
-    """One process, the two pipes to it, and the watch over its time."""
-
-    def __init__(self, name: str, timeout: float, memory: float) -> None:
-        self.name, self.memory = name, memory
-        self.alive = True
-        child_reads, parent_writes = os.pipe()
-        parent_reads, child_writes = os.pipe()
-        path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
-        limits = [str(timeout), str(int(memory * 2**30)), str(torch.get_num_threads())]
-        try:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "rewards.worker", str(child_reads), str(child_writes), *limits],
-                pass_fds=(child_reads, child_writes),
-                env=os.environ | {"PYTHONPATH": path, "PYTHONHASHSEED": "0"},
-                stdin=subprocess.DEVNULL,
-                stdout=2,  # what a reward prints is no output of ours
-                start_new_session=True,
-            )
-        finally:
-            os.close(child_reads)
-            os.close(child_writes)
-        self.outbox = Connection(parent_writes, readable=False)
-        self.inbox = Connection(parent_reads, writable=False)
-        self._end = weakref.finalize(self, _end, self.process, self.outbox, self.inbox)
-        self._receive("started", _START_UP)
-
-    def ask(self, message: Any, timeout: float) -> Any:
-        """The answer to a message; a worker that gives none within ``timeout`` seconds is ended."""
-        return self._receive(message, timeout)
-
-    def stop(self) -> None:
-        """End the process and all that it started, and close the pipes."""
-        self.alive = False
-        self._end()
-
-    def _receive(self, message: Any, timeout: float) -> Any:
-        late = threading.Event()
-
-        def end() -> None:  # a process that hangs neither reads nor writes: only its end unblocks this one
-            late.set()
-            _kill(self.process)
-
-        clock = threading.Timer(timeout, end)
-        clock.daemon = True
-        clock.start()
-        try:
-            if message != "started":
-                self.outbox.send(message)
-            kind, body = self.inbox.recv()
-        except (EOFError, OSError, pickle.UnpicklingError):
-            self.stop()
-            raise RewardError(f"reward {self.name!r} {self._how_it_ended(late.is_set(), timeout)}") from None
-        except BaseException:
-            self.stop()
-            raise
-        finally:
-            clock.cancel()
-        if kind == "done":
-            return body
-        error, text = body
-        raise _ERRORS.get(error, RewardError)(text)
-
-    def _how_it_ended(self, late: bool, timeout: float) -> str:
-        status = self.process.returncode
-        if late or status == -signal.SIGALRM:
-            return f"took longer than reward_timeout={timeout:g} s; its process was ended"
-        if status is not None and status < 0:
-            with contextlib.suppress(ValueError):
-                return f"crashed its process ({signal.Signals(-status).name})"
-        return f"ended its process (exit status {status}) instead of returning scores"
-
-
-def _end(process: subprocess.Popen[bytes], outbox: Connection, inbox: Connection) -> None:
-    for pipe in (outbox, inbox):
-        with contextlib.suppress(OSError):
-            pipe.close()
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(0.2)  # one that ended by itself is told from one that was ended
-    _kill(process)
-    process.wait()
-
-
-def _kill(process: subprocess.Popen[bytes]) -> None:
-    with contextlib.suppress(ProcessLookupError, PermissionError):
-        os.killpg(process.pid, signal.SIGKILL)
-
-
-def packed(output: RewardOutput) -> dict[str, Any]:
-    """An output as arrays, to be sent."""
-    return {
-        "value": output.value.cpu().numpy(),
-        "per_object": None if output.per_object is None else output.per_object.cpu().numpy(),
-        "terms": {name: term.cpu().numpy() for name, term in output.terms.items()},
-        "valid": output.is_valid.cpu().numpy(),
-        "object_flags": {name: flag.cpu().numpy() for name, flag in output.object_flags.items()},
-    }
-
-
-def _unpacked(body: Mapping[str, Any], device: torch.device) -> RewardOutput:
-    def tensor(array: Any) -> torch.Tensor:
-        return torch.from_numpy(np.array(array)).to(device)
-
-    return RewardOutput(
-        tensor(body["value"]),
-        None if body["per_object"] is None else tensor(body["per_object"]),
-        {name: tensor(term) for name, term in body["terms"].items()},
-        tensor(body["valid"]),
-        {name: tensor(flag) for name, flag in body["object_flags"].items()},
-    )

@@ -19,9 +19,9 @@ import torch
 
 from rewards.base import RewardContext, averages_objects, declared_maximum, depends_on_batch
 from rewards.evaluation import describe_error, evaluate_reward
-from rewards.isolation import packed
 from rewards.local_files import allow_local_rewards
 from rewards.registry import RewardInfo, allow_reward_targets, resolve_reward, reward_info
+from rewards.reward_process import packed
 from rewards.seeding import other_draw
 from scene_envs.errors import SceneEnvsError
 from scene_envs.physics import PhysicsPool

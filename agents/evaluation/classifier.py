@@ -9,7 +9,6 @@ from torch import Tensor, nn
 
 from agents.evaluation.scene_tokens import (
     NEIGHBOUR_FEATURES,
-    POSE_FEATURES,
     WAVE_FEATURES,
     SceneTokens,
     blurred,
@@ -26,7 +25,7 @@ from agents.evaluation.two_sample_test import (
     two_sample_accuracy,
 )
 from scene_envs.errors import InvalidInputError
-from scene_envs.scene import SceneBatch
+from scene_envs.scene import POSE_FEATURES, SceneBatch
 from scene_envs.scene_distance import check_same_assets
 
 RESOLUTION = (1e-3, 1e-2)

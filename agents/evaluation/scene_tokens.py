@@ -15,8 +15,6 @@ from scene_envs.scene import SceneBatch
 
 NEIGHBOURS = 4
 """Neighbours described per object."""
-POSE_FEATURES = 12
-"""Numbers per pose: translation and rotation matrix."""
 NEIGHBOUR_FEATURES = 7
 """Numbers per neighbour: offset (3), gap per axis (3), gap of the horizontal outlines."""
 WAVE_FEATURES = 26

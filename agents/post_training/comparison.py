@@ -17,7 +17,7 @@ from agents.post_training.report import Page, Picture, Section, Tile, write_repo
 from agents.post_training.run_files import write_metrics
 from agents.post_training.trainer import PostTrainResult
 from agents.priors.base import ScenePrior
-from rewards import PromptMatch, RewardContext, reward_name
+from rewards import PromptMatch, RewardContext, evaluate_reward, reward_name
 from scene_envs.scene import SceneBatch
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ class Measured:
         figures: ``objects`` (mean count, welded included), ``objects_sem`` (its standard error), ``feasible_objects``
             (free, raw), ``feasible_fraction`` of free objects, ``ready_objects`` (free, after projection and
             settling, feasible and in the workspace), ``ready_objects_sem``, ``ready_fraction``, ``scenes``,
+            ``reward`` (mean of the trained reward), ``reward_sem``, ``reward_invalid`` (scenes it could not score),
             ``prompt_match`` (with prompts: the reward of that name), ``prompt_match_sem``,
             ``invalid_scenes`` (physics failed: left out of feasible and ready figures), and the cheap realism figures.
         raw: the samples as they came.
@@ -57,6 +58,7 @@ def measure_prior(
     prompts: Sequence[str] | None = None,
     guidance: float = 0.0,
     slots: int | None = None,
+    reward: Any = None,
 ) -> Measured:
     """Sample ``count`` scenes and measure all of them; none is chosen, none is dropped.
 
@@ -69,6 +71,7 @@ def measure_prior(
         prompts: one per scene, which the samples are then compared with; None for none.
         guidance: weight of classifier-free guidance.
         slots: per sample; None means as trained.
+        reward: that the run trains, as :func:`rewards.isolation.run_reward` gives it; None measures none.
     """
     from agents.post_training.guard import realism
     from scene_envs.physics import feasibility, make_ready
@@ -82,6 +85,7 @@ def measure_prior(
         "scenes": float(count),
         "objects": float(counts.mean()),
         "objects_sem": _standard_error(counts),
+        **({} if reward is None else _reward_figures(raw, reward, prompts, pool)),
         **_counted("feasible", feasible.counts, feasible.valid, free),
         **_counted("ready", ready.counts, ready.valid, free),
         "invalid_scenes": float((~(feasible.valid & ready.valid)).sum()),
@@ -108,7 +112,7 @@ def write_comparison(
         What ``metrics.json`` holds: the run's metrics, ``before``, ``after`` and ``change`` (relative).
     """
     directory, settings = result.directory, result.config.plain()
-    names = [name for name in ("objects", "feasible_objects", "ready_objects") if name in before.figures]
+    names = [name for name in ("reward", "objects", "feasible_objects", "ready_objects") if name in before.figures]
     change = {name: _relative(before.figures[name], after.figures.get(name)) for name in names}
     metrics = {"before": before.figures, "after": after.figures, "change": change, **result.metrics, **(extra or {})}
     pictures = {
@@ -195,6 +199,7 @@ def _page(
         f"regularisation. All numbers are means over {count} fresh, seeded samples of each prior; none was selected."
     )
     tiles = [
+        _tile(f"reward: {reward}", "reward", before, after, "no scene could be scored"),
         _tile("objects per scene", "objects", before, after),
         _tile("feasible as sampled", "feasible_objects", before, after),
         _tile("simulation-ready", "ready_objects", before, after),
@@ -226,6 +231,7 @@ def _page(
 
 
 _LABELS = {
+    "reward": "the trained reward",
     "objects": "objects per scene (welded included)",
     "feasible_objects": "feasible free objects, as sampled",
     "feasible_fraction": "their share of free objects",
@@ -235,6 +241,7 @@ _LABELS = {
     "height_error_table_mm": "height error on the table, median mm",
     "height_error_stack_mm": "height error in stacks, median mm",
     "prompt_match": "match of prompt and scene, 1 at best",
+    "reward_invalid": "scenes that the reward could not score",
     "invalid_scenes": "scenes whose physics failed",
 }
 
@@ -261,16 +268,20 @@ def _number(figures: Mapping[str, float], name: str) -> str:
     return f"{value:.2f}" if error is None else f"{value:.2f} ± {error:.2f}"
 
 
-def _tile(label: str, name: str, before: Mapping[str, float], after: Mapping[str, float]) -> Tile:
+def _tile(
+    label: str, name: str, before: Mapping[str, float], after: Mapping[str, float], failure: str = "physics failed"
+) -> Tile:
     if name not in before or name not in after:
-        return Tile(label, "–", "physics failed")
+        return Tile(label, "–", failure)
     change = _relative(before[name], after[name])
-    note = f"from {before[name]:.1f}" + ("" if change is None else f", {change:+.0%}")
-    return Tile(label, f"{after[name]:.1f}", note)
+    digits = ".1f" if max(abs(before[name]), abs(after[name])) >= 10 or name != "reward" else ".3g"
+    note = f"from {before[name]:{digits}}" + ("" if change is None else f", {change:+.0%}")
+    return Tile(label, f"{after[name]:{digits}}", note)
 
 
 def _relative(before: float, after: float | None) -> float | None:
-    return None if after is None or before == 0 else after / before - 1.0
+    """The relative change; None where it has no meaning, as from 0 or from a negative value."""
+    return None if after is None or before <= 0 else after / before - 1.0
 
 
 def _counted(name: str, counts: Tensor, valid: Tensor, free: Tensor) -> dict[str, float]:
@@ -284,6 +295,16 @@ def _counted(name: str, counts: Tensor, valid: Tensor, free: Tensor) -> dict[str
         f"{name}_objects_sem": _standard_error(taken),
         f"{name}_fraction": share,
     }
+
+
+def _reward_figures(
+    batch: SceneBatch, reward: Any, prompts: Sequence[str] | None, pool: PhysicsPool | None
+) -> dict[str, float]:
+    """Mean of ``reward`` over the scenes that it can score, and the number of the others."""
+    output = evaluate_reward(reward, batch, RewardContext(prompts and tuple(prompts), pool))
+    value = output.value[output.is_valid].double()
+    lost = {"reward_invalid": float(len(batch) - len(value))}
+    return {"reward": float(value.mean()), "reward_sem": _standard_error(value), **lost} if len(value) else lost
 
 
 def _prompt_figures(batch: SceneBatch, prompts: Sequence[str]) -> dict[str, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from contextlib import ExitStack
 from typing import Any
 
 from torch import Generator
@@ -17,6 +18,7 @@ from agents.post_training.trainer import post_train
 from agents.priors.base import ScenePrior
 from agents.utils.process_group import ProcessGroup
 from rewards import reward_name
+from rewards.isolation import close_reward, run_reward
 from scene_envs.scene import SceneBatch
 
 SAMPLE_SEED = 100_000
@@ -41,7 +43,7 @@ def post_train_and_compare(
         prior: in place of the one that ``config.prior`` names.
 
     Returns:
-        The numbers of ``metrics.json``: ``before`` and ``after`` (``objects``, ``feasible_objects`` raw,
+        The numbers of ``metrics.json``: ``before`` and ``after`` (``reward``, ``objects``, ``feasible_objects`` raw,
         ``ready_objects``, and ``prompt_match`` with prompts), ``change``, ``guard``, ``seconds`` of each part, and the
         run's own; of several processes the first alone measures, the others return the run's own.
     """
@@ -55,12 +57,17 @@ def post_train_and_compare(
     trained = time.perf_counter()
     seed = config.seed + SAMPLE_SEED
     asked = _measured_prompts(config, base, scenes)
-    with make_pool(config.workers, PHYSICS_TIMEOUT) as pool:
+    workers = 0 if config.workers == "ray" else config.workers
+    reward = run_reward(
+        config.reward, seed=config.seed, timeout=config.reward_timeout, memory=config.reward_memory, workers=workers
+    )
+    with make_pool(config.workers, PHYSICS_TIMEOUT) as pool, ExitStack() as stack:
+        stack.callback(close_reward, reward)
 
         def measure(prior: ScenePrior) -> Measured:
             return measure_prior(
                 prior, scenes, num_steps=num_steps, seed=seed, pool=pool, prompts=asked, guidance=config.guidance,
-                slots=config.slots,
+                slots=config.slots, reward=reward,
             )  # fmt: skip
 
         _say(config, f"measuring {scenes} samples of the base prior")

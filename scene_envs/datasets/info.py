@@ -16,9 +16,8 @@ from scene_envs.datasets.store import METADATA
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
 from scene_envs.files import without_digest
 from scene_envs.normalizer import Normalizer
+from scene_envs.scene import POSE_FEATURES
 from scene_envs.scene_types import SceneType
-
-_POSE = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +47,7 @@ class DatasetInfo:
     @property
     def features(self) -> int:
         """D, the length of a slot in the files."""
-        return _POSE + len(self.model_paths) + 1
+        return POSE_FEATURES + len(self.model_paths) + 1
 
     @property
     def stems(self) -> tuple[str, ...]:
@@ -133,12 +132,13 @@ def _whole_slot(normalizer: Normalizer, one_hot: int, file: Path) -> Normalizer:
     """The normalizer of all features of a slot; one that covers the pose alone leaves one-hots as they are."""
     vectors = (normalizer.scale, normalizer.min, normalizer.input_min, normalizer.input_max)
     lengths = {len(vector) for vector in vectors}
-    if lengths == {_POSE}:
+    if lengths == {POSE_FEATURES}:
         kept = (torch.ones, torch.zeros, torch.zeros, torch.ones)
         return Normalizer(*(torch.cat([v, make(one_hot)]) for v, make in zip(vectors, kept, strict=True)))
-    if lengths != {_POSE + one_hot}:
+    if lengths != {POSE_FEATURES + one_hot}:
         raise CorruptFileError(
             f"{str(file)!r}: the normalizer has {sorted(lengths)} features; {one_hot - 1} model paths need "
-            f"{_POSE + one_hot} (3 translation, 9 rotation matrix, {one_hot} one-hot), or the first {_POSE}"
+            f"{POSE_FEATURES + one_hot} (3 translation, 9 rotation matrix, {one_hot} one-hot), or the first "
+            f"{POSE_FEATURES}"
         )
     return normalizer

@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from rich.console import Console
 
+from agents.post_training import post_train_and_compare
 from agents.post_training.curves import draw_curve
 from agents.post_training.demo import run_demo
 from agents.post_training.doctor import diagnose
@@ -72,6 +74,29 @@ def test_page_needs_nothing_but_itself_and_escapes_text(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_report_and_metrics_have_the_trained_reward_before_and_after(tmp_path: Path) -> None:
+    pytest.importorskip("pybullet")
+
+    def squared_count(batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        """A reward that no other figure of the report is equal to; it cannot score the second of three scenes."""
+        valid = torch.arange(len(batch)) != 1 if len(batch) == 3 else None
+        return RewardOutput(batch.counts.float() ** 2, valid=valid)
+
+    prior = tiny_prior(slots=6)
+    config = small_config(tmp_path, iterations=1, reward=squared_count)
+    metrics = post_train_and_compare(config, scenes=3, num_steps=4, prior=prior)
+    on_disk = json.loads((tmp_path / "metrics.json").read_text())
+    for when, measured in (("before", prior), ("after", ScenePrior.load(tmp_path))):
+        squares = measured.sample(3, num_steps=4, seed=100_000).counts.double()[[0, 2]] ** 2
+        assert on_disk[when]["reward"] == pytest.approx(float(squares.mean()))
+        assert on_disk[when]["reward_invalid"] == 1
+    assert on_disk["change"]["reward"] == pytest.approx(metrics["after"]["reward"] / metrics["before"]["reward"] - 1)
+    page = (tmp_path / "report.html").read_text()
+    assert "reward: squared count" in page
+    assert "the trained reward" in page
+    assert f"{metrics['after']['reward']:.2f}" in page
+
+
 def test_demonstration_end_to_end(tmp_path: Path) -> None:
     pytest.importorskip("scene_envs.physics")
     recipes = {

@@ -35,12 +35,13 @@ def say_change(metrics: Mapping[str, Any], run: Run) -> None:
     """Before and after, a line each."""
     before, after = metrics["before"], metrics["after"]
     for name, label in (
+        ("reward", "the trained reward"),
         ("objects", "objects per scene"),
         ("feasible_objects", "feasible as sampled"),
         ("ready_objects", "simulation-ready"),
         ("prompt_match", "match of the prompts"),
     ):
-        if before.get(name) and name in after:
-            change = after[name] / before[name] - 1
-            run.say(f"{label:<20} {before[name]:6.2f} -> {after[name]:6.2f}  ({change:+.0%})")
+        if name in before and name in after:
+            change = f"  ({after[name] / before[name] - 1:+.0%})" if before[name] > 0 else ""
+            run.say(f"{label:<20} {before[name]:6.2f} -> {after[name]:6.2f}{change}")
     run.say(f"{'held-out loss':<20} {metrics['guard']['ratio']:.2f}x of the base prior's")
