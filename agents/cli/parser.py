@@ -183,10 +183,11 @@ def _ask_for_files(key: str, reward: Any, allow_local: bool) -> None:
     for path in local_files(reward):
         if path in allowed_files():
             continue
-        if not allow_local and sys.stdin is not None and sys.stdin.isatty():
+        allowed = allow_local
+        if not allowed and sys.stdin is not None and sys.stdin.isatty():
             print(f"{key}= runs the file {path}. Run it? [y/N] ", end="", file=sys.stderr, flush=True)
-            allow_local = sys.stdin.readline().strip().lower() in ("y", "yes")
-        if not allow_local:
+            allowed = sys.stdin.readline().strip().lower() in ("y", "yes")
+        if not allowed:
             raise InvalidInputError(f"{key}= would run the file {str(path)!r}; add --allow-local if you trust it")
         allow_local_rewards(path)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 
@@ -77,6 +77,10 @@ class Node:
             left += [node.children[action] for action in sorted(node.children, reverse=True)]
 
 
+_OWN = tuple(entry.name for entry in fields(Node) if entry.name not in ("parent", "children"))
+"""Fields of a node that name no other node."""
+
+
 class Tree:
     """A UCT tree over opaque states. The work of an expansion grows with the depth alone, not with the tree.
 
@@ -106,6 +110,25 @@ class Tree:
         self.root = Node(root, actions=actions)
         self.exploration, self.children, self.widening = exploration, children, widening
         self._best = self.root
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Nodes as a flat list, each with the number of its parent, so that deep trees are pickled without recursion."""
+        nodes = self.nodes()
+        number = {id(node): index for index, node in enumerate(nodes)}
+        rows = [
+            (None if node.parent is None else number[id(node.parent)], {name: getattr(node, name) for name in _OWN})
+            for node in nodes
+        ]
+        return {**self.__dict__, "root": rows, "_best": number[id(self._best)]}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        nodes: list[Node] = []
+        for parent, own in state["root"]:
+            node = Node(**own, parent=None if parent is None else nodes[parent])
+            if node.parent is not None:
+                node.parent.children[node.action] = node
+            nodes.append(node)
+        self.__dict__.update(state | {"root": nodes[0], "_best": nodes[state["_best"]]})
 
     def select(self) -> tuple[Node, int] | None:
         """The next expansion: descend by UCB1 to a node that takes another child, and reserve its next action.

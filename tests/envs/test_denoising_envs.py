@@ -40,6 +40,13 @@ def test_check_env_passes_with_warnings_as_errors(prior, height, action_mode, fl
         check_env(env.unwrapped)
 
 
+def test_nothing_but_fixed_objects_is_seen_before_a_mixed_prior_has_drawn_categories(height):
+    env = DenoisingEnv(prior=tiny_prior("dimsum_table", process="mixed"), reward=height, num_steps=3)
+    observation, info = env.reset(seed=0)
+    assert observation["object_mask"].nonzero()[0].tolist() == [0]  # the table
+    assert info["objects"] == 1
+
+
 @pytest.mark.parametrize("action_mode", MODES)
 def test_two_environments_with_one_seed_live_the_same_life(prior, height, action_mode):
     first, second = (gym.make(ID, prior=prior, reward=height, num_steps=3, action_mode=action_mode) for _ in "ab")

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
+import sys
+from typing import Any
 
 import pytest
 
-from agents.planning import BestOfPlanner, UCTPlanner
+from agents.planning import BeamPlanner, BestOfPlanner, GreedyPlanner, MCTSPlanner, UCTPlanner
 from agents.planning.tree import Node, Tree, ucb1
 from scene_envs.errors import InvalidInputError
 from tests.helpers.toy_tree import ToyTree, matches, scrambled
@@ -150,3 +154,33 @@ def test_equal_values_prefer_the_shallowest_first_path() -> None:
         tree.attach(node, action, (action,), 0.5, actions=[])
     assert tree.best().path == (0,)
     assert isinstance(tree.best(), Node)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "planner",
+    [UCTPlanner(parallel=1), MCTSPlanner(children=1), GreedyPlanner(children=1), BeamPlanner(width=1, children=1)],
+    ids=lambda planner: type(planner).__name__,
+)
+def test_a_chain_deeper_than_pythons_recursion_is_searched_copied_and_pickled(planner: Any) -> None:
+    depth = sys.getrecursionlimit() + 200
+    result = planner.plan(ToyTree(lambda path: len(path) / 2 / depth, branching=1, depth=depth), depth)
+    assert result.best_path == (0,) * depth
+    for again in (pickle.loads(pickle.dumps(result)), copy.deepcopy(result)):
+        assert (again.best_path, again.best_value, again.values) == (result.best_path, 0.5, result.values)
+
+
+def test_a_tree_is_pickled_with_its_statistics_and_goes_on_as_it_was() -> None:
+    problem = ToyTree(scrambled, branching=3, depth=4)
+    tree = UCTPlanner(exploration=0.3, parallel=2).plan(problem, 40).tree
+    assert tree is not None
+    again = pickle.loads(pickle.dumps(tree))
+    named = ("path", "value", "visits", "total", "pending", "tried", "open_children", "action")
+    for node, other in zip(tree.nodes(), again.nodes(), strict=True):
+        assert [getattr(node, name) for name in named] == [getattr(other, name) for name in named]
+        assert list(node.children) == list(other.children)
+    assert again.best().path == tree.best().path
+    for _ in range(3):  # the same expansions are chosen next
+        node, action = tree.select() or (None, None)
+        twin, same = again.select() or (None, None)
+        assert (node and node.path, action) == (twin and twin.path, same)
