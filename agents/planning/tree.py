@@ -112,7 +112,10 @@ class Tree:
         self._best = self.root
 
     def __getstate__(self) -> dict[str, Any]:
-        """Nodes as a flat list, each with the number of its parent, so that deep trees are pickled without recursion."""
+        """Nodes as a flat list, each with the number of its parent.
+
+        Pickling and copying then need no recursion, however deep the tree is.
+        """
         nodes = self.nodes()
         number = {id(node): index for index, node in enumerate(nodes)}
         rows = [
