@@ -238,7 +238,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     ) -> list[SearchState]:
         """The children of (state, action) pairs, denoised as one batch; the current state stays.
 
-        ``steering`` makes what watches the denoising, as :class:`agents.planning.Particles`.
+        ``steering`` makes what watches the denoising, as :data:`scene_envs.envs.search.Steering` says.
         """
         children = self.problem.expand_batch(pairs, steering)
         self._remember(children)

@@ -72,6 +72,14 @@ def test_no_module_imports_upwards(package: str) -> None:
     assert upwards == []
 
 
+@pytest.mark.parametrize(("package", "above"), [("scene_envs", "agents|rewards"), ("rewards", "agents")])
+def test_no_module_names_a_package_above_its_own(package: str, above: str) -> None:
+    """Not in code, and not in docstrings."""
+    named = re.compile(rf"\b(?:{above})\.[a-z_]\w*")
+    found = [(file.name, named.findall(file.read_text())) for file in (ROOT / package).rglob("*.py")]
+    assert [(name, words) for name, words in found if words] == []
+
+
 def test_production_code_imports_no_testing_module() -> None:
     testing = {name for name in import_graph() if name.split(".")[-1] == "testing"}
     assert [
