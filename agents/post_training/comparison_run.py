@@ -70,12 +70,12 @@ def post_train_and_compare(
                 slots=config.slots, reward=reward,
             )  # fmt: skip
 
-        _say(config, f"measuring {scenes} samples of the base prior")
+        say_stage(config, f"measuring {scenes} samples of the base prior")
         before = measure(base)
-        _say(config, f"measuring {scenes} samples of the post-trained prior")
+        say_stage(config, f"measuring {scenes} samples of the post-trained prior")
         after = measure(result.prior)
     seconds = {"training": round(trained - started, 1), "measuring": round(time.perf_counter() - trained, 1)}
-    _say(config, "drawing the report")
+    say_stage(config, "drawing the report")
     title = f"Steering {base.scene_type.name.replace('_', ' ')} toward {reward_name(config.reward).replace('_', ' ')}"
     extra = {"stage_seconds": seconds, "num_steps": num_steps}
     return write_comparison(result, before, after, title=title, extra=extra)
@@ -93,6 +93,7 @@ def _measured_prompts(config: PostTrainConfig, prior: ScenePrior, count: int) ->
     return deck.deal(count, Generator().manual_seed(config.seed + SAMPLE_SEED))
 
 
-def _say(config: PostTrainConfig, text: str) -> None:
+def say_stage(config: PostTrainConfig, text: str) -> None:
+    """Tell on stderr what is done next, unless the run shows no progress."""
     if config.logger.progress != "none":
         print(text, file=sys.stderr, flush=True)

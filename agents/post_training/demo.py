@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from agents.post_training.comparison import Measured, draw_side_by_side, measure_prior, number_rows
-from agents.post_training.comparison_run import PHYSICS_TIMEOUT, SAMPLE_SEED
+from agents.post_training.comparison_run import PHYSICS_TIMEOUT, SAMPLE_SEED, say_stage
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.report import Page, Picture, Section, Tile, write_report
 from agents.post_training.run_files import write_metrics
@@ -59,7 +58,7 @@ def run_demo(
     base = ScenePrior.load(next(iter(configs.values())).prior if prior is None else prior)
     results = {}
     for name, config in configs.items():
-        _say(config, f"post-training toward {_goal(config)} with {_algorithm(config)}")
+        say_stage(config, f"post-training toward {_goal(config)} with {_algorithm(config)}")
         results[name] = post_train(config, prior=base)
     trained = time.perf_counter()
     measured = _measure(results, base, scenes, num_steps)
@@ -85,7 +84,7 @@ def _measure(
     measured = {}
     with make_pool(config.workers, PHYSICS_TIMEOUT) as pool:
         for name, prior in {"base": base, **{name: result.prior for name, result in results.items()}}.items():
-            _say(config, f"measuring {scenes} samples of the prior {name!r}")
+            say_stage(config, f"measuring {scenes} samples of the prior {name!r}")
             measured[name] = measure_prior(
                 prior, scenes, num_steps=num_steps, seed=config.seed + SAMPLE_SEED, pool=pool
             )
@@ -158,8 +157,3 @@ def _goal(config: PostTrainConfig) -> str:
 
 def _algorithm(config: PostTrainConfig) -> str:
     return config.algorithm.name.upper().replace("_", "-")
-
-
-def _say(config: PostTrainConfig, text: str) -> None:
-    if config.logger.progress != "none":
-        print(text, file=sys.stderr, flush=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from agents.cli.run_folder import Run
+    from scene_envs.progress import Progress
 
 FRESH_PRIOR = "dimsum_table"
 """The prior of a search that starts from fresh samples."""
@@ -46,9 +49,6 @@ class SearchKeys(SearchConfig):
 
 def run(settings: SearchKeys, run: Run) -> None:
     """Search; the search writes its own metrics and pictures."""
-    from rich.console import Console
-    from rich.progress import Progress
-
     from agents.planning import run_search
     from agents.utils.interrupts import Terminated
     from rewards.isolation import close_reward, is_foreign, run_reward
@@ -60,15 +60,7 @@ def run(settings: SearchKeys, run: Run) -> None:
     objective = settings.objective
     if is_foreign(objective):
         objective = run_reward(objective, seed=settings.seed, workers=settings.workers, **limits)
-    with Progress(console=Console(stderr=True)) as bar:
-        tasks: dict[str, Any] = {}
-
-        def show(planner: str, done: int, budget: int, best: float) -> None:
-            if planner not in tasks:
-                tasks[planner] = bar.add_task(planner, total=budget)
-            nfe = f"{done * search.nfe_per_scene} NFE"
-            bar.update(tasks[planner], completed=done, description=f"{planner}, best {best:.3f}, {nfe}")
-
+    with _search_progress(search.nfe_per_scene) as show:
         try:
             outcome = run_search(prior, objective, config=search, scenes=scenes, output=settings.output, progress=show)
         finally:
@@ -97,6 +89,28 @@ def run(settings: SearchKeys, run: Run) -> None:
     if metrics["stopped"] in ("interrupt", "terminated"):
         run.write_config()
         raise Terminated if metrics["stopped"] == "terminated" else KeyboardInterrupt
+
+
+@contextmanager
+def _search_progress(nfe_per_scene: int) -> Iterator[Callable[[str, int, int, float], None]]:
+    """A bar, or lines, for each planner in turn; yields the function that advances it.
+
+    It is called with the planner, the scenes made, the scenes that will be made, and the best value.
+    """
+    from scene_envs.progress import Progress
+
+    with ExitStack() as stack:
+        shown: dict[str, Progress] = {}
+
+        def show(planner: str, done: int, budget: int, best: float) -> None:
+            if planner not in shown:
+                stack.close()  # the bar of the planner before
+                shown.clear()
+                shown[planner] = stack.enter_context(Progress(planner, budget, always=(budget,)))
+            text = f"best {best:.3f}, {done * nfe_per_scene} NFE"
+            shown[planner].update(done, text, f"{planner}: {done}/{budget} scenes, {text}")
+
+        yield show
 
 
 def _summary(metrics: Mapping[str, Any], branching: int) -> str:
