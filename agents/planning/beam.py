@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from agents.planning.ledger import Ledger, Member, PlanResult, Progress, Searchable, best_different
 from agents.planning.registry import PlannerSettings, check_at_least, register_planner
@@ -29,10 +29,6 @@ class BeamPlanner(PlannerSettings):
 
     def __post_init__(self) -> None:
         check_at_least(self, 1, "width", "children")
-
-    def make(self, branching: int) -> BeamPlanner:
-        """The planner."""
-        return replace(self, children=branching if self.children is None else self.children)
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the current state."""

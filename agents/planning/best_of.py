@@ -27,10 +27,6 @@ class BestOfPlanner(PlannerSettings):
     def __post_init__(self) -> None:
         check_at_least(self, 1, "parallel")
 
-    def make(self, branching: int) -> BestOfPlanner:
-        """The planner."""
-        return self
-
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions, or as many as the root has actions."""
         ledger = Ledger(problem, budget, progress)

@@ -53,10 +53,6 @@ class EvolutionPlanner(PlannerSettings):
         if self.crossover > 1:
             raise InvalidInputError(f"planner {self.name}: crossover={self.crossover} is a chance, in 0..1")
 
-    def make(self, branching: int) -> EvolutionPlanner:
-        """The planner."""
-        return replace(self, children=branching if self.children is None else self.children)
-
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the current state; without ``with_scene`` there are no splices."""
         ledger = Ledger(problem, budget, progress)

@@ -113,10 +113,6 @@ class FeynmanKacPlanner(PlannerSettings):
         if self.begin >= 1:
             raise InvalidInputError(f"planner {self.name}: begin={self.begin} is a share of the steps, below 1")
 
-    def make(self, branching: int) -> FeynmanKacPlanner:
-        """The planner."""
-        return self
-
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the current state.
 

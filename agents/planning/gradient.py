@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -118,10 +118,6 @@ class GradientPlanner(PlannerSettings):
             raise InvalidInputError(f"planner {self.name}: begin={self.begin} is a share of the steps, below 1")
         if not callable(self.weight) and self.weight not in WEIGHTS:
             raise unknown_name("differentiable weight", str(self.weight), WEIGHTS)
-
-    def make(self, branching: int) -> GradientPlanner:
-        """The planner."""
-        return replace(self, children=branching if self.children is None else self.children)
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the current state.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from agents.planning.ledger import Candidate, Ledger, PlanResult, Progress, Searchable
 from agents.planning.registry import PlannerSettings, check_at_least, register_planner
@@ -28,10 +28,6 @@ class GreedyPlanner(PlannerSettings):
 
     def __post_init__(self) -> None:
         check_at_least(self, 1, "children")
-
-    def make(self, branching: int) -> GreedyPlanner:
-        """The planner."""
-        return replace(self, children=branching if self.children is None else self.children)
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the current state."""

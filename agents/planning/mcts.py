@@ -55,10 +55,6 @@ class MCTSPlanner(PlannerSettings):
         if self.rollout not in ROLLOUTS:
             raise unknown_name("rollout", str(self.rollout), ROLLOUTS)
 
-    def make(self, branching: int) -> MCTSPlanner:
-        """The planner."""
-        return replace(self, children=branching if self.children is None else self.children)
-
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the problem's current state."""
         ledger = Ledger(problem, budget, progress)

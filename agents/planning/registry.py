@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, TypeVar
 
 from scene_envs.errors import InvalidInputError
@@ -14,8 +13,12 @@ ENTRY_POINT_GROUP = "scene_envs.planners"
 """Entry points of installed packages: modules that call :func:`register_planner` when they are imported."""
 
 
+PER_STATE = ("children", "parallel")
+"""Keys of planners that are null for as many as the environment has actions per state."""
+
+
 @dataclass(frozen=True)
-class PlannerSettings(ABC):
+class PlannerSettings:
     """A planner by name, and its keys.
 
     Attributes:
@@ -27,13 +30,17 @@ class PlannerSettings(ABC):
     """Whether it chooses itself how many children a state gets. The environment of a search run then has as many
     actions as the budget instead of ``branching``."""
 
-    @abstractmethod
     def make(self, branching: int) -> Any:
         """The planner: an object with ``plan(problem, budget, progress)``, as :class:`agents.planning.UCTPlanner`.
+
+        Settings that plan by themselves are their own planner, with ``branching`` in place of null for
+        :data:`PER_STATE`.
 
         Args:
             branching: children of a state, as the user asks for them.
         """
+        unset = {name: branching for name in PER_STATE if getattr(self, name, branching) is None}
+        return replace(self, **unset) if unset else self
 
 
 _PLANNERS: Registry[type[PlannerSettings]] = Registry(

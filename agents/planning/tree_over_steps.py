@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -74,10 +74,6 @@ class TreeOverStepsPlanner(PlannerSettings):
         check_at_least(self, 0, "exploration", "widening")
         if not self.stops or any(not 0 < a < b for a, b in zip(self.stops, [*self.stops[1:], 1.0], strict=True)):
             raise InvalidInputError(f"planner {self.name}: stops={list(self.stops)} are no increasing shares, in 0..1")
-
-    def make(self, branching: int) -> TreeOverStepsPlanner:
-        """The planner."""
-        return replace(self, children=branching if self.children is None else self.children)
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the current state; one that begins midway counts as a whole one.

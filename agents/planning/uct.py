@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from agents.planning.ledger import Candidate, Ledger, PlanResult, Progress, Searchable
 from agents.planning.registry import PlannerSettings, check_at_least, register_planner
@@ -40,14 +40,6 @@ class UCTPlanner(PlannerSettings):
     def __post_init__(self) -> None:
         check_at_least(self, 1, "parallel", "children")
         check_at_least(self, 0, "exploration", "widening", "max_loss")
-
-    def make(self, branching: int) -> UCTPlanner:
-        """The planner."""
-        return replace(
-            self,
-            parallel=branching if self.parallel is None else self.parallel,
-            children=branching if self.children is None else self.children,
-        )
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions on the tree below the problem's current state."""

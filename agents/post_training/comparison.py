@@ -301,7 +301,7 @@ def _reward_figures(
     batch: SceneBatch, reward: Any, prompts: Sequence[str] | None, pool: PhysicsPool | None
 ) -> dict[str, float]:
     """Mean of ``reward`` over the scenes that it can score, and the number of the others."""
-    output = evaluate_reward(reward, batch, RewardContext(prompts and tuple(prompts), pool))
+    output = evaluate_reward(reward, batch, RewardContext(None if prompts is None else tuple(prompts), pool))
     value = output.value[output.is_valid].double()
     lost = {"reward_invalid": float(len(batch) - len(value))}
     return {"reward": float(value.mean()), "reward_sem": _standard_error(value), **lost} if len(value) else lost

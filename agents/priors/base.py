@@ -10,6 +10,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from agents.diffusion import (
+    GaussianProcess,
     Preconditioning,
     ResidualVariance,
     ReverseStep,
@@ -25,7 +26,7 @@ from agents.priors.prompt_validation import check_prompts, no_text
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
-from scene_envs.scene import SceneBatch
+from scene_envs.scene import TRANSLATION, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
 UNIONS = ("one_type", "any")
@@ -47,6 +48,8 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
     SceneBatch('dimsum_table', (2, 34, 20))
     """
 
+    process: GaussianProcess
+    """Of the poses, and of all else that is continuous."""
     denoiser: Any
     """The network inside its process, a module with ``.network``."""
     adapter: AdapterFacts | None = None
@@ -151,6 +154,11 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
         Known entries are certain; at the last step all are. ``eta`` scales the noise of what is continuous, as in
         :meth:`sample`.
         """
+
+    def estimate(self, step: int, table: StepTable) -> tuple[float, Tensor]:
+        """Weight of the denoised translations in x_{t-1}, and their standard deviation (3,), normalised."""
+        weight, std = self.process.estimate(int(table.timesteps[step]), int(table.previous[step]), self.residual)
+        return weight, std[TRANSLATION].to(self.device)
 
     @torch.no_grad()
     def sample_tensor(

@@ -26,7 +26,7 @@ from agents.priors.rotation_codes import SceneCode
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
-from scene_envs.scene import TRANSLATION, SceneBatch
+from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type
 
 SCENE_MOMENTS = ("feature", "scene")
@@ -199,11 +199,6 @@ class ContinuousPrior(ScenePrior):
         """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; used by :meth:`inpaint`."""
         x0 = self.encode(batch)
         return self._chain_with_noised(x0, self._entries(~mask), table, generators, resample, hook, start)
-
-    def estimate(self, step: int, table: StepTable) -> tuple[float, Tensor]:
-        """Weight of the denoised translations in x_{t-1}, and their standard deviation (3,), normalised."""
-        weight, std = self.process.estimate(int(table.timesteps[step]), int(table.previous[step]), self.residual)
-        return weight, std[TRANSLATION].to(self.device)
 
     def _chain_with_noised(
         self,

@@ -39,7 +39,7 @@ from agents.priors.observed_scenes import Noise
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
-from scene_envs.scene import POSE_FEATURES, TRANSLATION, SceneBatch
+from scene_envs.scene import POSE_FEATURES, SceneBatch
 from scene_envs.scene_types import get_scene_type
 
 CATEGORY_LOSSES = ("cross_entropy", "bound")
@@ -222,11 +222,6 @@ class MixedPrior(TrainableMixedPrior):
         x = self.clamp(self.with_states(noise[..., :POSE_FEATURES], probs, noise))
         first, x = (0, x) if start is None else (start[0], start[1].to(x))
         return self.run_chain(x, table, generators, observed, text, guidance, resample, hook=hook, first=first)
-
-    def estimate(self, step: int, table: StepTable) -> tuple[float, Tensor]:
-        """Weight of the denoised translations in x_{t-1}, and their standard deviation (3,), normalised."""
-        weight, std = self.process.estimate(int(table.timesteps[step]), int(table.previous[step]), self.residual)
-        return weight, std[TRANSLATION].to(self.device)
 
     @torch.no_grad()
     def run_chain(

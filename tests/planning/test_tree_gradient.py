@@ -10,32 +10,17 @@ from torch import Tensor
 
 from agents.diffusion import GaussianProcess, Preconditioning, ResidualVariance, StepTable
 from agents.diffusion.schedules import make_schedule
-from agents.planning import GradientPlanner, GreedyPlanner, PlanResult, TreeOverStepsPlanner
+from agents.planning import GradientPlanner, GreedyPlanner, TreeOverStepsPlanner
 from agents.planning.branches import Branches
 from agents.planning.gradient import Guidance, overlap
 from agents.priors.testing import tiny_prior
-from rewards import RewardContext, RewardOutput
-from scene_envs.envs import SearchEnv
+from rewards import RewardContext
 from scene_envs.errors import InvalidInputError, SceneEnvsError
 from scene_envs.scene import CATEGORY, TRANSLATION, SceneBatch
+from tests.helpers.small_plans import SLOTS, near_middle, plan
 from tests.helpers.toy_tree import ToyTree, scrambled
 
-SLOTS = 12
 PROCESSES = pytest.mark.parametrize("process", ["mixed", "continuous"])
-
-
-def near_middle(batch: SceneBatch, context: RewardContext) -> RewardOutput:
-    """Half of the free objects within 20 cm of the middle, so that Φ stays below 1; the others are to blame."""
-    central = batch.is_free & (batch.translations[..., :2].norm(dim=-1) < 0.2)
-    return RewardOutput(0.5 * central.sum(-1).float(), object_flags={"feasible": central})
-
-
-def plan(planner: Any, process: str = "mixed", budget: int = 14) -> tuple[PlanResult, SearchEnv]:
-    """A plan from nothing but the prior; the environment counts denoiser evaluations."""
-    prior = tiny_prior(process=process)
-    env = SearchEnv(prior=prior, objective=near_middle, branching=50, num_steps=4, max_depth=50, slots=SLOTS)
-    env.reset(seed=1, options={"scene": SceneBatch.empty(prior.scene_type, 1, SLOTS)})
-    return planner.plan(env, budget), env
 
 
 # -- trees over steps -----------------------------------------------------------------------------
