@@ -39,7 +39,7 @@ class PlannerSettings:
         Args:
             branching: children of a state, as the user asks for them.
         """
-        unset = {name: branching for name in PER_STATE if getattr(self, name, branching) is None}
+        unset: dict[str, Any] = {name: branching for name in PER_STATE if getattr(self, name, branching) is None}
         return replace(self, **unset) if unset else self
 
 

@@ -19,9 +19,6 @@ class Beam(PlannerSettings):
     name: str = "levels"
     width: int = 2
 
-    def make(self, branching):
-        return self
-
     def plan(self, problem, budget, progress=None):
         """Spend up to ``budget`` expansions below the current state."""
         root = problem.clone_state()
