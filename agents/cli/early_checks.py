@@ -66,7 +66,8 @@ def check_early(settings: Any, config_dir: str = "", module: ModuleType | None =
         raise InvalidInputError(f"scene={str(scene)[:200]}: give the name of one scene type, or several joined by +")
     for scene in str(getattr(settings, "scene", "") or "").split("+"):
         _check_name("scene type", scene, known_scenes, "scene_envs.grammars", config_dir)
-    for mask in [getattr(settings, "mask", None), *(getattr(settings, "masks", None) or [])]:
+    asked = [getattr(settings, "mask", None), _dotted(settings, "inpaint.mask")]
+    for mask in [*asked, *(getattr(settings, "masks", None) or [])]:
         _check_name("mask", mask, known_masks, "scene_envs.envs.masks", config_dir)
     if isinstance(device := getattr(settings, "device", "cpu"), str):
         _check_device(device)
@@ -139,7 +140,7 @@ def _check_name(kind: str, value: Any, known: Any, registry: str, config_dir: st
     """Refuse a name that no option and no package has, unless this process may have registered more."""
     if registry in sys.modules:
         return
-    name = value.get("name") if isinstance(value, dict) and set(value) == {"name"} else value
+    name = value.get("name") if isinstance(value, dict) else value
     if isinstance(name, str) and name.isidentifier() and (names := known(config_dir)) and name not in names:
         raise unknown_name(kind, name, names)
 
