@@ -67,7 +67,7 @@ class DenoisingEnv(SpecMixin, gym.Env[Any, np.ndarray]):
     |---|---|---|
     | `scene` | `Box(-10, 10, (N, D), float32)` | x_t, normalised |
     | `timestep` | `Box(0, T, (1,), int64)` | diffusion timestep t, 0 when the scene is finished |
-    | `object_mask` | `MultiBinary(N)` | slots whose arg-max category is an asset, not *empty* |
+    | `object_mask` | `MultiBinary(N)` | slots whose category is drawn and is an asset (arg-max), not *empty* |
     | `prompt` | `Box(0, V-1, (L,), int64)` | tokens of the prompt, padded with 0; only if the prior reads prompts |
 
     `info` holds the same numbers at every reset and step: `step` (steps taken), `timestep`, `objects` (slots that
