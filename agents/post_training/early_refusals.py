@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Generator
 
 from agents.post_training.config import PostTrainConfig
@@ -13,6 +14,8 @@ from scene_envs.scene import SceneBatch
 
 _PROBED = 2
 """Real scenes on which the reward and the mask of a run are tried."""
+_PROBED_WITH_PROMPTS = 8
+"""The same in a run under the prompts of its real scenes."""
 
 
 def check_it_can_learn(learner: Learner, real: SceneBatch, prompts: PromptSets | None) -> None:
@@ -31,14 +34,15 @@ def check_it_can_learn(learner: Learner, real: SceneBatch, prompts: PromptSets |
             nothing to regenerate in any scene.
         TrainingError: the reward scores none of the real scenes.
     """
-    config, scenes = learner.config, real[:_PROBED]
-    texts = _texts(learner, len(scenes), prompts)
+    config = learner.config
+    scenes, texts = _tried(learner, real, prompts)
     score = learner.scorer(scenes, texts)
     valid = bool(score.valid.any())
     if valid and score.per_object is None and getattr(config.algorithm, "credit", "") == "object":
         raise no_credit_per_object()
     if config.prompt in (None, "data") and not learner.processes.any(valid):
-        raise nothing_scored(config, f"none of {len(scenes)} real scenes, so that nothing was sampled")
+        pairs = "" if texts is None else " with a prompt"
+        raise nothing_scored(config, f"none of {len(scenes)} real scenes{pairs}, so that nothing was sampled")
     if learner.inpaint_deck is None:
         return
     if config.inpaint.scenes == "real":
@@ -55,8 +59,15 @@ def nothing_scored(config: PostTrainConfig, what: str) -> TrainingError:
     )
 
 
-def _texts(learner: Learner, count: int, prompts: PromptSets | None) -> list[str] | None:
-    """One prompt for each of the first ``count`` real scenes; None in a run without prompts."""
+def _tried(learner: Learner, real: SceneBatch, prompts: PromptSets | None) -> tuple[SceneBatch, list[str] | None]:
+    """The first real scenes and a prompt for each, None in a run without prompts.
+
+    Under their own prompts more scenes are tried, each with all of its prompts: rewards may read one kind alone.
+    """
     if learner.config.prompt == "data" and prompts is not None:
-        return [prompts(row)[0] for row in range(count)]
-    return None if learner.deck is None else learner.deck.deal(count, Generator().manual_seed(learner.config.seed))
+        pairs = [(row, text) for row in range(min(_PROBED_WITH_PROMPTS, len(real))) for text in prompts(row)]
+        return real[torch.tensor([row for row, _ in pairs])], [text for _, text in pairs]
+    scenes = real[:_PROBED]
+    if learner.deck is None:
+        return scenes, None
+    return scenes, learner.deck.deal(len(scenes), Generator().manual_seed(learner.config.seed))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -65,9 +66,23 @@ def test_real_scenes_are_scored_with_their_own_prompts_before_anything_is_sample
 
     monkeypatch.setattr(learner_module.Learner, "rollout", None)  # nothing is sampled
     config = changed(small_config(tmp_path, reward=no_scene), {"prompt": "data", "guard.samples": 0})
-    with pytest.raises(TrainingError, match="scored none of 2 real scenes, so that nothing was sampled"):
+    with pytest.raises(TrainingError, match=r"scored none of \d+ real scenes with a prompt, so that nothing"):
         post_train(config, prior=tiny_prior(process="mixed", text=True))
     texts = asked[-1]
-    batch = SceneBatch.load(tmp_path / SCENES_NAME)[:2]
-    for text, facts in zip(texts, scene_facts(batch), strict=True):
+    batch = SceneBatch.load(tmp_path / SCENES_NAME)[:8]
+    own = np.repeat(np.arange(8), len(texts) // 8)
+    for text, facts in zip(texts, scene_facts(batch[torch.from_numpy(own)]), strict=True):
         assert all(check.holds for check in parse_prompt(text, batch.scene_type).check(facts))
+
+
+def test_a_reward_that_reads_one_kind_of_prompts_alone_is_not_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def relations_alone(batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        valid = [text.startswith("A scene where") for text in context.prompts or [""] * len(batch)]
+        return RewardOutput(batch.counts.float(), valid=torch.tensor(valid))
+
+    monkeypatch.setattr(learner_module.Learner, "rollout", None)
+    config = changed(small_config(tmp_path, reward=relations_alone), {"prompt": "data", "guard.samples": 0})
+    with pytest.raises(TypeError, match="'NoneType' object is not callable"):  # sampling would begin
+        post_train(config, prior=tiny_prior(process="mixed", text=True))
