@@ -11,6 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
+from trimesh.visual.material import PBRMaterial
+from trimesh.visual.texture import TextureVisuals
 
 from scene_envs.assets import import_report, load_library
 from scene_envs.assets.importing import decomposition, user_library
@@ -66,6 +69,25 @@ def test_faces_of_an_obj_are_counted_before_they_are_read(tmp_path: Path, monkey
     assert "box.obj has 12 triangles" in refused(tmp_path, "more than the 11 ")
     monkeypatch.setenv("SCENE_ENVS_IMPORT_TRIANGLES", "12")
     assert load_library(tmp_path).names == ("box",)
+
+
+@pytest.mark.filterwarnings("ignore:Image size")  # Pillow's own limit is higher
+@pytest.mark.parametrize("kind", ["obj", "glb"])
+def test_a_small_file_with_a_huge_texture_is_refused_before_it_is_decoded(tmp_path: Path, kind: str) -> None:
+    texture = Image.new("1", (12_000, 9_000))  # 14 kB on the disk, 430 MB as colours
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    if kind == "glb":
+        small = TextureVisuals(uv=np.zeros((8, 2)), material=PBRMaterial(baseColorTexture=texture))
+        trimesh.Trimesh(box.vertices, box.faces, visual=small, process=False).export(listed(tmp_path, "box.glb"))
+    else:
+        texture.save(tmp_path / "huge.png")
+        (tmp_path / "box.mtl").write_text("newmtl skin\nmap_Kd huge.png\n")
+        corners = "".join(f"v {x} {y} {z}\n" for x, y, z in box.vertices.tolist())
+        faces = "".join(f"f {a + 1}/1 {b + 1}/1 {c + 1}/1\n" for a, b, c in box.faces.tolist())
+        listed(tmp_path, "box.obj").write_text(f"mtllib box.mtl\n{corners}vt 0 0\nusemtl skin\n{faces}")
+    assert sum(file.stat().st_size for file in tmp_path.iterdir()) < READ_HERE
+    text = refused(tmp_path, "a texture of 12,000 x 9,000 pixels, more than the 67,108,864")
+    assert f"box.{kind}" in text
 
 
 def test_without_a_list_a_file_beyond_the_limits_is_left_out_and_told(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scene_envs.assets.base import Array
 from scene_envs.assets.importing.limits import check_file, check_triangles, seconds_left
 from scene_envs.assets.importing.model import Color
-from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
+from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, SceneEnvsError
 
 if TYPE_CHECKING:
     import trimesh
@@ -29,6 +29,8 @@ _MOST_SMOOTHED = 100_000
 """Triangles up to which corners are smoothed."""
 _FINE_TEXTURE, _TEXTURE_COLORS = 500, 32
 """Textured meshes are cut into at least this many triangles, with at most so many colours."""
+_MOST_PIXELS = 8192 * 8192
+"""Of a texture."""
 _SAMPLES = np.array(
     [[a, b, 4 - a - b] for a in range(5) for b in range(5 - a)], dtype=np.float64
 ) / 4.0  # fmt: skip
@@ -61,7 +63,11 @@ def read_mesh(path: Path) -> list[trimesh.Trimesh]:
     options: dict[str, Any] = {"split_objects": True} if suffix == ".obj" else {}
     try:
         scene: Any = trimesh.load_scene(str(path), process=False, **options)
+        for geometry in scene.geometry.values():
+            _check_texture(geometry, path)
         pieces = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
+    except SceneEnvsError:
+        raise
     except ImportError as error:
         raise MissingDependencyError(
             f"{path} needs a package that is not installed ({error}); COLLADA files need "
@@ -105,6 +111,17 @@ def _check_mesh(mesh: trimesh.Trimesh, path: Path) -> None:
         raise CorruptFileError(f"{path}: vertex {row} is {vertices[row].tolist()}; coordinates must be finite")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise CorruptFileError(f"{path}: a triangle refers to vertex {int(faces.max())} of {len(vertices)}")
+
+
+def _check_texture(mesh: Any, path: Path) -> None:
+    """Refuse a texture of too many pixels before it is decoded: a file of some kB may hold a gigabyte of them."""
+    image = _image(getattr(getattr(mesh, "visual", None), "material", None))
+    width, height = getattr(image, "size", (0, 0))
+    if width * height > _MOST_PIXELS:
+        raise InvalidInputError(
+            f"{path} has a texture of {width:,} x {height:,} pixels, more than the {_MOST_PIXELS:,} that one may have; "
+            "scale it down"
+        )
 
 
 def _axes(path: Path) -> Array:
