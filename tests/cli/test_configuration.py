@@ -153,6 +153,7 @@ def test_cfg_job_prints_and_runs_nothing(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_multirun_has_a_folder_for_each(tmp_path: Path) -> None:
     words = ["generate", "count=2", "shard_size=2", "workers=0", "progress=false", f"output={tmp_path}"]
     assert main([*words, "--multirun", "seed=0,1"]) == 0

@@ -36,6 +36,7 @@ def plan(planner: Any, process: str = "mixed", budget: int = 14) -> tuple[PlanRe
     return planner.plan(env, budget), env
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "planner",
     [EvolutionPlanner(population=3, children=2, crossover=0.8), FeynmanKacPlanner(particles=4, begin=0.0)],

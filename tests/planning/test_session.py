@@ -88,7 +88,7 @@ def test_a_killed_run_goes_on_bit_for_bit(planner: str, prior: ScenePrior, tmp_p
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
-@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("count", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_an_interrupt_keeps_the_best_and_the_same_call_goes_on(
     planner: str, count: int, prior: ScenePrior, tmp_path: Path
 ) -> None:
@@ -130,6 +130,7 @@ def test_limits(planner: str, prior: ScenePrior) -> None:
     assert by_time.search.values == by_nfe.search.values[:3]
 
 
+@pytest.mark.slow
 def test_searches_side_by_side_are_those_alone(prior: ScenePrior) -> None:
     sizes: list[int] = []
 
@@ -283,6 +284,7 @@ def test_an_error_of_one_plan_ends_all_and_is_raised() -> None:
         Session(broken).run(Impatient(), [(), ()], budget=20)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("act", "status"), [(interrupt, 130), (lambda: os.kill(os.getpid(), signal.SIGTERM), 143)])
 def test_an_interrupted_command_says_so_and_can_go_on(
     prior: ScenePrior, tmp_path: Path, capsys: pytest.CaptureFixture[str], act: Callable[[], None], status: int
