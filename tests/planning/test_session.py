@@ -77,7 +77,7 @@ def test_a_killed_run_goes_on_bit_for_bit(planner: str, prior: ScenePrior, tmp_p
     journal = tmp_path / "search.journal"
     content = journal.read_bytes()
     shares = (0.999, 0.5, 0.0001, 0)  # a kill while writing the last record, in the middle, the first, none
-    for share in shares if planner == "greedy" else shares[:2]:  # what is left of no record does not hang on the planner
+    for share in shares if planner == "greedy" else shares[:2]:  # a journal without a record is of any planner
         journal.write_bytes(content[: int(share * len(content))])
         objective = Counting()
         again = run_search(prior, objective, output=tmp_path, **settings)
