@@ -2,6 +2,8 @@
 
 import gc
 import os
+import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -11,6 +13,9 @@ import pytest
 for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # parallel tests do not fight for cores
 os.environ.setdefault("MPLBACKEND", "Agg")
+_MEMORY = "/dev/shm"
+if "TMPDIR" not in os.environ and os.path.isdir(_MEMORY) and shutil.disk_usage(_MEMORY).free > 4 * 2**30:
+    os.environ["TMPDIR"], tempfile.tempdir = _MEMORY, None  # files of tests wait for no disk
 gc.disable()  # what collection imports is kept: the search of it for garbage costs seconds
 
 
@@ -77,7 +82,12 @@ def pytest_runtest_call() -> None:
 
 
 def _seed_torch() -> None:
-    """Seed torch's default generator as pytest-randomly seeds those of ``random`` and numpy."""
+    """Seed torch's default generator as pytest-randomly seeds those of ``random`` and numpy.
+
+    ``torch.manual_seed`` keeps a stack trace per call and kind of device until that device starts: milliseconds each.
+    """
     import torch
 
-    torch.manual_seed(0)
+    torch.default_generator.manual_seed(0)
+    if torch.cuda.is_initialized():
+        torch.cuda.manual_seed_all(0)

@@ -149,17 +149,18 @@ class BodyPool:
         # A shared small visual: without one PyBullet would read the collision mesh again for every body.
         visual = bullet.createVisualShape(bullet.GEOM_BOX, halfExtents=(1e-3, 1e-3, 1e-3), physicsClientId=client)
         self._bodies, self._parking = {}, {}
-        for key in sorted(sizes):  # one order in every process, whatever was asked for first
-            shape = self._shape(key)
-            self._bodies[key] = []
-            for _ in range(sizes[key]):
-                place = (0.0, 0.0, _PARKING + _PARKING_STEP * len(self._parking))
-                body = self._body(key[0], shape, visual, place)
-                self._parking[body] = place
-                self._bodies[key].append(body)
+        with tempfile.TemporaryDirectory() as folder:
+            for key in sorted(sizes):  # one order in every process, whatever was asked for first
+                shape = self._shape(key, Path(folder))
+                self._bodies[key] = []
+                for _ in range(sizes[key]):
+                    place = (0.0, 0.0, _PARKING + _PARKING_STEP * len(self._parking))
+                    body = self._body(key[0], shape, visual, place)
+                    self._parking[body] = place
+                    self._bodies[key].append(body)
 
-    def _shape(self, key: BodyKey) -> int:
-        """Collision shape of an asset: a compound of its convex parts, about the centre of mass."""
+    def _shape(self, key: BodyKey, folder: Path) -> int:
+        """Collision shape of an asset: a compound of its convex parts, about the centre of mass, from a file."""
         category, level = key
         if key not in self._wavefronts:
             geometry: LevelGeometry = getattr(self._library.assets[category], level)
@@ -167,12 +168,11 @@ class BodyPool:
             self._wavefronts[key] = _wavefront(
                 [SCALE * (inset_hull(part, MARGIN) - center) @ axes for part in geometry.parts]
             )
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "hulls.obj"
-            path.write_text(self._wavefronts[key])
-            shape = int(
-                self.bullet.createCollisionShape(self.bullet.GEOM_MESH, fileName=str(path), physicsClientId=self.client)
-            )
+        path = folder / f"{category}-{level}.obj"
+        path.write_text(self._wavefronts[key])
+        shape = int(
+            self.bullet.createCollisionShape(self.bullet.GEOM_MESH, fileName=str(path), physicsClientId=self.client)
+        )
         if shape < 0:
             name = self._library.assets[category].asset.name
             raise PhysicsError(f"PyBullet refused the collision shape of asset {name!r} ({level} parts)")

@@ -294,6 +294,7 @@ def test_each_asset_stands_under_its_center_of_mass_in_both_levels(library, name
         assert math.atan2(margin, asset.center_of_mass[2]) > math.radians(13.0)  # tilt before it tips
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("support", "z"), [("breakfast_table", 0.0), ("floor", 0.0), ("shelf", 0.1232)])
 def test_each_asset_stands_still(support, z):
     names = [name for name in FREE if support != "shelf" or name != "chair"]
@@ -371,6 +372,7 @@ def test_cutlery_lies_on_handle_and_head(library, name):
     assert (wide[:, 0] > 0.0).all()  # the head is toward +x
 
 
+@pytest.mark.slow
 def test_cutlery_stands_leaning_in_a_crock(library):
     layout = [("utensil_crock", 0.0, 0.0, 0.0)]
     for index, name in enumerate(CUTLERY):  # handles down, heads outward, one on each side

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import sys
 from pathlib import Path
@@ -74,9 +75,16 @@ def test_a_decomposition_is_computed_once_and_kept(
     tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     pytest.importorskip("coacd")
-    calls = []
+    calls, made = [], []
     real = decomposition.run_coacd
-    monkeypatch.setattr(decomposition, "run_coacd", lambda *args: calls.append(1) or real(*args))
+
+    def counted(*args):
+        """What the first call computed, which takes a second, whatever is asked later."""
+        calls.append(1)
+        made.extend([] if made else [real(*args)])
+        return copy.deepcopy(made[0])
+
+    monkeypatch.setattr(decomposition, "run_coacd", counted)
     first = load(tmp_path, angle_iron())
     again = load(tmp_path, angle_iron(), ", name: again")
     assert len(calls) == 1

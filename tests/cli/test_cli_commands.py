@@ -43,6 +43,7 @@ def test_sample_then_project(prior, tmp_path, capsys):
     assert "simulation-ready" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_same_seed_draws_the_same_scenes(prior, tmp_path):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         words = [f"prior={prior}", "count=2", "num_steps=2", "reward=null", "pictures=0", "workers=0", f"seed={seed}"]

@@ -113,6 +113,7 @@ def test_search_and_post_training_take_prompts(reader: Path, tmp_path: Path) -> 
     assert config["prompt"] == ["A scene with two cups.", "A scene with 9 objects."]
 
 
+@pytest.mark.slow
 def test_guidance_without_a_prompt_is_said(
     files: tuple[Path, Path], reader: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -49,6 +49,7 @@ def test_a_folder_of_scene_files_is_all_of_their_scenes(folder: Path) -> None:
         load_scenes(folder / "mixed")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", OWN_WORDS)
 def test_every_command_takes_a_folder_of_scene_files(
     folder: Path, tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]

@@ -14,6 +14,7 @@ STEPS = {
     "a class": ("from scene_envs import SceneBatch, get_scene_type", HEAVY),
     "an environment": ("import scene_envs.envs.denoising", ("rewards", "agents")),
     "gym.make": ("gymnasium.make('SceneEnvs/Denoising-v0', reward='object_count', num_steps=1).reset(seed=0)", ()),
+    "planners": ("from agents.planning import list_planners; found['known'] = list(list_planners())", ()),
     "text encoders": ("import agents.networks.text_encoders", ("transformers",)),
 }
 """What one process does, one after another, and the modules that it has not loaded then."""
@@ -35,6 +36,12 @@ def loaded() -> dict[str, list[str]]:
 @pytest.mark.parametrize("step", STEPS)
 def test_what_is_not_needed_is_not_loaded(loaded: dict[str, list[str]], step: str) -> None:
     assert {*STEPS[step][1]} & {*loaded[step]} == set()
+
+
+@pytest.mark.slow
+def test_the_planners_that_ship_are_known_without_further_imports(loaded: dict[str, list[str]]) -> None:
+    shipped = {"beam", "best_of", "evolution", "feynman_kac", "gradient", "greedy", "mcts", "tree_over_steps", "uct"}
+    assert shipped <= {*loaded["known"]}
 
 
 @pytest.mark.slow

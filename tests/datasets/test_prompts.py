@@ -65,6 +65,7 @@ def test_kinds_are_mixed_and_seeded(batch: SceneBatch) -> None:
     assert min(kinds[kind] for kind in CLAIMS_OF) >= 30
 
 
+@pytest.mark.slow
 def test_three_prompts_of_different_kinds_per_scene(batch: SceneBatch) -> None:
     prompts = describe_all(batch, np.random.default_rng(0))
     assert prompts == describe_all(batch, np.random.default_rng(0))
@@ -83,6 +84,7 @@ def test_an_empty_table_has_only_so_much_to_say() -> None:
     assert set(prompts) == {"A scene with 1 object.", "A scene with a table."}
 
 
+@pytest.mark.slow
 def test_half_of_the_name_lists_are_whole_and_none_is_longer_than_ten() -> None:
     batch = get_grammar("restaurant_high_clutter").sample(np.random.default_rng(0), 2)
     facts = scene_facts(batch)
@@ -145,6 +147,7 @@ def test_irregular_plurals() -> None:
     }
 
 
+@pytest.mark.slow
 def test_two_alike_are_told_apart_by_their_order() -> None:
     """A bowl holds a pear; the other one does not."""
     scene = build(

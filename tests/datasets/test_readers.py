@@ -102,6 +102,7 @@ def test_doubles_and_halves(scenes: torch.Tensor, tmp_path: Path, kind: pa.DataT
     assert torch.equal(loaded.tensor[:, 0, :12], table_pose.expand(ROWS, 12))
 
 
+@pytest.mark.slow
 def test_hugging_face_files_and_folders(scenes: torch.Tensor, tmp_path: Path) -> None:
     """``Array2D`` columns; ``save_to_disk`` with two files and rows chosen by an index; ``to_parquet``; in memory."""
     import datasets

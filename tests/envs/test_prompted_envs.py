@@ -61,6 +61,7 @@ def test_the_prompt_is_seen_as_the_tokens_of_the_prior(reader, prior):
     assert set(plain) == {"scene", "timestep", "object_mask"}
 
 
+@pytest.mark.slow
 def test_adapters_agree_and_prompts_hang_on_the_seed(reader):
     kwargs = {"prior": reader, "num_steps": 2, "action_mode": "noise", "prompt": PROMPTS, "guidance": 0.5}
     vector, env = gym.make_vec(ID, num_envs=3, **kwargs), DenoisingTorchRLEnv(3, **kwargs)

@@ -120,6 +120,7 @@ def place(scene_type: str, *objects: tuple[str, float, float, float]) -> SceneBa
     return SceneBatch.from_parts(translations, rotations, categories, kind)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene_type", sorted(SUPPORTS))
 def test_real_scenes_of_every_type_rest_where_supports_say(scene_type: str) -> None:
     batch = grammar_scenes(scene_type, 4, seed=1)

@@ -193,6 +193,7 @@ def test_wrong_input_is_named(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_only_usd_needs_a_package_and_says_which(tmp_path, monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(formats, "find_spec", lambda name: None if name == "pxr" else find(name))

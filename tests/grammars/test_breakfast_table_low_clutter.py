@@ -78,6 +78,7 @@ def test_kept_by_physics(arrays: NDArray[np.float32]) -> None:
     check_physics(arrays[:24], SCENE_TYPE)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_scenes_and_another_gives_others() -> None:
     first, again, other = (get_grammar(NAME).sample_array(np.random.default_rng(seed), 3) for seed in (4, 4, 5))
     assert (first == again).all()

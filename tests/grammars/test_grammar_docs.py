@@ -31,6 +31,7 @@ def page() -> Any:
     return names
 
 
+@pytest.mark.slow
 def test_every_node_of_the_page_makes_scenes_that_are_kept(page: dict[str, Any]) -> None:
     other = grammars.Surface | grammars.Tiers
     nodes = {name: node for name, node in page.items() if hasattr(node, "draw") and not isinstance(node, other)}

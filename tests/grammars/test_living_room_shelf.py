@@ -45,6 +45,7 @@ def test_slots_are_in_order(arrays: NDArray[np.float32]) -> None:
     check_slots(arrays, SCENE_TYPE)
 
 
+@pytest.mark.slow
 def test_counts_follow_the_published_statistics() -> None:
     number = counts(get_grammar(NAME), 400)
     # 400 scenes of standard deviation 2.3: the standard error of the mean is 0.12.

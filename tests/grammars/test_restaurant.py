@@ -71,6 +71,7 @@ def rooms(batch: SceneBatch) -> list[Room]:
     return _rooms(batch)
 
 
+@pytest.mark.slow
 def test_every_scene_is_kept(kind: str) -> None:
     grammar = get_grammar(kind)
     assert judge_scenes(grammar.sample(np.random.default_rng(2), 12)) == [""] * 12
@@ -151,6 +152,7 @@ def test_a_stack_of_three_steamers_stands_somewhere(rooms: list[Room]) -> None:
         assert steamers[:, 2].max() >= 2 * STEP - 1e-6
 
 
+@pytest.mark.slow
 def test_the_number_of_tables_keeps_its_weights_whatever_the_condition_rejects() -> None:
     """One table in a hundred has its stack of three; numbers are drawn before, so they do not lean to many tables."""
     table = Repeat(Stack("steamer_bottom", {"steamer_bottom": 0.1, None: 0.9}), Geometric(1.0, 1, 1))

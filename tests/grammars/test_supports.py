@@ -70,6 +70,7 @@ def test_boxes_packed_by_their_rectangles_never_overlap() -> None:
     assert feasibility(batch).feasible.sum() == 50
 
 
+@pytest.mark.slow
 def test_overhang_zero_keeps_whole_things_inside() -> None:
     crowd = Repeat(Object("serving_dish", Uniform(0.4, 0.4)), Geometric(0.0, 3, 3))
     batch = _sample(crowd, count=20, region=Region(0.3, 0.35, overhang=0.0, x=0.1))

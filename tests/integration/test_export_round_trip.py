@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import json
 import pickle
@@ -78,7 +79,14 @@ def test_mujoco_leaves_a_laid_table_still(folder, scenes):
 
 
 def drake_scene(folder, index, name):
+    """Plant, scene graph and diagram, shared by the tests, and a context of one's own."""
     pytest.importorskip("pydrake")
+    *built, diagram = drake_diagram(folder, index, name)
+    return *built, diagram, diagram.CreateDefaultContext()
+
+
+@functools.cache
+def drake_diagram(folder, index, name):
     from pydrake.multibody.parsing import Parser
     from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
     from pydrake.systems.framework import DiagramBuilder
@@ -89,8 +97,7 @@ def drake_scene(folder, index, name):
     parser.package_map().AddPackageXml(str(folder / "package.xml"))
     parser.AddModels(str(path_of(folder, index, name)))
     plant.Finalize()
-    diagram = builder.Build()
-    return plant, graph, diagram, diagram.CreateDefaultContext()
+    return plant, graph, builder.Build()
 
 
 def drake_poses(plant, context, scene):

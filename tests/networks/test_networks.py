@@ -328,6 +328,7 @@ def test_sizes_with_equal_parameters(name: str, process: str) -> None:
     assert (torch.get_rng_state() == before).all()
 
 
+@pytest.mark.slow
 def test_counts_agree_with_the_papers_size_and_with_a_sum_by_hand() -> None:
     paper = {**vars(PretrainConfig(network="paper").network), "modules": ()}
     size = network_config(process="mixed", features=33, categories=21, text_width=768, **paper)
@@ -368,6 +369,7 @@ def test_unknown_names_and_wrong_sizes_say_what_would_be_right() -> None:
         MixedMiDiffusionConfig(categories=8, depth=0)
 
 
+@pytest.mark.slow
 def test_the_pages_code_and_counts_hold() -> None:
     page = (Path(__file__).parents[2] / "docs" / "networks.md").read_text()
     for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):

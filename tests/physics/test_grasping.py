@@ -72,6 +72,7 @@ def test_verdicts_depend_neither_on_the_batch_nor_on_the_heading() -> None:
     assert 0 < int(together.any(dim=0).sum()) < int(batch.is_free.sum())
 
 
+@pytest.mark.slow
 def test_a_heap_is_invalid_and_leaves_the_others_alone() -> None:
     """Sixty objects of many parts at one point take many times the work of a crowded scene."""
     clean = get_grammar("pantry_shelf").sample(np.random.default_rng(0), 1)

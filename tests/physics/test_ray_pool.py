@@ -40,6 +40,16 @@ def pool() -> Iterator[PhysicsPool]:
         yield pool
 
 
+@pytest.fixture
+def shared(pool: PhysicsPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What asks for workers on Ray gets the actors of ``pool`` and leaves them running: each takes seconds to start."""
+    monkeypatch.setattr(
+        "scene_envs.physics.make_pool",
+        lambda workers, *timeout: pool if workers == "ray" else make_pool(workers, *timeout),
+    )
+    monkeypatch.setattr(pool, "close", lambda: None)
+
+
 def test_results_are_those_of_this_process_bit_for_bit_and_in_order(batch: SceneBatch, pool: PhysicsPool) -> None:
     found, expected = feasibility(batch, pool=pool), feasibility(batch)
     assert all(torch.equal(getattr(found, name), getattr(expected, name)) for name in FIELDS)
@@ -62,18 +72,18 @@ def test_a_worker_that_is_killed_costs_nothing(batch: SceneBatch, pool: PhysicsP
     assert victim not in pool.process_ids
 
 
-def test_scenes_that_take_too_long_twice_are_invalid(batch: SceneBatch, pool: PhysicsPool) -> None:
-    feasibility(batch[:1], pool=pool)  # a worker is up
-    with make_pool("ray") as other:
-        other.timeout = 1e-4
-        assert feasibility(batch[:2], pool=other).valid.tolist() == [False, False]
-        other.timeout = 60.0
-        assert feasibility(batch[:2], pool=other).valid.tolist() == [True, True]  # the pool stays usable
-
-
-def test_a_reward_is_scored_on_ray_and_kept_by_content(
+def test_scenes_that_take_too_long_twice_are_invalid(
     batch: SceneBatch, pool: PhysicsPool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    feasibility(batch[:1], pool=pool)  # a worker is up
+    with monkeypatch.context() as patch:
+        patch.setattr(pool, "timeout", 1e-4)
+        assert feasibility(batch[:2], pool=pool).valid.tolist() == [False, False]
+    assert feasibility(batch[:2], pool=pool).valid.tolist() == [True, True]  # the pool stays usable
+
+
+@pytest.mark.usefixtures("shared")
+def test_a_reward_is_scored_on_ray_and_kept_by_content(batch: SceneBatch, monkeypatch: pytest.MonkeyPatch) -> None:
     forget_verdicts()
     scorer = RewardScorer("feasible_objects", workers="ray")
     batch = batch[:4]
@@ -90,7 +100,8 @@ def feasibility_counts(batch: SceneBatch) -> list[float]:
     return RewardScorer("feasible_objects")(batch).value.tolist()
 
 
-def test_a_run_on_ray_is_the_run_in_this_process(tmp_path: Path, pool: PhysicsPool) -> None:
+@pytest.mark.usefixtures("shared")
+def test_a_run_on_ray_is_the_run_in_this_process(tmp_path: Path) -> None:
     from agents.post_training import PostTrainConfig, post_train
     from agents.priors.testing import tiny_prior
 

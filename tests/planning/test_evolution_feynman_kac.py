@@ -20,6 +20,7 @@ from tests.helpers.small_plans import SLOTS, near_middle, plan
 from tests.helpers.toy_tree import ToyTree, scrambled
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "planner",
     [EvolutionPlanner(population=3, children=2, crossover=0.8), FeynmanKacPlanner(particles=4, begin=0.0)],

@@ -87,6 +87,7 @@ def test_every_scene_gets_a_search_that_scores_no_less(prior: ScenePrior, scenes
     assert "the empty scene" not in page
 
 
+@pytest.mark.slow
 def test_the_journal_knows_the_scenes_it_started_from(prior: ScenePrior, scenes: SceneBatch, tmp_path: Path) -> None:
     first = run_search(prior, near_middle, scenes=scenes, count=1, output=tmp_path, **SMALL)
     assert len(first.best) == 1
@@ -98,6 +99,7 @@ def test_the_journal_knows_the_scenes_it_started_from(prior: ScenePrior, scenes:
             run_search(prior, near_middle, scenes=others, output=tmp_path, **SMALL)
 
 
+@pytest.mark.slow
 def test_a_scene_that_is_perfect_or_cannot_be_scored_stays(
     prior: ScenePrior, scenes: SceneBatch, tmp_path: Path
 ) -> None:
@@ -134,6 +136,7 @@ def sources(prior: ScenePrior, scenes: SceneBatch, tmp_path_factory: pytest.Temp
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("source", ["file", "run", "dataset", "shard"])
 def test_the_command_takes_what_scenes_takes(
     sources: dict[str, Path], source: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +13,7 @@ import pytest
 import torch
 
 from agents.cli import main
-from agents.planning import PlanResult, Session, list_planners, run_search
+from agents.planning import PlanResult, Session, run_search
 from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards import RewardContext, RewardOutput, register_reward
@@ -71,14 +69,6 @@ def prior() -> ScenePrior:
 
 
 @pytest.mark.slow
-def test_the_planners_are_those_that_ship() -> None:
-    assert set(PLANNERS) <= set(list_planners())
-    alone = "from agents.planning import list_planners; print(*list_planners())"  # before anything else is imported
-    shown = subprocess.run([sys.executable, "-c", alone], capture_output=True, text=True, check=True).stdout.split()
-    assert set(PLANNERS) <= set(shown)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("planner", PLANNERS)
 def test_a_killed_run_goes_on_bit_for_bit(planner: str, prior: ScenePrior, tmp_path: Path) -> None:
     settings = {**SETTINGS, "planner": {"name": planner}}
@@ -86,7 +76,8 @@ def test_a_killed_run_goes_on_bit_for_bit(planner: str, prior: ScenePrior, tmp_p
     whole = run_search(prior, all_scored, output=tmp_path, **settings)
     journal = tmp_path / "search.journal"
     content = journal.read_bytes()
-    for share in (0.999, 0.5, 0.0001, 0):  # a kill while writing the last record, in the middle, the first, none
+    shares = (0.999, 0.5, 0.0001, 0)  # a kill while writing the last record, in the middle, the first, none
+    for share in shares if planner == "greedy" else shares[:2]:  # a journal without a record is of any planner
         journal.write_bytes(content[: int(share * len(content))])
         objective = Counting()
         again = run_search(prior, objective, output=tmp_path, **settings)
@@ -98,7 +89,7 @@ def test_a_killed_run_goes_on_bit_for_bit(planner: str, prior: ScenePrior, tmp_p
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
-@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("count", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_an_interrupt_keeps_the_best_and_the_same_call_goes_on(
     planner: str, count: int, prior: ScenePrior, tmp_path: Path
 ) -> None:
@@ -140,6 +131,7 @@ def test_limits(planner: str, prior: ScenePrior) -> None:
     assert by_time.search.values == by_nfe.search.values[:3]
 
 
+@pytest.mark.slow
 def test_searches_side_by_side_are_those_alone(prior: ScenePrior) -> None:
     sizes: list[int] = []
 
@@ -293,6 +285,7 @@ def test_an_error_of_one_plan_ends_all_and_is_raised() -> None:
         Session(broken).run(Impatient(), [(), ()], budget=20)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("act", "status"), [(interrupt, 130), (lambda: os.kill(os.getpid(), signal.SIGTERM), 143)])
 def test_an_interrupted_command_says_so_and_can_go_on(
     prior: ScenePrior, tmp_path: Path, capsys: pytest.CaptureFixture[str], act: Callable[[], None], status: int

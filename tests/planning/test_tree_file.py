@@ -57,6 +57,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[SearchOutcome, Path]:
     return search(output, planner="uct", count=2, baseline=True), output
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("planner", list_planners())
 def test_every_planner_leaves_its_tree(planner: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("agents.planning.search_run.draw_scene", lambda *_: None)  # pictures cost most of the time
@@ -97,6 +98,7 @@ def test_visits_and_masks_are_those_of_the_states() -> None:
     assert record.nodes[1].mask == (2,)
 
 
+@pytest.mark.slow
 def test_a_run_that_goes_on_writes_the_whole_tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("agents.planning.search_run.draw_scene", lambda *_: None)
     search(tmp_path, planner="beam")

@@ -32,6 +32,7 @@ def log_of(run: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_trains_and_saves_a_prior(example: ModuleType, tmp_path: Path, kind: str) -> None:
     base = tiny_prior(**KINDS[kind])

@@ -286,6 +286,7 @@ def algorithm(name: str) -> dict[str, Any]:
     return {"name": name, "scenes_per_prompt": 3, **({"gradient_steps": 2} if name.startswith("ddpo") else {})}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ddpo_sf", "ddpo_is", "nft", "awm", "reward_weighted"])
 def test_every_algorithm_trains_inside_inpainting(tmp_path: Path, prior: ScenePrior, name: str) -> None:
     source = "samples" if name in ("ddpo_is", "awm") else "real"

@@ -96,10 +96,10 @@ def test_rows_go_to_the_logger_that_is_named(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("changes", [{}, {"ema": 0.5, "credit": "scene"}, {"algorithm": "ddpo_is"}])
 def test_stopped_and_resumed_run_equals_the_uninterrupted_one(tmp_path: Path, changes: dict) -> None:
-    whole = post_train(small_config(tmp_path / "whole", iterations=4, **changes), prior=tiny_prior())
+    whole = post_train(small_config(tmp_path / "whole", iterations=3, **changes), prior=tiny_prior())
     post_train(small_config(tmp_path / "parts", iterations=2, **changes), prior=tiny_prior())
     torch.randn(7)  # the global generator has moved on
-    parts = post_train(small_config(tmp_path / "parts", iterations=4, **changes), prior=tiny_prior())
+    parts = post_train(small_config(tmp_path / "parts", iterations=3, **changes), prior=tiny_prior())
     ours, theirs = weights(tmp_path / "parts"), weights(tmp_path / "whole")
     assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
     assert without_seconds(parts.history) == without_seconds(whole.history)

@@ -77,6 +77,7 @@ def test_scenes_are_compared_with_those_of_the_same_prompt(tmp_path: Path) -> No
     trainer.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("guidance", "chunk"), [(0.0, None), (1.0, 4)])
 def test_log_ratio_is_exactly_zero_before_the_first_update(tmp_path: Path, guidance: float, chunk: int | None) -> None:
     config = small_config(tmp_path, iterations=1, gradient_steps=4, chunk=chunk, prompt=TWO, guidance=guidance)
@@ -115,6 +116,7 @@ def test_the_torchrl_policy_reads_the_prompt_of_the_environment() -> None:
     torch.testing.assert_close(log_prob.sum(dim=1), transitions["action_log_prob"], atol=1e-4, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prompt", [None, "data"])
 def test_the_text_encoder_stays_as_it_is(tmp_path: Path, prompt: str | None) -> None:
     prior = reader()
@@ -192,6 +194,7 @@ def test_prompts_of_a_run_that_never_saved_are_not_taken_for_those_of_other_scen
             assert all(check.holds for check in parse_prompt(text, "dimsum_table").check(facts[0])), text
 
 
+@pytest.mark.slow
 def test_the_doctor_examines_a_prompted_run(tmp_path: Path) -> None:
     report = diagnose(small_config(tmp_path, prompt=TWO, scenes_per_prompt=3), prior=reader())
     assert report.log_ratio == 0.0

@@ -167,6 +167,7 @@ def test_a_tensor_that_is_not_finite_never_becomes_scenes(prior: ScenePrior) -> 
 # -- datasets ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_dataset_that_is_not_finite(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bad = change_column(folder / "data", tmp_path / "bad", "scenes", with_nan)
     with pytest.raises(CorruptFileError, match=r"row 4 of .*, slot 3, holds a value that is not finite"):

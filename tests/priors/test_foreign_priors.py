@@ -91,6 +91,7 @@ def test_a_name_that_no_file_can_have_is_refused_in_a_few_words(name):
     assert len(str(caught.value)) < 7000
 
 
+@pytest.mark.slow
 def test_the_shipped_priors_pass_their_own_bounds():
     for config in Path("agents/priors/shipped").glob("*/config.json"):
         assert ScenePrior.load(config.parent.name).scene_type.slots > 0

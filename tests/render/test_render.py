@@ -43,6 +43,7 @@ def _needs_pybullet():
     pytest.importorskip("pybullet")
 
 
+@pytest.mark.slow
 def test_semantic_images_have_class_colors_and_nothing_else():
     batch = scene(("teapot", 0.2, 0.1, 0, 0), ("dinner_plate", -0.3, 0.0, 0, 0))
     image = render(batch, style="semantic")[0]
@@ -78,6 +79,7 @@ def test_pictures_do_not_depend_on_slot_order_or_on_what_was_drawn_before():
     np.testing.assert_array_equal(first, again)
 
 
+@pytest.mark.slow
 def test_batches_are_drawn_scene_by_scene():
     scenes = [scene(("teapot", 0.2, 0.1, 0, 0)), scene(), scene(("teacup", 0.2, 0.1, 0, 0))]
     together = render(SceneBatch.concatenate(scenes), width=64, height=48)

@@ -66,6 +66,7 @@ def test_a_dataset_with_its_prompts_as_captions(tmp_path):
     assert [scene["caption"] for scene in data["scenes"]] == prompts[1:3]
 
 
+@pytest.mark.slow
 def test_a_prior_and_a_grammar(tmp_path):
     tiny_prior(slots=6).save(tmp_path / "prior")
     words = ("count=2", "num_steps=2")
@@ -77,6 +78,7 @@ def test_a_prior_and_a_grammar(tmp_path):
     assert first == again != other
 
 
+@pytest.mark.slow
 def test_pictures_are_drawn_beside_the_page(tmp_path):
     pytest.importorskip("pybullet")
     assert main(["view", "scene=dimsum_table", "count=2", "pictures=1", f"output={tmp_path / 'a'}"]) == 0
