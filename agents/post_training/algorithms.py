@@ -249,7 +249,7 @@ class NeonSettings(AlgorithmSettings):
     name: str = "neon"
     updates: int = 8
     draws: int = 1
-    w: float = 0.5
+    w: float = 1.0
     period: int = 20
     own_lr: float = 1e-4
     decay: float = 0.9
