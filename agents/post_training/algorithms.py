@@ -231,7 +231,7 @@ class RewardWeightedSettings(ForwardProcessSettings):
 
 @dataclass
 class NeonSettings(AlgorithmSettings):
-    """Neon: negative extrapolation from self-training, in rounds (Alemohammad et al. 2025); the reward is reported only.
+    """Neon: negative extrapolation from self-training (Alemohammad et al. 2025); the reward is reported only.
 
     Attributes:
         updates: optimiser steps per batch.

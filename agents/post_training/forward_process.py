@@ -149,9 +149,7 @@ class ForwardProcess(Algorithm[TensorDict]):
         everything, own = gather_rows(x0), processes.rows(processes.size * len(x0))
         seen = None if rollout.observed is None else gather_rows(rollout.observed)
         observed = self.prior.observed_by_mask(everything, seen)
-        draws = [
-            self.prior.noised(everything, generator, observed=observed).rows(own) for _ in range(self.draws)
-        ]
+        draws = [self.prior.noised(everything, generator, observed=observed).rows(own) for _ in range(self.draws)]
         total, distance, limited = 0.0, 0.0, 0.0
         learned = [] if self.copy is None else self.copy.trained
         gradient = GradientSum([*self.prior.parameters(), *learned])

@@ -128,17 +128,20 @@ class Neon(ForwardProcess):
         self._set({name: p.detach().clone() for name, p in prior.named_parameters()})
 
     def state(self) -> dict[str, Any]:
-        """The weights of both copies and of what samples."""
-        averages = {name: vars(average) for name, average in self._averages().items()}
-        return {"iterations": self.iterations, "copy": self.copy.state(), "averages": averages}
+        """The weights of both copies, their averages in this round, and those that sample."""
+        return {
+            "sampler": self._average.tensors,
+            "iterations": self.iterations,
+            "copy": self.copy.state(),
+            "real": vars(self._real),
+            "own": vars(self._own),
+        }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Inverse of :meth:`state`."""
+        self._average.tensors = state["sampler"]
+        self._average.copy_to(self.sampler)
         self.iterations = state["iterations"]
         self.copy.restore(state["copy"])
-        for name, average in self._averages().items():
-            vars(average).update(state["averages"][name])
-        self._average.copy_to(self.sampler)
-
-    def _averages(self) -> dict[str, WeightAverage]:
-        return {"round": self._average, "real": self._real, "own": self._own}
+        vars(self._real).update(state["real"])
+        vars(self._own).update(state["own"])
