@@ -239,7 +239,6 @@ class NeonSettings(AlgorithmSettings):
         w: length of the extrapolation away from the copy that is trained on own samples.
         period: iterations of a round, which ends with an extrapolation.
         own_lr: learning rate of the copy that is trained on own samples; the same as ``optimizer.lr``.
-        decay: of the weight averages of a round, per iteration.
     """
 
     learning_rate: ClassVar[float] = 1e-4
@@ -252,14 +251,11 @@ class NeonSettings(AlgorithmSettings):
     w: float = 1.0
     period: int = 20
     own_lr: float = 1e-4
-    decay: float = 0.9
 
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least(self, 1, "updates", "draws", "period")
         positive(self, "w", "own_lr")
-        if not 0 <= self.decay < 1:
-            raise InvalidInputError(f"decay={self.decay} must lie in [0, 1)")
 
     @property
     def optimiser_steps(self) -> int:

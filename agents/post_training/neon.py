@@ -71,10 +71,10 @@ class SelfTrainingLoss(ForwardProcessLoss):
 class Neon(ForwardProcess):
     """Negative extrapolation from self-training (Alemohammad et al. 2025, arXiv 2510.03597), in rounds.
 
-    A round lasts ``settings.period`` iterations, in which one prior samples all scenes. Two copies of it are trained
-    with the pretraining loss: one on real scenes (theta_real, by the loop), one on the samples (theta_own). The next
-    round samples with theta_real + w (theta_real - theta_own). What the two copies have in common, such as what further
-    training changes on any scenes, leaves the difference.
+    A round lasts ``settings.period`` iterations, in which the prior theta samples all scenes. Two copies of it are
+    trained with the pretraining loss from the same timesteps and noise: one on real scenes (theta_real, by the loop),
+    one on the samples (theta_own). The next round begins with theta + w (theta_real - theta_own). What the two copies
+    have in common, such as what further training changes on any scenes, leaves the difference.
 
     Args:
         settings: its keys.
@@ -82,66 +82,59 @@ class Neon(ForwardProcess):
         stds: of the reverse steps; not used.
     """
 
+    copy: TrainedCopy
+
     def __init__(self, settings: NeonSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
         self.policy = policy
         self.prior: ScenePrior = policy.prior  # type: ignore[assignment]
         self.sampler = deepcopy(self.prior).eval().requires_grad_(False)
         self._sampling_policy = DenoisingPolicy(self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance)
-        self.draws, self.period, self.weight, self.decay = settings.draws, settings.period, settings.w, settings.decay
+        self.draws, self.period, self.weight = settings.draws, settings.period, settings.w
         self.copy = TrainedCopy(self.prior, settings.own_lr)
         self.loss = SelfTrainingLoss(self.prior, self.sampler, copy=self.copy)
         self.iterations = 0
-        self._average = WeightAverage(self.prior, 0.0)  # that of the round, which samples
-        self._begin_round()
-
-    def _begin_round(self) -> None:
-        self._real, self._own = (WeightAverage(module, self.decay) for module in (self.prior, self.copy.prior))
+        self._average = WeightAverage(self.prior, 0.0)  # theta, which samples and is evaluated
 
     @property
     def branching(self) -> Branching:
         """Scenes share nothing."""
         return Branching()
 
+    @property
+    def real_noise(self) -> str:
+        """The stream of the own samples: both copies see the same timesteps and noise."""
+        return "steps"
+
     def advantage(self, rollout: Rollout) -> TensorDict:
         """Nothing: the samples are not weighted."""
         return TensorDict({}, [len(rollout.reward)])
 
     def end_iteration(self) -> None:
-        """Average the weights of both copies, and at the end of a round extrapolate."""
-        self._real.update(self.prior)
-        self._own.update(self.copy.prior)
+        """At the end of a round, extrapolate and begin the next one."""
         self.iterations += 1
         if self.iterations % self.period == 0:
-            own = self._own.tensors
-            self._set({name: real + self.weight * (real - own[name]) for name, real in self._real.tensors.items()})
+            real, own = (dict(module.named_parameters()) for module in (self.prior, self.copy.prior))
+            theta = self._average.tensors
+            self._begin({name: theta[name] + self.weight * (real[name] - own[name]).detach() for name in theta})
 
-    def _set(self, weights: dict[str, Tensor]) -> None:
+    def _begin(self, weights: dict[str, Tensor]) -> None:
         """Begin a round with these weights."""
         self._average.tensors = weights
         for module in (self.prior, self.copy.prior, self.sampler):
             self._average.copy_to(module)
-        self._begin_round()
 
     def return_to(self, prior: ScenePrior) -> None:
         """Begin a round with the weights of an earlier checkpoint."""
         self.iterations = 0
-        self._set({name: p.detach().clone() for name, p in prior.named_parameters()})
+        self._begin({name: p.detach().clone() for name, p in prior.named_parameters()})
 
     def state(self) -> dict[str, Any]:
-        """The weights of both copies, their averages in this round, and those that sample."""
-        return {
-            "sampler": self._average.tensors,
-            "iterations": self.iterations,
-            "copy": self.copy.state(),
-            "real": vars(self._real),
-            "own": vars(self._own),
-        }
+        """The weights that sample, those of the copy, and the place in the round."""
+        return {"sampler": self._average.tensors, "copy": self.copy.state(), "iterations": self.iterations}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Inverse of :meth:`state`."""
         self._average.tensors = state["sampler"]
         self._average.copy_to(self.sampler)
-        self.iterations = state["iterations"]
         self.copy.restore(state["copy"])
-        vars(self._real).update(state["real"])
-        vars(self._own).update(state["own"])
+        self.iterations = state["iterations"]
