@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from agents.post_training.forward_process_loss import ForwardProcessLoss
     from agents.post_training.guard import Guard
     from agents.post_training.losses import DDPOSFLoss
+    from agents.post_training.neon import Neon, SelfTrainingLoss
     from agents.post_training.policy import DenoisingPolicy
     from agents.post_training.trainer import PostTrainer, PostTrainResult, post_train
 
@@ -36,10 +37,12 @@ __all__ = [
     "ForwardProcessLoss",
     "Guard",
     "NFTLoss",
+    "Neon",
     "PostTrainConfig",
     "PostTrainResult",
     "PostTrainer",
     "RewardWeightedLoss",
+    "SelfTrainingLoss",
     "compute_advantages",
     "list_algorithms",
     "post_train",

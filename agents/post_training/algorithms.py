@@ -229,6 +229,40 @@ class RewardWeightedSettings(ForwardProcessSettings):
         positive(self, "temperature")
 
 
+@dataclass
+class NeonSettings(AlgorithmSettings):
+    """Neon: negative extrapolation from self-training (Alemohammad et al. 2025); the reward is reported only.
+
+    Attributes:
+        updates: optimiser steps per batch.
+        draws: timesteps and noises of every own sample per optimiser step.
+        w: length of the extrapolation away from the copy that is trained on own samples.
+        period: iterations of a round, which ends with an extrapolation.
+        own_lr: learning rate of the copy that is trained on own samples; the same as ``optimizer.lr``.
+    """
+
+    learning_rate: ClassVar[float] = 1e-4
+    regularisation_weight: ClassVar[float] = 1.0
+    sample_limits: ClassVar[Mapping[str, float]] = ForwardProcessSettings.sample_limits
+
+    name: str = "neon"
+    updates: int = 8
+    draws: int = 1
+    w: float = 1.0
+    period: int = 20
+    own_lr: float = 1e-4
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, 1, "updates", "draws", "period")
+        positive(self, "w", "own_lr")
+
+    @property
+    def optimiser_steps(self) -> int:
+        """Optimiser steps per batch."""
+        return self.updates
+
+
 @dataclass(frozen=True)
 class _Entry:
     settings: type[AlgorithmSettings]
@@ -245,6 +279,7 @@ _ALGORITHMS = Registry(
         "ddpo_is": _Entry(DDPOISSettings, "agents.post_training.ddpo:DDPO"),
         "nft": _Entry(NFTSettings, _FORWARD),
         "awm": _Entry(AWMSettings, _FORWARD),
+        "neon": _Entry(NeonSettings, "agents.post_training.neon:Neon"),
         "reward_weighted": _Entry(RewardWeightedSettings, _FORWARD),
     },
 )

@@ -56,6 +56,11 @@ class Algorithm(ABC, Generic[Credit]):
         """The weights that are evaluated and saved in place of those in training; None for the latter."""
         return None
 
+    @property
+    def real_noise(self) -> str:
+        """Stream of the timesteps and noise of real scenes: ``real``, or ``steps`` for those of the own samples."""
+        return "real"
+
     @abstractmethod
     def advantage(self, rollout: Rollout) -> Credit:
         """Advantages of the scenes of a batch, or of their objects."""

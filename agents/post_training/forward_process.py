@@ -15,7 +15,7 @@ from torch import Generator, Tensor
 from agents.post_training.advantages import compute_advantages, sibling_advantages
 from agents.post_training.algorithms import AWMSettings, ForwardProcessSettings, NFTSettings, RewardWeightedSettings
 from agents.post_training.base import Algorithm
-from agents.post_training.expectation import Expectation
+from agents.post_training.expectation import Expectation, TrainedCopy
 from agents.post_training.forward_losses import AWMLoss, NFTLoss, RewardWeightedLoss
 from agents.post_training.forward_process_loss import ForwardProcessLoss
 from agents.post_training.gradients import GradientSum, credited_reward
@@ -58,6 +58,8 @@ class ForwardProcess(Algorithm[TensorDict]):
     """
 
     loss: ForwardProcessLoss
+    copy: TrainedCopy | None
+    """A copy of the denoiser that is trained on the samples, by ``loss_expectation``."""
 
     def __init__(self, settings: ForwardProcessSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
         self.settings = settings
@@ -67,7 +69,8 @@ class ForwardProcess(Algorithm[TensorDict]):
         self._sampling_policy = DenoisingPolicy(self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance)
         self._average = WeightAverage(self.prior, settings.sampler_decay)
         rate = getattr(settings, "expectation_lr", 0.0)
-        self.expectation = Expectation(self.sampler, rate) if rate else None
+        self.copy = Expectation(self.sampler, rate) if rate else None
+        self.draws = settings.draws
         self.loss = self.make_loss()
 
     def make_loss(self) -> ForwardProcessLoss:
@@ -76,7 +79,7 @@ class ForwardProcess(Algorithm[TensorDict]):
         if isinstance(settings, NFTSettings | AWMSettings):
             kind = NFTLoss if isinstance(settings, NFTSettings) else AWMLoss
             base = deepcopy(self.sampler) if settings.push_limit else None
-            limits: dict[str, Any] = {"base": base, "push_limit": settings.push_limit, "expectation": self.expectation}
+            limits: dict[str, Any] = {"base": base, "push_limit": settings.push_limit, "expectation": self.copy}
             return kind(*pair, beta=settings.beta, clip=settings.advantage_clip, **limits)
         assert isinstance(settings, RewardWeightedSettings)
         return RewardWeightedLoss(*pair, temperature=settings.temperature)
@@ -146,16 +149,14 @@ class ForwardProcess(Algorithm[TensorDict]):
         everything, own = gather_rows(x0), processes.rows(processes.size * len(x0))
         seen = None if rollout.observed is None else gather_rows(rollout.observed)
         observed = self.prior.observed_by_mask(everything, seen)
-        draws = [
-            self.prior.noised(everything, generator, observed=observed).rows(own) for _ in range(self.settings.draws)
-        ]
+        draws = [self.prior.noised(everything, generator, observed=observed).rows(own) for _ in range(self.draws)]
         total, distance, limited = 0.0, 0.0, 0.0
-        learned = [] if self.expectation is None else self.expectation.trained
+        learned = [] if self.copy is None else self.copy.trained
         gradient = GradientSum([*self.prior.parameters(), *learned])
         for start in range(0, len(x0), size):
             rows = slice(start, start + size)
             part = scenes[rows]
-            share = int(part["valid"].sum()) / valid / self.settings.draws
+            share = int(part["valid"].sum()) / valid / self.draws
             for noised in draws:
                 result = self.loss.of_noised(noised.rows(rows), part)
                 objective = result["loss_objective"] * share
@@ -165,8 +166,8 @@ class ForwardProcess(Algorithm[TensorDict]):
                 limited += share * float(result["limited"])
             gradient.add_part()
         gradient.write()
-        if self.expectation is not None:
-            self.expectation.step()
+        if self.copy is not None:
+            self.copy.step()
         total, distance, limited = processes.sum_numbers(total, distance, limited)
         return ForwardGradient(total, distance**0.5, limited)
 
@@ -182,12 +183,12 @@ class ForwardProcess(Algorithm[TensorDict]):
 
     def state(self) -> dict[str, Any]:
         """The sampling policy's weights."""
-        expectation = None if self.expectation is None else self.expectation.state()
+        expectation = None if self.copy is None else self.copy.state()
         return {"sampler": self._average.tensors, "updates": self._average.updates, "expectation": expectation}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Inverse of :meth:`state`."""
         self._average.tensors, self._average.updates = state["sampler"], state["updates"]
         self._average.copy_to(self.sampler)
-        if self.expectation is not None:
-            self.expectation.restore(state["expectation"])
+        if self.copy is not None:
+            self.copy.restore(state["expectation"])

@@ -202,6 +202,8 @@ class Learner:
         held = self.regularisation.accumulate(self.algorithm, rollout, self._generator("kl", index))
         generator = self._generator("real", index)
         x0, prompts = scenes.batch(config.regularisation.batch_size, generator)
+        if self.algorithm.real_noise != "real":
+            generator = self._generator(self.algorithm.real_noise, index)
         real_loss, real_norm = add_regularisation_gradient(
             self.prior, x0, self.regularisation.weight, generator, chunk=config.optimizer.chunk, prompts=prompts
         )

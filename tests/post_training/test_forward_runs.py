@@ -35,7 +35,7 @@ def forward_config(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("algorithm", "process"), [("nft", "mixed"), ("awm", "continuous"), ("reward_weighted", "mixed")]
+    ("algorithm", "process"), [("nft", "mixed"), ("awm", "continuous"), ("reward_weighted", "mixed"), ("neon", "mixed")]
 )
 def test_stopped_and_resumed_run_equals_the_uninterrupted_one(tmp_path: Path, algorithm: str, process: str) -> None:
     whole = post_train(forward_config(tmp_path / "whole", algorithm, iterations=3), prior=tiny_prior(process=process))

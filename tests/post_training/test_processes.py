@@ -33,6 +33,7 @@ CASES: dict[str, tuple[str, torch.dtype, dict[str, Any]]] = {
         torch.float32,
         {"guard": {"action": "rollback", "limit": 0.5, "scenes": 40, "samples": 40}, "iterations": 3},
     ),
+    "neon": ("mixed", torch.float64, {"algorithm": {"updates": 2, "period": 2}}),
     "reward_weighted": ("mixed", torch.float32, {"reward": "diversity"}),
 }
 """Algorithm: the process of the prior, the dtype, and further keys."""

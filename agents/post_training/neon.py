@@ -1,0 +1,140 @@
+"""Neon: negative extrapolation from self-training, an algorithm that needs no reward."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Generator, Tensor
+
+from agents.networks.text import Text
+from agents.post_training.algorithms import NeonSettings
+from agents.post_training.expectation import TrainedCopy
+from agents.post_training.forward_process import ForwardProcess
+from agents.post_training.forward_process_loss import ForwardProcessLoss
+from agents.post_training.policy import DenoisingPolicy
+from agents.post_training.rollouts import Branching, Rollout
+from agents.priors.base import ScenePrior
+from agents.priors.forward import NoisedScenes
+from agents.utils.weight_average import WeightAverage
+
+
+class SelfTrainingLoss(ForwardProcessLoss):
+    """Pretraining loss of a copy of the denoiser on finished scenes, as ``loss_expectation``; no advantage is read.
+
+    ``loss_objective`` is 0: the prior in training gets no gradient from its own samples.
+
+    Args:
+        prior: what is trained elsewhere, on real scenes.
+        sampler: what made the scenes.
+        copy: the copy.
+        generator: source of timesteps, noise and observed entries (CPU); None for torch's own.
+
+    >>> from agents.priors.testing import tiny_prior
+    >>> prior = tiny_prior("dimsum_table", process="mixed")
+    >>> scenes = TensorDict({"scene": prior.encode(prior.sample(2, num_steps=3))}, [2])
+    >>> loss = SelfTrainingLoss(prior, prior, copy=TrainedCopy(prior, 1e-4))(scenes)
+    >>> float(loss["loss_objective"]), float(loss["loss_expectation"]) > 0
+    (0.0, True)
+    """
+
+    def __init__(
+        self, prior: ScenePrior, sampler: ScenePrior, *, copy: TrainedCopy, generator: Generator | None = None
+    ) -> None:
+        super().__init__(prior, sampler, generator=generator)
+        self.copy = copy
+
+    @property
+    def in_keys(self) -> list[Any]:  # type: ignore[override]
+        """Keys that must be present."""
+        return [self.tensor_keys.scene]
+
+    def continuous_loss(self, output: Tensor, old: Tensor, target: Tensor, advantage: Tensor) -> Tensor:
+        """Squared errors, whatever the advantage."""
+        return (output - target).square()
+
+    def category_loss(self, logits: Tensor, old: Tensor, category: Tensor, advantage: Tensor) -> Tensor:
+        """Cross-entropies, whatever the advantage."""
+        return -logits.log_softmax(-1).gather(-1, category[..., None])[..., 0]
+
+    def _losses(
+        self, noised: NoisedScenes, text: Text | None, advantage: Tensor, credit: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """See :class:`ForwardProcessLoss`."""
+        own = self.copy.prior.noised_loss(noised, text)
+        nothing = torch.zeros_like(own)
+        return nothing, own, nothing, own.new_zeros(())
+
+
+class Neon(ForwardProcess):
+    """Negative extrapolation from self-training (Alemohammad et al. 2025, arXiv 2510.03597), in rounds.
+
+    A round lasts ``settings.period`` iterations, in which the prior theta samples all scenes. Two copies of it are
+    trained with the pretraining loss from the same timesteps and noise: one on real scenes (theta_real, by the loop),
+    one on the samples (theta_own). The next round begins with theta + w (theta_real - theta_own). What the two copies
+    have in common, such as what further training changes on any scenes, leaves the difference.
+
+    Args:
+        settings: its keys.
+        policy: what is trained on real scenes.
+        stds: of the reverse steps; not used.
+    """
+
+    copy: TrainedCopy
+
+    def __init__(self, settings: NeonSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
+        self.policy = policy
+        self.prior: ScenePrior = policy.prior  # type: ignore[assignment]
+        self.sampler = deepcopy(self.prior).eval().requires_grad_(False)
+        self._sampling_policy = DenoisingPolicy(self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance)
+        self.draws, self.period, self.weight = settings.draws, settings.period, settings.w
+        self.copy = TrainedCopy(self.prior, settings.own_lr)
+        self.loss = SelfTrainingLoss(self.prior, self.sampler, copy=self.copy)
+        self.iterations = 0
+        self._average = WeightAverage(self.prior, 0.0)  # theta, which samples and is evaluated
+
+    @property
+    def branching(self) -> Branching:
+        """Scenes share nothing."""
+        return Branching()
+
+    @property
+    def real_noise(self) -> str:
+        """The stream of the own samples: both copies see the same timesteps and noise."""
+        return "steps"
+
+    def advantage(self, rollout: Rollout) -> TensorDict:
+        """Nothing: the samples are not weighted."""
+        return TensorDict({}, [len(rollout.reward)])
+
+    def end_iteration(self) -> None:
+        """At the end of a round, extrapolate and begin the next one."""
+        self.iterations += 1
+        if self.iterations % self.period == 0:
+            real, own = (dict(module.named_parameters()) for module in (self.prior, self.copy.prior))
+            theta = self._average.tensors
+            self._begin({name: theta[name] + self.weight * (real[name] - own[name]).detach() for name in theta})
+
+    def _begin(self, weights: dict[str, Tensor]) -> None:
+        """Begin a round with these weights."""
+        self._average.tensors = weights
+        for module in (self.prior, self.copy.prior, self.sampler):
+            self._average.copy_to(module)
+
+    def return_to(self, prior: ScenePrior) -> None:
+        """Begin a round with the weights of an earlier checkpoint."""
+        self.iterations = 0
+        self._begin({name: p.detach().clone() for name, p in prior.named_parameters()})
+
+    def state(self) -> dict[str, Any]:
+        """The weights that sample, those of the copy, and the place in the round."""
+        return {"sampler": self._average.tensors, "copy": self.copy.state(), "iterations": self.iterations}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Inverse of :meth:`state`."""
+        self._average.tensors = state["sampler"]
+        self._average.copy_to(self.sampler)
+        self.copy.restore(state["copy"])
+        self.iterations = state["iterations"]
