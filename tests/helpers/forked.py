@@ -101,5 +101,5 @@ def forked_workers() -> Iterator[None]:
     stand_in = SimpleNamespace(**{**vars(subprocess), "Popen": ForkedModule})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("scene_envs.physics.pool.subprocess", stand_in)
-        patch.setattr("rewards.isolation.subprocess", stand_in)
+        patch.setattr("rewards.reward_process.subprocess", stand_in)
         yield
