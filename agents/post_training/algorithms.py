@@ -238,7 +238,6 @@ class NeonSettings(AlgorithmSettings):
         draws: timesteps and noises of every own sample per optimiser step.
         w: length of the extrapolation away from the copy that is trained on own samples.
         period: iterations of a round, which ends with an extrapolation.
-        own_lr: learning rate of the copy that is trained on own samples; the same as ``optimizer.lr``.
     """
 
     learning_rate: ClassVar[float] = 1e-4
@@ -250,12 +249,11 @@ class NeonSettings(AlgorithmSettings):
     draws: int = 1
     w: float = 1.0
     period: int = 20
-    own_lr: float = 1e-4
 
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least(self, 1, "updates", "draws", "period")
-        positive(self, "w", "own_lr")
+        positive(self, "w")
 
     @property
     def optimiser_steps(self) -> int:

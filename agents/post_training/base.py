@@ -77,6 +77,15 @@ class Algorithm(ABC, Generic[Credit]):
         prior = cast(ScenePrior, self.policy.prior)
         return forward_kl(prior, base, rollout, generator, self.policy.chunk)
 
+    def learning_rate(self, rate: float, update: int) -> float:
+        """Learning rate of an update.
+
+        Args:
+            rate: ``optimizer.lr``, after its warm-up.
+            update: its number in the run.
+        """
+        return rate
+
     def end_iteration(self) -> None:
         """Called after the last update of every batch."""
         return

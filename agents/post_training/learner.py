@@ -223,12 +223,13 @@ class Learner:
             NonFiniteGradient: the gradient is not finite; nothing was changed.
         """
         config = self.config.optimizer
+        rate = self.algorithm.learning_rate(self.lr * min(1.0, (index + 1) / max(1, config.warmup)), index)
         row = self.accumulate(rollout, advantage, scenes, index)
         row["gradient_norm"] = float(nn.utils.clip_grad_norm_(self.parameters, config.clip))
         if not all(math.isfinite(row[name]) for name in ("gradient_norm", "policy_loss", "pretraining_loss")):
             self.optimizer.zero_grad(set_to_none=True)
             raise NonFiniteGradient(row)
-        row["learning_rate"] = self.lr * min(1.0, (index + 1) / max(1, config.warmup))
+        row["learning_rate"] = rate
         for group in self.optimizer.param_groups:
             group["lr"] = row["learning_rate"]
         self.optimizer.step()

@@ -74,7 +74,8 @@ class Neon(ForwardProcess):
     A round lasts ``settings.period`` iterations, in which the prior theta samples all scenes. Two copies of it are
     trained with the pretraining loss from the same timesteps and noise: one on real scenes (theta_real, by the loop),
     one on the samples (theta_own). The next round begins with theta + w (theta_real - theta_own). What the two copies
-    have in common, such as what further training changes on any scenes, leaves the difference.
+    have in common, such as what further training changes on any scenes, leaves the difference. In a round the learning
+    rate of both falls from ``optimizer.lr`` to 0.
 
     Args:
         settings: its keys.
@@ -90,7 +91,8 @@ class Neon(ForwardProcess):
         self.sampler = deepcopy(self.prior).eval().requires_grad_(False)
         self._sampling_policy = DenoisingPolicy(self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance)
         self.draws, self.period, self.weight = settings.draws, settings.period, settings.w
-        self.copy = TrainedCopy(self.prior, settings.own_lr)
+        self.updates = settings.updates
+        self.copy = TrainedCopy(self.prior, settings.learning_rate)
         self.loss = SelfTrainingLoss(self.prior, self.sampler, copy=self.copy)
         self.iterations = 0
         self._average = WeightAverage(self.prior, 0.0)  # theta, which samples and is evaluated
@@ -108,6 +110,14 @@ class Neon(ForwardProcess):
     def advantage(self, rollout: Rollout) -> TensorDict:
         """Nothing: the samples are not weighted."""
         return TensorDict({}, [len(rollout.reward)])
+
+    def learning_rate(self, rate: float, update: int) -> float:
+        """That of both copies."""
+        place = self.iterations % self.period + update % self.updates / self.updates
+        rate *= 1 - place / self.period
+        for group in self.copy.optimizer.param_groups:
+            group["lr"] = rate
+        return rate
 
     def end_iteration(self) -> None:
         """At the end of a round, extrapolate and begin the next one."""

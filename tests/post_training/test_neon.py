@@ -83,6 +83,16 @@ def test_without_real_scenes_the_prior_moves_away_from_its_samples(trainer: Post
     assert loss(copy) < anchor < loss(trainer.prior.state_dict())
 
 
+def test_the_learning_rate_of_both_copies_falls_to_zero_in_a_round(trainer: PostTrainer) -> None:
+    algorithm, rates = trainer.learner.algorithm, []
+    assert isinstance(algorithm, Neon)
+    for _ in range(3):
+        row = trainer.step()[1]  # of the second of two updates
+        rates.append(row["learning_rate"])
+        assert {group["lr"] for group in algorithm.copy.optimizer.param_groups} == {row["learning_rate"]}
+    assert rates == pytest.approx([0.75e-3, 0.25e-3, 0.75e-3])
+
+
 @pytest.mark.parametrize("process", ["mixed", "continuous"])
 def test_the_loss_is_the_pretraining_loss_of_the_copy(process: str) -> None:
     prior = tiny_prior(process=process)
@@ -100,7 +110,7 @@ def test_the_loss_is_the_pretraining_loss_of_the_copy(process: str) -> None:
 @pytest.mark.parametrize("process", ["mixed", "continuous"])
 def test_nothing_changes_where_the_real_scenes_are_the_own_samples(tmp_path: Path, process: str) -> None:
     """Both copies see the same timesteps and noise, so that only the scenes can tell them apart."""
-    keys: dict[str, Any] = {"algorithm": {"name": "neon", "updates": 2, "period": 1, "own_lr": 1e-3}}
+    keys: dict[str, Any] = {"algorithm": {"name": "neon", "updates": 2, "period": 1}}
     config = small_config(tmp_path, iterations=1, **keys, **{"regularisation.batch_size": 6})
     trainer = PostTrainer(config, prior=tiny_prior(process=process))
     trainer.prepare()
@@ -117,7 +127,7 @@ def test_nothing_changes_where_the_real_scenes_are_the_own_samples(tmp_path: Pat
     trainer.close()
 
 
-@pytest.mark.parametrize("keys", [{"w": 0.0}, {"period": 0}, {"own_lr": -1.0}])
+@pytest.mark.parametrize("keys", [{"w": 0.0}, {"period": 0}])
 def test_values_that_cannot_be_are_named(tmp_path: Path, keys: dict[str, Any]) -> None:
     with pytest.raises(InvalidInputError, match=next(iter(keys))):
         small_config(tmp_path, algorithm={"name": "neon", **keys})
