@@ -56,9 +56,16 @@ PARTS = {
 
 def main(words: Sequence[str]) -> None:
     """Measure what is asked for and print the sums."""
+    if {"-h", "--help"} & set(words):
+        sys.exit(__doc__)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     named = dict(word.partition("=")[::2] for word in words)
     path, seed = Path(named.pop("rows", "reliability.jsonl")), int(named.pop("seed", "0"))
+    unknown = [f"{name}={count}" for name, count in named.items() if name not in PARTS or not (count or "1").isdigit()]
+    if unknown:
+        sys.exit(
+            f"{', '.join(unknown)}: known are {', '.join(PARTS)}, each alone or as PART=COUNT, rows=FILE and seed=N"
+        )
     asked = {name: int(count or PARTS[name].count) for name, count in named.items()}
     asked = asked or {name: part.count for name, part in PARTS.items()}
     for name, count in asked.items():
