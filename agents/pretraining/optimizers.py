@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.optim.adamw import adamw
 
 from agents.pretraining.config import PretrainConfig
 from scene_envs.errors import unknown_name
@@ -93,11 +94,13 @@ class MuonAdamW(torch.optim.Optimizer):
     def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
         """One update of every parameter that has a gradient; a closure is not supported."""
         for group in self.param_groups:
-            update = self._muon if group["kind"] == "muon" else self._adamw
-            for parameter in group["params"]:
-                if parameter.grad is not None:
-                    parameter.mul_(1.0 - group["lr"] * group["weight_decay"])
-                    parameter.add_(update(parameter.grad, self.state[parameter]), alpha=-group["lr"])
+            parameters = [p for p in group["params"] if p.grad is not None]
+            if group["kind"] == "adamw":
+                self._step_adamw(parameters, group["lr"], group["weight_decay"])
+                continue
+            for parameter in parameters:
+                parameter.mul_(1.0 - group["lr"] * group["weight_decay"])
+                parameter.add_(self._muon(parameter.grad, self.state[parameter]), alpha=-group["lr"])
 
     @staticmethod
     def _muon(gradient: Tensor, state: dict[str, Any]) -> Tensor:
@@ -106,16 +109,27 @@ class MuonAdamW(torch.optim.Optimizer):
         direction = orthogonalised(gradient.lerp(momentum, _MOMENTUM))
         return 0.2 * math.sqrt(max(gradient.shape)) * direction
 
-    @staticmethod
-    def _adamw(gradient: Tensor, state: dict[str, Any]) -> Tensor:
-        if not state:
-            state |= {"step": 0, "mean": torch.zeros_like(gradient), "square": torch.zeros_like(gradient)}
-        state["step"] += 1
-        state["mean"].lerp_(gradient, 1.0 - _BETAS[0])
-        state["square"].mul_(_BETAS[1]).addcmul_(gradient, gradient, value=1.0 - _BETAS[1])
-        mean = state["mean"] / (1.0 - _BETAS[0] ** state["step"])
-        result: Tensor = mean / ((state["square"] / (1.0 - _BETAS[1] ** state["step"])).sqrt() + _EPS)
-        return result
+    def _step_adamw(self, parameters: list[Tensor], lr: float, weight_decay: float) -> None:
+        states = [self.state[p] for p in parameters]
+        for parameter, state in zip(parameters, states, strict=True):
+            if not state:
+                state |= {"step": 0, "mean": torch.zeros_like(parameter), "square": torch.zeros_like(parameter)}
+            state["step"] = torch.as_tensor(float(state["step"]))
+        adamw(
+            parameters,
+            [p.grad for p in parameters if p.grad is not None],
+            *([state[name] for state in states] for name in ("mean", "square")),
+            max_exp_avg_sqs=[],
+            state_steps=[state["step"] for state in states],
+            foreach=False,
+            amsgrad=False,
+            beta1=_BETAS[0],
+            beta2=_BETAS[1],
+            lr=lr,
+            weight_decay=weight_decay,
+            eps=_EPS,
+            maximize=False,
+        )
 
 
 def orthogonalised(matrix: Tensor, steps: int = 5) -> Tensor:
