@@ -118,7 +118,8 @@ class MuonAdamW(torch.optim.Optimizer):
         adamw(
             parameters,
             [p.grad for p in parameters if p.grad is not None],
-            *([state[name] for state in states] for name in ("mean", "square")),
+            [state["mean"] for state in states],
+            [state["square"] for state in states],
             max_exp_avg_sqs=[],
             state_steps=[state["step"] for state in states],
             foreach=False,
