@@ -97,6 +97,7 @@ def test_report_and_metrics_have_the_trained_reward_before_and_after(tmp_path: P
     assert f"{metrics['after']['reward']:.2f}" in page
 
 
+@pytest.mark.slow
 def test_demonstration_end_to_end(tmp_path: Path) -> None:
     pytest.importorskip("scene_envs.physics")
     recipes = {
