@@ -71,7 +71,7 @@ def _stability() -> tuple[Row, ...]:
 def _placement() -> tuple[Row, ...]:
     """Three algorithms at equal sampled scenes and Neon, three seeds on Dimsum and one on the other types."""
     return tuple(
-        Row(f"{prior}-{name}-{seed}", prior, _keys(name, "feasible_share", seed), 60 if name == NEON else LENGTH)
+        Row(f"{prior}-{name}-{seed}", prior, _keys(name, "feasible_share", seed), 20 if name == NEON else LENGTH)
         for prior in TYPES
         for name in (FORWARD, CHAIN, BASELINE, NEON)
         for seed in range(3 if prior == "dimsum_table" else 1)
