@@ -190,7 +190,7 @@ def _page(
     settings: Mapping[str, Any],
     held: Sequence[Section],
 ) -> Page:
-    reward = reward_name(settings["reward"]).replace("_", " ")
+    reward = reward_name(settings["reward"]).rpartition("<locals>.")[2].replace("_", " ")
     algorithm = settings["algorithm"]["name"].upper().replace("_", "-")
     before, after, guard = metrics["before"], metrics["after"], metrics["guard"]
     count = int(before["scenes"])
