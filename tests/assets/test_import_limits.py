@@ -127,7 +127,6 @@ def test_a_stage_is_ended_when_the_time_of_the_file_is_over(tmp_path: Path, monk
     assert "\n" not in text
 
 
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes are a thing of POSIX")
 def test_a_small_file_that_never_ends_is_ended_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
     listed(tmp_path, "box.obj").write_text(f"mtllib pipe.mtl\n{corners}usemtl a\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n")
