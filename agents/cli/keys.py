@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import re
 import shutil
 import textwrap
@@ -12,11 +13,11 @@ from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 from agents.configuration.compose import check_option, choice_word, compose_tree, group_options, hidden, shown
-from agents.configuration.tree import build, check_not_moved, dotted_keys, typed
+from agents.configuration.tree import build, check_not_moved, dotted_keys, parts_of, typed
 from agents.utils.docstrings import attribute_meanings
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
 
-_FIRST = ("scene", "prior", "scenes", "data", "reward", "objective", "count", "output")
+_FIRST = ("scene", "prior", "scenes", "data", "reward", "objective", "count")
 """Keys that a listing starts with, in this order."""
 _OPENING = "[{('\""
 
@@ -65,25 +66,46 @@ def keys_of(command: Any) -> type:
 
 
 def describe_fields(config: type | Any, prefix: str = "") -> list[KeyHelp]:
-    """The keys of a config, or of the default one of its class, those of groups last.
+    """The keys of a config, or of the default one of its class, part by part, those of groups last.
 
     Meanings stand under ``Attributes:`` in the docstrings.
     """
     made = config() if isinstance(config, type) else config
-    meanings = attribute_meanings(type(made))
-    keys, groups = [], []
-    for field in dataclasses.fields(made):
-        value = getattr(made, field.name)
-        if dataclasses.is_dataclass(value):
-            groups += describe_fields(value, f"{prefix}{field.name}.")
-        else:
-            keys.append(KeyHelp(prefix + field.name, typed(value), meanings.get(field.name, "")))
-    keys.sort(key=lambda key: _FIRST.index(key.name) if key.name in _FIRST else len(_FIRST))
-    return keys + groups
+    keys = _plain_keys(made, prefix) if prefix else [key for part in _parts(made).values() for key in part]
+    for field, value in _groups(made):
+        keys += describe_fields(value, f"{prefix}{field.name}.")
+    return keys
+
+
+def _groups(made: Any) -> list[tuple[dataclasses.Field[Any], Any]]:
+    """The fields that are groups of keys, and their values."""
+    values = [(field, getattr(made, field.name)) for field in dataclasses.fields(made)]
+    return [(field, value) for field, value in values if dataclasses.is_dataclass(value)]
+
+
+def _plain_keys(made: Any, prefix: str = "", fields: Sequence[dataclasses.Field[Any]] | None = None) -> list[KeyHelp]:
+    """Those of the fields, all unless they are given, that are no groups."""
+    fields = dataclasses.fields(made) if fields is None else fields
+    meanings, values = attribute_meanings(type(made)), {field.name: getattr(made, field.name) for field in fields}
+    return [
+        KeyHelp(prefix + name, typed(value), meanings.get(name, ""))
+        for name, value in values.items()
+        if not dataclasses.is_dataclass(value)
+    ]
+
+
+def _parts(made: Any) -> dict[type, list[KeyHelp]]:
+    """The keys of a command that are no groups, by the part of its config that declares them, in a listing's order."""
+    parts = {part: sorted(_plain_keys(made, fields=own), key=_place) for part, own in parts_of(type(made)).items()}
+    return dict(sorted(((part, keys) for part, keys in parts.items() if keys), key=lambda item: _place(item[1][0])))
+
+
+def _place(key: KeyHelp) -> int:
+    return _FIRST.index(key.name) if key.name in _FIRST else len(_FIRST)
 
 
 def help_text(config: type | Any, words: Sequence[str] = (), config_dir: str = "") -> str:
-    """All keys with their values and meanings, a paragraph for each group with its options.
+    """All keys with their values and meanings, a paragraph for each part and for each group with its options.
 
     Args:
         config: the config that ``words`` make, or its class.
@@ -91,18 +113,26 @@ def help_text(config: type | Any, words: Sequence[str] = (), config_dir: str = "
         config_dir: a folder with further options.
     """
     chosen = dict(word.partition("=")[::2] for word in words)
-    keys = describe_fields(config)
-    plain = [key for key in keys if "." not in key.name]
-    after = next((place for place, key in enumerate(plain, 1) if key.name == "prior"), 0)
-    plain[after:after] = [ADAPTER] if after else []
-    parts = [format_rows([(f"{key.name}={key.default}", key.meaning) for key in plain])] if plain else []
-    for field in dataclasses.fields(config):
-        rows = [(f"{k.name}={k.default}", k.meaning) for k in keys if k.name.startswith(f"{field.name}.")]
-        if rows:
-            known = getattr(field.default_factory, "KNOWN", ())
-            heading = _heading(field, chosen.get(field.name, ""), known, config_dir)
-            parts.append(f"{heading}\n{format_rows(rows)}")
-    return "\n\n".join(parts) or "  no keys"
+    made = config() if isinstance(config, type) else config
+    sections = []
+    parts = _parts(made)
+    for part, keys in parts.items():
+        after = next((place for place, key in enumerate(keys, 1) if key.name == "prior"), 0)
+        keys[after:after] = [ADAPTER] if after else []
+        title = inspect.cleandoc(part.__doc__ or "").partition("\n")[0].rstrip(".")
+        sections.append(f"{title}:\n" * (len(parts) > 1) + _key_rows(keys))
+    for field, group in _groups(made):
+        known = getattr(field.default_factory, "KNOWN", ())
+        sections.append(_heading(field, chosen.get(field.name, ""), known, config_dir))
+        sections[-1] += f"\n{_key_rows(_plain_keys(group, f'{field.name}.'))}"
+        for inner, value in _groups(group):
+            name = f"{field.name}.{inner.name}"
+            sections.append(f"{name}:\n{_key_rows(describe_fields(value, f'{name}.'))}")
+    return "\n\n".join(sections) or "  no keys"
+
+
+def _key_rows(keys: Sequence[KeyHelp]) -> str:
+    return format_rows([(f"{key.name}={key.default}", key.meaning) for key in keys])
 
 
 def _heading(field: dataclasses.Field[Any], chosen: str, known: Sequence[str], config_dir: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import inspect
 import types
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -81,6 +82,25 @@ def default_of(field: dataclasses.Field[Any]) -> Any:
     return None if field.default is dataclasses.MISSING else field.default
 
 
+def parts_of(kind: type) -> dict[type, list[dataclasses.Field[Any]]]:
+    """Fields of a dataclass by the class that declares them first, its own before those of the classes it extends.
+
+    >>> @dataclasses.dataclass
+    ... class Seeded:
+    ...     seed: int = 0
+    >>> @dataclasses.dataclass
+    ... class Draw(Seeded):
+    ...     count: int = 1
+    >>> {part.__name__: [field.name for field in fields] for part, fields in parts_of(Draw).items()}
+    {'Draw': ['count'], 'Seeded': ['seed']}
+    """
+    first = {name: part for part in kind.__mro__ for name in inspect.get_annotations(part)}
+    parts: dict[type, list[dataclasses.Field[Any]]] = {part: [] for part in kind.__mro__}
+    for field in dataclasses.fields(kind):
+        parts[first[field.name]].append(field)
+    return {part: fields for part, fields in parts.items() if fields}
+
+
 def check_not_moved(kind: type, key: str, command: str = "") -> None:
     """Refuse a key of an earlier version and name the one that took its place.
 
@@ -148,20 +168,21 @@ def dotted(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def plain_tree(config: Any) -> dict[str, Any]:
-    """A config as nested mappings of numbers, strings and lists."""
-    return {field.name: _plain(getattr(config, field.name)) for field in dataclasses.fields(config)}
+    """A config as nested mappings of numbers, strings and lists, its keys in the order of :func:`parts_of`."""
+    tree = _plain(config)
+    return {field.name: tree[field.name] for part in parts_of(type(config)).values() for field in part}
 
 
 def config_text(values: Any) -> str:
     """All keys as the ``config.yaml`` that ``--config`` reads; of a config, or of a nested mapping."""
     import yaml
 
-    return yaml.safe_dump(_plain(values), sort_keys=False)
+    return yaml.safe_dump(plain_tree(values) if dataclasses.is_dataclass(values) else _plain(values), sort_keys=False)
 
 
 def _plain(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return plain_tree(value)
+        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
         return {key: _plain(item) for key, item in value.items()}
     return [_plain(item) for item in value] if isinstance(value, list | tuple) else value

@@ -38,8 +38,8 @@ MODULES: dict[str, type[ModuleConfig]] = {
 
 
 @dataclass(frozen=True)
-class MixedFluxConfig:
-    """Size of a :class:`~agents.networks.MixedFlux`, and the modules that are added to its core.
+class MixedFluxSize:
+    """Size of the core of a :class:`~agents.networks.MixedFlux`.
 
     Attributes:
         categories: K = C + 1, assets and *empty*; the mask token is one more.
@@ -50,6 +50,23 @@ class MixedFluxConfig:
         mlp_ratio: width of the MLPs over ``hidden``.
         embedding: E, width of the embedding of a slot, and of what leaves the last layer.
         pose_head: hidden width of the pose output.
+    """
+
+    categories: int
+    hidden: int = 128
+    double_blocks: int = 2
+    single_blocks: int = 4
+    heads: int = 4
+    mlp_ratio: float = 4.0
+    embedding: int = 128
+    pose_head: int = 64
+
+
+@dataclass(frozen=True)
+class MixedFluxConfig(MixedFluxSize):
+    """Size of a :class:`~agents.networks.MixedFlux`, what it reads, and the modules that are added to its core.
+
+    Attributes:
         text_width: W, width of the text tokens; 0 for none.
         text_reach: how far text goes: to the ``"double"``-stream blocks, or through ``"all"`` blocks, as the paper's.
         time_input: what is embedded as time, one of :data:`TIME_INPUTS`; ``"timestep"`` is the paper's.
@@ -65,14 +82,6 @@ class MixedFluxConfig:
     (RelationsConfig(blur='axis'),)
     """
 
-    categories: int
-    hidden: int = 128
-    double_blocks: int = 2
-    single_blocks: int = 4
-    heads: int = 4
-    mlp_ratio: float = 4.0
-    embedding: int = 128
-    pose_head: int = 64
     text_width: int = 0
     text_reach: str = "all"
     time_input: str = "timestep"

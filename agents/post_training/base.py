@@ -56,11 +56,6 @@ class Algorithm(ABC, Generic[Credit]):
         """The weights that are evaluated and saved in place of those in training; None for the latter."""
         return None
 
-    @property
-    def real_noise(self) -> str:
-        """Stream of the timesteps and noise of real scenes: ``real``, or ``steps`` for those of the own samples."""
-        return "real"
-
     @abstractmethod
     def advantage(self, rollout: Rollout) -> Credit:
         """Advantages of the scenes of a batch, or of their objects."""
@@ -71,6 +66,15 @@ class Algorithm(ABC, Generic[Credit]):
 
         On several processes each adds the part of its own scenes in the mean over all, and the loop sums the parts.
         """
+
+    def real_generator(self, own: Generator, real: Generator) -> Generator:
+        """Source of the timesteps and noise of real scenes in an update (CPU).
+
+        Args:
+            own: in the state of the generator that :meth:`accumulate` was given in this update.
+            real: independent of it; drew the real scenes.
+        """
+        return real
 
     def kl(self, rollout: Rollout, base: ScenePrior, generator: Generator) -> Iterator[Tensor]:
         """Terms () whose sum is the KL divergence of the prior in training from ``base``, nats per random variable."""

@@ -12,6 +12,7 @@ from agents.configuration.checks import at_least, one_of, positive
 from agents.configuration.fields import composed, moved, named, nested
 from agents.configuration.prior_names import split_name
 from agents.configuration.settings import LoggerSettings, OptimizerSettings
+from agents.configuration.shared_keys import RewardLimits, SamplingKeys, TrainingKeys
 from agents.configuration.tree import plain_tree
 from agents.post_training.algorithms import AlgorithmSettings, DDPOSFSettings, algorithm_settings, list_algorithms
 from agents.post_training.inpaint_settings import InpaintSettings
@@ -120,9 +121,25 @@ class PostTrainLoggerSettings(LoggerSettings):
             raise InvalidInputError(f"report_scenes={self.report_scenes} must not be negative; 0 writes no report")
 
 
+@dataclass
+class BatchKeys:
+    """Batches of fresh scenes.
+
+    Attributes:
+        iterations: policy updates, that is batches of fresh scenes.
+        batch_size: scenes sampled per iteration.
+        workers: physics worker processes; 0 computes physics in this process, ``ray`` on a Ray cluster, with as many
+            as that has CPUs.
+    """
+
+    iterations: int = 60
+    batch_size: int = 48
+    workers: Any = 0
+
+
 @composed
 @dataclass
-class PostTrainConfig:
+class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
     """One post-training run.
 
     The gradient that AdamW sees is that of
@@ -140,24 +157,14 @@ class PostTrainConfig:
         prior: the prior to start from, a shipped name or a path.
         reward: registered name, or a mapping with ``name`` and settings; in Python a function or reward object as
             well, which runs in this process: a hang or crash of it is the run's.
+        recipe: a named set of the other keys: ``ours``, ``demo_clutter``, ``demo_feasible``; keys beside it win.
         output: run directory; an interrupted run found there goes on where it stopped; empty for runs/COMMAND-TIME
             on the command line, runs/post-train in Python.
         prompt: what the scenes should hold, for priors that read prompts: one text, a list such as
             '["A scene with two cups.", "A scene with 9 objects."]', ``data`` for the prompts of the real scenes, or
             ``grammar`` for descriptions of the grammar's; null for anything.
         guidance: weight of classifier-free guidance in the policy, 0 for none; needs a prompt.
-        num_steps: denoising steps per scene.
-        slots: slots per scene; null means as many as the prior was trained on.
         seed: of x_T, the chain's noise, the steps drawn and the real scenes.
-        device: torch device.
-        workers: physics worker processes; 0 computes physics in this process, ``ray`` on a Ray cluster, with as many
-            as that has CPUs.
-        reward_timeout: seconds that a reward from outside this package, which runs in a process of its own, may take
-            for a batch; then its scenes are invalid.
-        reward_memory: GiB that such a reward may allocate.
-        batch_size: scenes sampled per iteration.
-        iterations: policy updates, that is batches of fresh scenes.
-        recipe: a named set of the other keys: ``ours``, ``demo_clutter``, ``demo_feasible``; keys beside it win.
         algorithm: how rewards become a gradient.
         optimizer: of the weights.
         regularisation: on real scenes.
@@ -184,19 +191,8 @@ class PostTrainConfig:
 
     prior: str = "dimsum_table_continuous"
     reward: Any = named("object_count", "reward")
-    output: str = ""
-    prompt: str | list[str] | None = None
-    guidance: float = 0.0
+    prompt: str | list[str] | None = None  # type: ignore[assignment]
     num_steps: int = 25
-    slots: int | None = None
-    seed: int = 0
-    device: str = "cpu"
-    workers: Any = 0
-    reward_timeout: float = 60.0
-    reward_memory: float = 1.0
-    batch_size: int = 48
-    iterations: int = 60
-    recipe: str = "ours"
     algorithm: AlgorithmSettings = nested(
         DDPOSFSettings, folder="algorithm", option="ddpo_sf", kinds=algorithm_settings, registered=list_algorithms
     )

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -14,38 +13,19 @@ from torch import Generator, Tensor
 
 from agents.post_training.advantages import compute_advantages, sibling_advantages
 from agents.post_training.algorithms import AWMSettings, ForwardProcessSettings, NFTSettings, RewardWeightedSettings
-from agents.post_training.base import Algorithm
-from agents.post_training.expectation import Expectation, TrainedCopy
+from agents.post_training.expectation import Expectation
 from agents.post_training.forward_losses import AWMLoss, NFTLoss, RewardWeightedLoss
 from agents.post_training.forward_process_loss import ForwardProcessLoss
-from agents.post_training.gradients import GradientSum, credited_reward
+from agents.post_training.gradients import credited_reward
+from agents.post_training.own_samples import OwnSampleAlgorithm, OwnSampleGradient
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import Branching, Rollout, rollout_groups
 from agents.priors.base import ScenePrior
-from agents.utils.process_group import ProcessGroup, gather_rows
+from agents.utils.process_group import ProcessGroup
 from agents.utils.weight_average import WeightAverage
 
 
-@dataclass(frozen=True)
-class ForwardGradient:
-    """Statistics of an accumulated forward-process gradient.
-
-    Attributes:
-        loss: value of the objective.
-        distance: root mean square of the trained denoiser's output minus that of the sampling policy's.
-        limited: share of bad poses that no longer repel the output.
-    """
-
-    loss: float
-    distance: float
-    limited: float
-
-    def figures(self) -> Mapping[str, float]:
-        """Further columns of the log."""
-        return {"distance": self.distance, "limited": self.limited}
-
-
-class ForwardProcess(Algorithm[TensorDict]):
+class ForwardProcess(OwnSampleAlgorithm):
     """Algorithm of NFT, AWM and reward weighting, which differ in their loss; see :class:`ForwardProcessLoss`.
 
     A slower copy of the prior in training, an average of its weights, samples the scenes. This copy is also evaluated
@@ -58,19 +38,13 @@ class ForwardProcess(Algorithm[TensorDict]):
     """
 
     loss: ForwardProcessLoss
-    copy: TrainedCopy | None
-    """A copy of the denoiser that is trained on the samples, by ``loss_expectation``."""
+    copy: Expectation | None
 
     def __init__(self, settings: ForwardProcessSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
+        super().__init__(policy, draws=settings.draws, sampler_decay=settings.sampler_decay)
         self.settings = settings
-        self.policy = policy
-        self.prior: ScenePrior = policy.prior  # type: ignore[assignment]
-        self.sampler = deepcopy(self.prior).eval().requires_grad_(False)
-        self._sampling_policy = DenoisingPolicy(self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance)
-        self._average = WeightAverage(self.prior, settings.sampler_decay)
         rate = getattr(settings, "expectation_lr", 0.0)
         self.copy = Expectation(self.sampler, rate) if rate else None
-        self.draws = settings.draws
         self.loss = self.make_loss()
 
     def make_loss(self) -> ForwardProcessLoss:
@@ -83,16 +57,6 @@ class ForwardProcess(Algorithm[TensorDict]):
             return kind(*pair, beta=settings.beta, clip=settings.advantage_clip, **limits)
         assert isinstance(settings, RewardWeightedSettings)
         return RewardWeightedLoss(*pair, temperature=settings.temperature)
-
-    @property
-    def sampling_policy(self) -> DenoisingPolicy:
-        """The reverse chain of the slower copy."""
-        return self._sampling_policy
-
-    @property
-    def average(self) -> WeightAverage:
-        """The weights of the slower copy."""
-        return self._average
 
     @property
     def branching(self) -> Branching:
@@ -134,42 +98,14 @@ class ForwardProcess(Algorithm[TensorDict]):
             groups = rows // self.settings.siblings
         return compute_advantages(rollout.reward, rollout.valid, clip=math.inf, groups=groups)[:, None]
 
-    def accumulate(self, rollout: Rollout, advantage: TensorDict, generator: Generator) -> ForwardGradient:
-        """Add the gradient of a batch to ``.grad``: ``draws`` timesteps and noises of every scene.
+    def measure(self, result: TensorDict) -> dict[str, float]:
+        """Mean square of the trained denoiser's output minus the sampling policy's, and share of limited bad poses."""
+        return {"distance": float(result["distance"]) ** 2, "limited": float(result["limited"])}
 
-        On several processes ``.grad`` holds the part of this one's scenes in the mean over all.
-        """
-        x0 = self.prior.encode(rollout.batch.to(self.prior.device))
-        fields: dict[str, Any] = {"scene": x0, "valid": rollout.valid, **advantage}
-        if rollout.text is not None:
-            fields |= {"text": rollout.text[0], "text_mask": rollout.text[1]}
-        scenes = TensorDict(fields, [len(x0)])
-        size, processes = self.policy.chunk or len(x0), ProcessGroup.current()
-        valid = max(1.0, processes.sum_numbers(int(rollout.valid.sum()))[0])
-        everything, own = gather_rows(x0), processes.rows(processes.size * len(x0))
-        seen = None if rollout.observed is None else gather_rows(rollout.observed)
-        observed = self.prior.observed_by_mask(everything, seen)
-        draws = [self.prior.noised(everything, generator, observed=observed).rows(own) for _ in range(self.draws)]
-        total, distance, limited = 0.0, 0.0, 0.0
-        learned = [] if self.copy is None else self.copy.trained
-        gradient = GradientSum([*self.prior.parameters(), *learned])
-        for start in range(0, len(x0), size):
-            rows = slice(start, start + size)
-            part = scenes[rows]
-            share = int(part["valid"].sum()) / valid / self.draws
-            for noised in draws:
-                result = self.loss.of_noised(noised.rows(rows), part)
-                objective = result["loss_objective"] * share
-                (objective + result["loss_expectation"] * share).backward()
-                total += float(objective.detach())
-                distance += share * float(result["distance"]) ** 2
-                limited += share * float(result["limited"])
-            gradient.add_part()
-        gradient.write()
-        if self.copy is not None:
-            self.copy.step()
-        total, distance, limited = processes.sum_numbers(total, distance, limited)
-        return ForwardGradient(total, distance**0.5, limited)
+    def accumulate(self, rollout: Rollout, advantage: TensorDict, generator: Generator) -> OwnSampleGradient:
+        """See :class:`OwnSampleAlgorithm`; ``distance`` is a root mean square."""
+        gradient = super().accumulate(rollout, advantage, generator)
+        return replace(gradient, means={**gradient.means, "distance": gradient.means["distance"] ** 0.5})
 
     def end_iteration(self) -> None:
         """Move the sampling policy towards the prior in training."""

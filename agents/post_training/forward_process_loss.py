@@ -7,23 +7,24 @@ no stored trajectories and no particular sampler.
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Generator, Tensor
-from torchrl.objectives import LossModule
 
 from agents.networks.text import Text
 from agents.post_training.expectation import Expectation
+from agents.post_training.own_sample_loss import OwnSampleLoss
 from agents.priors.base import ScenePrior
 from agents.priors.forward import NoisedScenes
 from scene_envs.errors import InvalidInputError
 
 
-class ForwardProcessLoss(LossModule):
-    """A loss of finished scenes x_0 at random timesteps of the forward process.
+class ForwardProcessLoss(OwnSampleLoss):
+    """A loss of finished scenes x_0 at random timesteps of the forward process, weighted by their advantages.
 
     Every scene is noised once per call. o is the output of the trained denoiser, and o_old that of the sampling policy.
     A subclass defines the loss of an entry, given the advantage of its slot. Squared errors are weighted and reduced as
@@ -36,16 +37,10 @@ class ForwardProcessLoss(LossModule):
     Poses take ``advantage``, categories ``category_advantage``; each is one number per scene or one per slot. The
     network denoises every slot given the others, so an advantage per slot credits an object for its own pose alone.
 
-    Accepted keys (``set_keys``):
-        scene: (B, N, D) float, finished scenes x_0 as the prior encodes them. Default ``"scene"``.
+    Accepted keys (``set_keys``), beside those of :class:`~agents.post_training.own_sample_loss.OwnSampleLoss`:
         advantage: (B,), (B, 1) or (B, N) float, for poses. Default ``"advantage"``.
         category_advantage: the same for categories, optional; without it they have no credit. Default
             ``"category_advantage"``.
-        timestep: (B,) or (B, 1) int64, optional; drawn as in pretraining without. Default ``"timestep"``.
-        valid: (B,) or (B, 1) bool, optional; False rows are left out of the mean. Default ``"valid"``.
-        text, text_mask: (B, L, W) tokens and (B, L) their mask, optional. Default ``"text"`` and ``"text_mask"``.
-        observed: (B, N, 2) bool, optional, True where the pose, or the category, of a slot is observed: in an
-            inpainting the other entries alone have a loss. Default ``"observed"``.
 
     Args:
         prior: what is trained.
@@ -62,21 +57,13 @@ class ForwardProcessLoss(LossModule):
     """
 
     @dataclass
-    class _AcceptedKeys:
-        scene: NestedKey = "scene"
+    class _AcceptedKeys(OwnSampleLoss._AcceptedKeys):
         advantage: NestedKey = "advantage"
         category_advantage: NestedKey = "category_advantage"
-        timestep: NestedKey = "timestep"
-        valid: NestedKey = "valid"
-        text: NestedKey = "text"
-        text_mask: NestedKey = "text_mask"
-        observed: NestedKey = "observed"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
     out_keys = ["loss_objective", "loss_expectation", "distance", "limited"]  # noqa: RUF012  (torchrl reads lists)
-    prior: ScenePrior
-    generator: Generator | None
 
     def __init__(
         self,
@@ -88,13 +75,11 @@ class ForwardProcessLoss(LossModule):
         expectation: Expectation | None = None,
         generator: Generator | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(prior, generator=generator)
         if push_limit < 0:
             raise InvalidInputError(f"push_limit={push_limit} must not be negative; 0 is for no limit")
         if push_limit and base is None:
             raise InvalidInputError(f"push_limit={push_limit} compares with the base prior; give base=")
-        self.prior = prior
-        self.generator = generator
         self.push_limit = push_limit
         self.expectation = expectation
         self._others = (sampler, base)  # in a tuple: not modules of the loss, whose parameters are the prior's
@@ -110,17 +95,9 @@ class ForwardProcessLoss(LossModule):
         return self._others[1]
 
     @property
-    def functional(self) -> bool:
-        """False: the prior's own parameters receive the gradient."""
-        return False
-
-    @property
     def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
         """Keys that must be present."""
-        return [self.tensor_keys.scene, self.tensor_keys.advantage]
-
-    def _forward_value_estimator_keys(self, **kwargs: object) -> None:
-        """These losses have no value estimator."""
+        return [*super().in_keys, self.tensor_keys.advantage]
 
     @abstractmethod
     def continuous_loss(self, output: Tensor, old: Tensor, target: Tensor, advantage: Tensor) -> Tensor:
@@ -144,44 +121,21 @@ class ForwardProcessLoss(LossModule):
             advantage: (B, 1) or (B, N).
         """
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """The loss of a batch of finished scenes.
+    def of_noised(self, noised: NoisedScenes, flat: TensorDictBase) -> TensorDict:
+        """The loss of a batch of shape [B] whose scenes the prior has noised already.
 
         Raises:
             InvalidInputError: an advantage has neither one value per scene nor one per slot.
         """
-        flat = tensordict.reshape(-1)
-        timestep = flat.get(self.tensor_keys.timestep, None)
-        scene = flat.get(self.tensor_keys.scene).detach()
-        observed = self.prior.observed_by_mask(scene, flat.get(self.tensor_keys.observed, None))
-        t = None if timestep is None else timestep.reshape(-1)
-        noised = self.prior.noised(scene, self.generator, t, observed)
-        return self.of_noised(noised, flat)
+        found = super().of_noised(noised, flat)
+        found["distance"] = found["distance"].sqrt()
+        return found
 
-    def of_noised(self, noised: NoisedScenes, flat: TensorDictBase) -> TensorDict:
-        """The loss of a batch of shape [B] whose scenes the prior has noised already."""
-        keys = self.tensor_keys
-        scene = flat.get(keys.scene)
-        advantage = self._advantage(flat, keys.advantage, scene)
-        credit = self._advantage(flat, keys.category_advantage, scene)
-        tokens, mask = flat.get(keys.text, None), flat.get(keys.text_mask, None)
-        text = None if tokens is None or mask is None else (tokens.detach(), mask)
-        valid = flat.get(keys.valid, None)
-        kept = torch.ones(len(scene), dtype=torch.bool, device=scene.device) if valid is None else valid.reshape(-1)
-        losses, expectation, distance, limited = self._losses(noised, text, advantage, credit)
-        count = kept.sum().clamp(min=1)
-        fields = {
-            "loss_objective": torch.where(kept, losses, 0.0).sum() / count,
-            "loss_expectation": torch.where(kept, expectation, 0.0).sum() / count,
-            "distance": (torch.where(kept, distance, 0.0).sum() / count).sqrt(),
-            "limited": limited,
-        }
-        return TensorDict(fields, [])
-
-    def _losses(
-        self, noised: NoisedScenes, text: Text | None, advantage: Tensor, credit: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def of_scenes(self, noised: NoisedScenes, text: Text | None, flat: TensorDictBase) -> Mapping[str, Tensor]:
         """(B,) losses, (B,) those of the expectation, (B,) mean squares of o - o_old, and the limited share ()."""
+        scene = flat.get(self.tensor_keys.scene)
+        advantage = self._advantage(flat, self.tensor_keys.advantage, scene)
+        credit = self._advantage(flat, self.tensor_keys.category_advantage, scene)
         output = self.prior.output(noised, text)
         with torch.no_grad():
             old = self.sampler.output(noised, text)
@@ -205,7 +159,7 @@ class ForwardProcessLoss(LossModule):
             slots = self.category_loss(output.logits, old.logits, noised.category, credit)
             mean = (slots * noised.drawn).sum(dim=1) / noised.drawn.sum(dim=1).clamp(min=1.0)
             losses = losses + self.prior.config.category_weight * mean
-        return losses, expectation, distance, limited
+        return {"loss_objective": losses, "loss_expectation": expectation, "distance": distance, "limited": limited}
 
     def _limited(
         self, noised: NoisedScenes, text: Text | None, advantage: Tensor, old: Tensor

@@ -202,10 +202,9 @@ class Learner:
         held = self.regularisation.accumulate(self.algorithm, rollout, self._generator("kl", index))
         generator = self._generator("real", index)
         x0, prompts = scenes.batch(config.regularisation.batch_size, generator)
-        if self.algorithm.real_noise != "real":
-            generator = self._generator(self.algorithm.real_noise, index)
+        noise = self.algorithm.real_generator(self._generator("steps", index), generator)
         real_loss, real_norm = add_regularisation_gradient(
-            self.prior, x0, self.regularisation.weight, generator, chunk=config.optimizer.chunk, prompts=prompts
+            self.prior, x0, self.regularisation.weight, noise, chunk=config.optimizer.chunk, prompts=prompts
         )
         return {
             "policy_loss": policy.loss,

@@ -2,73 +2,52 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
+from collections.abc import Mapping
 from typing import Any
 
-import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 
 from agents.networks.text import Text
 from agents.post_training.algorithms import NeonSettings
 from agents.post_training.expectation import TrainedCopy
-from agents.post_training.forward_process import ForwardProcess
-from agents.post_training.forward_process_loss import ForwardProcessLoss
+from agents.post_training.own_sample_loss import OwnSampleLoss
+from agents.post_training.own_samples import OwnSampleAlgorithm
 from agents.post_training.policy import DenoisingPolicy
-from agents.post_training.rollouts import Branching, Rollout
+from agents.post_training.rollouts import Rollout
 from agents.priors.base import ScenePrior
 from agents.priors.forward import NoisedScenes
-from agents.utils.weight_average import WeightAverage
 
 
-class SelfTrainingLoss(ForwardProcessLoss):
-    """Pretraining loss of a copy of the denoiser on finished scenes, as ``loss_expectation``; no advantage is read.
+class SelfTrainingLoss(OwnSampleLoss):
+    """Pretraining loss of a copy of the denoiser on finished scenes, as ``loss_expectation``.
 
     ``loss_objective`` is 0: the prior in training gets no gradient from its own samples.
 
     Args:
-        prior: what is trained elsewhere, on real scenes.
-        sampler: what made the scenes.
+        prior: what is trained elsewhere, on real scenes; it noises the scenes.
         copy: the copy.
         generator: source of timesteps, noise and observed entries (CPU); None for torch's own.
 
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior("dimsum_table", process="mixed")
     >>> scenes = TensorDict({"scene": prior.encode(prior.sample(2, num_steps=3))}, [2])
-    >>> loss = SelfTrainingLoss(prior, prior, copy=TrainedCopy(prior, 1e-4))(scenes)
+    >>> loss = SelfTrainingLoss(prior, copy=TrainedCopy(prior, 1e-4))(scenes)
     >>> float(loss["loss_objective"]), float(loss["loss_expectation"]) > 0
     (0.0, True)
     """
 
-    def __init__(
-        self, prior: ScenePrior, sampler: ScenePrior, *, copy: TrainedCopy, generator: Generator | None = None
-    ) -> None:
-        super().__init__(prior, sampler, generator=generator)
+    def __init__(self, prior: ScenePrior, *, copy: TrainedCopy, generator: Generator | None = None) -> None:
+        super().__init__(prior, generator=generator)
         self.copy = copy
 
-    @property
-    def in_keys(self) -> list[Any]:  # type: ignore[override]
-        """Keys that must be present."""
-        return [self.tensor_keys.scene]
-
-    def continuous_loss(self, output: Tensor, old: Tensor, target: Tensor, advantage: Tensor) -> Tensor:
-        """Squared errors, whatever the advantage."""
-        return (output - target).square()
-
-    def category_loss(self, logits: Tensor, old: Tensor, category: Tensor, advantage: Tensor) -> Tensor:
-        """Cross-entropies, whatever the advantage."""
-        return -logits.log_softmax(-1).gather(-1, category[..., None])[..., 0]
-
-    def _losses(
-        self, noised: NoisedScenes, text: Text | None, advantage: Tensor, credit: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """See :class:`ForwardProcessLoss`."""
+    def of_scenes(self, noised: NoisedScenes, text: Text | None, flat: TensorDictBase) -> Mapping[str, Tensor]:
+        """(B,) zeros, and (B,) losses of the copy."""
         own = self.copy.prior.noised_loss(noised, text)
-        nothing = torch.zeros_like(own)
-        return nothing, own, nothing, own.new_zeros(())
+        return {"loss_objective": own.new_zeros(len(own)), "loss_expectation": own}
 
 
-class Neon(ForwardProcess):
+class Neon(OwnSampleAlgorithm):
     """Negative extrapolation from self-training (Alemohammad et al. 2025, arXiv 2510.03597), in rounds.
 
     A round lasts ``settings.period`` iterations, in which the prior theta samples all scenes. Two copies of it are
@@ -86,26 +65,15 @@ class Neon(ForwardProcess):
     copy: TrainedCopy
 
     def __init__(self, settings: NeonSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
-        self.policy = policy
-        self.prior: ScenePrior = policy.prior  # type: ignore[assignment]
-        self.sampler = deepcopy(self.prior).eval().requires_grad_(False)
-        self._sampling_policy = DenoisingPolicy(self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance)
-        self.draws, self.period, self.weight = settings.draws, settings.period, settings.w
-        self.updates = settings.updates
+        super().__init__(policy, draws=settings.draws, sampler_decay=0.0)
+        self.period, self.weight, self.updates = settings.period, settings.w, settings.updates
         self.copy = TrainedCopy(self.prior, settings.learning_rate)
-        self.loss = SelfTrainingLoss(self.prior, self.sampler, copy=self.copy)
+        self.loss = SelfTrainingLoss(self.prior, copy=self.copy)
         self.iterations = 0
-        self._average = WeightAverage(self.prior, 0.0)  # theta, which samples and is evaluated
 
-    @property
-    def branching(self) -> Branching:
-        """Scenes share nothing."""
-        return Branching()
-
-    @property
-    def real_noise(self) -> str:
-        """The stream of the own samples: both copies see the same timesteps and noise."""
-        return "steps"
+    def real_generator(self, own: Generator, real: Generator) -> Generator:
+        """That of the own samples: both copies see the same timesteps and noise."""
+        return own
 
     def advantage(self, rollout: Rollout) -> TensorDict:
         """Nothing: the samples are not weighted."""

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 from agents.configuration.checks import at_least
 from agents.configuration.fields import composed, moved, named, nested
+from agents.configuration.shared_keys import TrainingKeys
 from agents.pretraining.settings import (
     LossSettings,
     NetworkSettings,
@@ -20,10 +21,9 @@ from agents.pretraining.settings import (
 )
 
 
-@composed
 @dataclass
-class PretrainConfig:
-    """One pretraining run.
+class SceneKeys:
+    """Scenes to train on.
 
     Attributes:
         scene: scene type; with several datasets it is their union, and this key is not read.
@@ -31,6 +31,19 @@ class PretrainConfig:
             types with equal chances; ``grammar`` stands for fresh scenes of the grammar without end.
         heldout: dataset directory of held-out scenes; empty takes the last 2 % of ``data``, or 512 of the grammar;
             with several datasets it must be empty.
+    """
+
+    scene: Any = named("dimsum_table", "scene")
+    data: str = "data/dimsum_table"
+    heldout: str = ""
+
+
+@composed
+@dataclass
+class PretrainConfig(SceneKeys, TrainingKeys):
+    """One pretraining run.
+
+    Attributes:
         prior: shipped name, or folder of a prior or a run, that training starts from, whatever the keys of its size
             and kind say; empty for a fresh one.
         output: run directory; an interrupted run in it goes on where it stopped; empty for runs/COMMAND-TIME on the
@@ -38,7 +51,6 @@ class PretrainConfig:
         iterations: optimiser steps.
         batch_size: scenes per step, over all processes and parts.
         seed: of weights, batches and noise.
-        device: torch device.
         recipe: a named set of the other keys: ``ours``, or ``paper`` for the paper's setting; keys given beside it win.
         network: what denoises.
         process: of noise and denoising.
@@ -70,16 +82,10 @@ class PretrainConfig:
     }
     """Keys of earlier versions, and their names."""
 
-    scene: Any = named("dimsum_table", "scene")
-    data: str = "data/dimsum_table"
-    heldout: str = ""
     prior: str = ""
-    output: str = ""
     iterations: int = 5000
     batch_size: int = 128
     seed: int = 0
-    device: str = "cpu"
-    recipe: str = "ours"
     network: NetworkSettings = nested(NetworkSettings, folder="network", option="flux", registered=registered_networks)
     process: ProcessSettings = nested(ProcessSettings, folder="process", option="mixed")
     loss: LossSettings = nested(LossSettings)

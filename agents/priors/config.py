@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from agents.diffusion.gaussian import current_prediction
-from agents.networks.registry import ContinuousNetworkConfig, MixedNetworkConfig
+from agents.networks.registry import ContinuousNetworkConfig, MixedNetworkConfig, NetworkConfig
 from agents.networks.text_encoders import AnyTextConfig
 
 PROCESSES = ("continuous", "mixed")
@@ -15,20 +15,31 @@ PROCESSES = ("continuous", "mixed")
 
 
 @dataclass(frozen=True)
-class PriorConfig:
-    """Configuration of a prior.
+class DenoiserConfig:
+    """What is denoised, and by which network.
 
     Attributes:
         scene_type: name of its scene type.
         slots: slots per scene that it was trained on.
-        network: kind and size of its denoiser, any configuration of a continuous network.
+        network: kind and size of its denoiser.
+    """
+
+    scene_type: str
+    slots: int
+    network: NetworkConfig
+
+
+@dataclass(frozen=True)
+class PoseDiffusionConfig:
+    """Noise of the poses, and the loss of their denoising.
+
+    Attributes:
         schedule: noise schedule, ``"karras"``, ``"linear"`` or ``"cosine"``.
         prediction: ``"edm"`` (preconditioning of Karras et al. 2022), ``"epsilon"``, ``"x0"`` or ``"v"``.
         num_timesteps: T of the schedule.
         noise_mean: mean of ln(noise-to-signal) over training timesteps.
         noise_std: its standard deviation.
         translation_weight: weight of x, y, z in the pretraining loss, other features having 1.
-        rotation: what is diffused as rotation, ``"matrix"``, ``"quaternion"`` or ``"axis_angle"``.
         timesteps: distribution of training timesteps, ``"lognormal"`` (of the noise-to-signal ratio), ``"uniform"`` or
             ``"both"`` in equal parts; None is what was published with the prediction, lognormal for ``"edm"`` and
             uniform for the others.
@@ -38,16 +49,12 @@ class PriorConfig:
         clip: bound on denoised scenes while sampling, normalised units; 0 for none (1 is that of Ho et al. 2020).
     """
 
-    scene_type: str
-    slots: int
-    network: ContinuousNetworkConfig
     schedule: str = "karras"
     prediction: str = "edm"
     num_timesteps: int = 1000
     noise_mean: float = -1.8
     noise_std: float = 2.1
     translation_weight: float = 3.0
-    rotation: str = "matrix"
     timesteps: str | None = None
     loss_weighting: str = "none"
     noise_floor: float = 0.002
@@ -56,33 +63,32 @@ class PriorConfig:
 
 
 @dataclass(frozen=True)
-class MixedPriorConfig:
+class PriorConfig(PoseDiffusionConfig, DenoiserConfig):
+    """Configuration of a continuous prior, whose categories are diffused as numbers with the poses.
+
+    Attributes:
+        network: kind and size of its denoiser, any configuration of a continuous network.
+        rotation: what is diffused as rotation, ``"matrix"``, ``"quaternion"`` or ``"axis_angle"``.
+    """
+
+    network: ContinuousNetworkConfig
+    rotation: str = "matrix"
+
+
+@dataclass(frozen=True)
+class MixedPriorConfig(PoseDiffusionConfig, DenoiserConfig):
     """Configuration of a mixed discrete-continuous prior.
 
     Attributes:
-        scene_type: name of its scene type.
-        slots: slots per scene that it was trained on.
-        network: kind and size of its denoiser.
-        schedule: noise schedule of the poses, ``"karras"``, ``"linear"`` or ``"cosine"``.
-        prediction: ``"edm"`` (preconditioning of Karras et al. 2022), ``"epsilon"``, ``"x0"`` or ``"v"``, of the poses.
+        timesteps: as of continuous priors, but for None.
         kernel: of the categories, one of :data:`~agents.diffusion.CATEGORICAL_KERNELS`.
-        num_timesteps: T of both.
-        noise_mean: mean of ln(noise-to-signal) over training timesteps.
-        noise_std: its standard deviation.
-        translation_weight: weight of x, y, z in the pretraining loss, rotation entries having 1.
         category_loss: ``"cross_entropy"`` of the clean category, or ``"bound"``, the paper's variational bound.
         category_weight: weight of the category loss beside the pose loss.
         auxiliary: weight of the cross-entropy in the bound.
         observed_share: share of training scenes in which some poses or categories are observed, for inpainting.
         text: kind and size of the text encoder; None for a prior that reads no prompts.
-        noise_floor: lowest noise-to-signal ratio of the ``"karras"`` schedule, in normalised units.
-        noise_ceiling: highest.
-        timesteps: distribution of training timesteps, ``"lognormal"`` (of the noise-to-signal ratio), ``"uniform"`` or
-            ``"both"`` in equal parts.
-        loss_weighting: of the pose loss by timestep, ``"none"`` or ``"min_snr"``.
         empty_slots: ``"dropped"`` leaves slots that are known to be empty out of the network, which saves most of the
             work at low noise and needs an absorbing kernel; ``"attended"`` is the paper's.
-        clip: bound on denoised poses while sampling, normalised units; 0 for none (1 is the paper's).
         unmasking: which masked slots a step of an absorbing kernel unmasks: ``"even"``, as near to the expected number
             as can be, or ``"independent"``, each by its own chance. Other kernels take only ``"independent"``.
         union: what a scene of a union of scene types may hold: ``"one_type"``, the assets of one member, which is
@@ -90,27 +96,15 @@ class MixedPriorConfig:
             types have one member.
     """
 
-    scene_type: str
-    slots: int
     network: MixedNetworkConfig
-    schedule: str = "karras"
-    prediction: str = "edm"
+    timesteps: str = "lognormal"
     kernel: str = "mask_and_replace"
-    num_timesteps: int = 1000
-    noise_mean: float = -1.8
-    noise_std: float = 2.1
-    translation_weight: float = 3.0
     category_loss: str = "cross_entropy"
     category_weight: float = 0.3
     auxiliary: float = 5e-4
     observed_share: float = 0.3
     text: AnyTextConfig | None = None
-    noise_floor: float = 0.002
-    noise_ceiling: float = 80.0
-    timesteps: str = "lognormal"
-    loss_weighting: str = "none"
     empty_slots: str = "attended"
-    clip: float = 0.0
     unmasking: str = "even"
     union: str = "one_type"
 

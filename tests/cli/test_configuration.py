@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
+import re
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -13,11 +15,14 @@ import yaml
 from agents import PostTrainConfig, PretrainConfig, SearchConfig
 from agents.cli import main
 from agents.cli.commands import COMMANDS
-from agents.cli.keys import compose, keys_of
+from agents.cli.keys import compose, help_text, keys_of
 from agents.cli.sweep import expand_sweeps
 from agents.configuration import changed, config_text, dotted_values, group_options
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
+ROOT = Path(__file__).resolve().parents[2]
+CONFIG_NAMES = ("Config", "Entry", "Keys", "Limits", "Names", "Planner", "Settings", "Size")
+"""How the names of configuration dataclasses end."""
 CONFIGS = {name: keys_of(import_module(f"agents.cli.commands.{name.replace('-', '_')}")) for name in COMMANDS}
 SMALLEST_FIRST = sorted(CONFIGS, key=lambda name: len(dotted_values(CONFIGS[name]())))
 GROUPS = [
@@ -50,12 +55,45 @@ def test_every_key_given_with_its_default_changes_nothing(command: str) -> None:
     assert compose(command, CONFIGS[command], words) == CONFIGS[command]()
 
 
+def config_classes() -> dict[str, list[str]]:
+    """The fields that every configuration dataclass of the packages declares itself."""
+    found = {}
+    for package in ("agents", "rewards", "scene_envs"):
+        for file in sorted((ROOT / package).rglob("*.py")):
+            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+                if not isinstance(node, ast.ClassDef) or not node.name.endswith(CONFIG_NAMES):
+                    continue
+                if any("dataclass" in ast.unparse(decorator) for decorator in node.decorator_list):
+                    lines = [line for line in node.body if isinstance(line, ast.AnnAssign)]
+                    own = [ast.unparse(line.target) for line in lines if "ClassVar" not in ast.unparse(line)]
+                    found[f"{file.relative_to(ROOT)}: {node.name}"] = own
+    return found
+
+
+def test_configs_declare_a_dozen_fields_at_most() -> None:
+    found = config_classes()
+    assert len(found) > 60
+    assert {name: len(own) for name, own in found.items() if len(own) > 12} == {}
+
+
 @pytest.mark.parametrize("kind", [PretrainConfig, PostTrainConfig])
 def test_groups_have_a_dozen_keys_at_most(kind: type) -> None:
     groups = [value for value in vars(kind()).values() if dataclasses.is_dataclass(value)]
     assert len(groups) >= 5
     assert all(len(dataclasses.fields(group)) <= 12 for group in groups)
-    assert len(vars(kind())) - len(groups) <= 15  # the keys of all commands, recipe, and the limits of rewards
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_has_a_paragraph_of_a_dozen_keys_at_most_for_each_part(command: str) -> None:
+    paragraphs = help_text(CONFIGS[command]).split("\n\n")
+    listed = []
+    for paragraph in paragraphs:
+        assert len(paragraphs) == 1 or re.match(r"\S.*:\n", paragraph), paragraph  # a heading
+        keys = re.findall(r"^  ([\w.]+)=", paragraph, flags=re.MULTILINE)
+        assert 1 <= len(keys) <= 13, paragraph  # a dozen, and adapter= beside prior=
+        listed += keys
+    assert sorted(set(listed) - {"adapter"}) == sorted(dotted_values(CONFIGS[command]()))
+    assert len(listed) == len(set(listed))
 
 
 @pytest.mark.slow

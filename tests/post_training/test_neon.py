@@ -98,7 +98,7 @@ def test_the_loss_is_the_pretraining_loss_of_the_copy(process: str) -> None:
     prior = tiny_prior(process=process)
     x0 = prior.encode(prior.sample(3, num_steps=3, seed=0))
     copy = TrainedCopy(prior, 1e-3)
-    loss = SelfTrainingLoss(prior, prior, copy=copy, generator=Generator().manual_seed(5))
+    loss = SelfTrainingLoss(prior, copy=copy, generator=Generator().manual_seed(5))
     said = loss(TensorDict({"scene": x0}, [3]))
     torch.testing.assert_close(said["loss_expectation"], prior.pretraining_loss(x0, Generator().manual_seed(5)))
     assert float(said["loss_objective"]) == 0.0

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.configuration.measure_names import choose_measures
+from agents.configuration.shared_keys import OutputKeys
 from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -27,16 +28,28 @@ _OF_PROMPTS = {"prompt_count", "guidance"}
 
 
 @dataclass
-class EvaluateConfig:
+class RealSceneKeys:
+    """Real scenes to compare with.
+
+    Attributes:
+        data: dataset folder that the prior was trained on, several joined by commas for a prior of their union;
+            empty compares with fresh scenes of the grammar, without novelty.
+        heldout: dataset folder of held-out scenes; empty takes the last scenes of data.
+        training_scenes: scenes of data among which novelty looks for the nearest, drawn at random.
+    """
+
+    data: str = ""
+    heldout: str = ""
+    training_scenes: int = 20_000
+
+
+@dataclass
+class EvaluateConfig(RealSceneKeys, OutputKeys):
     """Measures of a prior's raw samples, each beside that of real scenes.
 
     Attributes:
         prior: a shipped name, or the folder of a prior or a run.
         count: samples, and real scenes of each of two sets to compare with.
-        data: dataset folder that the prior was trained on, several joined by commas for a prior of their union;
-            empty compares with fresh scenes of the grammar, without novelty.
-        heldout: dataset folder of held-out scenes; empty takes the last scenes of data.
-        training_scenes: scenes of data among which novelty looks for the nearest, drawn at random.
         prompt_count: samples with prompts, each of a held-out scene, at most count; null takes count.
         num_steps: denoising steps per sample.
         guidance: weight of classifier-free guidance for the samples with prompts, 0 for none.
@@ -46,18 +59,12 @@ class EvaluateConfig:
         project: whether all includes ready, the measures after projection and settling.
         fid_weights: path of the weights of an Inception-v3, for fid.
         pictures: how many samples gallery.png shows; 0 draws none.
-        batch_size: scenes denoised at once.
-        workers: physics worker processes; 0 computes in this one.
-        device: torch device of the sampling.
         output: folder for metrics.json, metrics.md, scenes.safetensors and gallery.png; with the same keys again,
             groups that are measured already are not measured anew.
     """
 
     prior: str = "dimsum_table"
     count: int = 200
-    data: str = ""
-    heldout: str = ""
-    training_scenes: int = 20_000
     prompt_count: int | None = None
     num_steps: int = 50
     guidance: float = 0.0
@@ -66,10 +73,6 @@ class EvaluateConfig:
     project: bool = True
     fid_weights: str = ""
     pictures: int = 16
-    batch_size: int = 64
-    workers: int = 2
-    device: str = "cpu"
-    output: str = ""
 
     def __post_init__(self) -> None:
         if self.count < 2 or self.training_scenes < 1:

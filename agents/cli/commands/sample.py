@@ -10,6 +10,7 @@ from agents.cli.commands.export import export_scenes
 from agents.cli.commands.scenes import draw_scenes, make_ready, reward_figures
 from agents.configuration.checks import one_of
 from agents.configuration.fields import named
+from agents.configuration.shared_keys import OutputKeys, SamplingKeys
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
@@ -17,50 +18,31 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class SampleConfig:
+class SampleConfig(SamplingKeys, OutputKeys):
     """Scenes from a prior.
 
     Attributes:
         prior: a shipped name, or the folder of a prior or a run.
         count: scenes to draw.
-        prompt: what the scenes should hold, for priors that read prompts; null for anything.
-        guidance: weight of classifier-free guidance, 0 for none; needs a prompt.
-        num_steps: denoising steps per scene.
         eta: scale of the noise of the Gaussian steps, 1 for the ancestral chain, 0 for a deterministic one (DDIM).
-        slots: slots per scene, more than trained is allowed; null means as trained.
         union: what a scene of a prior of several scene types may hold, one_type (objects of one of them) or any.
-        seed: of the noise.
         reward: scores the samples, for metrics.json; null for none.
         reward_timeout: seconds that a reward from outside this package, which runs in a process of its own, may take.
         project: also make the samples simulation-ready (project out of penetration, then settle).
         export: formats to write the scenes in, as drake or [drake, mjcf], the simulation-ready ones with
             project=true; null for none. See scene-envs export.
-        pictures: how many scenes the galleries show; 0 draws none.
-        batch_size: scenes denoised at once.
-        workers: physics worker processes; 0 computes in this one.
-        device: torch device.
         output: folder for scenes.safetensors, gallery.png and, with project=true, ready.safetensors and ready.png;
             exported scenes go to export/ in it.
     """
 
     prior: str = "dimsum_table"
     count: int = 16
-    prompt: str | None = None
-    guidance: float = 0.0
-    num_steps: int = 50
     eta: float = 1.0
-    slots: int | None = None
     union: str = "one_type"
-    seed: int = 0
     reward: Any = named("feasible_objects", "reward")
     reward_timeout: float = 60.0
     project: bool = False
     export: Any = None
-    pictures: int = 12
-    batch_size: int = 64
-    workers: int = 2
-    device: str = "cpu"
-    output: str = ""
 
 
 def check(settings: SampleConfig) -> None:

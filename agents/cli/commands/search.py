@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.configuration.fields import composed, named
+from agents.configuration.shared_keys import RewardLimits
 from agents.planning.config import SearchConfig
 from scene_envs.scene_sources import load_scenes
 
@@ -23,9 +24,9 @@ FRESH_PRIOR = "dimsum_table"
 
 
 @composed
-@dataclass(frozen=True)
-class SearchKeys(SearchConfig):
-    """What to search, and how.
+@dataclass
+class SearchKeys(SearchConfig, RewardLimits):
+    """What to search.
 
     Attributes:
         scenes: what the search starts from, one search per scene: a scene file or a folder of them, the folder of a run
@@ -33,17 +34,12 @@ class SearchKeys(SearchConfig):
         prior: a shipped name, or the folder of a prior or a run; empty means the shipped prior of the scenes' type, and
             dimsum_table without scenes.
         objective: what the scene should score high on: any reward.
-        reward_timeout: seconds that an objective from outside this package, which runs in a process of its own, may
-            take for a batch; then its scenes are invalid.
-        reward_memory: GiB that such an objective may allocate.
         output: folder for best.safetensors, tree.html, tree.json and pictures; the same command goes on there.
     """
 
     scenes: str = ""
     prior: str = ""
     objective: Any = named("feasible_objects", "reward")
-    reward_timeout: float = 60.0
-    reward_memory: float = 1.0
     output: str = ""
 
 

@@ -25,14 +25,27 @@ BASES: tuple[Base, ...] = ("bottom", "origin")
 
 
 @dataclass(frozen=True)
-class AssetEntry:
-    """One asset of a library.
+class AssetNames:
+    """File and names of an asset.
 
     Attributes:
         file: path relative to the folder.
         name: identifier; the stem of the file by default.
         display_name: what prompts call it; the name with spaces by default.
         plural: plural of the display name; the regular one by default.
+    """
+
+    file: str
+    name: str = ""
+    display_name: str = ""
+    plural: str = ""
+
+
+@dataclass(frozen=True)
+class AssetEntry(AssetNames):
+    """One asset of a library: its names and how its file becomes a body.
+
+    Attributes:
         scale: factor on all lengths; a file in millimetres wants 0.001.
         density: kg/m^3; fills the shape evenly.
         mass: kg.
@@ -44,10 +57,6 @@ class AssetEntry:
         concavity: CoACD's threshold, 0.01 (many parts) to 1 (one).
     """
 
-    file: str
-    name: str = ""
-    display_name: str = ""
-    plural: str = ""
     scale: float = 1.0
     density: float | None = None
     mass: float | None = None

@@ -1,0 +1,120 @@
+"""Base class of algorithms that train on their own finished samples, noised anew for every update."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections import defaultdict
+from collections.abc import Mapping
+from copy import deepcopy
+from dataclasses import dataclass, field
+from typing import Any
+
+from tensordict import TensorDict
+from torch import Generator
+
+from agents.post_training.base import Algorithm
+from agents.post_training.expectation import TrainedCopy
+from agents.post_training.gradients import GradientSum
+from agents.post_training.own_sample_loss import OwnSampleLoss
+from agents.post_training.policy import DenoisingPolicy
+from agents.post_training.rollouts import Rollout
+from agents.priors.base import ScenePrior
+from agents.utils.process_group import ProcessGroup, gather_rows
+from agents.utils.weight_average import WeightAverage
+
+
+@dataclass(frozen=True)
+class OwnSampleGradient:
+    """Statistics of an accumulated gradient.
+
+    Attributes:
+        loss: value of the objective of the prior in training.
+        means: over the parts of the batch, of what the algorithm measures.
+    """
+
+    loss: float
+    means: Mapping[str, float] = field(default_factory=dict)
+
+    def figures(self) -> Mapping[str, float]:
+        """Further columns of the log."""
+        return self.means
+
+
+class OwnSampleAlgorithm(Algorithm[TensorDict]):
+    """An algorithm whose sampling policy is another copy of the prior, with weights that are evaluated and saved.
+
+    Args:
+        policy: what is optimised.
+        draws: timesteps and noises of every scene per update.
+        sampler_decay: of the average of the weights in training that samples, per :meth:`WeightAverage.update`.
+
+    Attributes:
+        sampler: the prior that samples.
+        copy: a copy of the denoiser that is trained on the samples, by ``loss_expectation``; None for none.
+    """
+
+    loss: OwnSampleLoss
+    copy: TrainedCopy | None
+
+    def __init__(self, policy: DenoisingPolicy, *, draws: int, sampler_decay: float) -> None:
+        self.policy = policy
+        self.prior: ScenePrior = policy.prior  # type: ignore[assignment]
+        self.sampler = deepcopy(self.prior).eval().requires_grad_(False)
+        self.draws = draws
+        self._sampling_policy = DenoisingPolicy(self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance)
+        self._average = WeightAverage(self.prior, sampler_decay)
+
+    @property
+    def sampling_policy(self) -> DenoisingPolicy:
+        """The reverse chain of the copy that samples."""
+        return self._sampling_policy
+
+    @property
+    def average(self) -> WeightAverage:
+        """The weights of the copy that samples."""
+        return self._average
+
+    @abstractmethod
+    def advantage(self, rollout: Rollout) -> TensorDict:
+        """The keys of the scenes that the loss reads beside the scenes themselves."""
+
+    def measure(self, result: TensorDict) -> dict[str, float]:
+        """Figures of a part of the batch, from its loss."""
+        return {}
+
+    def accumulate(self, rollout: Rollout, advantage: TensorDict, generator: Generator) -> OwnSampleGradient:
+        """Add the gradient of a batch to ``.grad``: ``draws`` timesteps and noises of every scene.
+
+        On several processes ``.grad`` holds the part of this one's scenes in the mean over all.
+        """
+        x0 = self.prior.encode(rollout.batch.to(self.prior.device))
+        fields: dict[str, Any] = {"scene": x0, "valid": rollout.valid, **advantage}
+        if rollout.text is not None:
+            fields |= {"text": rollout.text[0], "text_mask": rollout.text[1]}
+        scenes = TensorDict(fields, [len(x0)])
+        size, processes = self.policy.chunk or len(x0), ProcessGroup.current()
+        valid = max(1.0, processes.sum_numbers(int(rollout.valid.sum()))[0])
+        everything, own = gather_rows(x0), processes.rows(processes.size * len(x0))
+        seen = None if rollout.observed is None else gather_rows(rollout.observed)
+        observed = self.prior.observed_by_mask(everything, seen)
+        draws = [self.prior.noised(everything, generator, observed=observed).rows(own) for _ in range(self.draws)]
+        total, sums = 0.0, defaultdict[str, float](float)
+        learned = [] if self.copy is None else self.copy.trained
+        gradient = GradientSum([*self.prior.parameters(), *learned])
+        for start in range(0, len(x0), size):
+            rows = slice(start, start + size)
+            part = scenes[rows]
+            share = int(part["valid"].sum()) / valid / self.draws
+            for noised in draws:
+                result = self.loss.of_noised(noised.rows(rows), part)
+                objective = result["loss_objective"] * share
+                (objective + result["loss_expectation"] * share).backward()
+                total += float(objective.detach())
+                for name, value in self.measure(result).items():
+                    sums[name] += share * value
+            gradient.add_part()
+        gradient.write()
+        if self.copy is not None:
+            self.copy.step()
+        total, *means = processes.sum_numbers(total, *sums.values())
+        return OwnSampleGradient(total, dict(zip(sums, means, strict=True)))
