@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Generator, Tensor, nn
 
+from agents.networks.mixed_denoiser import Observed
 from agents.networks.text import Text
 from agents.post_training.losses import DDPOSFLoss
 from agents.post_training.rollouts import Rollout
 from agents.priors.base import ScenePrior
+from agents.priors.forward import NoisedScenes
 from agents.utils.process_group import ProcessGroup
 from scene_envs.errors import InvalidInputError
+
+SceneLoss = Callable[[NoisedScenes, Text | None], Tensor]
+"""(B,) losses of noised scenes and their prompts."""
 
 
 @dataclass(frozen=True)
@@ -121,21 +126,25 @@ def add_regularisation_gradient(
     coefficient: float,
     generator: Generator,
     *,
+    loss: SceneLoss | None = None,
     chunk: int | None = None,
-    prompts: Sequence[str] | None = None,
+    text: Callable[[slice], Text | None] | None = None,
+    observed: Observed | None = None,
 ) -> tuple[float, float]:
-    """Add ``coefficient`` times the gradient of the pretraining loss to ``.grad``.
+    """Add ``coefficient`` times the gradient of a loss of noised scenes to ``.grad``.
 
     Args:
         prior: the prior in training.
-        x0: (B, N, D) normalised real scenes, of all processes; each takes its share of them.
+        x0: (B, N, D) normalised scenes, of all processes; each takes its share of them.
         coefficient: of the loss, which is a mean over scenes and entries.
         generator: source of timesteps and noise (CPU).
+        loss: (B,) losses of noised scenes; None for the pretraining loss.
         chunk: scenes per pass.
-        prompts: of the scenes, ``""`` for none; None for a prior that reads none.
+        text: encoded prompts of some of the scenes; None for scenes without.
+        observed: entries that have no part in the loss; None draws them as in pretraining.
 
     Returns:
-        The pretraining loss of all, and the norm of ``coefficient`` times its gradient.
+        The mean loss of all, and the norm of ``coefficient`` times its gradient.
     """
     if coefficient == 0:
         return 0.0, 0.0
@@ -144,14 +153,14 @@ def add_regularisation_gradient(
     for parameter in parameters:
         parameter.grad = None
     value, total = 0.0, GradientSum(parameters)
-    noised, own = prior.noised(x0, generator), processes.rows(len(x0))
+    noised, own = prior.noised(x0, generator, observed=observed), processes.rows(len(x0))
+    losses = loss or prior.noised_loss
     size = chunk or len(x0)
     for start in range(own.start, own.stop, size):
         rows = slice(start, min(start + size, own.stop))
-        text = None if prompts is None else encoded(prior, prompts[rows])
-        loss = prior.noised_loss(noised.rows(rows), text).mean() * ((rows.stop - start) / len(x0))
-        value += float(loss.detach())
-        (coefficient * loss).backward()
+        mean = losses(noised.rows(rows), text and text(rows)).mean() * ((rows.stop - start) / len(x0))
+        value += float(mean.detach())
+        (coefficient * mean).backward()
         total.add_part()
     total.write()
     processes.sum_gradients(parameters)

@@ -14,7 +14,7 @@ from torch import Generator, nn
 from agents.post_training.algorithms import make_algorithm
 from agents.post_training.base import Algorithm
 from agents.post_training.config import PostTrainConfig
-from agents.post_training.gradients import add_regularisation_gradient, gradient_norm
+from agents.post_training.gradients import gradient_norm
 from agents.post_training.inpaint_deck import InpaintDeck, Parts, real_parts, sampled_parts
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.processes import WholeBatchReward
@@ -203,14 +203,11 @@ class Learner:
         generator = self._generator("real", index)
         x0, prompts = scenes.batch(config.regularisation.batch_size, generator)
         noise = self.algorithm.real_generator(self._generator("steps", index), generator)
-        real_loss, real_norm = add_regularisation_gradient(
-            self.prior, x0, self.regularisation.weight, noise, chunk=config.optimizer.chunk, prompts=prompts
-        )
+        real = self.regularisation.accumulate_scenes(self.prior, x0, prompts, rollout, noise, config.optimizer.chunk)
         return {
             "policy_loss": policy.loss,
             "policy_gradient_norm": policy_norm,
-            "pretraining_loss": real_loss,
-            "pretraining_gradient_norm": real_norm,
+            **real,
             **held,
             **policy.figures(),
         }

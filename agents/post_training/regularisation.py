@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import asdict
 from typing import Any
 
 import torch
-from torch import Generator
+from torch import Generator, Tensor
 
+from agents.networks.text import Text
 from agents.post_training.base import Algorithm
-from agents.post_training.gradients import add_gradient
+from agents.post_training.base_kl import rows_of_text
+from agents.post_training.discriminative import DiscriminativeLoss
+from agents.post_training.gradients import add_gradient, add_regularisation_gradient, encoded
 from agents.post_training.hold import FAR, HIGHEST, HoldState, adjust
 from agents.post_training.regularisation_settings import RegularisationSettings
 from agents.post_training.rollouts import Rollout
 from agents.priors.base import ScenePrior
-from agents.utils.process_group import ProcessGroup
+from agents.utils.process_group import ProcessGroup, gather_rows
 
 logger = logging.getLogger(__name__)
 
@@ -27,7 +31,7 @@ class Regularisation:
 
     Args:
         settings: its keys.
-        prior: the base prior; it is copied where the KL divergence is needed.
+        prior: the base prior; it is copied where it is needed.
     """
 
     def __init__(self, settings: RegularisationSettings, prior: ScenePrior) -> None:
@@ -35,7 +39,9 @@ class Regularisation:
         self.target = settings.target
         self.state = HoldState()
         measures = settings.kl_weight > 0 or (self.target is not None and self.target.figure == "kl")
-        self.base = deepcopy(prior).eval().requires_grad_(False) if measures else None
+        self.measures_kl = measures
+        needed = measures or settings.objective == "discriminative"
+        self.base = deepcopy(prior).eval().requires_grad_(False) if needed else None
 
     @property
     def weight(self) -> float:
@@ -50,7 +56,7 @@ class Regularisation:
     def accumulate(self, algorithm: Algorithm[Any], rollout: Rollout, generator: Generator) -> dict[str, float]:
         """Add the gradient of the KL divergence to ``.grad``; returns columns of the log."""
         row = {} if self.target is None else {"regularisation_weight": self.weight, "hold_factor": self.state.factor}
-        if self.base is None:
+        if self.base is None or not self.measures_kl:
             return row
         terms = algorithm.kl(rollout, self.base, generator)
         value, norm = math.nan, 0.0
@@ -61,6 +67,63 @@ class Regularisation:
                 processes = ProcessGroup.current()
                 value = processes.sum_numbers(sum(float(term) for term in terms))[0] / processes.size
         return {**row, "kl": value, "kl_weight": self.kl_weight, "kl_gradient_norm": norm}
+
+    def accumulate_scenes(
+        self,
+        prior: ScenePrior,
+        x0: Tensor,
+        prompts: Sequence[str] | None,
+        rollout: Rollout,
+        generator: Generator,
+        chunk: int | None,
+    ) -> dict[str, float]:
+        """Add the gradient of the loss on real scenes, and on own samples where it has one; returns columns of the log.
+
+        Real scenes and own samples take the same timesteps and noise where there are as many of both.
+
+        Args:
+            prior: in training.
+            x0: (B, N, D) real scenes, normalised, of all processes.
+            prompts: of the real scenes, ``""`` for none; None for a prior that reads none.
+            rollout: the samples of this process.
+            generator: source of timesteps and noise (CPU).
+            chunk: scenes per pass.
+        """
+
+        def of_real(rows: slice) -> Text | None:
+            return None if prompts is None else encoded(prior, prompts[rows])
+
+        if self.settings.objective == "pretraining" or self.base is None or self.weight == 0:
+            value, norm = add_regularisation_gradient(prior, x0, self.weight, generator, chunk=chunk, text=of_real)
+            return {"pretraining_loss": value, "pretraining_gradient_norm": norm}
+        loss = DiscriminativeLoss(prior, self.base, self.settings.sharpness)
+        same = Generator().set_state(generator.get_state())
+        value, norm = add_regularisation_gradient(
+            prior, x0, self.weight, generator, loss=loss.of_real, chunk=chunk, text=of_real
+        )
+        samples = gather_rows(prior.encode(rollout.batch.to(prior.device)))
+        first = ProcessGroup.current().rows(len(samples)).start
+
+        def of_own(rows: slice) -> Text | None:
+            return rows_of_text(rollout.text, slice(rows.start - first, rows.stop - first))
+
+        seen = None if rollout.observed is None else gather_rows(rollout.observed)
+        own, own_norm = add_regularisation_gradient(
+            prior,
+            samples,
+            self.weight,
+            same,
+            loss=loss.of_own,
+            chunk=chunk,
+            text=of_own,
+            observed=prior.observed_by_mask(samples, seen),
+        )
+        return {
+            "pretraining_loss": value,
+            "pretraining_gradient_norm": norm,
+            "own_loss": own,
+            "own_gradient_norm": own_norm,
+        }
 
     def observe(self, figure: str, value: float | None, iteration: int) -> None:
         """Adjust the weights after a measurement; does nothing where another figure is held, or none."""

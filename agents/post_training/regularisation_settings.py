@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from agents.configuration.checks import at_least, positive
+from agents.configuration.checks import at_least, one_of, positive
 from agents.post_training.hold import Target
 from scene_envs.errors import InvalidInputError
+
+OBJECTIVES = ("pretraining", "discriminative")
+"""Losses of the regularisation."""
 
 
 @dataclass
@@ -14,7 +17,10 @@ class RegularisationSettings:
     """Settings of the regularisation: pretraining loss on real scenes, and KL divergence from the base prior.
 
     Attributes:
-        weight: coefficient of the pretraining loss; null takes the algorithm's own.
+        objective: ``pretraining`` for the pretraining loss on real scenes; ``discriminative`` for a loss that raises
+            their likelihood over the base prior's and lowers that of own samples.
+        weight: coefficient of this loss; null takes the algorithm's own.
+        sharpness: of the discriminative loss: the larger, the less it moves the prior from its base.
         kl: coefficient of the KL divergence from the base prior, on own samples, in nats per random variable of a
             scene; null for none, or 1 with ``hold=kl:VALUE``.
         hold: target that is held by a factor on both coefficients: ``guard:1.05`` for the held-out loss as a ratio to
@@ -27,7 +33,9 @@ class RegularisationSettings:
         replay_share: of the scenes of each batch of the pretraining loss, if there is a replay.
     """
 
+    objective: str = "pretraining"
     weight: float | None = None
+    sharpness: float = 20.0
     kl: float | None = None
     hold: str | None = None
     batch_size: int = 48
@@ -38,6 +46,8 @@ class RegularisationSettings:
 
     def __post_init__(self) -> None:
         at_least(self, 1, "batch_size")
+        one_of(self, "objective", OBJECTIVES)
+        positive(self, "sharpness")
         if not 0 < self.replay_share <= 1:
             raise InvalidInputError(f"regularisation.replay_share={self.replay_share} must be in (0, 1]")
         if self.weight is not None and not self.weight >= 0:

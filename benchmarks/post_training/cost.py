@@ -20,7 +20,7 @@ from unittest.mock import patch
 import yaml
 
 from agents.configuration.tree import changed
-from agents.post_training import PostTrainConfig, PostTrainer, learner
+from agents.post_training import PostTrainConfig, PostTrainer, regularisation
 from agents.post_training.algorithms import list_algorithms
 from agents.priors.base import ScenePrior
 from scene_envs.envs.scoring import RewardScorer
@@ -57,11 +57,11 @@ def iteration_seconds(config: PostTrainConfig, prior: ScenePrior) -> dict[str, f
             trainer.prepare()
             gradient = clock.timed("policy gradient", trainer.learner.algorithm.accumulate)
             rollout = clock.timed("rollout", trainer.learner.rollout)
-            real = clock.timed("regularisation", learner.add_regularisation_gradient)
+            real = clock.timed("regularisation", regularisation.add_regularisation_gradient)
             with (
                 patch.object(trainer.learner.algorithm, "accumulate", gradient),
                 patch.object(trainer.learner, "rollout", rollout),
-                patch.object(learner, "add_regularisation_gradient", real),
+                patch.object(regularisation, "add_regularisation_gradient", real),
             ):
                 trainer.step()
                 clock.seconds.clear()

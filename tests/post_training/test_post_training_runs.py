@@ -13,7 +13,7 @@ import torch
 
 from agents.configuration.tree import changed
 from agents.post_training import PostTrainer, post_train
-from agents.post_training import learner as learner_module
+from agents.post_training import regularisation as regularisation_module
 from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards.base import RewardContext, RewardOutput
@@ -183,7 +183,7 @@ def test_full_disk_leaves_the_previous_checkpoint(tmp_path: Path, monkeypatch: p
 
 
 def test_nan_gradient_stops_the_run_and_keeps_what_was_good(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    regularise = learner_module.add_regularisation_gradient
+    regularise = regularisation_module.add_regularisation_gradient
     calls = []
 
     def broken(prior: ScenePrior, *args: object, **kwargs: object) -> tuple[float, float]:
@@ -193,7 +193,7 @@ def test_nan_gradient_stops_the_run_and_keeps_what_was_good(tmp_path: Path, monk
             next(p for p in prior.parameters() if p.grad is not None).grad.fill_(float("nan"))
         return value, norm
 
-    monkeypatch.setattr(learner_module, "add_regularisation_gradient", broken)
+    monkeypatch.setattr(regularisation_module, "add_regularisation_gradient", broken)
     with pytest.raises(TrainingError, match=r"iteration 4 .*not finite.*checkpoint\.pt.*lr"):
         post_train(small_config(tmp_path), prior=tiny_prior())
     state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
