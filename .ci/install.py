@@ -25,10 +25,10 @@ from pathlib import Path
 PIP = (sys.executable, "-m", "pip")
 RESUMING_PIP = (25, 1)
 """The first version of pip that goes on in the middle of a file."""
-PAUSES = (5.0, 15.0, 30.0, 60.0, 60.0)
+PAUSES = (5.0, 10.0, 20.0)
 """Seconds before each further try."""
 NETWORK = re.compile(
-    r"connection|timed out|timeout|IncompleteRead|ProtocolError|incomplete.download|name resolution|"
+    r"connection|timed out|timeout|IncompleteRead|ProtocolError|not enough bytes|name resolution|"
     r"network is unreachable|HTTP error 5|SSLError|RemoteDisconnected|do not match the hash",
     re.IGNORECASE,
 )
@@ -52,8 +52,8 @@ class Pip:
         quiet = ("--disable-pip-version-check", "--progress-bar", "off")
         self.command = [*PIP, "install", *quiet, *resume, *arguments]
         self.said: list[str] = []
-        self.crash: list[str] = []
-        self._file, self._size, self._expected, self._before, self._shown = "", "", 0, 0, ""
+        self.errors: list[str] = []
+        self._file, self._size, self._warning, self._shown, self._expected, self._before = "", "", "", "", 0, 0
 
     def run(self) -> int:
         """Exit status of pip."""
@@ -90,14 +90,19 @@ class Pip:
 
     def network_reason(self) -> str:
         """The last words of pip about the network; empty where it says nothing of it in the end."""
-        found = [line.strip() for line in (*self.said[-30:], *self.crash) if NETWORK.search(line)]
-        return found[-1][-200:] if found else ""
+        found = [line.strip(" ×") for line in (*self.said[-10:], *self.errors) if NETWORK.search(line)]
+        return reason_of(found[-1]) if found else ""
 
     def _take(self, line: str) -> None:
-        if self.crash or line.startswith("ERROR: Exception:"):  # a traceback follows
-            self.crash.append(line)
+        if self.errors or line.strip().lower().startswith("error:"):  # shown in the end, unless it is the network
+            self.errors.append(line)
             return
         self.said.append(line)
+        if "WARNING: Retrying (Retry(" in line:
+            line = f"  {reason_of(line)}; pip tries again"
+            if line == self._warning:
+                return
+            self._warning = line
         if found := DOWNLOAD.match(line):
             self._file, self._size = found["url"].rpartition("/")[2].partition("-")[0], found["size"]
         elif line.strip():
@@ -135,7 +140,7 @@ def install(
         status = pip.run()
         reason = pip.network_reason() if status else ""
         if not reason:
-            print(*pip.crash, sep="\n", end="\n" * bool(pip.crash), flush=True)
+            print(*pip.errors, sep="\n", end="\n" * bool(pip.errors), flush=True)
             return status
         if pause is not None:
             print(f"The network failed: {reason}\nTrying again in {pause:g} s ...", flush=True)
@@ -146,6 +151,16 @@ def install(
         file=sys.stderr,
     )
     return 1
+
+
+def reason_of(line: str) -> str:
+    """The reason in a line of pip about a broken connection.
+
+    >>> reason_of("after connection broken by 'NewError(Pool(port=80): No route)': /simple/a/")
+    'No route'
+    """
+    inner = line.partition("broken by '")[2].rpartition("': /")[0]
+    return (inner.rpartition("): ")[2].strip("\"')") or line.strip())[-200:]
 
 
 def repair(packages: Path) -> list[str]:
