@@ -28,7 +28,7 @@ RESUMING_PIP = (25, 1)
 PAUSES = (5.0, 10.0, 20.0)
 """Seconds before each further try."""
 NETWORK = re.compile(
-    r"connection|timed out|timeout|IncompleteRead|ProtocolError|not enough bytes|name resolution|"
+    r"connection|timed out|timeout|IncompleteRead|ProtocolError|not enough bytes|name resolution|Wheel .* is invalid|"
     r"network is unreachable|HTTP error 5|SSLError|RemoteDisconnected|do not match the hash",
     re.IGNORECASE,
 )
