@@ -9,6 +9,7 @@ network failed, 130 after an interrupt.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import queue
 import re
@@ -28,8 +29,8 @@ RESUMING_PIP = (25, 1)
 PAUSES = (5.0, 10.0, 20.0)
 """Seconds before each further try."""
 NETWORK = re.compile(
-    r"connection|timed out|timeout|IncompleteRead|ProtocolError|not enough bytes|name resolution|Wheel .* is invalid|"
-    r"network is unreachable|HTTP error 5|SSLError|RemoteDisconnected|do not match the hash",
+    r"connection|timed out|TimeoutError|IncompleteRead|ProtocolError|not enough bytes|name resolution|"
+    r"Wheel .* is invalid|network is unreachable|HTTP error 5|SSLError|RemoteDisconnected|do not match the hash",
     re.IGNORECASE,
 )
 """Words of pip about a network that failed."""
@@ -117,8 +118,9 @@ class Pip:
             done = max(0, len(_installed(self.packages)) - self._before)
             return f"  {done} of {self._expected} packages installed, {seconds:.0f} s at the next"
         if self._file:
-            sizes = [file.stat().st_size for file in self.scratch.glob(f"pip-unpack-*/{self._file}*") if file.is_file()]
-            return f"  {self._file}: {max(sizes, default=0) / 1e6:.1f} of {self._size}, {seconds:.0f} s"
+            with contextlib.suppress(OSError):  # pip may have just moved it
+                sizes = [file.stat().st_size for file in self.scratch.glob(f"pip-unpack-*/{self._file}*")]
+                return f"  {self._file}: {max(sizes, default=0) / 1e6:.1f} of {self._size}, {seconds:.0f} s"
         return f"  still at it, {seconds:.0f} s"
 
     def _show(self, text: str) -> None:
