@@ -13,7 +13,7 @@
 JOBS ?= 2
 SEED ?= $(shell date +%s)
 ENV := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=
-PIP := .venv/bin/python -m pip install --disable-pip-version-check -c constraints.txt
+INSTALL := .venv/bin/python .ci/install.py -c constraints.txt
 
 PYTEST := $(ENV) .venv/bin/python -m pytest --randomly-seed=$(SEED) -n $(JOBS) --dist worksteal
 PAGES := tests/docs/test_pages.py tests/integration/test_notebooks.py
@@ -48,18 +48,16 @@ install: .venv/installed
 
 install-dev: .venv/installed-dev
 
-.venv/installed: pyproject.toml constraints.txt | .venv/bin/python
+.venv/installed: pyproject.toml constraints.txt
+	@sh .ci/make-venv "$(PYTHON)"
 	@echo "Installing SceneEnvs into .venv (once, some minutes on a slow network) ..."
-	$(PIP) -e .
+	@$(INSTALL) -e .
 	@touch $@
 
 .venv/installed-dev: .venv/installed
 	@echo "Installing the test tools into .venv ..."
-	$(PIP) -e ".[dev]"
+	@$(INSTALL) -e ".[dev]"
 	@touch $@
-
-.venv/bin/python:
-	@sh .ci/make-venv "$(PYTHON)"
 
 clean:
 	rm -rf .venv build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -2,9 +2,14 @@
 
 from agents.configuration.compose import compose_tree, group_options
 from agents.configuration.fields import composed, named, nested
+from agents.configuration.shared_keys import OutputKeys, RewardLimits, SamplingKeys, TrainingKeys
 from agents.configuration.tree import build, changed, config_text, dotted_values, plain_tree
 
 __all__ = [
+    "OutputKeys",
+    "RewardLimits",
+    "SamplingKeys",
+    "TrainingKeys",
     "build",
     "changed",
     "compose_tree",

@@ -39,18 +39,7 @@ MODULES: dict[str, type[ModuleConfig]] = {
 
 @dataclass(frozen=True)
 class MixedFluxSize:
-    """Size of the core of a :class:`~agents.networks.MixedFlux`.
-
-    Attributes:
-        categories: K = C + 1, assets and *empty*; the mask token is one more.
-        hidden: H, width of the token streams; a multiple of ``heads``.
-        double_blocks: blocks in which text and slots have weights of their own; used only with text.
-        single_blocks: blocks on text and slots together.
-        heads: attention heads.
-        mlp_ratio: width of the MLPs over ``hidden``.
-        embedding: E, width of the embedding of a slot, and of what leaves the last layer.
-        pose_head: hidden width of the pose output.
-    """
+    """Size of the core of a :class:`~agents.networks.MixedFlux`; :class:`MixedFluxConfig` describes the fields."""
 
     categories: int
     hidden: int = 128
@@ -67,6 +56,14 @@ class MixedFluxConfig(MixedFluxSize):
     """Size of a :class:`~agents.networks.MixedFlux`, what it reads, and the modules that are added to its core.
 
     Attributes:
+        categories: K = C + 1, assets and *empty*; the mask token is one more.
+        hidden: H, width of the token streams; a multiple of ``heads``.
+        double_blocks: blocks in which text and slots have weights of their own; used only with text.
+        single_blocks: blocks on text and slots together.
+        heads: attention heads.
+        mlp_ratio: width of the MLPs over ``hidden``.
+        embedding: E, width of the embedding of a slot, and of what leaves the last layer.
+        pose_head: hidden width of the pose output.
         text_width: W, width of the text tokens; 0 for none.
         text_reach: how far text goes: to the ``"double"``-stream blocks, or through ``"all"`` blocks, as the paper's.
         time_input: what is embedded as time, one of :data:`TIME_INPUTS`; ``"timestep"`` is the paper's.

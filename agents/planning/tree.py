@@ -82,7 +82,7 @@ _OWN = tuple(entry.name for entry in fields(Node) if entry.name not in ("parent"
 
 
 class Tree:
-    """A UCT tree over opaque states. The work of an expansion grows with the depth alone, not with the tree.
+    """A UCT tree over opaque states. The work of an expansion is that of comparing the children on its way.
 
     Args:
         root: state the search starts from.
@@ -197,10 +197,10 @@ class Tree:
         weight = self.exploration * math.sqrt(math.log(tries))
         best, highest = None, -math.inf
         for child in node.children.values():
-            if not child.is_open:
+            if child.tried >= len(child.actions) and not child.open_children:  # closed; the loop that costs most
                 continue
             visits = child.visits + child.pending
-            bound = child.mean + weight / math.sqrt(visits) if visits else math.inf
+            bound = child.total / visits + weight / math.sqrt(visits) if visits else math.inf
             if best is None or bound > highest or (bound == highest and child.action < best.action):
                 best, highest = child, bound
         assert best is not None

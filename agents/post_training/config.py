@@ -125,11 +125,7 @@ class PostTrainLoggerSettings(LoggerSettings):
 class BatchKeys:
     """Batches of fresh scenes.
 
-    Attributes:
-        iterations: policy updates, that is batches of fresh scenes.
-        batch_size: scenes sampled per iteration.
-        workers: physics worker processes; 0 computes physics in this process, ``ray`` on a Ray cluster, with as many
-            as that has CPUs.
+    :class:`PostTrainConfig` describes the keys.
     """
 
     iterations: int = 60
@@ -153,10 +149,17 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
     meaningful only together with these reductions: with ``"sum"`` the same balance needs a weight larger by the number
     of random entries of a scene.
 
+    Keys that are not listed are those of :class:`~agents.configuration.SamplingKeys`,
+    :class:`~agents.configuration.TrainingKeys` and :class:`~agents.configuration.RewardLimits`.
+
     Attributes:
         prior: the prior to start from, a shipped name or a path.
         reward: registered name, or a mapping with ``name`` and settings; in Python a function or reward object as
             well, which runs in this process: a hang or crash of it is the run's.
+        iterations: policy updates, that is batches of fresh scenes.
+        batch_size: scenes sampled per iteration.
+        workers: physics worker processes; 0 computes physics in this process, ``ray`` on a Ray cluster, with as many
+            as that has CPUs.
         recipe: a named set of the other keys: ``ours``, ``demo_clutter``, ``demo_feasible``; keys beside it win.
         output: run directory; an interrupted run found there goes on where it stopped; empty for runs/COMMAND-TIME
             on the command line, runs/post-train in Python.

@@ -3,14 +3,16 @@
 from agents.configuration.prior_names import list_priors
 from agents.priors.base import ScenePrior
 from agents.priors.checkpoint_import import import_checkpoint
-from agents.priors.config import MixedPriorConfig, PriorConfig
+from agents.priors.config import DenoiserConfig, MixedPriorConfig, PoseDiffusionConfig, PriorConfig
 from agents.priors.continuous import ContinuousPrior
 from agents.priors.mixed import MixedPrior
 
 __all__ = [
     "ContinuousPrior",
+    "DenoiserConfig",
     "MixedPrior",
     "MixedPriorConfig",
+    "PoseDiffusionConfig",
     "PriorConfig",
     "ScenePrior",
     "import_checkpoint",

@@ -66,6 +66,8 @@ class PoseDiffusionConfig:
 class PriorConfig(PoseDiffusionConfig, DenoiserConfig):
     """Configuration of a continuous prior, whose categories are diffused as numbers with the poses.
 
+    Further fields are those of :class:`DenoiserConfig` and :class:`PoseDiffusionConfig`.
+
     Attributes:
         network: kind and size of its denoiser, any configuration of a continuous network.
         rotation: what is diffused as rotation, ``"matrix"``, ``"quaternion"`` or ``"axis_angle"``.
@@ -78,6 +80,8 @@ class PriorConfig(PoseDiffusionConfig, DenoiserConfig):
 @dataclass(frozen=True)
 class MixedPriorConfig(PoseDiffusionConfig, DenoiserConfig):
     """Configuration of a mixed discrete-continuous prior.
+
+    Further fields are those of :class:`DenoiserConfig` and :class:`PoseDiffusionConfig`.
 
     Attributes:
         timesteps: as of continuous priors, but for None.
