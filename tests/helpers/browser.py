@@ -115,6 +115,12 @@ class Browser:
             self.mouse("Moved", *end, **held)
         self.mouse("Released", *end, clickCount=1, button=button)
 
+    def resize(self, width: int, height: int, sharpness: float = 1.0) -> None:
+        """Another window, whose canvas has ``sharpness`` pixels per CSS pixel."""
+        self.send(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=sharpness, mobile=False
+        )
+
     def touch(self, *points: tuple[float, float], kind: str = "Move") -> None:
         """Fingers at these places: Start, Move or End."""
         fingers = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(points)]
