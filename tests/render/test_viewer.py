@@ -262,6 +262,7 @@ def test_mouse_and_touch_move_the_camera_and_choose_objects(coarse_browser, tmp_
 
 def test_without_webgl_the_scene_is_listed(coarse_browser, tmp_path):
     browser = coarse_browser
+    browser.send("Page.enable")
     script = browser.send("Page.addScriptToEvaluateOnNewDocument", source=_NO_WEBGL)
     try:
         shown = browser.open(write_viewer(scenes(2), tmp_path / "viewer.html"))
@@ -271,6 +272,7 @@ def test_without_webgl_the_scene_is_listed(coarse_browser, tmp_path):
         cells = browser.run("Array.from(document.querySelectorAll('td'), (cell) => cell.textContent)")
     finally:
         browser.send("Page.removeScriptToEvaluateOnNewDocument", **script)
+        browser.send("Page.disable")
     assert len(cells) == 4 * 4
     assert cells[:3] == ["table", "0", "0.0000, 0.0000, 0.0000"]
     assert cells[4:8] == ["teapot", "3", "0.1000, -0.3500, 0.0000", "0.0, 0.0, 40.1"]
