@@ -40,7 +40,8 @@ class Browser:
         self._answers, answers = os.pipe()
         words = [
             CHROMIUM, "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader",
-            "--enable-unsafe-swiftshader", "--hide-scrollbars", f"--window-size={width},{height}",
+            "--enable-unsafe-swiftshader", "--disable-gpu-rasterization", "--disable-gpu-compositing",
+            "--hide-scrollbars", f"--window-size={width},{height}",
             "--remote-debugging-pipe", f"--user-data-dir={profile}", *flags, "about:blank",
         ]  # fmt: skip
         starter = [sys.executable, "-c", _START, str(commands), str(answers), *words]

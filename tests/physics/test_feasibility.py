@@ -227,7 +227,7 @@ def test_projection_before_simulation_keeps_objects_closer_to_what_was_asked(nam
 
     Simulation alone moves objects further (at most 0.3 m counted per object), though none is thrown away.
     """
-    clean = get_grammar(name).sample(np.random.default_rng(4), 2)
+    clean = get_grammar(name).sample(np.random.default_rng(4), 4)
     noise = 0.01 * torch.randn(clean.translations.shape, generator=torch.Generator().manual_seed(1))
     given = clean.with_poses(clean.translations + noise * clean.is_free.unsqueeze(-1), clean.rotations)
 

@@ -190,9 +190,7 @@ def test_a_browser_plays_the_path_and_shows_what_is_clicked(coarse_browser: Brow
     browser.wait_for(f"document.body?.dataset.state === 'ready' && {inside}?.state === 'ready'")
     browser.run("document.querySelector('.family').scrollIntoView()")
     browser.wait_for("document.querySelectorAll('[data-painted]').length > 2")
-    colors = (
-        "new Set(document.querySelector('.card canvas').getContext('2d').getImageData(0, 0, 200, 150).data).size"
-    )
+    colors = "new Set(document.querySelector('.card canvas').getContext('2d').getImageData(0, 0, 200, 150).data).size"
     assert browser.run(colors) > 50
     shown = json.loads(browser.run(f"JSON.stringify({inside})"))
     assert (shown["scenes"], shown["scene"], shown["errors"]) == (str(len(scenes) + 1), "0", "0")
