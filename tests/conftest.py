@@ -14,7 +14,7 @@ from PIL import Image
 
 
 def pytest_collection_finish() -> None:
-    """The ranges of a built-in grammar are measured once per process, on fewer objects, and its scenes drawn once."""
+    """The ranges of a built-in grammar are measured once per process, on fewer objects: that takes seconds."""
     ranges = sys.modules.get("scene_envs.datasets.ranges")
     if ranges is None:  # nothing that was collected generates
         return
@@ -35,10 +35,6 @@ def pytest_collection_finish() -> None:
         return low.clone(), high.clone(), tilted
 
     ranges._ranges = once
-
-    from tests.helpers.drawn_once import keep_scenes
-
-    keep_scenes()
 
 
 @pytest.fixture(autouse=True)
