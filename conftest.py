@@ -4,8 +4,9 @@ import gc
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,7 +14,7 @@ import pytest
 for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # parallel tests do not fight for cores
 os.environ.setdefault("MPLBACKEND", "Agg")
-_MEMORY = "/dev/shm"
+_TESTS, _MEMORY = Path(__file__).parent / "tests", "/dev/shm"
 if "TMPDIR" not in os.environ and os.path.isdir(_MEMORY) and shutil.disk_usage(_MEMORY).free > 4 * 2**30:
     os.environ["TMPDIR"], tempfile.tempdir = _MEMORY, None  # files of tests wait for no disk
 gc.disable()  # what collection imports is kept: the search of it for garbage costs seconds
@@ -63,6 +64,15 @@ def _registries_of_test(_registries_of_module: None) -> Iterator[None]:
     evaluation._warned.clear()
     with _restored():
         yield
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collect_file(file_path: Path) -> Generator[None, list[pytest.Collector], list[pytest.Collector]]:
+    """Modules of tests have no doctests; to look for some in all that they import takes a second."""
+    found = yield
+    if file_path.is_relative_to(_TESTS) and ">>>" not in file_path.read_text(encoding="utf-8", errors="replace"):
+        return [collector for collector in found if type(collector) is pytest.Module]
+    return found
 
 
 @pytest.hookimpl(trylast=True)

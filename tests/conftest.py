@@ -57,6 +57,32 @@ def _coarse_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(pictures, "light_camera", coarse_lamp)
 
 
+@pytest.fixture(scope="session")
+def _browser_of_session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    from tests.helpers.browser import CHROMIUM, Browser
+
+    if CHROMIUM is None:
+        pytest.skip("no Chromium is installed")
+    browser = Browser(tmp_path_factory.mktemp("profile"))
+    yield browser
+    browser.close()
+
+
+@pytest.fixture
+def browser(_browser_of_session: Any) -> Any:
+    """The browser of all tests, in a window of 700 x 560 pixels; drawing in software is what it takes its time for."""
+    _browser_of_session.resize(700, 560)
+    _browser_of_session.exceptions.clear()
+    return _browser_of_session
+
+
+@pytest.fixture
+def coarse_browser(browser: Any) -> Any:
+    """The same with a quarter of the pixels, for tests of what a page does and not of its picture."""
+    browser.resize(700, 560, sharpness=0.5)
+    return browser
+
+
 @pytest.fixture
 def copied_workers() -> Iterator[None]:
     """Workers of physics and of rewards of files start as copies of this process, and import nothing again."""

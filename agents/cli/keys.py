@@ -265,14 +265,15 @@ def _parsed(command: str, key: str, value: str) -> Any:
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
 
     if "," in value and value[:1] not in _OPENING:
         value = f"[{value}]"  # a,b is a list, where Hydra would see a sweep
     try:
         found = OverridesParser.create().parse_override(hidden(f"{key}={value}")).value()
-    except (HydraException, ValueError):
+        return shown(OmegaConf.to_container(OmegaConf.create({"value": found}))["value"])  # type: ignore[index, call-overload]
+    except (HydraException, OmegaConfBaseException, ValueError):
         raise InvalidInputError(f"{command}: a value cannot be read: {key}={value[:200]}") from None
-    return shown(OmegaConf.to_container(OmegaConf.create({"value": found}))["value"])  # type: ignore[index, call-overload]
 
 
 def _hint(config: type, key: str) -> Any:

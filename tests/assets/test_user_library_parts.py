@@ -5,7 +5,9 @@ from __future__ import annotations
 import copy
 import logging
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,6 +27,23 @@ def cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPa
     folder = tmp_path_factory.mktemp("cache")
     monkeypatch.setenv("SCENE_ENVS_CACHE", str(folder))
     return folder
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _decomposed_once() -> Iterator[None]:
+    """CoACD takes a second for the angle iron, and is asked by several tests for the same."""
+    made: dict[Any, Any] = {}
+    real = decomposition.run_coacd
+
+    def once(vertices: Any, faces: Any, settings: Any, *rest: Any) -> Any:
+        asked = (vertices.tobytes(), faces.tobytes(), str(settings))
+        if asked not in made:
+            made[asked] = real(vertices, faces, settings, *rest)
+        return copy.deepcopy(made[asked])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(decomposition, "run_coacd", once)
+        yield
 
 
 def angle_iron() -> trimesh.Trimesh:
@@ -75,14 +94,12 @@ def test_a_decomposition_is_computed_once_and_kept(
     tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     pytest.importorskip("coacd")
-    calls, made = [], []
-    real = decomposition.run_coacd
+    calls = []
+    compute = decomposition.run_coacd
 
     def counted(*args):
-        """What the first call computed, which takes a second, whatever is asked later."""
         calls.append(1)
-        made.extend([] if made else [real(*args)])
-        return copy.deepcopy(made[0])
+        return compute(*args)
 
     monkeypatch.setattr(decomposition, "run_coacd", counted)
     first = load(tmp_path, angle_iron())

@@ -182,6 +182,31 @@ def test_words_win_over_a_file(tmp_path: Path) -> None:
     assert found.iterations == settings.iterations
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["reward={name: weighted_sum, rewards: [object_count]}", "optimizer={lr: 0.1}", "optimizer.lr=1e-4"],
+        ["algorithm=nft", "algorithm={siblings: 2}", "seed=null", "prompt='${x}, y'"],
+        ["guard={action: rollback}", "hold=guard:1.05", "reward.name=clip"],
+        ["seed=range(1,3)"],
+        ["seed.x=3"],
+        ["reward=choice(a,b)"],
+    ],
+)
+def test_values_over_known_groups_are_what_hydra_makes_of_all_at_once(
+    words: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def made() -> str:
+        try:
+            return repr(compose("post-train", PostTrainConfig, words))
+        except (InvalidInputError, UnknownNameError) as error:
+            return str(error)
+
+    quick = made()
+    monkeypatch.setattr("agents.configuration.compose._quickly", lambda *_: None)
+    assert quick == made()
+
+
 def test_cfg_job_prints_and_runs_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

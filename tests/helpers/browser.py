@@ -40,7 +40,8 @@ class Browser:
         self._answers, answers = os.pipe()
         words = [
             CHROMIUM, "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader",
-            "--enable-unsafe-swiftshader", "--hide-scrollbars", f"--window-size={width},{height}",
+            "--enable-unsafe-swiftshader", "--disable-gpu-rasterization", "--disable-gpu-compositing",
+            "--hide-scrollbars", f"--window-size={width},{height}",
             "--remote-debugging-pipe", f"--user-data-dir={profile}", *flags, "about:blank",
         ]  # fmt: skip
         starter = [sys.executable, "-c", _START, str(commands), str(answers), *words]
@@ -114,6 +115,12 @@ class Browser:
         if end != start:
             self.mouse("Moved", *end, **held)
         self.mouse("Released", *end, clickCount=1, button=button)
+
+    def resize(self, width: int, height: int, sharpness: float = 1.0) -> None:
+        """Another window, whose canvas has ``sharpness`` pixels per CSS pixel."""
+        self.send(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=sharpness, mobile=False
+        )
 
     def touch(self, *points: tuple[float, float], kind: str = "Move") -> None:
         """Fingers at these places: Start, Move or End."""

@@ -229,7 +229,7 @@ def test_scenes_without_overlap_stay_where_they_are() -> None:
 @pytest.mark.parametrize("name", TYPES)
 def test_jittered_scenes_come_apart_and_keep_their_rotations(name: str) -> None:
     """Everything moved by 1 and 2 cm at random: no pair deeper than 0.1 mm is left, nothing leaves the workspace."""
-    clean = get_grammar(name).sample(np.random.default_rng(1), 3)
+    clean = get_grammar(name).sample(np.random.default_rng(1), 2)
     batch = SceneBatch.concatenate([jittered(clean, 0.01), jittered(clean, 0.02)])
     assert float(penetration(batch).depth.max()) > 5e-3
     result = project(batch)
@@ -244,8 +244,8 @@ def test_jittered_scenes_come_apart_and_keep_their_rotations(name: str) -> None:
 @pytest.mark.slow
 def test_objects_stay_between_the_boards_where_they_were() -> None:
     """A packed pantry moved by 1 cm: out of boards and walls, and each on the board it stood on."""
-    batch = get_grammar("pantry_shelf").sample(np.random.default_rng(2), 40)
-    batch = batch[batch.counts.argsort(descending=True)[:4].tolist()]
+    batch = get_grammar("pantry_shelf").sample(np.random.default_rng(2), 16)
+    batch = batch[batch.counts.argsort(descending=True)[:3].tolist()]
     assert int(batch.counts.min()) >= 30
     noisy = jittered(batch, 0.01)
     result = project(noisy)

@@ -17,7 +17,7 @@ from rewards import RewardContext, RewardOutput
 from scene_envs.envs import SearchState
 from scene_envs.errors import CorruptFileError
 from scene_envs.scene import SceneBatch
-from tests.helpers.browser import CHROMIUM, Browser
+from tests.helpers.browser import Browser
 
 SETTINGS: dict[str, Any] = {"branching": 3, "num_steps": 2, "max_depth": 5, "seed": 3, "mask": "random", "slots": 8}
 SETTINGS["objective_scale"] = 20.0  # of which 7 can be reached: no search ends early
@@ -179,34 +179,27 @@ def metrics_of(record: SearchRecord) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_a_browser_plays_the_path_and_shows_what_is_clicked(tmp_path: Path) -> None:
-    if CHROMIUM is None:
-        pytest.skip("no Chromium is installed")
-    record, _ = recorded(depth=6, width=4)
+def test_a_browser_plays_the_path_and_shows_what_is_clicked(coarse_browser: Browser, tmp_path: Path) -> None:
+    browser = coarse_browser
+    record, _ = recorded(depth=3, width=3)
     scenes = dict.fromkeys(shown_nodes(record), search_scene())
     path = write_tree_page(tmp_path / "tree.html", record, scenes, metrics_of(record), returned=search_scene())
     assert "</script><b>" not in path.read_text()
-    browser = Browser(tmp_path / "profile")
-    try:
-        browser.send("Page.navigate", url=path.as_uri())
-        inside = "document.getElementById('viewer')?.contentDocument?.body?.dataset"
-        browser.wait_for(f"document.body?.dataset.state === 'ready' && {inside}?.state === 'ready'")
-        browser.run("document.querySelector('.family').scrollIntoView()")
-        browser.wait_for("document.querySelectorAll('[data-painted]').length > 2")
-        colors = (
-            "new Set(document.querySelector('.card canvas').getContext('2d').getImageData(0, 0, 200, 150).data).size"
-        )
-        assert browser.run(colors) > 50
-        shown = json.loads(browser.run(f"JSON.stringify({inside})"))
-        assert (shown["scenes"], shown["scene"], shown["errors"]) == (str(len(scenes) + 1), "0", "0")
-        browser.run("document.querySelectorAll('button.card')[4].click()")
-        browser.wait_for(f"{inside}.scene === document.querySelectorAll('button.card')[4].dataset.frame")
-        browser.run("document.getElementById('play').click()")
-        browser.wait_for("document.getElementById('playing').textContent === 'step 7 of 7'")
-        assert browser.run(f"{inside}.scene") == str(len(scenes))  # the scene that the search returned
-        assert "play" in browser.run("document.getElementById('play').textContent")
-        dots = browser.run("document.querySelector('#plot .dots').getAttribute('d').split('M').length - 1")
-        assert dots == len(record.nodes) - 1
-        assert browser.exceptions == []
-    finally:
-        browser.close()
+    browser.send("Page.navigate", url=path.as_uri())
+    inside = "document.getElementById('viewer')?.contentDocument?.body?.dataset"
+    browser.wait_for(f"document.body?.dataset.state === 'ready' && {inside}?.state === 'ready'")
+    browser.run("document.querySelector('.family').scrollIntoView()")
+    browser.wait_for("document.querySelectorAll('[data-painted]').length > 2")
+    colors = "new Set(document.querySelector('.card canvas').getContext('2d').getImageData(0, 0, 200, 150).data).size"
+    assert browser.run(colors) > 50
+    shown = json.loads(browser.run(f"JSON.stringify({inside})"))
+    assert (shown["scenes"], shown["scene"], shown["errors"]) == (str(len(scenes) + 1), "0", "0")
+    browser.run("document.querySelectorAll('button.card')[4].click()")
+    browser.wait_for(f"{inside}.scene === document.querySelectorAll('button.card')[4].dataset.frame")
+    browser.run("document.getElementById('play').click()")
+    browser.wait_for("document.getElementById('playing').textContent === 'step 4 of 4'")
+    assert browser.run(f"{inside}.scene") == str(len(scenes))  # the scene that the search returned
+    assert "play" in browser.run("document.getElementById('play').textContent")
+    dots = browser.run("document.querySelector('#plot .dots').getAttribute('d').split('M').length - 1")
+    assert dots == len(record.nodes) - 1
+    assert browser.exceptions == []

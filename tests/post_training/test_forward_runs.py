@@ -57,7 +57,7 @@ def test_more_objects_after_training_on_their_number(tmp_path: Path, algorithm: 
     config = forward_config(
         tmp_path,
         algorithm,
-        iterations=15,
+        iterations=12,
         batch_size=16,
         regularisation={"weight": 0.0, "bank_size": 24},
         optimizer={"lr": 5e-3},

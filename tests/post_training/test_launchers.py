@@ -5,16 +5,20 @@ from __future__ import annotations
 import os
 import runpy
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from torch.distributed.elastic.multiprocessing.subprocess_handler import subprocess_handler
 
 from agents.cli.parser import main
 from agents.post_training.run_files import CHECKPOINT_NAME
 from agents.priors.testing import tiny_prior
 from agents.utils.process_group import ProcessGroup, is_first_process, launched_processes
 from scene_envs.errors import InvalidInputError
+from tests.helpers.forked import ForkedModule
 from tests.helpers.processes import in_processes
 
 KEYS = (
@@ -33,7 +37,10 @@ def train_as_torchrun_does(folder: Path) -> None:
 
 
 def train_as_accelerate_does(folder: Path) -> None:
-    """The launcher's own module in this process, which starts two interpreters; what they print goes to a file."""
+    """The launcher's own module in this process; what the two that it starts print goes to a file.
+
+    They are copies of this process with the launcher's variables, as a new interpreter imports for seconds.
+    """
     for name in ("MASTER_ADDR", "MASTER_PORT", "WORLD_SIZE", "RANK"):
         del os.environ[name]
     os.environ |= {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
@@ -41,7 +48,14 @@ def train_as_accelerate_does(folder: Path) -> None:
         os.dup2(told.fileno(), 1)
     module, *options = LAUNCHER.split()
     sys.argv = [module, *options, *KEYS.split(), f"prior={folder / 'base'}", f"output={folder / 'accelerate'}"]
+    subprocess_handler.Popen = _forked  # type: ignore[misc, assignment]
     runpy.run_module(module, run_name="__main__")
+
+
+def _forked(args: Sequence[str], env: Mapping[str, str], **_: Any) -> ForkedModule:
+    """What stands for ``python -u -m agents.cli ...``."""
+    command = [word for word in args if word != "-u"]
+    return ForkedModule(command, pass_fds=(), env=env, start_new_session=True, stdout=1)
 
 
 @pytest.mark.slow
