@@ -244,7 +244,7 @@ def test_sweeps_are_every_combination() -> None:
         (["algorithm=ppo"], "unknown algorithm 'ppo'"),
         (["recipe=paper"], "recipe=paper is not for post-train"),
         (["optimizer=muon"], "unknown optimizer 'muon'. Known: adamw."),
-        (["regularisation=0.5"], "give one of regularisation.weight"),
+        (["regularisation=0.5"], "give one of regularisation.objective, regularisation.weight"),
     ],
 )
 def test_wrong_flags_are_said(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
