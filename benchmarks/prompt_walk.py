@@ -2,8 +2,8 @@
 
 python benchmarks/prompt_walk.py [--output docs/images/prompt_walk.png] [--rows 3] [--union any]
 
-Each column has one prompt, from the things of Living Room Shelf to those of Pantry Shelf; each row has one seed. No
-sample is selected. The table says how many of ``--count`` samples follow their prompt, and how many free objects are
+The prior completes an empty shelf. Each column has one prompt, from the things of Living Room Shelf to those of Pantry
+Shelf; each row has one seed. No sample is selected. The table says how many of ``--count`` samples follow their prompt, and how many free objects are
 of assets that only one of the two types has.
 """
 
@@ -16,7 +16,7 @@ import torch
 
 from agents import ScenePrior
 from scene_envs import SceneBatch, get_scene_type
-from scene_envs.datasets import parse_prompt, scene_facts
+from scene_envs.datasets import parse_prompt, scene_facts, to_union
 from scene_envs.render import gallery, picture_camera, render
 
 PROMPTS = (
@@ -34,9 +34,9 @@ def main() -> None:
     """Sample, print the table and draw the picture."""
     arguments = _arguments()
     prior = ScenePrior.load("cotrained").with_union(arguments.union)
+    shelves = to_union(SceneBatch.empty(ENDS[0], arguments.count), prior.scene_type)
     walks = [
-        prior.sample(arguments.count, prompt=prompt, guidance=arguments.guidance, num_steps=50, seed=0)
-        for prompt in PROMPTS
+        prior.complete(shelves, prompt=prompt, guidance=arguments.guidance, num_steps=50, seed=0) for prompt in PROMPTS
     ]
     print("| prompt | free objects | of living room alone | of pantry alone | claims that hold | all hold |")
     print("|---|---|---|---|---|---|")
@@ -69,7 +69,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--output", type=Path, default=Path("docs/images/prompt_walk.png"), help="the picture")
     parser.add_argument("--rows", type=int, default=3, help="rows of the picture")
     parser.add_argument("--count", type=int, default=16, help="samples per prompt")
-    parser.add_argument("--guidance", type=float, default=0.5, help="weight of classifier-free guidance")
+    parser.add_argument("--guidance", type=float, default=0.0, help="weight of classifier-free guidance")
     parser.add_argument("--union", choices=("one_type", "any"), default="any", help="what a scene may hold")
     return parser.parse_args()
 
