@@ -2,9 +2,9 @@
 
 python benchmarks/prompt_walk.py [--output docs/images/prompt_walk.png] [--rows 3] [--union any]
 
-The prior completes an empty shelf. Each column has one prompt, from the things of Living Room Shelf to those of Pantry
-Shelf; each row has one seed. No sample is selected. The table says how many of ``--count`` samples follow their prompt, and how many free objects are
-of assets that only one of the two types has.
+The prior completes an empty shelf. Each column has one prompt, from the things of Living Room Shelf to those of
+Pantry Shelf; each row has one seed. No sample is selected. The table says how many of ``--count`` samples follow
+their prompt, and how many free objects are of assets that only one of the two types has.
 """
 
 from __future__ import annotations
