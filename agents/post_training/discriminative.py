@@ -1,4 +1,4 @@
-"""Discriminative loss: a prior gains likelihood on real scenes over its base prior, and loses it on own samples."""
+"""Discriminative loss: over its base prior, a prior gains likelihood on real scenes and loses it on base samples."""
 
 from __future__ import annotations
 
@@ -17,25 +17,26 @@ from agents.priors.forward import NoisedScenes
 class DiscriminativeLoss:
     """Direct discriminative optimisation (Zheng et al. 2025, arXiv 2503.01103) of a diffusion prior.
 
-    The log-likelihood ratio of the prior and its base is the logit of a discriminator of real scenes and own samples,
-    which is trained with the logistic loss. The pretraining losses l of one noised scene stand for -log p. With the gap
-    d = l(base) - l(prior), the losses are
+    The log-likelihood ratio of the prior and its base is the logit of a discriminator of real scenes and samples of the
+    base prior, which is trained with the logistic loss. The best discriminator has the ratio of the densities of real
+    scenes and base samples as its odds, so the best prior has the density of real scenes. The pretraining losses l of
+    one noised scene stand for -log p. With the gap d = l(base) - l(prior), the losses are
 
-        (2 / s) softplus(-s d) of real scenes,    (2 / s) softplus(s d) of own samples
+        (2 / s) softplus(-s d) of real scenes,    (2 / s) softplus(s d) of base samples
 
     At the base prior their gradients are those of l and of -l. They vanish where s d is large, so that no sample repels
-    without bound. Where own samples are like real scenes, the two gradients cancel in the mean.
+    without bound. Where base samples are like real scenes, the two gradients cancel in the mean.
 
     Attributes:
         prior: in training.
         base: what it is compared with; its weights get no gradient.
-        sharpness: s, per unit of the pretraining loss; near 0 nothing bounds the loss of own samples.
+        sharpness: s, per unit of the pretraining loss; near 0 nothing bounds the loss of base samples.
 
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior("dimsum_table", process="mixed")
     >>> noised = prior.noised(prior.encode(prior.sample(2, num_steps=3)))
     >>> loss = DiscriminativeLoss(prior, prior, sharpness=20.0)
-    >>> [round(value, 4) for value in loss.of_own(noised).tolist()]  # (2 / s) log 2
+    >>> [round(value, 4) for value in loss.of_base(noised).tolist()]  # (2 / s) log 2
     [0.0693, 0.0693]
     """
 
@@ -47,8 +48,8 @@ class DiscriminativeLoss:
         """(B,) losses of noised real scenes."""
         return F.softplus(-self.sharpness * self.gap(noised, text)) * (2 / self.sharpness)
 
-    def of_own(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
-        """(B,) losses of noised samples."""
+    def of_base(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
+        """(B,) losses of noised samples of the base prior."""
         return F.softplus(self.sharpness * self.gap(noised, text)) * (2 / self.sharpness)
 
     def gap(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:

@@ -201,13 +201,15 @@ class Learner:
         policy_norm = gradient_norm(self.parameters)
         held = self.regularisation.accumulate(self.algorithm, rollout, self._generator("kl", index))
         generator = self._generator("real", index)
-        x0, prompts = scenes.batch(config.regularisation.batch_size, generator)
+        count = config.regularisation.batch_size
+        real = scenes.batch(count, generator)
+        samples = None if scenes.base is None else scenes.base.batch(count, self._generator("base", index))
         noise = self.algorithm.real_generator(self._generator("steps", index), generator)
-        real = self.regularisation.accumulate_scenes(self.prior, x0, prompts, rollout, noise, config.optimizer.chunk)
+        row = self.regularisation.accumulate_scenes(self.prior, real, samples, noise, config.optimizer.chunk)
         return {
             "policy_loss": policy.loss,
             "policy_gradient_norm": policy_norm,
-            **real,
+            **row,
             **held,
             **policy.figures(),
         }

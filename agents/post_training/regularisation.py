@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import asdict
 from typing import Any
 
 import torch
-from torch import Generator, Tensor
+from torch import Generator
 
 from agents.networks.text import Text
 from agents.post_training.base import Algorithm
-from agents.post_training.base_kl import rows_of_text
 from agents.post_training.discriminative import DiscriminativeLoss
-from agents.post_training.gradients import add_gradient, add_regularisation_gradient, encoded
+from agents.post_training.gradients import SceneLoss, add_gradient, add_regularisation_gradient, encoded
 from agents.post_training.hold import FAR, HIGHEST, HoldState, adjust
 from agents.post_training.regularisation_settings import RegularisationSettings
 from agents.post_training.rollouts import Rollout
+from agents.post_training.scene_bank import PromptedScenes
 from agents.priors.base import ScenePrior
-from agents.utils.process_group import ProcessGroup, gather_rows
+from agents.utils.process_group import ProcessGroup
 
 logger = logging.getLogger(__name__)
 
@@ -71,58 +70,43 @@ class Regularisation:
     def accumulate_scenes(
         self,
         prior: ScenePrior,
-        x0: Tensor,
-        prompts: Sequence[str] | None,
-        rollout: Rollout,
+        real: PromptedScenes,
+        base: PromptedScenes | None,
         generator: Generator,
         chunk: int | None,
     ) -> dict[str, float]:
-        """Add the gradient of the loss on real scenes, and on own samples where it has one; returns columns of the log.
+        """Add the gradient of the loss on real scenes, and on samples of the base prior; returns columns of the log.
 
-        Real scenes and own samples take the same timesteps and noise where there are as many of both.
+        Both take the same timesteps and noise.
 
         Args:
             prior: in training.
-            x0: (B, N, D) real scenes, normalised, of all processes.
-            prompts: of the real scenes, ``""`` for none; None for a prior that reads none.
-            rollout: the samples of this process.
+            real: real scenes of all processes.
+            base: as many samples of the base prior; None but for the discriminative loss.
             generator: source of timesteps and noise (CPU).
             chunk: scenes per pass.
         """
 
-        def of_real(rows: slice) -> Text | None:
-            return None if prompts is None else encoded(prior, prompts[rows])
+        def add(scenes: PromptedScenes, generator: Generator, loss: SceneLoss | None) -> tuple[float, float]:
+            def text(rows: slice) -> Text | None:
+                return None if scenes.prompts is None else encoded(prior, scenes.prompts[rows])
 
-        if self.settings.objective == "pretraining" or self.base is None or self.weight == 0:
-            value, norm = add_regularisation_gradient(prior, x0, self.weight, generator, chunk=chunk, text=of_real)
+            return add_regularisation_gradient(
+                prior, scenes.scenes, self.weight, generator, loss=loss, chunk=chunk, text=text
+            )
+
+        if base is None or self.base is None:
+            value, norm = add(real, generator, None)
             return {"pretraining_loss": value, "pretraining_gradient_norm": norm}
         loss = DiscriminativeLoss(prior, self.base, self.settings.sharpness)
         same = Generator().set_state(generator.get_state())
-        value, norm = add_regularisation_gradient(
-            prior, x0, self.weight, generator, loss=loss.of_real, chunk=chunk, text=of_real
-        )
-        samples = gather_rows(prior.encode(rollout.batch.to(prior.device)))
-        first = ProcessGroup.current().rows(len(samples)).start
-
-        def of_own(rows: slice) -> Text | None:
-            return rows_of_text(rollout.text, slice(rows.start - first, rows.stop - first))
-
-        seen = None if rollout.observed is None else gather_rows(rollout.observed)
-        own, own_norm = add_regularisation_gradient(
-            prior,
-            samples,
-            self.weight,
-            same,
-            loss=loss.of_own,
-            chunk=chunk,
-            text=of_own,
-            observed=prior.observed_by_mask(samples, seen),
-        )
+        value, norm = add(real, generator, loss.of_real)
+        base_value, base_norm = add(base, same, loss.of_base)
         return {
             "pretraining_loss": value,
             "pretraining_gradient_norm": norm,
-            "own_loss": own,
-            "own_gradient_norm": own_norm,
+            "base_sample_loss": base_value,
+            "base_sample_gradient_norm": base_norm,
         }
 
     def observe(self, figure: str, value: float | None, iteration: int) -> None:

@@ -18,9 +18,10 @@ class RegularisationSettings:
 
     Attributes:
         objective: ``pretraining`` for the pretraining loss on real scenes; ``discriminative`` for a loss that raises
-            their likelihood over the base prior's and lowers that of own samples.
+            their likelihood over the base prior's and lowers that of the base prior's samples.
         weight: coefficient of this loss; null takes the algorithm's own.
         sharpness: of the discriminative loss: the larger, the less it moves the prior from its base.
+        base_samples: samples of the base prior that the discriminative loss compares with real scenes; drawn once.
         kl: coefficient of the KL divergence from the base prior, on own samples, in nats per random variable of a
             scene; null for none, or 1 with ``hold=kl:VALUE``.
         hold: target that is held by a factor on both coefficients: ``guard:1.05`` for the held-out loss as a ratio to
@@ -36,6 +37,7 @@ class RegularisationSettings:
     objective: str = "pretraining"
     weight: float | None = None
     sharpness: float = 20.0
+    base_samples: int = 1024
     kl: float | None = None
     hold: str | None = None
     batch_size: int = 48
@@ -45,7 +47,7 @@ class RegularisationSettings:
     replay_share: float = 0.5
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "batch_size")
+        at_least(self, 1, "batch_size", "base_samples")
         one_of(self, "objective", OBJECTIVES)
         positive(self, "sharpness")
         if not 0 < self.replay_share <= 1:

@@ -20,7 +20,21 @@ from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.errors import InvalidInputError, TrainingError
 from scene_envs.scene import SceneBatch
 
-STREAMS = ("start", "noise", "steps", "real", "bank", "guard", "prompts", "samples", "kl", "inpaint")
+STREAMS = (
+    "start",
+    "noise",
+    "steps",
+    "real",
+    "bank",
+    "guard",
+    "prompts",
+    "samples",
+    "kl",
+    "inpaint",
+    "base",
+    "base_prompts",
+    "base_samples",
+)
 
 
 @dataclass(frozen=True)

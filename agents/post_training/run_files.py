@@ -21,6 +21,7 @@ LOG_NAME = "log.csv"
 METRICS_NAME = "metrics.json"
 SCENES_NAME = "real_scenes.safetensors"
 REPLAY_NAME = "replay.safetensors"
+BASE_SAMPLES_NAME = "base_samples.safetensors"
 
 
 def write_text(path: Path, text: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,6 +24,25 @@ _WITHHELD = 0.1
 
 
 @dataclass(frozen=True)
+class PromptedScenes:
+    """Normalised scenes and a prompt of each.
+
+    Attributes:
+        scenes: (M, N, D).
+        prompts: ``""`` for none; None for a prior that reads none.
+    """
+
+    scenes: Tensor
+    prompts: Sequence[str] | None
+
+    def batch(self, count: int, generator: Generator) -> PromptedScenes:
+        """``count`` of them, drawn with replacement."""
+        index = torch.randint(len(self.scenes), (count,), generator=generator)
+        prompts = None if self.prompts is None else [self.prompts[i] for i in index.tolist()]
+        return PromptedScenes(self.scenes[index], prompts)
+
+
+@dataclass(frozen=True)
 class SceneBank:
     """Normalised real scenes, split once and for all.
 
@@ -32,6 +52,7 @@ class SceneBank:
         prompts: all prompts of scene i of both, the held-out ones being last; None when they are not asked for.
         replay: (R, N, D) further scenes for the regularisation; None for none.
         replay_share: of a batch that they take.
+        base: samples of the base prior; None for none.
     """
 
     train: Tensor
@@ -39,6 +60,7 @@ class SceneBank:
     prompts: PromptSets | None = None
     replay: Tensor | None = None
     replay_share: float = 0.0
+    base: PromptedScenes | None = None
 
     @classmethod
     def split(cls, x0: Tensor, heldout: int, prompts: PromptSets | None = None) -> SceneBank:
@@ -51,8 +73,8 @@ class SceneBank:
         """The same bank with ``scenes`` (R, N, D) as a share of each batch."""
         return replace(self, replay=scenes.to(self.train.device), replay_share=share)
 
-    def batch(self, count: int, generator: Generator) -> tuple[Tensor, list[str] | None]:
-        """(count, N, D) training scenes, drawn with replacement, and one of each one's prompts.
+    def batch(self, count: int, generator: Generator) -> PromptedScenes:
+        """``count`` training scenes, drawn with replacement, and one of each one's prompts.
 
         As in pretraining, the prompt is withheld (``""``) from one scene in ten. Replayed scenes come last and have no
         prompt.
@@ -70,7 +92,7 @@ class SceneBank:
             chosen = torch.randint(len(self.replay), (replayed,), generator=generator)
             x0 = torch.cat([x0[: count - replayed], self.replay[chosen]])
             texts = None if texts is None else [*texts[: count - replayed], *[""] * replayed]
-        return x0, texts
+        return PromptedScenes(x0, texts)
 
     def heldout_prompts(self) -> list[str] | None:
         """One prompt of each held-out scene, of all kinds in turn; None when they are not asked for."""

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import time
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from agents.post_training.base_samples import kept_base_samples
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.curves import draw_curve
 from agents.post_training.early_refusals import check_it_can_learn, nothing_scored
@@ -190,6 +191,10 @@ class PostTrainer:
         self.learner.deal_parts(batch[: len(self.scenes.train)], prompts)
         if not reuse_scenes:
             check_it_can_learn(self.learner, batch, prompts)
+        base = self.learner.regularisation.base
+        if base is not None and config.regularisation.objective == "discriminative":
+            samples = kept_base_samples(self.directory, base, self.scenes, config, reuse=reuse_scenes)
+            self.scenes = replace(self.scenes, base=samples)
         self.guard = make_guard(config, self.learner, self.scenes)
 
     def step(self) -> tuple[Rollout, dict[str, float]]:

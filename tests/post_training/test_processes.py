@@ -27,7 +27,16 @@ TWO = ["A scene with two cups.", "A scene with 9 objects."]
 CASES: dict[str, tuple[str, torch.dtype, dict[str, Any]]] = {
     "ddpo_sf": ("continuous", torch.float64, {}),
     "ddpo_is": ("mixed", torch.float64, {"algorithm": {"updates": 2, "scenes_per_prompt": 3}, "prompt": TWO}),
-    "nft": ("mixed", torch.float64, {"optimizer.lr": 1e-4}),
+    "nft": (
+        "mixed",
+        torch.float64,
+        {
+            "optimizer.lr": 1e-4,
+            "regularisation.objective": "discriminative",
+            "regularisation.weight": 0.5,
+            "regularisation.base_samples": 8,
+        },
+    ),
     "awm": (
         "continuous",
         torch.float32,

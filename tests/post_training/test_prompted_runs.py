@@ -162,7 +162,8 @@ def test_real_scenes_bring_their_own_prompts(tmp_path: Path) -> None:
     every = SceneBatch.load(tmp_path / "run" / "real_scenes.safetensors").tensor
     for i in range(20):
         assert set(scenes.prompts(i)) == known[bytes(every[i, : dataset.tensor.shape[1]].numpy())]
-    x0, texts = scenes.batch(200, Generator().manual_seed(0))
+    batch = scenes.batch(200, Generator().manual_seed(0))
+    x0, texts = batch.scenes, batch.prompts
     assert texts is not None
     assert 5 <= sum(text == "" for text in texts) <= 40
     for scene, text in zip(x0, texts, strict=True):

@@ -36,7 +36,8 @@ def replay_config(output: Path, replay: Path | None, **changes: Any) -> PostTrai
 def test_a_share_of_each_batch_is_replayed() -> None:
     real, replay = torch.zeros(20, 3, 2), torch.arange(5.0).add(1).reshape(5, 1, 1).expand(5, 3, 2)
     bank = SceneBank.split(real, 4, lambda i: (f"scene {i}",)).with_replay(replay, 0.3)
-    x0, texts = bank.batch(10, Generator().manual_seed(0))
+    batch = bank.batch(10, Generator().manual_seed(0))
+    x0, texts = batch.scenes, batch.prompts
     assert not x0[:7].any()
     assert set(x0[7:].flatten().tolist()) <= set(replay.flatten().tolist())
     assert texts is not None
@@ -47,7 +48,7 @@ def test_a_share_of_each_batch_is_replayed() -> None:
 def test_the_guard_holds_out_real_scenes_alone() -> None:
     bank = SceneBank.split(torch.zeros(20, 3, 2), 4).with_replay(torch.ones(5, 3, 2), 1.0)
     assert not bank.heldout.any()
-    assert bank.batch(6, Generator().manual_seed(0))[0].all()
+    assert bank.batch(6, Generator().manual_seed(0)).scenes.all()
 
 
 @pytest.mark.slow

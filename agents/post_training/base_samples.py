@@ -1,0 +1,45 @@
+"""Samples of the base prior, from which the discriminative regularisation tells real scenes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from torch import Generator
+
+from agents.post_training.config import PostTrainConfig
+from agents.post_training.rollouts import stream_seed
+from agents.post_training.run_files import BASE_SAMPLES_NAME, writing
+from agents.post_training.scene_bank import PromptedScenes, SceneBank
+from agents.priors.base import ScenePrior
+from agents.utils.process_group import ProcessGroup
+from scene_envs.scene import SceneBatch
+
+
+def kept_base_samples(
+    directory: Path, base: ScenePrior, bank: SceneBank, config: PostTrainConfig, *, reuse: bool
+) -> PromptedScenes:
+    """The base prior's samples of a run, kept in its folder; the first process draws them.
+
+    They have the prompts of real scenes, so that prompts do not tell the two apart.
+
+    Args:
+        directory: of the run.
+        base: the base prior.
+        bank: real scenes, which give the prompts and the number of slots.
+        config: of the run.
+        reuse: take those that are there, as a resumed run does.
+    """
+    path, processes, count = directory / BASE_SAMPLES_NAME, ProcessGroup.current(), config.regularisation.base_samples
+    prompts = bank.batch(count, Generator().manual_seed(stream_seed(config.seed, "base_prompts"))).prompts
+    if processes.is_first and not (reuse and path.exists()):
+        batch = base.sample(
+            count,
+            prompt=prompts,
+            num_steps=config.num_steps,
+            slots=bank.train.shape[1],
+            seed=stream_seed(config.seed, "base_samples"),
+            batch_size=config.batch_size,
+        )
+        writing(f"the base prior's samples {str(path)!r}", lambda: batch.save(path))
+    processes.wait()
+    return PromptedScenes(base.encode(SceneBatch.load(path).to(base.device)), prompts)
