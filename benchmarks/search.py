@@ -19,7 +19,7 @@ denoising are the same for one seed. An objective or a mask with settings is giv
 `curve` draws the curves of recorded runs, median and range.
 
 `rest` exports scenes without the objects that physics calls infeasible, lets another simulator run, and counts the
-objects that moved, and those outside the workspace. `pictures` draws scenes.
+objects that moved, and those outside the workspace. `pictures` draws scenes, with what the objective says of them.
 
 `crowding` masks random slots of samples, or their culprits and some of their empty slots, inpaints once, and counts
 objects.

@@ -52,16 +52,20 @@ def distances(batch: SceneBatch, simulator: str, duration: float) -> np.ndarray:
 
 
 def pictures(options: argparse.Namespace) -> None:
-    """A gallery of the scenes in files, with what is feasible in them."""
+    """A gallery of the scenes in files, with what is feasible in them, or what another objective says of them."""
     from scene_envs.render import gallery, render
 
-    scorer, images, captions = RewardScorer("feasible_objects"), [], []
+    scorer, images, captions = RewardScorer(options.objective), [], []
     for file in options.files:
         batch = SceneBatch.load(file)
-        score = scorer(batch)
-        bad = batch.is_free & ~score.object_flags["feasible"]
-        images.append(render(batch[0], width=480, height=360, highlight=bad[:1])[0])
-        captions.append(f"{int(score.value[0])} of {int(batch.is_free[0].sum())} feasible")
+        score = scorer(batch, None if options.prompt is None else [options.prompt] * len(batch))
+        bad = None
+        if "feasible" in score.object_flags:
+            bad = (batch.is_free & ~score.object_flags["feasible"])[:1]
+            captions.append(f"{int(score.value[0])} of {int(batch.is_free[0].sum())} feasible")
+        else:
+            captions.append(f"{options.objective} {float(score.value[0]):.2f}")
+        images.append(render(batch[0], width=480, height=360, highlight=bad)[0])
     gallery(images, columns=min(4, len(images)), captions=captions).save(options.output)
 
 
