@@ -102,6 +102,7 @@ class FeynmanKacPlanner(PlannerSettings):
 
     name: str = "feynman_kac"
     widens = True
+    steers = True
     particles: int = 8
     resamplings: int = 2
     begin: float = 0.7

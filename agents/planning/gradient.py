@@ -9,9 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from agents.planning.greedy import GreedyPlanner
 from agents.planning.ledger import PlanResult, Progress, Searchable, Steered
-from agents.planning.registry import PlannerSettings, check_at_least, register_planner
+from agents.planning.registry import PlannerSettings, check_at_least, list_planners, planner_settings, register_planner
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_facts import hull_corners
@@ -91,21 +90,25 @@ class Guidance:
 @register_planner("gradient")
 @dataclass(frozen=True)
 class GradientPlanner(PlannerSettings):
-    """Gradient guidance of every inpainting, in rounds of iterated repair.
+    """Gradient guidance of every inpainting that another planner makes.
 
     Scenes follow the prior times exp(strength * weight), to first order about what the network expects; what comes out
-    is scored by the objective and kept as in :class:`~agents.planning.GreedyPlanner`. A step costs one gradient of the
+    is scored by the objective, and the other planner chooses what is inpainted next. A step costs one gradient of the
     weight more, and no evaluation of the denoiser.
 
     Attributes:
+        planner: the other planner: its name, or a mapping of its ``name`` and keys; one that takes any number of
+            children of a state, and does not steer by itself.
         weight: a differentiable log-weight: ``overlap``, or in Python a function.
         strength: of the weight; 0 is greedy repair.
         begin: share of the denoising steps before guidance.
-        children: inpaintings per round, one batch of the denoiser; null takes ``branching``.
+        children: inpaintings per round of the other planner, one batch of the denoiser; null takes ``branching``.
     """
 
     name: str = "gradient"
     widens = True
+    steers = True
+    planner: Any = "greedy"
     weight: Any = "overlap"
     strength: float = 1.0
     begin: float = 0.5
@@ -118,6 +121,7 @@ class GradientPlanner(PlannerSettings):
             raise InvalidInputError(f"planner {self.name}: begin={self.begin} is a share of the steps, below 1")
         if not callable(self.weight) and self.weight not in WEIGHTS:
             raise unknown_name("differentiable weight", str(self.weight), WEIGHTS)
+        self._guided()
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the current state.
@@ -126,8 +130,24 @@ class GradientPlanner(PlannerSettings):
             InvalidInputError: the expansions of ``problem`` cannot be steered.
         """
         steered = Steered(problem, self.name, self._guide)
-        return GreedyPlanner(children=self.children).plan(steered, budget, progress)
+        plan: PlanResult = self._guided().make(self.children or 1).plan(steered, budget, progress)
+        return plan
+
+    def _guided(self) -> PlannerSettings:
+        """The other planner."""
+        keys = {"name": self.planner} if isinstance(self.planner, str) else dict(self.planner)
+        settings = planner_settings(str(keys.get("name", "")))
+        if not _is_guidable(settings):
+            known = ", ".join(name for name in list_planners() if _is_guidable(planner_settings(name)))
+            raise InvalidInputError(
+                f"planner {self.name}: planner={self.planner!r} cannot be guided; give one of {known}"
+            )
+        return settings(**keys)
 
     def _guide(self, pairs: Sequence[tuple[Any, int]], values: Callable[[SceneBatch], Tensor]) -> Guidance:
         weight = self.weight if callable(self.weight) else WEIGHTS[self.weight]
         return Guidance(weight, self.strength, self.begin)
+
+
+def _is_guidable(settings: type[PlannerSettings]) -> bool:
+    return settings.widens and not settings.steers

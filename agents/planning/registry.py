@@ -29,6 +29,8 @@ class PlannerSettings:
     widens: ClassVar[bool] = False
     """Whether it chooses itself how many children a state gets. The environment of a search run then has as many
     actions as the budget instead of ``branching``."""
+    steers: ClassVar[bool] = False
+    """Whether it steers the denoising itself."""
 
     def make(self, branching: int) -> Any:
         """The planner: an object with ``plan(problem, budget, progress)``, as :class:`agents.planning.UCTPlanner`.

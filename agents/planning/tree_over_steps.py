@@ -63,6 +63,7 @@ class TreeOverStepsPlanner(PlannerSettings):
 
     name: str = "tree_over_steps"
     widens = True
+    steers = True
     children: int | None = None
     stops: tuple[float, ...] = (0.5, 0.7)
     rounds: int = 3
