@@ -6,85 +6,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import Tensor
 
+from agents.planning.guidance import WEIGHTS, Guidance
 from agents.planning.ledger import PlanResult, Progress, Searchable, Steered
-from agents.planning.registry import PlannerSettings, check_at_least, list_planners, planner_settings, register_planner
+from agents.planning.registry import (
+    PlannerSettings,
+    check_at_least,
+    list_planners,
+    planner_settings,
+    register_planner,
+)
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_facts import hull_corners
-
-Weight = Callable[[SceneBatch, Tensor], Tensor]
-"""``(batch, translations) -> (B,)``: log-weight of scenes of which the translations (B, N, 3), m, are those given.
-
-Differentiable in ``translations``.
-"""
-
-
-def overlap(batch: SceneBatch, translations: Tensor) -> Tensor:
-    """(B,) minus half the sum of squared overlaps of objects, mm²: 0 where no two overlap.
-
-    Each object is the upright cylinder around its asset; a pair overlaps by the smaller of how far the two circles and
-    how far the two heights do. Two welded objects are no pair.
-    """
-    radius, low, high = (column[batch.categories.clamp(max=batch.scene_type.num_assets)] for column in _sizes(batch))
-    flat = translations[..., :2]
-    away = (flat[:, :, None] - flat[:, None]).square().sum(-1).clamp(min=1e-12).sqrt()
-    across = radius[:, :, None] + radius[:, None] - away
-    bottom, top = translations[..., 2] + low, translations[..., 2] + high
-    along = torch.minimum(top[:, :, None], top[:, None]) - torch.maximum(bottom[:, :, None], bottom[:, None])
-    pairs = (
-        ~batch.is_empty[:, :, None] & ~batch.is_empty[:, None] & (batch.is_free[:, :, None] | batch.is_free[:, None])
-    )
-    pairs = pairs.triu(diagonal=1) & ~_contained(across, radius)
-    depth = torch.minimum(across, along).clamp(min=0.0)
-    return -0.5 * (1e3 * torch.where(pairs, depth, torch.zeros_like(depth))).square().sum(dim=(1, 2))
-
-
-def _contained(across: Tensor, radius: Tensor) -> Tensor:
-    """(B, N, N) bool: pairs of which one circle holds the middle of the other: things on tables, food in bowls."""
-    return across.detach() > torch.minimum(radius[:, :, None], radius[:, None])
-
-
-def _sizes(batch: SceneBatch) -> tuple[Tensor, Tensor, Tensor]:
-    """Radius, lowest and highest point of every asset, (C + 1,) m each; 0 for the empty slot."""
-    rows = [
-        (corners[:, :2].norm(dim=-1).amax(), corners[:, 2].amin(), corners[:, 2].amax())
-        for corners in hull_corners(batch.scene_type.library)
-    ]
-    columns = torch.tensor([*[[float(x) for x in row] for row in rows], [0.0, 0.0, 0.0]], device=batch.tensor.device)
-    return columns[:, 0], columns[:, 1], columns[:, 2]
-
-
-WEIGHTS: dict[str, Weight] = {"overlap": overlap}
-"""Log-weights by name."""
-
-
-class Guidance:
-    """Gradient of a log-weight at what scenes are expected to become.
-
-    Args:
-        weight: the log-weight.
-        strength: factor of it.
-        begin: share of the denoising steps that stay as they are.
-    """
-
-    role = "guide"
-
-    def __init__(self, weight: Weight, strength: float, begin: float) -> None:
-        self.weight, self.strength, self.begin = weight, strength, begin
-
-    def __call__(self, step: int, steps: int, denoised: Callable[[], SceneBatch]) -> Tensor | None:
-        """(B, N, 3) gradient by translation, 1/m; None at a step without guidance."""
-        if step < int(self.begin * steps) or not self.strength:
-            return None
-        batch = denoised()
-        with torch.enable_grad():
-            translations = batch.translations.detach().clone().requires_grad_()
-            total = self.weight(batch, translations).sum()
-            (gradient,) = torch.autograd.grad(total, translations)
-        return self.strength * torch.nan_to_num(gradient)
 
 
 @register_planner("gradient")

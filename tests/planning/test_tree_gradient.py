@@ -10,9 +10,10 @@ from torch import Tensor
 
 from agents.diffusion import GaussianProcess, Preconditioning, ResidualVariance, StepTable
 from agents.diffusion.schedules import make_schedule
-from agents.planning import GradientPlanner, GreedyPlanner, TreeOverStepsPlanner
+from agents.planning import EvolutionPlanner, GradientPlanner, TreeOverStepsPlanner
 from agents.planning.branches import Branches
-from agents.planning.gradient import Guidance, overlap
+from agents.planning.guidance import Guidance, overlap
+from agents.planning.registry import planner_settings
 from agents.priors.testing import tiny_prior
 from rewards import RewardContext
 from scene_envs.errors import InvalidInputError, SceneEnvsError
@@ -142,12 +143,24 @@ def test_guidance_moves_what_is_regenerated_and_nothing_else(process: str) -> No
     assert bool(torch.isfinite(far.tensor).all())
 
 
-@PROCESSES
-def test_without_strength_gradient_is_greedy_repair(process: str) -> None:
-    guided, env = plan(GradientPlanner(children=3, strength=0.0), process)
-    greedy, _ = plan(GreedyPlanner(children=3), process)
-    assert guided.values == greedy.values
+@pytest.mark.parametrize("name", ["greedy", "evolution", "beam", "uct"])
+def test_without_strength_gradient_is_the_planner_that_it_guides(name: str) -> None:
+    guided, env = plan(GradientPlanner(children=3, planner=name, strength=0.0), "mixed")
+    plain, _ = plan(planner_settings(name)().make(3), "mixed")
+    assert guided.values == plain.values
     assert env.nfe == 14 * 4
+
+
+def test_gradient_hands_keys_on_to_the_planner_that_it_guides() -> None:
+    guided, _ = plan(GradientPlanner(children=3, planner={"name": "evolution", "seed": 1}, strength=0.0), "continuous")
+    plain, _ = plan(EvolutionPlanner(children=3, seed=1), "continuous")
+    assert guided.values == plain.values
+
+
+@pytest.mark.parametrize("name", ["gradient", "feynman_kac", "tree_over_steps"])
+def test_planners_that_steer_are_not_guided(name: str) -> None:
+    with pytest.raises(InvalidInputError, match=f"'{name}' cannot be guided; give one of .*evolution, greedy"):
+        GradientPlanner(planner=name)
 
 
 def test_overlap_is_half_the_square_of_the_smaller_depth() -> None:
