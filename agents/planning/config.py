@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from agents.configuration.fields import composed, moved, named, nested
 from agents.configuration.shared_keys import SamplingKeys
-from agents.planning.evolution import EvolutionPlanner
+from agents.planning.gradient import GradientPlanner
 from agents.planning.registry import PlannerSettings, list_planners, planner_settings
 from scene_envs.errors import InvalidInputError
 
@@ -71,7 +71,7 @@ class SearchConfig(BudgetKeys, SamplingKeys):
     objective_scale: float | None = None
     workers: int = 0
     planner: PlannerSettings = nested(
-        EvolutionPlanner, folder="planner", option="evolution", kinds=planner_settings, registered=list_planners
+        GradientPlanner, folder="planner", option="gradient", kinds=planner_settings, registered=list_planners
     )
 
     @property

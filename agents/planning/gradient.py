@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from torch import Tensor
-
-from agents.planning.guidance import WEIGHTS, Guidance
 from agents.planning.ledger import PlanResult, Progress, Searchable, Steered
 from agents.planning.registry import (
     PlannerSettings,
@@ -18,7 +15,15 @@ from agents.planning.registry import (
     register_planner,
 )
 from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.scene import SceneBatch
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from agents.planning.guidance import Guidance
+    from scene_envs.scene import SceneBatch
+
+WEIGHTS = ("overlap",)
+"""Differentiable log-weights of :mod:`agents.planning.guidance`."""
 
 
 @register_planner("gradient")
@@ -34,7 +39,7 @@ class GradientPlanner(PlannerSettings):
         planner: the other planner: its name, or a mapping of its ``name`` and keys; one that takes any number of
             children of a state, and does not steer by itself.
         weight: a differentiable log-weight: ``overlap``, or in Python a function.
-        strength: of the weight; 0 is greedy repair.
+        strength: of the weight; 0 is the other planner alone.
         begin: share of the denoising steps before guidance.
         children: inpaintings per round of the other planner, one batch of the denoiser; null takes ``branching``.
     """
@@ -79,8 +84,10 @@ class GradientPlanner(PlannerSettings):
         return settings(**keys)
 
     def _guide(self, pairs: Sequence[tuple[Any, int]], values: Callable[[SceneBatch], Tensor]) -> Guidance:
-        weight = self.weight if callable(self.weight) else WEIGHTS[self.weight]
-        return Guidance(weight, self.strength, self.begin)
+        from agents.planning import guidance
+
+        weight = self.weight if callable(self.weight) else getattr(guidance, self.weight)
+        return guidance.Guidance(weight, self.strength, self.begin)
 
 
 def _is_guidable(settings: type[PlannerSettings]) -> bool:

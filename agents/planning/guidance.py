@@ -1,4 +1,4 @@
-"""Guidance of the denoising: the gradient of a differentiable weight of scenes, and the weights there are."""
+"""Guidance of the denoising by the gradient of a differentiable weight of scenes, and the weights by name."""
 
 from __future__ import annotations
 
@@ -50,10 +50,6 @@ def _sizes(batch: SceneBatch) -> tuple[Tensor, Tensor, Tensor]:
     ]
     columns = torch.tensor([*[[float(x) for x in row] for row in rows], [0.0, 0.0, 0.0]], device=batch.tensor.device)
     return columns[:, 0], columns[:, 1], columns[:, 2]
-
-
-WEIGHTS: dict[str, Weight] = {"overlap": overlap}
-"""Log-weights by name."""
 
 
 class Guidance:

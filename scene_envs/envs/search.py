@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -257,7 +258,9 @@ class SearchProblem:
         batch, masks = batch.to(self.device), masks.to(self.device)
         how: dict[str, Any] = {"num_steps": self.num_steps, "generators": noises}
         if watch is not None:
-            how[getattr(watch, "role", "watch")] = watch
+            role = getattr(watch, "role", "watch")
+            _check_takes(self.prior, role)
+            how[role] = watch
         if reader is None or self.prompt is None:
             return self.prior.inpaint(batch, masks, **how).to("cpu")
         return reader.inpaint(batch, masks, prompt=self.prompt, guidance=guidance, **how).to("cpu")
@@ -318,3 +321,13 @@ class SearchProblem:
     def close(self) -> None:
         """Stop physics workers, if any."""
         self.scorer.close()
+
+
+def _check_takes(prior: Any, role: str) -> None:
+    """Refuse to steer the inpaintings of a prior that cannot be steered."""
+    keys = inspect.signature(prior.inpaint).parameters.values()
+    if not any(key.name == role or key.kind is inspect.Parameter.VAR_KEYWORD for key in keys):
+        raise InvalidInputError(
+            f"the planner steers the denoising, and inpaint of {type(prior).__name__} takes no {role}=; "
+            "choose another planner, such as evolution"
+        )

@@ -98,7 +98,7 @@ def test_search_writes_its_pictures_and_curve(prior, tmp_path, capsys):
     assert {"best.safetensors", "before.png", "after.png", "curve.png", "config.yaml"} <= files(tmp_path)
     found = metrics(tmp_path)
     assert found["search"]["objective"] >= found["first_samples"]["objective"]
-    assert "by evolution with" in capsys.readouterr().out
+    assert "by gradient with" in capsys.readouterr().out
 
 
 def test_listings_and_the_contract_check(capsys):
