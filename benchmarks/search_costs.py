@@ -14,6 +14,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from agents.planning.guidance import Guidance, overlap
 from agents.planning.registry import planner_settings
 from scene_envs.envs import SearchEnv
 from scene_envs.envs.mask_generators import BalancedMask, CulpritsMask
@@ -54,18 +55,20 @@ def crowding(options: argparse.Namespace) -> None:
         BalancedMask()(batch[i], score.row(i), np.random.default_rng(options.seed + i)) for i in range(len(batch))
     ]
     counts = [f"A scene with {count} objects." for count in batch.counts.tolist()]
-    tries: dict[str, tuple[torch.Tensor, list[str] | None]] = {}
+    tries: dict[str, tuple[torch.Tensor, dict[str, Any]]] = {}
     for slots in (0, 2, 4, 8):
         mask = fixed.clone()
         for row, empties in zip(mask, batch.is_empty, strict=True):
             row[empties.nonzero().flatten()[:slots]] = True
-        tries[str(slots)] = mask, None
-    tries["balanced"] = torch.stack(balanced), None
-    tries["all"] = fixed | batch.is_empty, None
+        tries[str(slots)] = mask, {}
+    tries["balanced"] = torch.stack(balanced), {}
+    tries["all"] = fixed | batch.is_empty, {}
     if prior.conditional:
-        tries["all, the prompt being the number of objects"] = fixed | batch.is_empty, counts
-    for name, (mask, prompt) in tries.items():
-        new = prior.inpaint(batch, mask, prompt=prompt, num_steps=options.num_steps, generators=generators)
+        tries["all, the prompt being the number of objects"] = fixed | batch.is_empty, {"prompt": counts}
+    for name in ("balanced", "all"):
+        tries[f"{name}, guided apart"] = tries[name][0], {"guide": Guidance(overlap, 1.0, 0.5)}
+    for name, (mask, how) in tries.items():
+        new = prior.inpaint(batch, mask, num_steps=options.num_steps, generators=generators, **how)
         flags = scorer(new).object_flags["feasible"]
         kept = batch.is_free & score.object_flags["feasible"] & ~mask
         share = float((flags & kept).sum() / kept.sum())
