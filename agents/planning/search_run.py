@@ -156,7 +156,7 @@ def _search(
             break
     searched, best_of = time.perf_counter(), None
     if config.baseline and spent and stopped in ("", "time"):
-        # The same seeds by path, so the first scenes are those of the first search.
+        # The same seeds by path: the first scenes are those of the first search, unless it steers the denoising.
         wide = spent if config.masks is None else max(actions, -(-spent // len(config.masks)))
         _, _, (best_of,) = run.plan(BestOfPlanner(), wide, spent, range(1), "best of N", progress)
     seconds = {"search": searched - started, "best_of": time.perf_counter() - searched}
