@@ -44,13 +44,12 @@ def _as_default(x: Any) -> Any:
 def in_processes(function: Callable[..., None], *arguments: Any, count: int = 2) -> list[int]:
     """Call ``function`` in ``count`` processes that find each other as under ``torchrun``; returns their statuses.
 
-    They begin as copies of a process that has imported what a run needs and done nothing else.
+    They begin as copies of this process, with all that it has imported.
     """
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1]), "WORLD_SIZE": str(count)}
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([__name__, "scene_envs.assets.built_in", "matplotlib.figure", "scipy.stats"])
+    context = multiprocessing.get_context("fork")
     processes = [
         context.Process(target=_launched, args=({"RANK": str(rank), **address}, function, arguments))
         for rank in range(count)
