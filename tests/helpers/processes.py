@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import sys
 from collections.abc import Callable, Iterable
 from typing import Any
 from unittest.mock import patch
@@ -66,5 +67,6 @@ def in_processes(function: Callable[..., None], *arguments: Any, count: int = 2)
 
 def _launched(environment: dict[str, str], function: Callable[..., None], arguments: tuple[Any, ...]) -> None:
     torch.set_num_threads(1)
+    sys.stdout, sys.stderr = sys.__stdout__, sys.__stderr__  # pytest's own hang on descriptors that copies may close
     os.environ |= environment
     function(*arguments)
