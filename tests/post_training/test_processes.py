@@ -40,7 +40,7 @@ CASES: dict[str, tuple[str, torch.dtype, dict[str, Any]]] = {
     "awm": (
         "continuous",
         torch.float32,
-        {"guard": {"action": "rollback", "limit": 0.5, "scenes": 40, "samples": 40}, "iterations": 3},
+        {"guard": {"action": "rollback", "limit": 0.5, "scenes": 20, "samples": 20}, "iterations": 3, "bank_size": 30},
     ),
     "neon": ("mixed", torch.float64, {"algorithm": {"updates": 2, "period": 2}}),
     "reward_weighted": ("mixed", torch.float32, {"reward": "diversity"}),
@@ -68,7 +68,6 @@ def runs(folder: Path, chunk: int | None) -> list[Run]:
             "reward": full_scenes,
             "iterations": 2,
             "chunk": chunk,
-            "bank_size": 60,
             "regularisation.batch_size": 6,
             **keys,
         }
