@@ -48,10 +48,10 @@ def _ranges_of_a_tenth() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def folder(tea_house: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset of ten scenes, made by a spawned process that finds the package by itself."""
+    """A dataset of six scenes, made by a spawned process that finds the package by itself."""
     output = tmp_path_factory.mktemp("data") / NAME
-    report = generate(NAME, 10, output, seed=3, workers=1, shard_size=5, progress=False)
-    assert report.scenes == 10
+    report = generate(NAME, 6, output, seed=3, workers=1, shard_size=3, progress=False)
+    assert report.scenes == 6
     return output
 
 
@@ -96,7 +96,7 @@ def test_the_grammar_does_as_it_says() -> None:
 
 
 def test_the_command_line_makes_the_same_dataset(folder: Path, tmp_path: Path) -> None:
-    words = ["generate", f"scene={NAME}", "count=10", "seed=3", "shard_size=5", "workers=0", f"output={tmp_path}"]
+    words = ["generate", f"scene={NAME}", "count=6", "seed=3", "shard_size=3", "workers=0", f"output={tmp_path}"]
     assert main(words) == 0
     here, there = SceneDataset.load(tmp_path), SceneDataset.load(folder)
     assert here.scene_type == there.scene_type == get_scene_type(NAME)

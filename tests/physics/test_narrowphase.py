@@ -44,7 +44,7 @@ def depth_of(
 @pytest.fixture(scope="module")
 def pairs() -> tuple[list[Array], PlacedParts, list[str]]:
     """Pairs of library parts, polytopes and slivers in every kind of contact."""
-    return sample(1500, seed=5)
+    return sample(1000, seed=5)
 
 
 @pytest.fixture(scope="module")

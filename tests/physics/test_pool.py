@@ -48,9 +48,8 @@ def pool() -> Iterator[PhysicsPool]:
 def test_none_one_and_two_workers_agree_bit_for_bit(
     batch: SceneBatch, expected: FeasibilityResult, pool: PhysicsPool
 ) -> None:
-    with PhysicsPool(workers=1) as one:  # a new interpreter
+    with forked_workers(), PhysicsPool(workers=1) as one:
         assert same(feasibility(batch, pool=one), expected)
-    with forked_workers():
         assert same(feasibility(batch, pool=pool), expected)
     assert len(pool.process_ids) == 2
 

@@ -59,8 +59,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[SearchOutcome, Path]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("planner", list_planners())
-def test_every_planner_leaves_its_tree(planner: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("agents.planning.search_run.draw_scene", lambda *_: None)  # pictures cost most of the time
+def test_every_planner_leaves_its_tree(planner: str, tmp_path: Path) -> None:
     outcome = search(tmp_path, planner=planner)
     record = SearchRecord.load(tmp_path / "tree.json")
     root, *nodes = record.nodes

@@ -34,7 +34,7 @@ def setting(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Path, str]:
 @pytest.mark.slow
 def test_a_run_writes_an_adapter_that_makes_its_prior_of_the_base(setting: tuple[Path, str], tmp_path: Path) -> None:
     base, algorithm = setting
-    result = post_train(_config(tmp_path / "run", base, algorithm))
+    result = post_train(_config(tmp_path / "run", base, algorithm, iterations=2))
     loaded, before = ScenePrior.load(base, adapter=tmp_path / "run").weights(), ScenePrior.load(base).weights()
     moved = set()
     for name, weight in result.prior.weights().items():
@@ -47,8 +47,8 @@ def test_a_run_writes_an_adapter_that_makes_its_prior_of_the_base(setting: tuple
 @pytest.mark.slow
 def test_a_killed_run_goes_on_bit_for_bit(setting: tuple[Path, str], tmp_path: Path) -> None:
     base, algorithm = setting
-    whole = post_train(_config(tmp_path / "whole", base, algorithm))
-    config = _config(tmp_path / "killed", base, algorithm)
+    whole = post_train(_config(tmp_path / "whole", base, algorithm, iterations=3))
+    config = _config(tmp_path / "killed", base, algorithm, iterations=3)
     post_train(changed(config, {"iterations": 2}))
     resumed = post_train(config)
     assert [row["gradient_norm"] for row in resumed.history] == [row["gradient_norm"] for row in whole.history]

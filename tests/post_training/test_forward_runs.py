@@ -58,7 +58,7 @@ def test_more_objects_after_training_on_their_number(tmp_path: Path, algorithm: 
         tmp_path,
         algorithm,
         iterations=12,
-        batch_size=16,
+        batch_size=12,
         regularisation={"weight": 0.0, "bank_size": 24},
         optimizer={"lr": 5e-3},
         algorithm_settings={"credit": "scene", "sampler_decay": 0.3},

@@ -147,7 +147,8 @@ def test_both_estimates_of_the_kl_agree_on_long_chains(process: str) -> None:
 @pytest.mark.parametrize("algorithm", ["ddpo_sf", "nft"])
 def test_a_penalty_on_the_kl_keeps_a_run_near_the_base(tmp_path: Path, algorithm: str) -> None:
     def last_kl(weight: float) -> float:
-        config = _run(tmp_path / f"{weight}", algorithm, regularisation__weight=0.0, regularisation__kl=weight)
+        weights = {"regularisation__weight": 0.0, "regularisation__kl": weight}
+        config = _run(tmp_path / f"{weight}", algorithm, iterations=3, **weights)
         return post_train(config, prior=tiny_prior(process="mixed")).history[-1]["kl"]
 
     assert last_kl(1000.0) < 0.5 * last_kl(1e-9)
@@ -206,7 +207,7 @@ def test_a_target_that_cannot_be_held_is_said_in_log_metrics_and_report(
     monkeypatch.setattr("agents.post_training.hold.HIGHEST", 1.1)
     config = _run(tmp_path, "ddpo_sf", regularisation__hold="kl:1e-9")
     with caplog.at_level(logging.WARNING):
-        metrics = post_train_and_compare(config, scenes=2, num_steps=2, prior=tiny_prior())  # the first KL is 0
+        metrics = post_train_and_compare(config, scenes=2, num_steps=2, prior=tiny_prior(slots=6))  # the first KL is 0
     assert metrics["hold"]["not_held_from"] is not None
     assert "could not be held" in caplog.text
     page = (tmp_path / "report.html").read_text()

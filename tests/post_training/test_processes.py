@@ -40,7 +40,7 @@ CASES: dict[str, tuple[str, torch.dtype, dict[str, Any]]] = {
     "awm": (
         "continuous",
         torch.float32,
-        {"guard": {"action": "rollback", "limit": 0.5, "scenes": 40, "samples": 40}, "iterations": 3},
+        {"guard": {"action": "rollback", "limit": 0.5, "scenes": 20, "samples": 20}, "iterations": 3, "bank_size": 30},
     ),
     "neon": ("mixed", torch.float64, {"algorithm": {"updates": 2, "period": 2}}),
     "reward_weighted": ("mixed", torch.float32, {"reward": "diversity"}),
@@ -68,7 +68,6 @@ def runs(folder: Path, chunk: int | None) -> list[Run]:
             "reward": full_scenes,
             "iterations": 2,
             "chunk": chunk,
-            "bank_size": 60,
             "regularisation.batch_size": 6,
             **keys,
         }
@@ -108,9 +107,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = (path.parent if "PYTEST_XDIST_WORKER" in os.environ else path) / "processes"  # one for all workers
     with FileLock(f"{path}.lock"):
         if not (path / "done").exists():
+            train(runs(path / "one", chunk=3))  # first, so that the two processes find everything imported
             failing = small_config(path / "failing", reward=fails_elsewhere, iterations=2), "continuous", torch.float32
             assert in_processes(train, [*runs(path / "two", chunk=None), failing]) == [0, 0]
-            train(runs(path / "one", chunk=3))
             (path / "done").touch()
     return path
 

@@ -134,10 +134,10 @@ def test_the_text_encoder_stays_as_it_is(tmp_path: Path, prompt: str | None) -> 
 @pytest.mark.slow
 def test_stopped_and_resumed_run_equals_the_uninterrupted_one(tmp_path: Path) -> None:
     changes = {"prompt": "data", "scenes_per_prompt": 2, "reward": count_objects}
-    post_train(small_config(tmp_path / "whole", **changes), prior=reader())
+    post_train(small_config(tmp_path / "whole", iterations=3, **changes), prior=reader())
     post_train(small_config(tmp_path / "parts", iterations=2, **changes), prior=reader())
     torch.randn(7)
-    post_train(small_config(tmp_path / "parts", **changes), prior=reader())
+    post_train(small_config(tmp_path / "parts", iterations=3, **changes), prior=reader())
     ours, theirs = weights(tmp_path / "parts"), weights(tmp_path / "whole")
     assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
 
