@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import socket
-import sys
 from collections.abc import Callable, Iterable
 from typing import Any
 from unittest.mock import patch
@@ -45,12 +44,13 @@ def _as_default(x: Any) -> Any:
 def in_processes(function: Callable[..., None], *arguments: Any, count: int = 2) -> list[int]:
     """Call ``function`` in ``count`` processes that find each other as under ``torchrun``; returns their statuses.
 
-    They begin as copies of this process, with all that it has imported.
+    They begin as copies of a process that has imported what a run needs and done nothing else.
     """
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1]), "WORLD_SIZE": str(count)}
-    context = multiprocessing.get_context("fork")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__, "scene_envs.assets.built_in", "matplotlib.figure", "scipy.stats"])
     processes = [
         context.Process(target=_launched, args=({"RANK": str(rank), **address}, function, arguments))
         for rank in range(count)
@@ -67,6 +67,5 @@ def in_processes(function: Callable[..., None], *arguments: Any, count: int = 2)
 
 def _launched(environment: dict[str, str], function: Callable[..., None], arguments: tuple[Any, ...]) -> None:
     torch.set_num_threads(1)
-    sys.stdout, sys.stderr = sys.__stdout__, sys.__stderr__  # pytest's own hang on descriptors that copies may close
     os.environ |= environment
     function(*arguments)

@@ -176,9 +176,7 @@ class Renderer {
     const gl = this.gl;
     const { light, center, radius } = this.view;
     const half = 1.15 * radius;
-    const sharpness = Math.min(window.devicePixelRatio || 1, 1); // a page that is zoomed out has coarser shadows
-    const wanted = Math.round(sharpness * (radius > 2 ? SUN_PIXELS.room : SUN_PIXELS.table));
-    const pixels = Math.min(wanted, gl.getParameter(gl.MAX_TEXTURE_SIZE));
+    const pixels = Math.min(radius > 2 ? SUN_PIXELS.room : SUN_PIXELS.table, gl.getParameter(gl.MAX_TEXTURE_SIZE));
     const side = Math.abs(light[2]) > 0.99 ? [1, 0, 0] : unit(cross([0, 0, 1], light));
     const view = viewMatrix([side, cross(light, side), light], add(center, scale(light, 3 * radius)));
     const depth = makeTexture(gl, gl.DEPTH_COMPONENT24, pixels, pixels);
