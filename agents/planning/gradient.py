@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from agents.configuration.tree import build
 from agents.planning.ledger import PlanResult, Progress, Searchable, Steered
 from agents.planning.registry import (
     PlannerSettings,
@@ -74,14 +75,19 @@ class GradientPlanner(PlannerSettings):
 
     def _guided(self) -> PlannerSettings:
         """The other planner."""
-        keys = {"name": self.planner} if isinstance(self.planner, str) else dict(self.planner)
-        settings = planner_settings(str(keys.get("name", "")))
+        keys = {"name": self.planner} if isinstance(self.planner, str) else self.planner
+        if not isinstance(keys, Mapping) or not isinstance(keys.get("name"), str):
+            raise InvalidInputError(
+                f"planner {self.name}: planner={self.planner!r} must be a planner's name, or a mapping of its name and "
+                "keys"
+            )
+        settings = planner_settings(keys["name"])
         if not _is_guidable(settings):
             known = ", ".join(name for name in list_planners() if _is_guidable(planner_settings(name)))
             raise InvalidInputError(
                 f"planner {self.name}: planner={self.planner!r} cannot be guided; give one of {known}"
             )
-        return settings(**keys)
+        return build(settings, keys, "planner.planner.")
 
     def _guide(self, pairs: Sequence[tuple[Any, int]], values: Callable[[SceneBatch], Tensor]) -> Guidance:
         from agents.planning import guidance

@@ -157,6 +157,21 @@ def test_gradient_hands_keys_on_to_the_planner_that_it_guides() -> None:
     assert guided.values == plain.values
 
 
+@pytest.mark.parametrize(
+    ("planner", "message"),
+    [
+        (5, "planner=5 must be a planner's name, or a mapping of its name and keys"),
+        ({"population": 3}, "must be a planner's name"),
+        ("evolutoin", "unknown planner 'evolutoin'; did you mean 'evolution'"),
+        ({"name": "evolution", "size": 3}, "size"),
+        ({"name": "evolution", "population": "many"}, "planner.planner.population"),
+    ],
+)
+def test_what_cannot_be_guided_is_told(planner: Any, message: str) -> None:
+    with pytest.raises(SceneEnvsError, match=message):
+        GradientPlanner(planner=planner)
+
+
 @pytest.mark.parametrize("name", ["gradient", "feynman_kac", "tree_over_steps"])
 def test_planners_that_steer_are_not_guided(name: str) -> None:
     with pytest.raises(InvalidInputError, match=f"'{name}' cannot be guided; give one of .*evolution, greedy"):
