@@ -16,9 +16,11 @@ from agents.planning.guidance import Guidance, overlap
 from agents.planning.registry import planner_settings
 from agents.priors.testing import tiny_prior
 from rewards import RewardContext
+from scene_envs.envs import SearchEnv
 from scene_envs.errors import InvalidInputError, SceneEnvsError
 from scene_envs.scene import CATEGORY, TRANSLATION, SceneBatch
 from tests.helpers.small_plans import SLOTS, near_middle, plan
+from tests.helpers.toy_prior import ToyPrior
 from tests.helpers.toy_tree import ToyTree, scrambled
 
 PROCESSES = pytest.mark.parametrize("process", ["mixed", "continuous"])
@@ -176,6 +178,13 @@ def test_what_cannot_be_guided_is_told(planner: Any, message: str) -> None:
 def test_planners_that_steer_are_not_guided(name: str) -> None:
     with pytest.raises(InvalidInputError, match=f"'{name}' cannot be guided; give one of .*evolution, greedy"):
         GradientPlanner(planner=name)
+
+
+def test_a_prior_that_cannot_be_guided_is_told() -> None:
+    env = SearchEnv(prior=ToyPrior(), objective=near_middle, branching=10, num_steps=2, slots=SLOTS)
+    env.reset(seed=0)
+    with pytest.raises(InvalidInputError, match="inpaint of ToyPrior takes no guide=; choose another planner"):
+        GradientPlanner(children=2).plan(env, 4)
 
 
 def test_overlap_is_half_the_square_of_the_smaller_depth() -> None:
