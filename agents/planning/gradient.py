@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from agents.planning.guidance import Guidance
     from scene_envs.scene import SceneBatch
 
+_PLANNER = "greedy"
 WEIGHTS = ("overlap",)
 """Differentiable log-weights of :mod:`agents.planning.guidance`."""
 
@@ -48,7 +49,7 @@ class GradientPlanner(PlannerSettings):
     name: str = "gradient"
     widens = True
     steers = True
-    planner: Any = "greedy"
+    planner: Any = _PLANNER
     weight: Any = "overlap"
     strength: float = 1.0
     begin: float = 0.5
@@ -61,7 +62,8 @@ class GradientPlanner(PlannerSettings):
             raise InvalidInputError(f"planner {self.name}: begin={self.begin} is a share of the steps, below 1")
         if not callable(self.weight) and self.weight not in WEIGHTS:
             raise unknown_name("differentiable weight", str(self.weight), WEIGHTS)
-        self._guided()
+        if self.planner != _PLANNER:  # to look a name up loads all planners, and with them torch
+            self._guided()
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the current state.

@@ -16,6 +16,7 @@ from torch import Generator, Tensor
 from agents.post_training import PostTrainer, SelfTrainingLoss
 from agents.post_training.expectation import TrainedCopy
 from agents.post_training.neon import Neon
+from agents.post_training.scene_bank import PromptedScenes
 from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError
@@ -117,7 +118,7 @@ def test_nothing_changes_where_the_real_scenes_are_the_own_samples(tmp_path: Pat
     base, learner = named(trainer.prior), trainer.learner
     rollout = learner.rollout(0)
     own = trainer.prior.encode(rollout.batch)
-    real = SimpleNamespace(batch=lambda count, generator: (own, None))
+    real = SimpleNamespace(batch=lambda count, generator: PromptedScenes(own, None), base=None)
     for index in range(2):
         learner.update(rollout, learner.algorithm.advantage(rollout), real, index)  # type: ignore[arg-type]
     assert any(not torch.equal(value, base[name]) for name, value in named(trainer.prior).items())
