@@ -41,7 +41,7 @@ def chain_kl(
     drawn = max(1, min(batch, round(batch * count / len(steps))))
     for step in steps:
         for rows in torch.randperm(batch, generator=generator)[:drawn].split(policy.chunk or drawn):
-            x_t, text = rollout.scenes[step][rows], rows_of_text(rollout.text, rows)
+            x_t, text = rollout.scenes[step][rows], _rows(rollout.text, rows)
             observed = None if rollout.observed is None else rollout.observed[rows]
             with torch.no_grad():
                 then = first.distribution(x_t, step, text, observed)
@@ -80,7 +80,7 @@ def forward_kl(
     size = chunk or count
     for start in range(0, count, size):
         rows = slice(start, start + size)
-        yield noised_kl(prior, base, noised.rows(rows), rows_of_text(rollout.text, rows)).sum() * ((total - 1) / count)
+        yield noised_kl(prior, base, noised.rows(rows), _rows(rollout.text, rows)).sum() * ((total - 1) / count)
 
 
 def noised_kl(prior: ScenePrior, base: ScenePrior, noised: NoisedScenes, text: Text | None = None) -> Tensor:
@@ -107,6 +107,5 @@ def noised_kl(prior: ScenePrior, base: ScenePrior, noised: NoisedScenes, text: T
     return total / entries.clamp(min=1.0)
 
 
-def rows_of_text(text: Text | None, rows: slice | Tensor) -> Text | None:
-    """Tokens and mask of some of the scenes."""
+def _rows(text: Text | None, rows: slice | Tensor) -> Text | None:
     return None if text is None else (text[0][rows], text[1][rows])

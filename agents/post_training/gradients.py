@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import torch
 from torch import Generator, Tensor, nn
 
-from agents.networks.mixed_denoiser import Observed
 from agents.networks.text import Text
 from agents.post_training.losses import DDPOSFLoss
 from agents.post_training.rollouts import Rollout
@@ -128,8 +127,7 @@ def add_regularisation_gradient(
     *,
     loss: SceneLoss | None = None,
     chunk: int | None = None,
-    text: Callable[[slice], Text | None] | None = None,
-    observed: Observed | None = None,
+    prompts: Sequence[str] | None = None,
 ) -> tuple[float, float]:
     """Add ``coefficient`` times the gradient of a loss of noised scenes to ``.grad``.
 
@@ -140,8 +138,7 @@ def add_regularisation_gradient(
         generator: source of timesteps and noise (CPU).
         loss: (B,) losses of noised scenes; None for the pretraining loss.
         chunk: scenes per pass.
-        text: encoded prompts of some of the scenes; None for scenes without.
-        observed: entries that have no part in the loss; None draws them as in pretraining.
+        prompts: of the scenes, ``""`` for none; None for a prior that reads none.
 
     Returns:
         The mean loss of all, and the norm of ``coefficient`` times its gradient.
@@ -153,12 +150,13 @@ def add_regularisation_gradient(
     for parameter in parameters:
         parameter.grad = None
     value, total = 0.0, GradientSum(parameters)
-    noised, own = prior.noised(x0, generator, observed=observed), processes.rows(len(x0))
+    noised, own = prior.noised(x0, generator), processes.rows(len(x0))
     losses = loss or prior.noised_loss
     size = chunk or len(x0)
     for start in range(own.start, own.stop, size):
         rows = slice(start, min(start + size, own.stop))
-        mean = losses(noised.rows(rows), text and text(rows)).mean() * ((rows.stop - start) / len(x0))
+        text = None if prompts is None else encoded(prior, prompts[rows])
+        mean = losses(noised.rows(rows), text).mean() * ((rows.stop - start) / len(x0))
         value += float(mean.detach())
         (coefficient * mean).backward()
         total.add_part()

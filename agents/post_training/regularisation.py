@@ -11,10 +11,9 @@ from typing import Any
 import torch
 from torch import Generator
 
-from agents.networks.text import Text
 from agents.post_training.base import Algorithm
 from agents.post_training.discriminative import DiscriminativeLoss
-from agents.post_training.gradients import SceneLoss, add_gradient, add_regularisation_gradient, encoded
+from agents.post_training.gradients import SceneLoss, add_gradient, add_regularisation_gradient
 from agents.post_training.hold import FAR, HIGHEST, HoldState, adjust
 from agents.post_training.regularisation_settings import RegularisationSettings
 from agents.post_training.rollouts import Rollout
@@ -88,11 +87,8 @@ class Regularisation:
         """
 
         def add(scenes: PromptedScenes, generator: Generator, loss: SceneLoss | None) -> tuple[float, float]:
-            def text(rows: slice) -> Text | None:
-                return None if scenes.prompts is None else encoded(prior, scenes.prompts[rows])
-
             return add_regularisation_gradient(
-                prior, scenes.scenes, self.weight, generator, loss=loss, chunk=chunk, text=text
+                prior, scenes.scenes, self.weight, generator, loss=loss, chunk=chunk, prompts=scenes.prompts
             )
 
         if base is None or self.base is None:
