@@ -32,7 +32,8 @@ def _registries() -> list[dict[str, Any]]:
     from scene_envs.scene_types.registry import _SCENE_TYPES
 
     for registry in (GRAMMARS, _PLANNERS):
-        registry.load()  # what modules of this project register comes once per process
+        for name in registry.names():
+            registry[name]  # what modules of this project register comes once per process
     return [_SCENE_TYPES, GRAMMARS, _MASKS, _FORMATS, _REWARDS, _ENTRIES, _PLANNERS, _ALGORITHMS]
 
 

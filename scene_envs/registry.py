@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from importlib.metadata import EntryPoint
 from typing import Any, TypeVar
@@ -14,13 +14,13 @@ Component = TypeVar("Component")
 
 
 class Registry(dict[str, Component]):
-    """Components of one kind by name; a lookup of a name that is not there first loads what may bring it.
+    """Components of one kind by name; a lookup of a name that is not there first loads the module that has it.
 
     Args:
         kind: what messages call a component, such as ``"planner"``.
         group: entry points of installed packages.
         components: those that are there from the start.
-        modules: modules of this project that register components when they are imported.
+        modules: modules of this project by name of the component that each registers when it is imported.
         read: from an entry point, which is called like its component, to the component; None where the entry points are
             modules that register components when they are imported.
 
@@ -42,34 +42,39 @@ class Registry(dict[str, Component]):
         group: str,
         components: Mapping[str, Component] | None = None,
         *,
-        modules: Sequence[str] = (),
+        modules: Mapping[str, str] | None = None,
         read: Callable[[EntryPoint], Component] | None = None,
     ) -> None:
         super().__init__(components or {})
-        self.kind, self.group, self._modules, self._read = kind, group, modules, read
+        self.kind, self.group, self._modules, self._read = kind, group, modules or {}, read
 
     def __missing__(self, name: Any) -> Component:
-        self.load()
+        self._load_plugins()
+        if name not in self and name in self._modules:
+            self._import(self._modules[name])
+        if name not in self and self._read is not None and name in self.points():
+            self.setdefault(name, self._read(self.points()[name]))
         if name not in self:
-            point = None if self._read is None else self.points().get(name)
-            if self._read is None or point is None:
-                raise unknown_name(self.kind, str(name), self.names())
-            self.setdefault(name, self._read(point))
+            raise unknown_name(self.kind, str(name), self.names())
         return self[name]
 
-    def load(self) -> None:
-        """Import the modules that register components; those of this project replace nothing."""
-        registered = dict(self)
-        for module in self._modules:
-            import_module(module)
-        self.update(registered)
-        if self._read is None:
+    def names(self) -> list[str]:
+        """All names, those of installed packages included, sorted. No module of this project is imported for it."""
+        self._load_plugins()
+        return sorted({*self, *self._modules, *(self.points() if self._read is not None else ())})
+
+    def _load_plugins(self) -> None:
+        """Import the modules of installed packages after those of this project, whose components they may replace."""
+        if self._read is None and self.points():
+            self._import(*self._modules.values())
             load_plugins(self.group)
 
-    def names(self) -> list[str]:
-        """All names, those of installed packages included, sorted."""
-        self.load()
-        return sorted({*self, *(self.points() if self._read is not None else ())})
+    def _import(self, *modules: str) -> None:
+        """Import modules of this project, which replace no component that is there."""
+        registered = dict(self)
+        for module in modules:
+            import_module(module)
+        self.update(registered)
 
     def points(self) -> dict[str, EntryPoint]:
         """The entry points of installed packages, by name."""

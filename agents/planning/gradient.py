@@ -62,8 +62,7 @@ class GradientPlanner(PlannerSettings):
             raise InvalidInputError(f"planner {self.name}: begin={self.begin} is a share of the steps, below 1")
         if not callable(self.weight) and self.weight not in WEIGHTS:
             raise unknown_name("differentiable weight", str(self.weight), WEIGHTS)
-        if self.planner != _PLANNER:  # to look a name up loads all planners, and with them torch
-            self._guided()
+        self._guided()
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the current state.

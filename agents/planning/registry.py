@@ -48,8 +48,8 @@ class PlannerSettings:
 _PLANNERS: Registry[type[PlannerSettings]] = Registry(
     "planner",
     ENTRY_POINT_GROUP,
-    modules=[
-        f"agents.planning.{name}"
+    modules={
+        name: f"agents.planning.{name}"
         for name in (
             "beam",
             "best_of",
@@ -61,7 +61,7 @@ _PLANNERS: Registry[type[PlannerSettings]] = Registry(
             "tree_over_steps",
             "uct",
         )
-    ],
+    },
 )
 Settings = TypeVar("Settings", bound=type[PlannerSettings])
 

@@ -125,7 +125,7 @@ class Grammar:
 
 
 GRAMMARS: Registry[Callable[[], Grammar]] = Registry(
-    "grammar", PLUGINS, modules=[f"scene_envs.grammars.{scene_type.name}" for scene_type in BUILT_IN]
+    "grammar", PLUGINS, modules={built_in.name: f"scene_envs.grammars.{built_in.name}" for built_in in BUILT_IN}
 )
 """Functions that make a grammar each, by name."""
 

@@ -37,6 +37,8 @@ LINES = {
     "post-train optimizer.weight_decay=nan": "weight_decay=nan must be at least 0",
     "search objective=object_cuont": "did you mean 'object_count'",
     "search scenes=nowhere": "no scene file, run or dataset is there",
+    "search planner=baem": "did you mean 'beam'",
+    "search planner=gradient planner.planner=baem": "did you mean 'beam'",
     "search mask=culprit": "did you mean 'culprits'",
     "search mask={name:culprit,at_least:2}": "did you mean 'culprits'",
     "post-train inpaint.mask=culprit": "did you mean 'culprits'",
