@@ -246,5 +246,5 @@ def _add_bias(bias: Tensor | None, mask: Tensor | None, count: int) -> Tensor | 
     """What is added to attention logits: ``bias`` on the slots, which follow ``count`` tokens, and the mask."""
     if bias is None:
         return mask
-    bias = F.pad(bias, (count, 0, count, 0))
+    bias = F.pad(bias, (count, 0, count, 0)) if count else bias
     return bias if mask is None else bias.masked_fill(~mask, -torch.inf)

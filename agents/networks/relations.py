@@ -17,8 +17,8 @@ from torch.nn import functional as F
 from agents.networks.flux_modules import FluxModule, FluxSizes, ModuleConfig, Scene
 from scene_envs.errors import unknown_name
 
-_SCALES, _DIRECTED = 8, 8
-FEATURES = 2 * _SCALES + 3 * _DIRECTED
+_SCALES = 8
+FEATURES = 5 * _SCALES
 """Numbers per pair of slots."""
 BLURS = ("axis", "largest")
 """Whose noise blurs the features of an axis."""
@@ -59,20 +59,18 @@ def pair_features(metres: Tensor, noise: Tensor, scales: Tensor) -> Tensor:
 
     Args:
         metres: (B, N, 3) positions.
-        noise: (B, N, 3) standard deviation of the noise on them along x, y, z, metres.
+        noise: (B, N, 3) standard deviation of the noise on them along x, y, z, metres; (B, N, 1) along every axis.
         scales: (8,) lengths, metres.
     """
-    variance = noise.square()
-    offset = (metres.unsqueeze(2) - metres.unsqueeze(1)).unsqueeze(-1)  # (B, N, N, 3, 1)
-    squared = offset.square()
-    spread = (variance.unsqueeze(2) + variance.unsqueeze(1)).unsqueeze(-1) + scales.square()  # (B, N, N, 3, 8)
-    across = (squared[..., :2, :] / spread[..., :2, :]).sum(dim=-2)
-    coarse = spread[..., :: _SCALES // _DIRECTED]
-    level = offset[..., 2, :] / (squared[..., 2, :] + coarse[..., 2, :]).sqrt()
-    horizontal = squared[..., :2, :].sum(dim=-2, keepdim=True)
-    direction = (offset[..., :2, :] / (horizontal + coarse[..., :2, :]).sqrt()).flatten(-2)
-    gaussians = [torch.exp(-0.5 * across), torch.exp(-0.5 * squared[..., 2, :] / spread[..., 2, :])]
-    return torch.cat([*gaussians, level, direction], dim=-1)
+    variance, wide = noise.square(), scales.square()
+    x, y, z = (metres.unsqueeze(2) - metres.unsqueeze(1)).unsqueeze(-1).unbind(dim=-2)  # (B, N, N, 1)
+    blurs = (variance.unsqueeze(2) + variance.unsqueeze(1)).unsqueeze(-1).unbind(dim=-2)
+    along_x, along_y, along_z = [blur + wide for blur in blurs] if len(blurs) == 3 else [blurs[0] + wide] * 3  # ..., 8
+    xx, yy, zz = x.square(), y.square(), z.square()
+    reach_x = (xx + yy + along_x).sqrt()
+    reach_y = reach_x if along_y is along_x else (xx + yy + along_y).sqrt()
+    parts = [torch.exp(-0.5 * (xx / along_x + yy / along_y)), torch.exp(-0.5 * zz / along_z)]
+    return torch.cat([*parts, z / (zz + along_z).sqrt(), x / reach_x, y / reach_y], dim=-1)
 
 
 class Relations(FluxModule):
@@ -106,7 +104,7 @@ class Relations(FluxModule):
         self.scales: Tensor
         self.register_buffer("unit", torch.tensor(unit), persistent=False)
         self.register_buffer("scales", torch.logspace(-2, float(largest.log10()), _SCALES), persistent=False)
-        self.hidden = nn.Linear(2 * _SCALES + _DIRECTED, width)
+        self.hidden = nn.Linear(3 * _SCALES, width)
         self.out = nn.Linear(width, blocks * heads)
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
@@ -125,10 +123,10 @@ class Relations(FluxModule):
             noise_level: (B, N) noise on them, in the same units.
         """
         unit = self.unit.to(position)
-        blurred = unit if self.blur == "axis" else unit.max().expand(3)
+        blurred = unit if self.blur == "axis" else unit.max().reshape(1)
         features = pair_features(position * unit, noise_level.unsqueeze(-1) * blurred, self.scales.to(position))
-        bias: Tensor = self.out(F.silu(self.hidden(features[..., : 2 * _SCALES + _DIRECTED])))
-        return bias.unflatten(-1, (self.blocks, self.heads)).permute(3, 0, 4, 1, 2), features
+        bias: Tensor = self.out(F.silu(self.hidden(features[..., : 3 * _SCALES])))
+        return bias.unflatten(-1, (self.blocks, self.heads)).permute(3, 0, 4, 1, 2).contiguous(), features
 
 
 def joint_attention(
