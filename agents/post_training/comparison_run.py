@@ -17,7 +17,7 @@ from agents.post_training.run_files import SCENES_NAME
 from agents.post_training.trainer import post_train
 from agents.priors.base import ScenePrior
 from agents.utils.process_group import ProcessGroup
-from rewards import reward_name
+from rewards import reward_label
 from rewards.isolation import close_reward, run_reward
 from scene_envs.scene import SceneBatch
 
@@ -76,7 +76,7 @@ def post_train_and_compare(
         after = measure(result.prior)
     seconds = {"training": round(trained - started, 1), "measuring": round(time.perf_counter() - trained, 1)}
     say_stage(config, "drawing the report")
-    title = f"Steering {base.scene_type.name.replace('_', ' ')} toward {reward_name(config.reward).replace('_', ' ')}"
+    title = f"Steering {base.scene_type.name.replace('_', ' ')} toward {reward_label(config.reward)}"
     extra = {"stage_seconds": seconds, "num_steps": num_steps}
     return write_comparison(result, before, after, title=title, extra=extra)
 
