@@ -1,4 +1,4 @@
-"""Scenes from whatever holds them: a file, a run's folder, a dataset. Imports no torch before it reads."""
+"""Sources of scenes: a file, the folder of a run, a dataset. Imports no torch before it reads."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The common part of the networks that ours is compared with: how slots, time and text enter, and how slots leave.
+"""Common part of the baseline networks: inputs for slots, time and text, and outputs for slots.
 
-Between the two stands a *trunk*, which is what tells the baselines apart: tokens (B, N, H), a time embedding (B, H) and
-text (B, L, H) with its mask (B, 1, 1, L), both None without text, to tokens (B, N, H).
+The *trunk* between inputs and outputs differs from baseline to baseline. It maps tokens (B, N, H), a time embedding
+(B, H) and text (B, L, H) with its mask (B, 1, 1, L), both None without text, to tokens (B, N, H).
 """
 
 from __future__ import annotations

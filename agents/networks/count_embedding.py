@@ -1,4 +1,4 @@
-"""Count embedding: slots seen of each category, and slots still masked, join the embedded time.
+"""Count embedding: numbers of visible slots of each category and of masked slots, added to the embedded time.
 
 Attention takes averages, and a prompt asks for numbers.
 """

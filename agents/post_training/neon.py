@@ -52,9 +52,9 @@ class Neon(OwnSampleAlgorithm):
 
     A round lasts ``settings.period`` iterations, in which the prior theta samples all scenes. Two copies of it are
     trained with the pretraining loss from the same timesteps and noise: one on real scenes (theta_real, by the loop),
-    one on the samples (theta_own). The next round begins with theta + w (theta_real - theta_own). What the two copies
-    have in common, such as what further training changes on any scenes, leaves the difference. In a round the learning
-    rate of both falls from ``optimizer.lr`` to 0.
+    one on the samples (theta_own). The next round begins with theta + w (theta_real - theta_own). Changes
+    that training makes whatever the scenes are the same in both copies, so the difference does not contain them. In a
+    round the learning rate of both falls from ``optimizer.lr`` to 0.
 
     Args:
         settings: its keys.

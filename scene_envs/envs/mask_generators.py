@@ -1,4 +1,4 @@
-"""Mask generators that ship: by blame of the objective, by physics, by prompt, by place."""
+"""Shipped mask generators: masks by the objective's blame, by physics, by prompt and by place."""
 
 from __future__ import annotations
 
