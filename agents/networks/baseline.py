@@ -25,7 +25,7 @@ _TIME_WIDTH = 256
 
 @dataclass(frozen=True, kw_only=True)
 class BaselineConfig:
-    """What the sizes of all baselines have in common.
+    """Common part of the sizes of all baselines.
 
     Attributes:
         hidden: width of the tokens; a multiple of ``heads``.
@@ -48,13 +48,13 @@ class BaselineConfig:
 
     @property
     def time_input(self) -> str:
-        """What is embedded as time, as of :class:`~agents.networks.MixedFluxConfig`."""
+        """The number that is embedded as time, as of :class:`~agents.networks.MixedFluxConfig`."""
         return "log_noise" if self.frequencies else "timestep"
 
 
 @dataclass(frozen=True, kw_only=True)
 class MixedBaselineConfig(BaselineConfig):
-    """What the sizes of all baselines of mixed scenes have in common.
+    """Common part of the sizes of all baselines of mixed scenes.
 
     Attributes:
         categories: K = C + 1, assets and *empty*; the mask token is one more.

@@ -39,7 +39,7 @@ def split_words(prompt: str) -> list[str]:
 
 
 def number_features(word: str) -> list[float]:
-    """What a word says of numbers: 1, n/16, log(1 + n), and sines and cosines of n; zeros where it is no number.
+    """Features of a number word: 1, n/16, log(1 + n), and sines and cosines of n; zeros where it is no number.
 
     Embeddings alone would have to learn for each number by itself how many it is. Articles stand for 1.
 

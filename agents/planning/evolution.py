@@ -79,7 +79,7 @@ class EvolutionPlanner(PlannerSettings):
         return ledger.result()
 
     def _mated(self, ledger: Ledger, index: int, members: list[Member], rng: np.random.Generator) -> Candidate:
-        """What is inpainted: a member, or its splice with another one."""
+        """The candidate to inpaint: a member, or its splice with another one."""
         from agents.planning.splice import spliced
 
         problem: Any = ledger.problem

@@ -42,7 +42,7 @@ class Parts:
     prompts: list[str] | None
 
     def take(self, rows: Tensor) -> Parts:
-        """Those of ``rows`` (K,), which may come more than once."""
+        """The parts of ``rows`` (K,), which may repeat."""
         prompts = None if self.prompts is None else [self.prompts[row] for row in rows.tolist()]
         return Parts(self.scenes[rows], self.mask[rows], self.groups[rows], prompts)
 

@@ -214,7 +214,7 @@ class DDPOSFLoss(LossModule):
         return advantage
 
     def _count_entries(self, log_prob: Tensor, observed: Tensor | None) -> int | Tensor:
-        """What (b, N) log-probabilities are divided by, (b, 1) where scenes have different observed entries."""
+        """Divisor of (b, N) log-probabilities; (b, 1) where scenes have different observed entries."""
         if self.reduction != "mean":
             return 1
         if observed is not None:

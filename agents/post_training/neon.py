@@ -72,15 +72,15 @@ class Neon(OwnSampleAlgorithm):
         self.iterations = 0
 
     def real_generator(self, own: Generator, real: Generator) -> Generator:
-        """That of the own samples: both copies see the same timesteps and noise."""
+        """The generator of the own samples, so that both copies see the same timesteps and noise."""
         return own
 
     def advantage(self, rollout: Rollout) -> TensorDict:
-        """Nothing: the samples are not weighted."""
+        """No keys: the samples are not weighted."""
         return TensorDict({}, [len(rollout.reward)])
 
     def learning_rate(self, rate: float, update: int) -> float:
-        """That of both copies."""
+        """The learning rate of both copies."""
         place = self.iterations % self.period + update % self.updates / self.updates
         rate *= 1 - place / self.period
         for group in self.copy.optimizer.param_groups:

@@ -97,5 +97,5 @@ class AdapterSettings:
 
     @property
     def scale(self) -> float:
-        """Of the updates."""
+        """Scale of the updates, alpha / rank."""
         return self.alpha / self.rank

@@ -30,7 +30,7 @@ from scene_envs.scene import TRANSLATION, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
 UNIONS = ("one_type", "any")
-"""What a scene of a union of scene types may hold."""
+"""Assets that a scene of a union of scene types may hold: those of one of its types, or any."""
 
 Prior = TypeVar("Prior", bound="ScenePrior")
 
@@ -49,7 +49,7 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
     """
 
     process: GaussianProcess
-    """Of the poses, and of all else that is continuous."""
+    """Gaussian process of the poses, and of all other continuous features."""
     denoiser: Any
     """The network inside its process, a module with ``.network``."""
     adapter: AdapterFacts | None = None

@@ -24,7 +24,7 @@ from scene_envs.normalizer import Normalizer
 from scene_envs.scene_types import SceneType, get_scene_type
 
 BACKENDS = ("processes", "ray")
-"""Where shards are made."""
+"""Backends that make shards."""
 _SETTINGS = ("grammar", "seed", "count", "shard_size", "verified")
 
 
