@@ -157,7 +157,7 @@ def checkpoint_import(text: int) -> Figures:
 
 def search(name: str) -> Figures:
     """A search for many objects, and best of N beside it."""
-    config = SearchConfig(budget=8, branching=2, max_depth=3, num_steps=4, mask="random", seed=2)
+    config = SearchConfig(planner="evolution", budget=8, branching=2, max_depth=3, num_steps=4, mask="random", seed=2)
     outcome = run_search(name, "object_count", config=config)
     return {
         "values": outcome.search.values,
