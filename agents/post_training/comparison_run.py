@@ -56,7 +56,7 @@ def post_train_and_compare(
         return result.metrics
     trained = time.perf_counter()
     seed = config.seed + SAMPLE_SEED
-    asked = _measured_prompts(config, base, scenes)
+    prompts = _measured_prompts(config, base, scenes)
     workers = 0 if config.workers == "ray" else config.workers
     reward = run_reward(
         config.reward, seed=config.seed, timeout=config.reward_timeout, memory=config.reward_memory, workers=workers
@@ -66,7 +66,7 @@ def post_train_and_compare(
 
         def measure(prior: ScenePrior) -> Measured:
             return measure_prior(
-                prior, scenes, num_steps=num_steps, seed=seed, pool=pool, prompts=asked, guidance=config.guidance,
+                prior, scenes, num_steps=num_steps, seed=seed, pool=pool, prompts=prompts, guidance=config.guidance,
                 slots=config.slots, reward=reward,
             )  # fmt: skip
 

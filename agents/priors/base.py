@@ -213,8 +213,8 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
         generator = Generator(str(self._fixed.device)).manual_seed(seed)
         chunks, done = [], 0
         for size in _chunk_sizes(count, batch_size):
-            asked = None if prompts is None else prompts[done : done + size]
-            chunks.append(self._sample_chunk(size, asked, guidance, num_steps, slots, generator, eta))
+            texts = None if prompts is None else prompts[done : done + size]
+            chunks.append(self._sample_chunk(size, texts, guidance, num_steps, slots, generator, eta))
             done += size
         return self.decode(torch.cat(chunks))
 
