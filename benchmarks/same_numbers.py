@@ -37,7 +37,6 @@ from agents import (
     pretrain,
     run_search,
 )
-from agents.planning.registry import planner_settings
 from agents.priors import import_checkpoint
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.scene import SceneBatch
@@ -158,8 +157,7 @@ def checkpoint_import(text: int) -> Figures:
 
 def search(name: str) -> Figures:
     """A search for many objects, and best of N beside it."""
-    planner = planner_settings("evolution")()
-    config = SearchConfig(planner=planner, budget=8, branching=2, max_depth=3, num_steps=4, mask="random", seed=2)
+    config = SearchConfig(planner="evolution", budget=8, branching=2, max_depth=3, num_steps=4, mask="random", seed=2)
     outcome = run_search(name, "object_count", config=config)
     return {
         "values": outcome.search.values,

@@ -30,6 +30,7 @@ from rewards.registry import (
     register_reward,
     resolve_reward,
     reward_info,
+    reward_label,
     reward_name,
 )
 from rewards.relation import Relation
@@ -70,5 +71,6 @@ __all__ = [
     "register_reward",
     "resolve_reward",
     "reward_info",
+    "reward_label",
     "reward_name",
 ]

@@ -13,7 +13,7 @@ from scene_envs.errors import unknown_name
 from scene_envs.scene import SceneBatch
 
 MEASURES = ("total", "deepest")
-"""What is counted: the sum over object pairs, or the deepest pair."""
+"""Ways to count: the sum over object pairs, or the deepest pair."""
 _TOUCHING = 1e-4
 """Objects in each other up to this depth (m) touch, and are not counted as overlapping."""
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from scene_envs.physics.grasping import Gripper
 
 SIDES = ("above", "front")
-"""Where the gripper may come from: straight from above, or level from the viewer's side of the scene."""
+"""Directions from which the gripper may come: straight from above, or level from the viewer's side of the scene."""
 
 
 @register_reward("reachability")

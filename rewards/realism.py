@@ -1,4 +1,4 @@
-"""Reward: how likely a scene is under a frozen prior."""
+"""Reward: likelihood of a scene under a frozen prior."""
 
 from __future__ import annotations
 

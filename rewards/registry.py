@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import EntryPoint
+from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
@@ -153,6 +154,16 @@ def reward_name(reward: Any) -> str:
         return str(reward.get("name") or reward.get("_target_") or "reward")
     name = getattr(reward, "name", None)
     return name if isinstance(name, str) and name else getattr(reward, "__qualname__", type(reward).__qualname__)
+
+
+def reward_label(reward: Any) -> str:
+    """A reward's name in words, for headings: of a reward in a file, the name of the file and of the function.
+
+    >>> reward_label("object_count"), reward_label("/home/me/my_rewards.py:clutter")
+    ('object count', 'my_rewards.py:clutter')
+    """
+    name = reward_name(reward)
+    return Path(name).name if is_local(name) else name.rpartition("<locals>.")[2].replace("_", " ")
 
 
 def allowed_targets() -> list[str]:

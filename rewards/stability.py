@@ -1,4 +1,4 @@
-"""Reward: how little objects move when simulated, graded."""
+"""Reward: graded stillness of the free objects in simulation."""
 
 from __future__ import annotations
 

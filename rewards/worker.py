@@ -61,7 +61,7 @@ def _lacked_memory(error: BaseException) -> bool:
 
 
 class _Answers:
-    """What the parent may ask."""
+    """Calls that the parent may make."""
 
     def __init__(self) -> None:
         self.reward: Any = None

@@ -1,4 +1,4 @@
-"""Locks of folders: one writer at a time, and what killed writers left half-written is swept."""
+"""Locks of folders, which admit one writer at a time, and removal of files that killed writers left half-written."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def load_plugins(group: str) -> None:
 
 
 def load_plugin(point: EntryPoint) -> Any:
-    """What an entry point names, its module imported.
+    """The object that an entry point names, whose module is imported.
 
     ``sys.exit`` and ``os._exit`` at import end the import and not the process, and an import that takes longer than
     ``SCENE_ENVS_PLUGIN_SECONDS`` (60 by default) is ended; that of compiled code which holds the interpreter is

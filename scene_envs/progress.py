@@ -80,7 +80,7 @@ class Progress:
         return perf_counter() - self._started
 
     def update(self, done: int, text: str, line: str = "") -> None:
-        """So many are done.
+        """Show that ``done`` of the total are done.
 
         Args:
             done: how many of the total.

@@ -1,4 +1,4 @@
-"""Scenes from whatever holds them: a file, a run's folder, a dataset. Imports no torch before it reads."""
+"""Sources of scenes: a file, the folder of a run, a dataset. Imports no torch before it reads."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ if TYPE_CHECKING:
     from scene_envs.scene import SceneBatch
 
 SCENE_FILES = ("ready.safetensors", "scenes.safetensors", "best.safetensors")
-"""What is taken from the folder of a run, the first that is there."""
+"""Files of a run's folder that hold scenes; the first that exists is taken."""
 _PRIORS = ("prior/config.json", "config.json")
-"""Where a folder has the configuration of a prior."""
+"""Places of a prior's configuration in a folder."""
 
 
 def find_scenes(path: Path, key: str = "scenes") -> Path:

@@ -47,7 +47,7 @@ ADAPTER = KeyHelp(
 
 @dataclass(frozen=True)
 class Sources:
-    """Where the values of a command come from, beside its words.
+    """Sources of a command's values, beside its words.
 
     Attributes:
         config_dir: a folder with further groups and experiments; empty for none.
@@ -84,7 +84,7 @@ def _groups(made: Any) -> list[tuple[dataclasses.Field[Any], Any]]:
 
 
 def _plain_keys(made: Any, prefix: str = "", fields: Sequence[dataclasses.Field[Any]] | None = None) -> list[KeyHelp]:
-    """Those of the fields, all unless they are given, that are no groups."""
+    """The fields that are no groups, of ``fields`` or of all."""
     fields = dataclasses.fields(made) if fields is None else fields
     meanings, values = attribute_meanings(type(made)), {field.name: getattr(made, field.name) for field in fields}
     return [

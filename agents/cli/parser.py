@@ -253,7 +253,7 @@ def _named(words: Sequence[str], keys: Sequence[str]) -> list[str]:
 
 
 def _verdict(error: Exception) -> tuple[str, int]:
-    """What to tell, and the exit status."""
+    """The message for the user, and the exit status."""
     if isinstance(error, InvalidInputError | UnknownNameError | CorruptFileError):
         return str(error), WRONG_INPUT
     if isinstance(error, SceneEnvsError):

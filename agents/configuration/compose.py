@@ -97,7 +97,7 @@ def compose_tree(
 
 
 def _by_hydra(command: str, primary: Mapping[str, Any], words: Sequence[str]) -> dict[str, Any]:
-    """What Hydra makes of a primary config and the words for it."""
+    """The composition by Hydra of a primary config and the words for it."""
     from hydra import compose, initialize_config_module
     from hydra.core.config_store import ConfigStore
     from omegaconf import OmegaConf

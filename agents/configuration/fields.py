@@ -93,7 +93,7 @@ def _place_short(kind: type, keywords: dict[str, Any]) -> None:
 def _complete(
     kind: type, given: Mapping[str, Any], fields: Mapping[str, dataclasses.Field[Any]], recipe: Any
 ) -> dict[str, Any]:
-    """What was given, over what the recipe and the named options say."""
+    """The values given in Python, over those of the recipe and of the named options."""
     options = {
         name: value
         for name, value in given.items()

@@ -44,7 +44,7 @@ class OptimizerSettings:
 
 @dataclass
 class LoggerSettings:
-    """What a run writes, and how often.
+    """Files of a run, and how often they are written.
 
     Attributes:
         name: ``csv`` for log.csv alone, which every run has; ``tensorboard`` or ``wandb`` (offline) besides.

@@ -76,7 +76,7 @@ def _early_absorbing(num_timesteps: int) -> tuple[Tensor, Tensor]:
 
 
 def _squared_absorbing(num_timesteps: int) -> tuple[Tensor, Tensor]:
-    """As ``early_absorbing``, but along a square: the last categories are decided one at a time.
+    """The kernel ``early_absorbing`` with a quadratic schedule: the last categories are decided one at a time.
 
     Categories that are decided in the same step do not know of each other, so that counts come out inexactly. Few
     should be left for the last such steps, as with the cosine of MaskGIT (Chang et al. 2022).

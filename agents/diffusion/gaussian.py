@@ -14,7 +14,7 @@ Moments = tuple[Tensor, Tensor]
 """Mean and standard deviation."""
 
 PREDICTIONS = ("edm", "epsilon", "x0", "v")
-"""What a network may predict; see :meth:`GaussianProcess.x0_from_output`."""
+"""Targets that a network may predict; see :meth:`GaussianProcess.x0_from_output`."""
 _FORMER = {"karras": "edm"}
 """Predictions as earlier versions called them, and their names."""
 

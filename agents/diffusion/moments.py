@@ -91,7 +91,7 @@ class Preconditioning:
         return Preconditioning(self.mean, self.std.square().mean().sqrt().expand_as(self.std).clone())
 
     def state(self) -> dict[str, Any]:
-        """As JSON."""
+        """The moments as JSON."""
         state: dict[str, Any] = {"mean": self.mean.tolist(), "std": self.std.tolist()}
         if self.by_category is not None:
             own = self.by_category

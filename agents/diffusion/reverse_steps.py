@@ -197,8 +197,8 @@ class MixedStep(NamedTuple):
             return _invert(cumulative, uniform)
         unmasked = draw_unmasked(self.masked, 1 - self.probs[..., -1], order)
         chosen = _invert(cumulative[..., :-1], uniform)
-        seen = torch.where(unmasked, chosen, torch.full_like(chosen, mask))
-        return torch.where(self.masked, seen, self.probs.argmax(dim=-1))
+        states = torch.where(unmasked, chosen, torch.full_like(chosen, mask))
+        return torch.where(self.masked, states, self.probs.argmax(dim=-1))
 
     def log_prob(self, x: Tensor) -> Tensor:
         """(B, N) nats: the log-density of the pose plus the log-probability of the state.

@@ -1,8 +1,8 @@
-"""Unmasking of absorbing chains: as near to the expected number of slots per step as possible.
+"""Unmasking of absorbing chains: numbers of slots per step that differ from their expectation by less than one.
 
-Where every slot is unmasked by its own chance, slots that are unmasked in the same step do not know of each other's
-categories, and a scene of few steps gets one cup too many. The chance of each slot stays what the chain says it is;
-that their number is never more than one off its expectation lets most steps of a small scene decide one category alone.
+Slots that are unmasked in the same step do not know each other's categories, so scenes get too many objects of a kind.
+If each slot is unmasked independently, some steps unmask many slots. Here most steps of a small scene unmask one slot
+alone. Each slot keeps the chance that the chain gives it.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 UNMASKINGS = ("even", "independent")
-"""Laws of which masked slots a step unmasks."""
+"""Ways to choose the masked slots that a step unmasks."""
 _TINY = 1e-30
 
 
@@ -19,7 +19,7 @@ def draw_unmasked(masked: Tensor, chance: Tensor, uniform: Tensor) -> Tensor:
     """(B, N) bool: of the ``masked`` slots of each scene, those that are unmasked now, drawn without replacement.
 
     Of M masked slots with chance p, M p rounded down or up are unmasked, up with the probability that makes M p the
-    mean. Ranks of independent numbers say nothing of their minimum, so that one number per slot decides both.
+    mean. The ranks of independent numbers do not depend on their minimum, so one number per slot decides both.
 
     Args:
         masked: (B, N) bool.

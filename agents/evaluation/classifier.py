@@ -136,7 +136,7 @@ class _Moments:
 
 @dataclass(frozen=True)
 class _Typical:
-    """Where real objects are: poses per asset, offsets to neighbours per pair of assets."""
+    """Places of real objects: poses per asset, offsets to neighbours per pair of assets."""
 
     poses: _Moments
     offsets: _Moments

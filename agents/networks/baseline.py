@@ -1,7 +1,7 @@
-"""The common part of the networks that ours is compared with: how slots, time and text enter, and how slots leave.
+"""Common part of the baseline networks: inputs for slots, time and text, and outputs for slots.
 
-Between the two stands a *trunk*, which is what tells the baselines apart: tokens (B, N, H), a time embedding (B, H) and
-text (B, L, H) with its mask (B, 1, 1, L), both None without text, to tokens (B, N, H).
+The *trunk* between inputs and outputs differs from baseline to baseline. It maps tokens (B, N, H), a time embedding
+(B, H) and text (B, L, H) with its mask (B, 1, 1, L), both None without text, to tokens (B, N, H).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _TIME_WIDTH = 256
 
 @dataclass(frozen=True, kw_only=True)
 class BaselineConfig:
-    """What the sizes of all baselines have in common.
+    """Common part of the sizes of all baselines.
 
     Attributes:
         hidden: width of the tokens; a multiple of ``heads``.
@@ -48,13 +48,13 @@ class BaselineConfig:
 
     @property
     def time_input(self) -> str:
-        """What is embedded as time, as of :class:`~agents.networks.MixedFluxConfig`."""
+        """The number that is embedded as time, as of :class:`~agents.networks.MixedFluxConfig`."""
         return "log_noise" if self.frequencies else "timestep"
 
 
 @dataclass(frozen=True, kw_only=True)
 class MixedBaselineConfig(BaselineConfig):
-    """What the sizes of all baselines of mixed scenes have in common.
+    """Common part of the sizes of all baselines of mixed scenes.
 
     Attributes:
         categories: K = C + 1, assets and *empty*; the mask token is one more.

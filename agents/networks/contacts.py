@@ -169,7 +169,7 @@ class Contacts(FluxModule):
 
 
 def gated_displacement(displacements: Tensor, gates: Tensor) -> Tensor:
-    """What displacements (B, N, :data:`CHANNELS`, 3) add to the output of translations, (B, N, 3).
+    """Contribution (B, N, 3) of displacements (B, N, :data:`CHANNELS`, 3) to the output of translations.
 
     Args:
         displacements: as :class:`Contacts` make them.

@@ -1,4 +1,4 @@
-"""Count conditioning: what a prompt still wants of each kind of object joins the logits of the categories."""
+"""Count conditioning: numbers of objects that a prompt still asks for, added to the logits of the categories."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Count embedding: slots seen of each category, and slots still masked, join the embedded time.
+"""Count embedding: numbers of visible slots of each category and of masked slots, added to the embedded time.
 
 Attention takes averages, and a prompt asks for numbers.
 """
@@ -70,7 +70,7 @@ class CountEmbedding(FluxModule):
         return result
 
     def forward(self, states: Tensor, text: Tensor | None = None, slot_mask: Tensor | None = None) -> Tensor:
-        """As :func:`count_states`; ``text`` (B, W) is what the prompt says, zeros when None."""
+        """Embed the numbers of :func:`count_states` with ``text`` (B, W), the mean text token; zeros when None."""
         counts = count_states(states, self.categories, slot_mask).to(next(self.parameters()).dtype)
         inputs = [counts / 8.0, counts.log1p()]
         if self.text_width:

@@ -127,7 +127,7 @@ class FluxModule(nn.Module):
 
 @dataclass(frozen=True)
 class ModuleConfig(ABC):
-    """What configures a module; subclasses are frozen dataclasses whose fields go into files as they are.
+    """Configuration of a module; subclasses are frozen dataclasses whose fields go into files as they are.
 
     Attributes:
         name: of the module, in files and as the first part of the names of its weights.

@@ -20,10 +20,10 @@ from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.scene import POSE_FEATURES
 
 EMPTY_SLOTS = ("attended", "dropped")
-"""What a network does with slots that are known to be empty."""
+"""Treatments of slots that are known to be empty."""
 
 _CERTAIN = 30.0
-"""How far, in nats, other categories are behind one that is known."""
+"""Difference (nats) of the logit of a known category to those of the others."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Observed:
     category: Tensor
 
     def rows(self, rows: slice) -> Observed:
-        """Those of some of the scenes."""
+        """The observed entries of some of the scenes."""
         return Observed(self.x[rows], self.pose[rows], self.category[rows])
 
     def flags(self) -> Tensor:

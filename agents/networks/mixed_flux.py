@@ -243,7 +243,7 @@ def _where_to_attend(text_mask: Tensor | None, slot_mask: Tensor | None, count: 
 
 
 def _add_bias(bias: Tensor | None, mask: Tensor | None, count: int) -> Tensor | None:
-    """What is added to attention logits: ``bias`` on the slots, which follow ``count`` tokens, and the mask."""
+    """Sum of attention biases: ``bias`` on the slots, which follow ``count`` tokens, and the mask."""
     if bias is None:
         return mask
     bias = F.pad(bias, (count, 0, count, 0)) if count else bias

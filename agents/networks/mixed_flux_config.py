@@ -20,7 +20,7 @@ from scene_envs.errors import InvalidInputError, unknown_name
 TEXT_REACHES = ("all", "double")
 """Blocks in which slots meet text."""
 TIME_INPUTS = ("timestep", "log_noise")
-"""What is embedded as time: t - 1, or 250 times the logarithm of the noise-to-signal ratio."""
+"""Numbers that may be embedded as time: t - 1, or 250 times the logarithm of the noise-to-signal ratio."""
 MODULES: dict[str, type[ModuleConfig]] = {
     kind.name: kind
     for kind in (

@@ -23,7 +23,7 @@ from scene_envs.plugins import load_plugins
 NETWORKS = ("flux", "midiffusion", "diffuscene")
 """Ours, and the two that it is compared with."""
 NETWORK_PROCESSES = ("continuous", "mixed")
-"""What a network may denoise: scenes as numbers, or poses with discrete categories."""
+"""Processes that a network may denoise: scenes as numbers, or poses with discrete categories."""
 ENTRY_POINT_GROUP = "scene_envs.networks"
 """Entry points of installed packages: modules that call :func:`register_network` when they are imported."""
 
@@ -34,7 +34,7 @@ NetworkConfig = ContinuousNetworkConfig | MixedNetworkConfig
 
 @dataclass(frozen=True)
 class _Entry:
-    """What the registry knows of a network.
+    """Entry of a network in the registry.
 
     Attributes:
         config: class of its configuration, a frozen dataclass.

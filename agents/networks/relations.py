@@ -51,7 +51,7 @@ class RelationsConfig(ModuleConfig):
 
 
 def pair_features(metres: Tensor, noise: Tensor, scales: Tensor) -> Tensor:
-    """What stands between any two slots, (B, N, N, :data:`FEATURES`), from slot i to j.
+    """Features of every pair of slots, (B, N, N, :data:`FEATURES`), from slot i to j.
 
     Horizontal distance and difference in height as Gaussians at every scale, then the offset along z, x and y, which
     saturates beyond each scale. All are blurred by the noise that is on the two positions: E exp(-d^2 / 2 l^2) under

@@ -74,7 +74,7 @@ def nearest_rotations(rotation: Tensor) -> Tensor:
 
 @torch.no_grad()
 def rotation_features(rotation: Tensor, nearest: Tensor, noise: Tensor) -> Tensor:
-    """How far rotations are off SO(3), and how far the nearest ones are off upright, (B, N, :data:`ROTATION_FEATURES`).
+    """Differences of matrices to SO(3), and of the nearest rotations to upright, (B, N, :data:`ROTATION_FEATURES`).
 
     Args:
         rotation: (B, N, 3, 3) noisy rotation matrices.
@@ -97,7 +97,7 @@ def rotation_features(rotation: Tensor, nearest: Tensor, noise: Tensor) -> Tenso
 
 
 def gated_rotation(features: Tensor, gates: Tensor) -> Tensor:
-    """What features (B, N, F) add to the nine outputs of a rotation, each with a gate (B, N, F) of its own.
+    """Contribution of features (B, N, F) to the nine outputs of a rotation, each with a gate (B, N, F) of its own.
 
     Carried through the blocks they would be thirteen numbers of noise to keep for every object. So the network only has
     to say which of them count, which is a matter of the category and of where the object lies.

@@ -39,7 +39,7 @@ def split_words(prompt: str) -> list[str]:
 
 
 def number_features(word: str) -> list[float]:
-    """What a word says of numbers: 1, n/16, log(1 + n), and sines and cosines of n; zeros where it is no number.
+    """Features of a number word: 1, n/16, log(1 + n), and sines and cosines of n; zeros where it is no number.
 
     Embeddings alone would have to learn for each number by itself how many it is. Articles stand for 1.
 
@@ -72,8 +72,8 @@ class TextConfig:
         max_tokens: longest prompt, its start token included.
         latents: tokens that a prompt is condensed to, so that long ones cost no more than short ones; 0 for none.
         window: neighbouring words that are read together before attention ("two tea bottles"), an odd number.
-        asked: of how many things (kinds of objects, and objects at all) it says as well what is asked of them, a token
-            each before the latents; needs latents.
+        asked: leading tokens for count conditioning, one for each kind of object and one for all objects, before the
+            latents; needs latents.
         numbers: whether words that are numbers say how many they are (:func:`number_features`).
     """
 
@@ -89,7 +89,7 @@ class TextConfig:
 
     def __post_init__(self) -> None:
         if self.asked and not self.latents:
-            raise InvalidInputError("a text encoder without latents does not say what is asked of things; give latents")
+            raise InvalidInputError("a text encoder without latents has no tokens for count conditioning; give latents")
         if self.window < 1 or self.window % 2 == 0:
             raise InvalidInputError(f"a text window of {self.window} words: give an odd number, 1 for single words")
 

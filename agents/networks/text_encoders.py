@@ -12,7 +12,7 @@ VOCABULARY = "vocabulary"
 """The key of the small encoder with a closed vocabulary, trained with the prior."""
 
 AnyTextConfig = TextConfig | BertTextConfig
-"""What configures a text encoder."""
+"""Configurations of text encoders."""
 
 
 def text_encoder(config: AnyTextConfig) -> TextEncoder | BertEncoder:

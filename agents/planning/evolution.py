@@ -56,7 +56,7 @@ class EvolutionPlanner(PlannerSettings):
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the current state; without ``with_scene`` there are no splices."""
         ledger = Ledger(problem, budget, progress)
-        rng = np.random.default_rng([self.seed, getattr(ledger.root.state, "seed", 0)])
+        rng = ledger.generator(self.seed)
         fresh = ledger.actions(ledger.root)
         members: list[Member] = []  # the best first
         while ledger.left:
@@ -79,7 +79,7 @@ class EvolutionPlanner(PlannerSettings):
         return ledger.result()
 
     def _mated(self, ledger: Ledger, index: int, members: list[Member], rng: np.random.Generator) -> Candidate:
-        """What is inpainted: a member, or its splice with another one."""
+        """The candidate to inpaint: a member, or its splice with another one."""
         from agents.planning.splice import spliced
 
         problem: Any = ledger.problem

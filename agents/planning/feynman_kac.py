@@ -1,4 +1,4 @@
-"""Feynman-Kac steering: scenes that are denoised side by side, resampled by the objective of what they will be."""
+"""Feynman-Kac steering: scenes denoised side by side, resampled by the objective of their expected final scenes."""
 
 from __future__ import annotations
 

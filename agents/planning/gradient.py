@@ -1,4 +1,4 @@
-"""Gradient guidance: inpaintings that a differentiable weight of scenes pushes while they are denoised."""
+"""Gradient guidance: inpaintings that are moved along the gradient of a weight of scenes while they are denoised."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ WEIGHTS = ("overlap",)
 class GradientPlanner(PlannerSettings):
     """Gradient guidance of every inpainting that another planner makes.
 
-    Scenes follow the prior times exp(strength * weight), to first order about what the network expects; what comes out
-    is scored by the objective, and the other planner chooses what is inpainted next. A step costs one gradient of the
-    weight more, and no evaluation of the denoiser.
+    Scenes follow the prior times exp(strength * weight), to first order about the scene that the network expects. The
+    objective scores the finished scenes, and the other planner chooses the scene that is inpainted next. A step costs
+    one gradient of the weight more, and no evaluation of the denoiser.
 
     Attributes:
-        planner: the other planner: its name, or a mapping of its ``name`` and keys; one that takes any number of
-            children of a state, and does not steer by itself.
+        planner: the other planner: its name, or a mapping of its ``name`` and keys; it must accept any number of
+            children of a state, and must not steer the denoising itself.
         weight: a differentiable log-weight: ``overlap``, or in Python a function.
         strength: of the weight; 0 is the other planner alone.
         begin: share of the denoising steps before guidance.

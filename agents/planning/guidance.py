@@ -11,7 +11,7 @@ from scene_envs.scene import SceneBatch
 from scene_envs.scene_facts import hull_corners
 
 Weight = Callable[[SceneBatch, Tensor], Tensor]
-"""``(batch, translations) -> (B,)``: log-weight of scenes of which the translations (B, N, 3), m, are those given.
+"""``(batch, translations) -> (B,)``: log-weight of the scenes of ``batch`` with these translations (B, N, 3), m.
 
 Differentiable in ``translations``.
 """
@@ -20,8 +20,8 @@ Differentiable in ``translations``.
 def overlap(batch: SceneBatch, translations: Tensor) -> Tensor:
     """(B,) minus half the sum of squared overlaps of objects, mm²: 0 where no two overlap.
 
-    Each object is the upright cylinder around its asset; a pair overlaps by the smaller of how far the two circles and
-    how far the two heights do. Two welded objects are no pair.
+    Each object is the upright cylinder around its asset. The overlap of a pair is that of the two circles or that of
+    the two heights, whichever is smaller. Two welded objects are no pair.
     """
     radius, low, high = (column[batch.categories.clamp(max=batch.scene_type.num_assets)] for column in _sizes(batch))
     flat = translations[..., :2]
@@ -53,7 +53,7 @@ def _sizes(batch: SceneBatch) -> tuple[Tensor, Tensor, Tensor]:
 
 
 class Guidance:
-    """Gradient of a log-weight at what scenes are expected to become.
+    """Gradient of a log-weight at the scenes that the network expects.
 
     Args:
         weight: the log-weight.

@@ -114,7 +114,7 @@ class Journal:
         self._states = [_state(values) for states in records[1:] for values in states]
 
     def _records(self, file: BinaryIO) -> Iterator[Any]:
-        """What was written whole; the file stands behind the record that is given."""
+        """The records that were written whole; the file is positioned behind the record that is yielded."""
         file.seek(len(_MAGIC))
         while len(head := file.read(_HEAD.size)) == _HEAD.size:
             length, checksum = _HEAD.unpack(head)

@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
+import numpy as np
+
 from scene_envs.errors import InvalidInputError, SceneEnvsError
 
 if TYPE_CHECKING:
@@ -151,6 +153,10 @@ class Ledger:
     def left(self) -> int:
         """Expansions that may still be made."""
         return 0 if self._stopped or self.best.value >= 1.0 else self.budget - len(self.values)
+
+    def generator(self, seed: int) -> np.random.Generator:
+        """Random numbers of a planner's own choices, which depend on its seed and on that of the root."""
+        return np.random.default_rng([seed, getattr(self.root.state, "seed", 0)])
 
     def actions(self, candidate: Candidate) -> Sequence[int]:
         """Legal actions of a candidate."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from agents.planning.ledger import Candidate, Ledger, PlanResult, Progress, Searchable, state_value
 from agents.planning.registry import PlannerSettings, check_at_least, register_planner
 from scene_envs.errors import unknown_name
@@ -58,7 +56,7 @@ class MCTSPlanner(PlannerSettings):
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the problem's current state."""
         ledger = Ledger(problem, budget, progress)
-        rng = np.random.default_rng([self.seed, getattr(ledger.root.state, "seed", 0)])
+        rng = ledger.generator(self.seed)
         root = _Node(ledger.root)
         while ledger.left and not root.closed:
             leaf = self._select(root)

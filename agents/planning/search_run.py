@@ -30,7 +30,7 @@ from scene_envs.folders import claimed
 from scene_envs.scene import SceneBatch
 
 _PLAIN = (bool, int, float, str, list, dict, type(None))
-"""What YAML takes."""
+"""Types of values that YAML holds."""
 
 _LIMITS = ("budget", "max_nfe", "max_seconds", "baseline", "workers")
 """Keys of which the states of a search do not depend: they may change when a run goes on."""
@@ -196,7 +196,7 @@ def _search(
 
 @dataclass(frozen=True)
 class _Run:
-    """What the searches of one run share."""
+    """Common part of the searches of one run."""
 
     prior: Any
     objective: Any

@@ -74,7 +74,7 @@ class Lane:
         return getattr(self.problem, name)
 
     def result(self) -> PlanResult:
-        """What is kept of a planner that did not return."""
+        """The plan of a planner that did not return: the best state seen."""
         value, state = self.best
         path = getattr(state, "path", ()) if self.values else ()
         return PlanResult(state, value if value > -math.inf else math.nan, path, self.values, start=self.start)

@@ -35,7 +35,7 @@ class _Stop:
             node.visits, node.total, node = node.visits + 1, node.total + value, node.parent
 
     def select(self, last: int, exploration: float, widening: float) -> _Stop:
-        """Where the next scenes branch off: a stop with fewer branches than its visits allow, from here on by UCB."""
+        """The node from which the next scenes branch: found by UCB, with fewer branches than its visits allow."""
         node = self
         while node.level < last and len(node.children) >= max(1.0, node.visits**widening):
             weight = exploration * math.sqrt(math.log(max(1, node.visits)))

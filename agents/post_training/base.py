@@ -16,7 +16,7 @@ from agents.priors.base import ScenePrior
 from agents.utils.weight_average import WeightAverage
 
 Credit = TypeVar("Credit")
-"""What an algorithm makes of the rewards of a batch: advantages, in the form that its loss reads."""
+"""Advantages of a batch, in the form that the algorithm's loss reads."""
 
 
 class BatchGradient(Protocol):

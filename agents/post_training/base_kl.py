@@ -73,8 +73,8 @@ def forward_kl(
     order = torch.randperm(len(everything), generator=generator)
     even = (order + torch.rand((), generator=generator)) / len(everything)
     timesteps = (2 + even * (total - 1)).long().clamp(max=total).to(x0.device)  # the last step, t = 1, is certain
-    seen = None if rollout.observed is None else gather_rows(rollout.observed)
-    observed = prior.observed_entries(everything, prior.observed_by_mask(everything, seen))
+    mask = None if rollout.observed is None else gather_rows(rollout.observed)
+    observed = prior.observed_entries(everything, prior.observed_by_mask(everything, mask))
     noised = prior.noised(everything, generator, timesteps, observed)
     noised = noised.rows(ProcessGroup.current().rows(len(everything)))
     size = chunk or count

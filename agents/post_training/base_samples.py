@@ -1,4 +1,4 @@
-"""Samples of the base prior, from which the discriminative regularisation tells real scenes."""
+"""Samples of the base prior, with which the discriminative regularisation compares real scenes."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from agents.post_training.report import Page, Picture, Section, Tile, write_repo
 from agents.post_training.run_files import write_metrics
 from agents.post_training.trainer import PostTrainResult
 from agents.priors.base import ScenePrior
-from rewards import PromptMatch, RewardContext, evaluate_reward, reward_name
+from rewards import PromptMatch, RewardContext, evaluate_reward, reward_label
 from scene_envs.scene import SceneBatch
 
 if TYPE_CHECKING:
@@ -190,7 +190,7 @@ def _page(
     settings: Mapping[str, Any],
     held: Sequence[Section],
 ) -> Page:
-    reward = reward_name(settings["reward"]).rpartition("<locals>.")[2].replace("_", " ")
+    reward = reward_label(settings["reward"])
     algorithm = settings["algorithm"]["name"].upper().replace("_", "-")
     before, after, guard = metrics["before"], metrics["after"], metrics["guard"]
     count = int(before["scenes"])

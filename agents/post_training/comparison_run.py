@@ -17,7 +17,7 @@ from agents.post_training.run_files import SCENES_NAME
 from agents.post_training.trainer import post_train
 from agents.priors.base import ScenePrior
 from agents.utils.process_group import ProcessGroup
-from rewards import reward_name
+from rewards import reward_label
 from rewards.isolation import close_reward, run_reward
 from scene_envs.scene import SceneBatch
 
@@ -56,7 +56,7 @@ def post_train_and_compare(
         return result.metrics
     trained = time.perf_counter()
     seed = config.seed + SAMPLE_SEED
-    asked = _measured_prompts(config, base, scenes)
+    prompts = _measured_prompts(config, base, scenes)
     workers = 0 if config.workers == "ray" else config.workers
     reward = run_reward(
         config.reward, seed=config.seed, timeout=config.reward_timeout, memory=config.reward_memory, workers=workers
@@ -66,7 +66,7 @@ def post_train_and_compare(
 
         def measure(prior: ScenePrior) -> Measured:
             return measure_prior(
-                prior, scenes, num_steps=num_steps, seed=seed, pool=pool, prompts=asked, guidance=config.guidance,
+                prior, scenes, num_steps=num_steps, seed=seed, pool=pool, prompts=prompts, guidance=config.guidance,
                 slots=config.slots, reward=reward,
             )  # fmt: skip
 
@@ -76,7 +76,7 @@ def post_train_and_compare(
         after = measure(result.prior)
     seconds = {"training": round(trained - started, 1), "measuring": round(time.perf_counter() - trained, 1)}
     say_stage(config, "drawing the report")
-    title = f"Steering {base.scene_type.name.replace('_', ' ')} toward {reward_name(config.reward).replace('_', ' ')}"
+    title = f"Steering {base.scene_type.name.replace('_', ' ')} toward {reward_label(config.reward)}"
     extra = {"stage_seconds": seconds, "num_steps": num_steps}
     return write_comparison(result, before, after, title=title, extra=extra)
 

@@ -245,7 +245,7 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
         return Path(self.output or "runs/post-train")
 
     def plain(self) -> dict[str, Any]:
-        """As numbers, strings and lists; a reward given as an object becomes its name."""
+        """The configuration as numbers, strings and lists; a reward given as an object becomes its name."""
         if _is_plain(self.reward):
             return plain_tree(self)
         from rewards import reward_name

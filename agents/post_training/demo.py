@@ -15,7 +15,7 @@ from agents.post_training.report import Page, Picture, Section, Tile, write_repo
 from agents.post_training.run_files import write_metrics
 from agents.post_training.trainer import PostTrainResult, post_train
 from agents.priors.base import ScenePrior
-from rewards import reward_name
+from rewards import reward_label
 
 RUNS = ("clutter", "feasible")
 """Names of the two runs: their folders, and the columns of the report. Their recipes are ``demo_<name>``."""
@@ -152,7 +152,7 @@ def _share(figures: Mapping[str, float]) -> str:
 
 
 def _goal(config: PostTrainConfig) -> str:
-    return reward_name(config.reward).replace("_", " ")
+    return reward_label(config.reward)
 
 
 def _algorithm(config: PostTrainConfig) -> str:

@@ -1,4 +1,4 @@
-"""Discriminative loss: over its base prior, a prior gains likelihood on real scenes and loses it on base samples."""
+"""Discriminative loss: raises the likelihood of real scenes over the base prior's, and lowers that of base samples."""
 
 from __future__ import annotations
 

@@ -86,12 +86,12 @@ class ForwardProcessLoss(OwnSampleLoss):
 
     @property
     def sampler(self) -> ScenePrior:
-        """What made the scenes."""
+        """The prior that sampled the scenes."""
         return self._others[0]
 
     @property
     def base(self) -> ScenePrior | None:
-        """What training began with."""
+        """The prior that training began with."""
         return self._others[1]
 
     @property

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from scene_envs.errors import InvalidInputError, unknown_name
 
 BASE_VALUES = {"guard": 1.0, "kl": 0.0}
-"""What can be held, and its value for the base prior."""
+"""Figures that can be held, and their values for the base prior."""
 LOWEST, HIGHEST = 0.01, 100.0
 """Bounds of the factor."""
 GAIN = 0.05

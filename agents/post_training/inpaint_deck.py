@@ -42,7 +42,7 @@ class Parts:
     prompts: list[str] | None
 
     def take(self, rows: Tensor) -> Parts:
-        """Those of ``rows`` (K,), which may come more than once."""
+        """The parts of ``rows`` (K,), which may repeat."""
         prompts = None if self.prompts is None else [self.prompts[row] for row in rows.tolist()]
         return Parts(self.scenes[rows], self.mask[rows], self.groups[rows], prompts)
 
@@ -74,10 +74,10 @@ class InpaintDeck:
         groups = max(1, count // self.share)
         of_row = torch.tensor([row * groups // count for row in range(count)])
         first = [int(torch.nonzero(of_row == group)[0]) for group in range(groups)]
-        asked = None if prompts is None else [prompts[row] for row in first]
+        group_prompts = None if prompts is None else [prompts[row] for row in first]
         found: dict[int, Parts] = {}
         for again in range(_ROUNDS):
-            for group, part in self._candidates(asked, groups, derived_seed(seed, again)):
+            for group, part in self._candidates(group_prompts, groups, derived_seed(seed, again)):
                 found.setdefault(group, part)
             if len(found) == groups:
                 break
@@ -145,12 +145,12 @@ def real_parts(scenes: SceneBatch, slots: int, prompts: PromptSets | None = None
             "more slots, or inpaint.scenes=samples"
         )
 
-    def draw(count: int, asked: Sequence[str] | None, seed: int) -> tuple[SceneBatch, Sequence[str] | None]:
+    def draw(count: int, episode_prompts: Sequence[str] | None, seed: int) -> tuple[SceneBatch, Sequence[str] | None]:
         generator = Generator().manual_seed(seed)
         rounds = [torch.randperm(len(fitting), generator=generator) for _ in range(-(-count // len(fitting)))]
         rows = fitting[torch.cat(rounds)[:count]]
-        texts = asked
-        if asked is not None and prompts is not None:
+        texts = episode_prompts
+        if episode_prompts is not None and prompts is not None:
             sets = [prompts(row) for row in rows.tolist()]
             texts = [own[int(torch.randint(len(own), (), generator=generator))] for own in sets]
         return scenes[rows].with_slots(slots), texts
@@ -161,9 +161,11 @@ def real_parts(scenes: SceneBatch, slots: int, prompts: PromptSets | None = None
 def sampled_parts(prior: ScenePrior, num_steps: int, slots: int, guidance: float = 0.0) -> Source:
     """Fresh samples of ``prior``, as it is when they are drawn."""
 
-    def draw(count: int, asked: Sequence[str] | None, seed: int) -> tuple[SceneBatch, Sequence[str] | None]:
-        weight = 0.0 if asked is None else guidance
-        batch = prior.sample(count, prompt=asked, guidance=weight, num_steps=num_steps, slots=slots, seed=seed)
-        return batch.to("cpu"), asked
+    def draw(count: int, episode_prompts: Sequence[str] | None, seed: int) -> tuple[SceneBatch, Sequence[str] | None]:
+        weight = 0.0 if episode_prompts is None else guidance
+        batch = prior.sample(
+            count, prompt=episode_prompts, guidance=weight, num_steps=num_steps, slots=slots, seed=seed
+        )
+        return batch.to("cpu"), episode_prompts
 
     return draw

@@ -150,13 +150,14 @@ class DDPOSFLoss(LossModule):
         for t in timestep.unique().tolist():
             rows = timestep == t
             step = self.policy.step_of(int(t))
-            asked = None if text is None else (text[0][rows], text[1][rows])
-            seen = None if observed is None else observed[rows]
-            log_prob = self.policy.log_prob(scene[rows], step, action[rows], asked, seen)  # (b, N)
+            part_text = None if text is None else (text[0][rows], text[1][rows])
+            entry_flags = None if observed is None else observed[rows]
+            log_prob = self.policy.log_prob(scene[rows], step, action[rows], part_text, entry_flags)  # (b, N)
             earlier = None if old is None else old[rows].detach()
             if earlier is not None:
                 largest = torch.maximum(largest, (log_prob.detach() - earlier).sum(dim=-1).abs().max())
-            objective, beyond = self._objective(log_prob, advantage[rows], earlier, self._count_entries(log_prob, seen))
+            entries = self._count_entries(log_prob, entry_flags)
+            objective, beyond = self._objective(log_prob, advantage[rows], earlier, entries)
             total = total + self.step_weights[step] * torch.where(kept[rows], objective, 0.0).sum()
             clipped = clipped + torch.where(kept[rows], beyond, 0.0).sum()
         count = kept.sum().clamp(min=1)
@@ -214,7 +215,7 @@ class DDPOSFLoss(LossModule):
         return advantage
 
     def _count_entries(self, log_prob: Tensor, observed: Tensor | None) -> int | Tensor:
-        """What (b, N) log-probabilities are divided by, (b, 1) where scenes have different observed entries."""
+        """Divisor of (b, N) log-probabilities; (b, 1) where scenes have different observed entries."""
         if self.reduction != "mean":
             return 1
         if observed is not None:

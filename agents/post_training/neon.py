@@ -52,9 +52,9 @@ class Neon(OwnSampleAlgorithm):
 
     A round lasts ``settings.period`` iterations, in which the prior theta samples all scenes. Two copies of it are
     trained with the pretraining loss from the same timesteps and noise: one on real scenes (theta_real, by the loop),
-    one on the samples (theta_own). The next round begins with theta + w (theta_real - theta_own). What the two copies
-    have in common, such as what further training changes on any scenes, leaves the difference. In a round the learning
-    rate of both falls from ``optimizer.lr`` to 0.
+    one on the samples (theta_own). The next round begins with theta + w (theta_real - theta_own). Changes
+    that training makes whatever the scenes are the same in both copies, so the difference does not contain them. In a
+    round the learning rate of both falls from ``optimizer.lr`` to 0.
 
     Args:
         settings: its keys.
@@ -72,15 +72,15 @@ class Neon(OwnSampleAlgorithm):
         self.iterations = 0
 
     def real_generator(self, own: Generator, real: Generator) -> Generator:
-        """That of the own samples: both copies see the same timesteps and noise."""
+        """The generator of the own samples, so that both copies see the same timesteps and noise."""
         return own
 
     def advantage(self, rollout: Rollout) -> TensorDict:
-        """Nothing: the samples are not weighted."""
+        """No keys: the samples are not weighted."""
         return TensorDict({}, [len(rollout.reward)])
 
     def learning_rate(self, rate: float, update: int) -> float:
-        """That of both copies."""
+        """The learning rate of both copies."""
         place = self.iterations % self.period + update % self.updates / self.updates
         rate *= 1 - place / self.period
         for group in self.copy.optimizer.param_groups:

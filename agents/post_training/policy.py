@@ -177,8 +177,8 @@ class DenoisingPolicy(TensorDictModuleBase):
             rows = timestep == t
             if t == 0:  # a finished episode that waits for its reset
                 continue
-            asked = None if text is None else (text[0][rows], text[1][rows])
-            action[rows], log_prob[rows] = self.draw(scene[rows], self.step_of(t), text=asked)
+            part_text = None if text is None else (text[0][rows], text[1][rows])
+            action[rows], log_prob[rows] = self.draw(scene[rows], self.step_of(t), text=part_text)
         tensordict.set("action", action)
         tensordict.set("action_log_prob", log_prob.sum(dim=-1))
         tensordict.set("slot_log_prob", log_prob)

@@ -18,9 +18,9 @@ class RegularisationSettings:
 
     Attributes:
         objective: ``pretraining`` for the pretraining loss on real scenes; ``discriminative`` for a loss that raises
-            their likelihood over the base prior's and lowers that of the base prior's samples.
+            the likelihood of real scenes over the base prior's, and lowers that of samples of the base prior.
         weight: coefficient of this loss; null takes the algorithm's own.
-        sharpness: of the discriminative loss: the larger, the less it moves the prior from its base.
+        sharpness: of the discriminative loss; a larger value moves the prior less from its base.
         base_samples: samples of the base prior that the discriminative loss compares with real scenes; drawn once.
         kl: coefficient of the KL divergence from the base prior, on own samples, in nats per random variable of a
             scene; null for none, or 1 with ``hold=kl:VALUE``.
@@ -97,5 +97,5 @@ class AdapterSettings:
 
     @property
     def scale(self) -> float:
-        """Of the updates."""
+        """Scale of the updates, alpha / rank."""
         return self.alpha / self.rank

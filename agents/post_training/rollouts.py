@@ -177,8 +177,8 @@ def collect(
         text = texts[0] if texts else None
         if together > 1 and step < branching.steps:
             first = None if text is None else (text[0][::together], text[1][::together])
-            x_t, seen = x_t[::together], None if entries is None else entries[::together]
-            drawn = policy.draw(x_t, step, text=first, noise=noise(x_t), observed=seen)
+            x_t, flags = x_t[::together], None if entries is None else entries[::together]
+            drawn = policy.draw(x_t, step, text=first, noise=noise(x_t), observed=flags)
             action, log_prob = (part.repeat_interleave(together, dim=0) for part in drawn)
         else:
             action, log_prob = policy.draw(x_t, step, text=text, noise=noise(x_t), observed=entries)

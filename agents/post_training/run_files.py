@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -30,10 +29,7 @@ def write_text(path: Path, text: str) -> None:
     Raises:
         TrainingError: the disk refused; what was there before is untouched.
     """
-    try:
-        files.write_text(path, text)
-    except OSError as error:
-        raise TrainingError(f"could not write {str(path)!r} ({error}); free some space and run again") from error
+    writing(repr(str(path)), lambda: files.write_text(path, text))
 
 
 def writing(what: str, write: Callable[[], object]) -> None:
@@ -73,7 +69,8 @@ def run_metrics(
 
 def write_metrics(directory: Path, metrics: Mapping[str, Any]) -> None:
     """``metrics.json``; numbers that JSON lacks become null."""
-    write_text(directory / METRICS_NAME, json.dumps(files.finite(metrics), indent=1, allow_nan=False) + "\n")
+    path = directory / METRICS_NAME
+    writing(repr(str(path)), lambda: files.write_json(path, metrics))
 
 
 def write_log(directory: Path, history: Sequence[Mapping[str, float]]) -> None:

@@ -15,7 +15,7 @@ from scene_envs.envs.scoring import RewardScorer
 from scene_envs.scene import SceneBatch
 
 FIGURES = ("count_distance", "category_kl", "classifier_accuracy")
-"""What is compared with the base prior's."""
+"""Figures that are compared with those of the base prior."""
 _AT_ONCE = 32
 """Scenes sampled together."""
 _CLASSIFIERS = 3

@@ -37,7 +37,7 @@ from agents.utils.checkpoints import save_checkpoint
 from agents.utils.interrupts import finishing_steps
 from agents.utils.loggers import make_logger
 from agents.utils.process_group import ProcessGroup, launched_processes
-from rewards import reward_name
+from rewards import reward_label
 from scene_envs.errors import TrainingError
 from scene_envs.folders import claimed
 
@@ -304,7 +304,7 @@ class PostTrainer:
             draw_curve(
                 self.history,
                 self.directory / "curve.png",
-                reward_name=f"mean {reward_name(self.config.reward).replace('_', ' ')}",
+                reward_name=f"mean {reward_label(self.config.reward)}",
                 limit=self.config.guard.limit,
                 beyond=self.guard.over_limit_at,
                 highest=self.learner.largest_reward(),

@@ -147,7 +147,7 @@ def _mixed(config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts:
 
 
 def _chain(config: PretrainConfig) -> dict[str, Any]:
-    """What both kinds of prior are told of noise and loss."""
+    """Settings of noise and loss that both kinds of prior share."""
     process, loss = config.process, config.loss
     return {
         "schedule": process.schedule,
@@ -249,6 +249,6 @@ def _unit(normalizer: Normalizer) -> tuple[float, float, float]:
 
 
 def _rotations(normalizer: Normalizer) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """What nine normalised numbers are multiplied by, and what is then added, to be a rotation matrix."""
+    """Factors and offsets that turn nine normalised numbers into a rotation matrix."""
     low, high = normalizer.input_min[3:POSE_FEATURES], normalizer.input_max[3:POSE_FEATURES]
     return tuple(((high - low) / 2).tolist()), tuple(((high + low) / 2).tolist())

@@ -1,4 +1,4 @@
-"""What a training run shows: rows in the log, in a CSV file and in a logger, and pictures of samples."""
+"""Log of a training run: rows for the CSV file and for a logger, and pictures of samples."""
 
 from __future__ import annotations
 

@@ -14,12 +14,12 @@ from agents.pretraining.config import PretrainConfig
 from scene_envs.errors import unknown_name
 
 OPTIMIZERS = ("adamw", "muon")
-"""What :func:`build_optimizer` builds."""
+"""Optimisers that :func:`build_optimizer` builds."""
 
 _BETAS, _EPS = (0.9, 0.99), 1e-8
 _MOMENTUM = 0.95
 _COEFFICIENTS = (3.4445, -4.7750, 2.0315)
-"""Of the quintic Newton-Schulz iteration (Jordan et al. 2024)."""
+"""Coefficients of the quintic Newton-Schulz iteration (Jordan et al. 2024)."""
 
 
 def learning_rate_at(step: int, config: PretrainConfig) -> float:

@@ -14,7 +14,7 @@ from scene_envs.errors import InvalidInputError
 
 @dataclass
 class ModuleSettings:
-    """What is added to the core of the mixed flux network; other networks do not read it.
+    """Modules that are added to the core of the mixed flux network; other networks do not read them.
 
     Attributes:
         observed_flags: the network is told which poses and categories are observed, for inpainting.
@@ -182,7 +182,7 @@ class LossSettings:
 
 @dataclass
 class TextSettings:
-    """What a mixed prior reads.
+    """Text encoder of a mixed prior.
 
     Attributes:
         encoder: ``none`` for a prior that reads no prompts; ``vocabulary`` for a small encoder with a closed
@@ -261,7 +261,7 @@ class PretrainOptimizerSettings(OptimizerSettings):
 
 @dataclass
 class PretrainLoggerSettings(LoggerSettings):
-    """What a pretraining run writes, and how often.
+    """Files of a pretraining run, and how often they are written.
 
     Attributes:
         log_every: steps between log rows.

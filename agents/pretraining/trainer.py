@@ -88,7 +88,7 @@ class Pretrainer:
 
     @property
     def checkpoint_path(self) -> Path:
-        """Where the resumable state lives."""
+        """File of the resumable state."""
         return self.directory / "checkpoint.pt"
 
     def run(self) -> ScenePrior:

@@ -50,7 +50,7 @@ class Adaptable(Protocol):
         """Trained tensors by name."""
 
     def requires_grad_(self, requires_grad: bool = True) -> Any:
-        """As of torch modules."""
+        """Switch the gradient of all weights on or off, as torch modules do."""
 
 
 Prior = TypeVar("Prior", bound=Adaptable)
@@ -70,7 +70,7 @@ class AdapterTerm:
 
     @property
     def file(self) -> Path:
-        """Where the tensors are."""
+        """File of the tensors."""
         return self.path / ADAPTER_NAME if self.path.is_dir() else self.path
 
 

@@ -30,7 +30,7 @@ from scene_envs.scene import TRANSLATION, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
 UNIONS = ("one_type", "any")
-"""What a scene of a union of scene types may hold."""
+"""Assets that a scene of a union of scene types may hold: those of one of its types, or any."""
 
 Prior = TypeVar("Prior", bound="ScenePrior")
 
@@ -49,7 +49,7 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
     """
 
     process: GaussianProcess
-    """Of the poses, and of all else that is continuous."""
+    """Gaussian process of the poses, and of all other continuous features."""
     denoiser: Any
     """The network inside its process, a module with ``.network``."""
     adapter: AdapterFacts | None = None
@@ -213,8 +213,8 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
         generator = Generator(str(self._fixed.device)).manual_seed(seed)
         chunks, done = [], 0
         for size in _chunk_sizes(count, batch_size):
-            asked = None if prompts is None else prompts[done : done + size]
-            chunks.append(self._sample_chunk(size, asked, guidance, num_steps, slots, generator, eta))
+            texts = None if prompts is None else prompts[done : done + size]
+            chunks.append(self._sample_chunk(size, texts, guidance, num_steps, slots, generator, eta))
             done += size
         return self.decode(torch.cat(chunks))
 

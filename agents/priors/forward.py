@@ -64,12 +64,12 @@ class DenoiserOutput:
 
 
 class Trainable(ABC):
-    """The part of a prior that noises scenes, and says what is lost by what the denoiser makes of them."""
+    """The part of a prior that noises scenes, and computes the loss of the denoiser's output for them."""
 
     config: Any
-    """What the prior is made of, a dataclass."""
+    """Configuration of the prior, a dataclass."""
     process: GaussianProcess
-    """The process of what is continuous."""
+    """Gaussian process of the continuous features."""
     _timestep_weights: Tensor
 
     @abstractmethod
@@ -133,7 +133,7 @@ class Trainable(ABC):
         return self.process.x0_from_output(noised.x_t[..., :features], noised.t, output.continuous)
 
     def observed_entries(self, x: Tensor, observed: Observed | None = None) -> Observed | None:
-        """What the network is told of scenes ``x`` (B, N, D) without noise, given ``observed``; None for nothing."""
+        """Observed entries of scenes ``x`` (B, N, D), without noise, as the network reads them; None for none."""
         return observed
 
     def category_kl(self, noised: NoisedScenes, now: DenoiserOutput, then: DenoiserOutput) -> Tensor | None:

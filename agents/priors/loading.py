@@ -32,7 +32,7 @@ class Loadable(ABC):
     process_name = ""
     """Name of the process in configuration files; a subclass that sets it can be loaded by :meth:`load`."""
     config: Any
-    """What the prior is made of, a dataclass."""
+    """Configuration of the prior, a dataclass."""
     denoiser: Any
     """The network inside its process, a module with ``.network``."""
     scene_type: SceneType

@@ -201,9 +201,9 @@ class MixedPrior(TrainableMixedPrior):
         text: Text | None = None, guidance: float = 0.0,
     ) -> MixedStep:  # fmt: skip
         """p(x_{t-1} | x_t) of scenes whose observed entries are certain; see :class:`Inpainting`."""
-        seen = Observed(x_t, observed[..., 0], observed[..., 1])
-        reverse = self.transition(x_t, step, table, observed=seen, text=text, guidance=guidance)
-        return reverse.observing(seen.pose, seen.category, x_t)
+        entries = Observed(x_t, observed[..., 0], observed[..., 1])
+        reverse = self.transition(x_t, step, table, observed=entries, text=text, guidance=guidance)
+        return reverse.observing(entries.pose, entries.category, x_t)
 
     def write_observed(self, x: Tensor, x0: Tensor, observed: Tensor, level: int, noise: Noise | None = None) -> Tensor:
         """States with the observed entries of ``x0``, without noise at every level."""
@@ -214,7 +214,7 @@ class MixedPrior(TrainableMixedPrior):
         prompts: Sequence[str] | None = None, guidance: float = 0.0, hook: Hook | None = None,
         start: Start | None = None,
     ) -> Tensor:  # fmt: skip
-        """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; the rest is seen as it is."""
+        """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; the rest is observed."""
         text = None if prompts is None else self.encode_prompts(prompts)
         observed = Observed(self.encode(batch), ~mask[..., 0], ~mask[..., 1])
         noise = draw_noise(observed.x, generators)

@@ -41,7 +41,7 @@ class MixedStates(PromptReader, ScenePrior):
         return Observed(x, fixed, fixed)
 
     def with_union(self: Prior, union: str) -> Prior:
-        """As :meth:`ScenePrior.with_union`."""
+        """Restrict the scenes of a union, as :meth:`ScenePrior.with_union` does."""
         super().with_union(union)
         self.config = replace(self.config, union=union)
         return self

@@ -1,4 +1,4 @@
-"""Signals that end a command: SIGTERM as an exception, and both held back while a step is finished."""
+"""Signals that end a command: SIGTERM as an exception; SIGTERM and Ctrl-C held back until a step is finished."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Averages of weights over training, which are what is evaluated and saved."""
+"""Averages of weights over training, for evaluation and for saving."""
 
 from __future__ import annotations
 

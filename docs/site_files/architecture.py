@@ -25,7 +25,7 @@ ROWS: tuple[dict[str, tuple[int, str]], ...] = (
     },
     {
         "rewards": (2, "scores of scenes"),
-        "agents.planning": (3, "UCT, best of N"),
+        "agents.planning": (3, "planners, search runs"),
         "agents.evaluation": (4, "measures of scenes"),
     },
     {"agents.priors": (3, "sample, inpaint, save")},
@@ -38,14 +38,14 @@ ROWS: tuple[dict[str, tuple[int, str]], ...] = (
 WAY = ("scene_envs.grammars", "scene_envs.datasets", "agents.pretraining", "agents.post_training", "agents.cli")
 """Subpackages that hold one sample, in order; each imports the one before it."""
 
-ASKS = (
+CALLS = (
     ("scene_envs.datasets", "scene_envs.physics"),
     ("agents.pretraining", "agents.priors"),
     ("agents.post_training", "scene_envs.envs"),
     ("agents.post_training", "rewards"),
     ("agents.post_training", "agents.evaluation"),
 )
-"""Who asks whom on the way; the first imports the second."""
+"""Calls on the way of the sample: the first imports and calls the second."""
 
 _WIDTH, _HEIGHT, _LEFT, _TOP = 186, 44, 20, 56
 _STEP_X, _STEP_Y = 200, 68
@@ -63,7 +63,7 @@ def drawing() -> str:
     width, height = 2 * _LEFT + 5 * _STEP_X - 14, _TOP + len(ROWS) * _STEP_Y + 56
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" font-family="sans-serif">',
-        "<defs>" + _head("way", "#00796b") + _head("asks", "#8a8f98") + "</defs>",
+        "<defs>" + _head("way", "#00796b") + _head("calls", "#8a8f98") + "</defs>",
         f'<rect width="{width}" height="{height}" fill="#ffffff"/>',
     ]
     for name, column, count in _COLUMNS:
@@ -72,7 +72,7 @@ def drawing() -> str:
             f'<rect x="{x}" y="14" width="{wide}" height="{height - 70}" rx="10" fill="#f3f5f6"/>',
             f'<text x="{x + 12}" y="38" font-size="16" font-weight="bold" fill="#3a3e46">{name}</text>',
         ]
-    parts += [_asks(*pair) for pair in ASKS]
+    parts += [_call(*pair) for pair in CALLS]
     parts += [_way(first, second) for first, second in pairwise(WAY)]
     for rooms in ROWS:
         parts += [_box(room, text) for room, (_, text) in rooms.items()]
@@ -80,7 +80,7 @@ def drawing() -> str:
     parts += [
         f'<path d="M20 {legend} h40" stroke="#00796b" stroke-width="3" marker-end="url(#way)"/>',
         f'<text x="74" y="{legend + 4}" font-size="13" fill="#3a3e46">path of one sample</text>',
-        f'<path d="M330 {legend} h40" stroke="#8a8f98" stroke-dasharray="5 4" marker-end="url(#asks)"/>',
+        f'<path d="M330 {legend} h40" stroke="#8a8f98" stroke-dasharray="5 4" marker-end="url(#calls)"/>',
         f'<text x="384" y="{legend + 4}" font-size="13" fill="#3a3e46">calls on the path</text>',
         f'<text x="540" y="{legend + 4}" font-size="13" fill="#3a3e46">',
         "A subpackage imports only subpackages of higher rows.</text>",
@@ -116,14 +116,14 @@ def _way(first: str, second: str) -> str:
     return _path(f"M{start[0]} {start[1]} V{end[1]}", "way")
 
 
-def _asks(first: str, second: str) -> str:
+def _call(first: str, second: str) -> str:
     (x0, y0), (x1, y1) = corner(first), corner(second)
     if x0 == x1:  # beside the boxes, along their left or right side
         side, out = (x0 + _WIDTH, 10) if first.startswith("agents") else (x0 + _WIDTH, 8)
-        return _path(f"M{side} {y0 + 22} h{out} V{y1 + 22} H{side}", "asks")
+        return _path(f"M{side} {y0 + 22} h{out} V{y1 + 22} H{side}", "calls")
     target = (x1 + _WIDTH // 2, y1 + _HEIGHT)
     start = (x0, y0 + 14) if x1 < x0 else (x0 + _WIDTH, y0 + 14)
-    return _path(f"M{start[0]} {start[1]} H{target[0]} V{target[1]}", "asks")
+    return _path(f"M{start[0]} {start[1]} H{target[0]} V{target[1]}", "calls")
 
 
 def _path(line: str, kind: str) -> str:

@@ -1,4 +1,4 @@
-"""Groups of assets by what they are, such as edible things, and the registry that they enter."""
+"""Groups of assets of a kind, such as edible things, and the registry that they enter."""
 
 from __future__ import annotations
 

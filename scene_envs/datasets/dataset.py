@@ -19,7 +19,7 @@ from scene_envs.datasets.info import DatasetInfo, read_metadata
 from scene_envs.datasets.layout import FIXED_TOLERANCE, Layout, scene_keys
 from scene_envs.datasets.splits import Part, check_fractions, split_rows
 from scene_envs.errors import InvalidInputError, UnknownNameError
-from scene_envs.files import with_digest
+from scene_envs.files import with_digest, write_json
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
@@ -214,7 +214,7 @@ class SceneDataset:
         folder.mkdir(parents=True, exist_ok=True)
         metadata = store.make_metadata(self.scene_type, self.normalizer, count=len(self))
         metadata["max_num_objects_per_scene"] = self.tensor.shape[1]
-        store.write_json(folder / store.METADATA, with_digest(metadata))
+        write_json(folder / store.METADATA, with_digest(metadata), indent=2)
         for index, start in enumerate(range(0, len(self), shard_size)):
             chunk = slice(start, start + shard_size)
             scenes = self.normalizer.normalize(self.tensor[chunk]).numpy()

@@ -17,14 +17,14 @@ from scene_envs.datasets.ray_workers import run_ray
 from scene_envs.datasets.shards import Job, shard_journal
 from scene_envs.datasets.workers import Work, run_processes, write_shard_of
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
-from scene_envs.files import storage_error, with_digest
+from scene_envs.files import storage_error, with_digest, write_json
 from scene_envs.grammars import Grammar, get_grammar
 from scene_envs.grammars.catalogue import grammar_factory
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene_types import SceneType, get_scene_type
 
 BACKENDS = ("processes", "ray")
-"""Where shards are made."""
+"""Backends that make shards."""
 _SETTINGS = ("grammar", "seed", "count", "shard_size", "verified")
 
 
@@ -157,7 +157,7 @@ def _prepare(folder: Path, grammar: Grammar, settings: dict[str, Any]) -> Normal
     except OSError as error:
         raise storage_error(folder, error) from error
     normalizer = fixed_normalizer(grammar)
-    store.write_json(path, with_digest(store.make_metadata(scene_type, normalizer, **settings)))
+    write_json(path, with_digest(store.make_metadata(scene_type, normalizer, **settings)), indent=2)
     return normalizer
 
 

@@ -19,9 +19,9 @@ from scene_envs.scene import CATEGORY, POSE, POSE_FEATURES, ROTATION, SceneBatch
 from scene_envs.scene_types import FixedObject, SceneType
 
 FIXED_TOLERANCE = 1e-3
-"""How far (m, and entries of the rotation matrix) a fixed object may stand from its scene type's pose."""
+"""Largest difference (m, and entries of the rotation matrix) of a fixed object to its scene type's pose."""
 _ONE_HOT = 0.1
-"""How far a one-hot entry may be from 0 or 1."""
+"""Largest difference of a one-hot entry to 0 or 1."""
 _ROTATION = 0.05
 """How far entries of R^T R may be from the identity; what is further than 1e-5 is projected to SO(3)."""
 _KEYS_AT_ONCE = 1024

@@ -8,8 +8,7 @@ column ``language_annotations`` holds all prompts of a scene.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,14 +52,9 @@ def make_metadata(scene_type: SceneType, normalizer: Normalizer, **extra: Any) -
     }
 
 
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write JSON atomically; raises :class:`StorageError`."""
-    write_bytes(path, (json.dumps(content, indent=2) + "\n").encode())
-
-
 def write_bytes(path: Path, content: bytes) -> None:
     """Write one file, whole or not at all; raises :class:`StorageError`."""
-    with _replacing(path) as partial:
+    with replacing(path) as partial:
         partial.write_bytes(content)
 
 
@@ -135,10 +129,3 @@ def remove_partial(folder: Path) -> None:
     """Remove what killed processes left half-written in ``folder``."""
     for path in folder.glob(".*.partial"):
         path.unlink(missing_ok=True)
-
-
-@contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
-    """A place to write ``path`` at before it takes its name; one per process, so that two never mix."""
-    with replacing(path) as partial:
-        yield partial

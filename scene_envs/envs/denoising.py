@@ -208,7 +208,7 @@ class DenoisingCore:
         self._text: tuple[Tensor, ...] | None = None
 
     def _text_of(self, rows: IntArray) -> tuple[Tensor, ...] | None:
-        """What the prior's network attends to in ``rows``; encoded once per reset."""
+        """Text tokens of the prompts in ``rows``; encoded once per reset."""
         reader = self.prompting.reader
         if reader is None or self._tokens is None:
             return None

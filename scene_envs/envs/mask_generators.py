@@ -1,4 +1,4 @@
-"""Mask generators that ship: by blame of the objective, by physics, by prompt, by place."""
+"""Shipped mask generators: masks by the objective's blame, by physics, by prompt and by place."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ class GivenMask:
 
 @dataclass(frozen=True)
 class OffPromptMask:
-    """What a prompt speaks against, and empty slots for what it asks for.
+    """Objects that contradict a prompt, and empty slots for those that it asks for.
 
     These are the objects beyond the number it gives, both things of a relation that does not hold, and as many empty
     slots as objects are missing.

@@ -26,10 +26,10 @@ _SAME = 1e-4
 """Scenes are the same when their objects agree to this, m."""
 
 Steering = Callable[[Sequence[tuple["SearchState", int]], Callable[[SceneBatch], Tensor]], Any]
-"""``(pairs, values) -> watch``: makes what watches the denoising of an expansion, as a prior's ``inpaint`` takes it.
+"""``(pairs, values) -> watch``: makes the object that a prior's ``inpaint`` calls during the denoising of ``pairs``.
 
-``values`` gives Φ (B,) of scenes that are being denoised, 0 where the objective cannot score one. What watches may have
-``trace(row)``, the ``trace`` of that child, and ``first_step(steps)``, the step that its denoising begins at.
+``values`` gives Φ (B,) of scenes that are being denoised, 0 where the objective cannot score one. The object may have
+the methods ``trace(row)``, the ``trace`` of that child, and ``first_step(steps)``, the first step of its denoising.
 """
 
 

@@ -238,7 +238,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     ) -> list[SearchState]:
         """The children of (state, action) pairs, denoised as one batch; the current state stays.
 
-        ``steering`` makes what watches the denoising, as :data:`scene_envs.envs.search.Steering` says.
+        ``steering`` acts on the scenes while they are denoised (:data:`scene_envs.envs.search.Steering`).
         """
         children = self.problem.expand_batch(pairs, steering)
         self._remember(children)

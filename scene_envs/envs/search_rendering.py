@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class SearchRendering:
-    """What ``render()`` of the search environments gives.
+    """Rendering of the search environments.
 
     Args:
         mode: ``"rgb_array"`` for pictures in which the objects that are to be regenerated are red; ``"human"`` for a

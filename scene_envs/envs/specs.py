@@ -34,7 +34,7 @@ class SpecMixin:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """What ``gym.make`` was told."""
+        """Keyword arguments of ``gym.make``."""
         return self._spec
 
     @spec.setter

@@ -25,7 +25,7 @@ SCALE = 20.0
 """Bullet length units per metre. Bullet grows each convex mesh by 0.001 units and rounds its edges by as much: 1 mm if
 a unit were a metre, 0.05 mm like this. Times and masses are as they are; gravity and inertia are scaled to match."""
 MARGIN = 1e-3 / SCALE
-"""What Bullet adds to each convex mesh (m). Hulls go in smaller by as much, so that they act at their true size."""
+"""Margin (m) that Bullet adds to each convex mesh. Hulls are shrunk by it, so that they act at their true size."""
 
 _PARKING = 1000.0
 """Height (Bullet units) of the first parked body; the next ones are above it."""

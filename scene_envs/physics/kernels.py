@@ -74,7 +74,7 @@ def _objects(physics: Physics, chunk: Chunk) -> Objects:
 
 
 def _budgets(chunk: Chunk, objects: Objects, pairs: ObjectPairs) -> list[Budget]:
-    """What the simulation of each scene may spend."""
+    """Work that the simulation of each scene may take."""
     if chunk.units is not None:
         return [Budget(units) for units in chunk.units.tolist()]
     scenes = [np.flatnonzero(objects.scene == index) for index in range(len(chunk))]
@@ -238,4 +238,4 @@ KERNELS: dict[str, Kernel] = {
     "settle": settle_kernel,
     "units": units_kernel,
 }
-"""What workers can be asked to run."""
+"""Functions that workers run."""

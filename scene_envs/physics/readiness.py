@@ -19,7 +19,7 @@ from scene_envs.physics.results import ReadyResult
 from scene_envs.scene import SceneBatch
 
 _READY_DEPTH = 1e-4
-"""How deep a ready object may overlap another one (m)."""
+"""Deepest overlap (m) of a ready object with another one."""
 _LEAN = 0.12
 """Angle (rad) by which gravity may lean before a ready object gives way: what leans and only just holds in one
 simulator creeps in the next."""

@@ -111,7 +111,7 @@ def _web(name: str) -> str:
 
 
 def _viewer_data(batch: SceneBatch, captions: Sequence[str]) -> dict[str, Any]:
-    """What the page draws: assets in use, scenes, and how to look at them."""
+    """Data of the page: assets in use, scenes and the view."""
     scene_type = batch.scene_type
     categories = batch.categories.cpu().numpy()
     used = np.unique(categories[categories < scene_type.num_assets])

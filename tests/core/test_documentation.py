@@ -73,7 +73,7 @@ def test_every_room_is_drawn_below_what_it_imports() -> None:
 
 def test_arrows_of_the_drawing_are_imports() -> None:
     steps = [(later, earlier) for earlier, later in pairwise(ARCHITECTURE.WAY)]
-    assert {*steps, *ARCHITECTURE.ASKS} <= room_imports()
+    assert {*steps, *ARCHITECTURE.CALLS} <= room_imports()
 
 
 def test_the_committed_drawing_is_that_of_the_script() -> None:

@@ -94,3 +94,8 @@ def test_nothing_is_at_the_top_of_agents_but_its_surface() -> None:
 def test_what_tests_share_is_in_helpers() -> None:
     shared = re.compile(r"^\s*(?:from|import) tests\.(?!helpers\b)", re.MULTILINE)
     assert [file.name for file in (ROOT / "tests").rglob("*.py") if shared.search(file.read_text())] == []
+
+
+def test_every_subpackage_has_a_folder_of_tests() -> None:
+    packages = [path.parent.name for top in ("scene_envs", "agents") for path in (ROOT / top).glob("*/__init__.py")]
+    assert [name for name in packages if not list((ROOT / "tests" / name).glob("test_*.py"))] == []

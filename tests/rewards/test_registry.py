@@ -15,6 +15,7 @@ from rewards import (
     registry,
     resolve_reward,
     reward_info,
+    reward_label,
     reward_name,
 )
 from scene_envs.errors import InvalidInputError, UnknownNameError
@@ -60,6 +61,15 @@ def test_an_object_comes_back_as_it_is_and_a_class_is_built():
     assert resolve_reward(reward) is reward
     assert resolve_reward(ObjectCount) == reward
     assert reward_name(reward) == reward_name("object_count") == "object_count"
+
+
+def test_a_label_is_short(tmp_path):
+    def local(batch):
+        return batch.counts
+
+    assert reward_label("feasible_share") == reward_label({"name": "feasible_share"}) == "feasible share"
+    assert reward_label(f"{tmp_path}/my_rewards.py:wide_tables") == "my_rewards.py:wide_tables"
+    assert reward_label(local) == "local"
 
 
 def test_an_unknown_name_offers_the_nearest():

@@ -25,7 +25,7 @@ COMMANDS = {
     "check-reward": "check that a reward keeps its contract",
     "demo": "steer the shipped prior two ways, compare the results, write a report",
 }
-"""What each command does, in the order of the listing."""
+"""Summaries of the commands, in the order of the listing."""
 
 RENAMED = {
     "ship": "scene-envs package-prior",

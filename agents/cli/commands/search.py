@@ -110,7 +110,7 @@ def _search_progress(nfe_per_scene: int) -> Iterator[Callable[[str, int, int, fl
 
 
 def _summary(metrics: Mapping[str, Any], branching: int) -> str:
-    """What was found, beside the baseline and what there was at first."""
+    """Result of the search, beside the baseline and the start."""
     best_of = f"{_figure(metrics['best_of'])} by as many samples, " if "best_of" in metrics else ""
     first = (
         f"{_figure(metrics['start'])} at the start"

@@ -35,7 +35,7 @@ Method = Literal["auto", "coacd", "convex"]
 METHODS: tuple[Method, ...] = ("auto", "coacd", "convex")
 _LOGGER = logging.getLogger(__name__)
 _VERSION = 2
-"""Of what is kept on disk."""
+"""Version of the format on disk."""
 _DRAWN = 0.015
 """CoACD rebuilds surfaces that are not closed on a grid; corners this near the true one, relative to the size
 of the body, are drawn back onto it, so that flat faces stay flat."""

@@ -30,7 +30,7 @@ _MOST_SMOOTHED = 100_000
 _FINE_TEXTURE, _TEXTURE_COLORS = 500, 32
 """Textured meshes are cut into at least this many triangles, with at most so many colours."""
 _MOST_PIXELS = 8192 * 8192
-"""Of a texture."""
+"""Most pixels of a texture."""
 _SAMPLES = np.array(
     [[a, b, 4 - a - b] for a in range(5) for b in range(5 - a)], dtype=np.float64
 ) / 4.0  # fmt: skip

@@ -56,7 +56,7 @@ class Tolerances:
 
 
 NOMINAL = Tolerances()
-"""What checks use."""
+"""Tolerances of checks."""
 STRICT = Tolerances(contact=0.005, aside=0.03, cone=1.25, beside=0.04, beside_furniture=0.4, order=0.02)
 LOOSE = Tolerances(contact=0.015, beside=0.06, beside_furniture=0.6)
 """Prompts are written only when they hold under all three, so that no prompt hangs on a millimetre."""
