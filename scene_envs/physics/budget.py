@@ -12,6 +12,9 @@ from scene_envs.physics.placement import Objects
 PER_SCENE, PER_OBJECT, PER_PAIR, MOST_PER_OBJECT = 1_000.0, 1_200.0, 500.0, 10_000.0
 """Units of simulation (see :class:`Budget`) that a scene may take: so many, so many more for each free object and for
 each pair of them, which may meet, and in all at most so many for each object beyond the first number,"""
+LEAST = 20_000.0
+"""but at least so many beyond the first number where that is no more than the most for each object: a scene of five
+objects goes through all rounds of :func:`~scene_envs.physics.make_ready` with them,"""
 _CROWDED = 0.75
 """unless more than this share of them do not stand clear of each other."""
 _COINCIDENT = 0.9
@@ -64,4 +67,4 @@ def simulation_units(objects: Objects, pairs: ObjectPairs) -> float:
     if crowded.sum() > _CROWDED * free:
         return PER_SCENE
     more = PER_OBJECT * free + PER_PAIR * free * (free - 1) / 2
-    return PER_SCENE + min(more, MOST_PER_OBJECT * free)
+    return PER_SCENE + min(max(more, LEAST), MOST_PER_OBJECT * free)

@@ -14,7 +14,7 @@ from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import equilibrium, feasibility, make_ready, penetration, project, settle
 from scene_envs.physics.batches import run_kernel, spent, stack
-from scene_envs.physics.budget import PER_OBJECT, PER_PAIR, PER_SCENE
+from scene_envs.physics.budget import LEAST, MOST_PER_OBJECT, PER_OBJECT, PER_PAIR, PER_SCENE
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type
 from scene_envs.scene_types.built_in import BUILT_IN
@@ -162,3 +162,18 @@ def test_search_goes_on_from_a_degenerate_scene() -> None:
     value = env.step(0)[1]
     assert np.isfinite(value)
     env.close()
+
+
+@pytest.mark.parametrize(
+    ("objects", "units"), [(1, MOST_PER_OBJECT), (2, LEAST), (5, LEAST), (8, 8 * PER_OBJECT + 28 * PER_PAIR)]
+)
+def test_scenes_of_few_objects_may_take_as_many_units_as_larger_ones(objects: int, units: float) -> None:
+    dimsum = get_grammar("dimsum_table").sample(np.random.default_rng(0), 1)
+    kept = dimsum.is_free.cumsum(dim=-1) <= objects
+    few = SceneBatch.from_parts(
+        dimsum.translations,
+        dimsum.rotations,
+        dimsum.categories.masked_fill(dimsum.is_free & ~kept, dimsum.scene_type.num_assets),
+        dimsum.scene_type,
+    )
+    assert stack(run_kernel("units", few, {}, None), few, "units", shape=()).item() == PER_SCENE + units
