@@ -3,28 +3,33 @@
     python benchmarks/sampling_cost.py [--prior dimsum_table] [--count 48] [--num-steps 25] [--memory]
 
 Records every matrix product of a sampling run with the shapes and strides of its operands, and repeats the products
-alone, in the same order and on one thread. ``--memory``: also the peak memory of processes that pretrain, sample and
-post-train the network of the paper's recipe at B = 32.
+alone, in the same order and on one thread. ``--memory``: also the peak memory of processes that sample and post-train
+the network of the paper's recipe at B = 32.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
 import torch
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from agents.pretraining import PretrainConfig
+from agents.pretraining.initial_prior import build_prior
 from agents.priors.base import ScenePrior
+from scene_envs.grammars import get_grammar
+from scene_envs.normalizer import Normalizer
 
 PRODUCTS = {
     "aten::mm",
@@ -100,48 +105,31 @@ def sampling_seconds(prior: ScenePrior, count: int, num_steps: int) -> tuple[flo
 
 
 def paper_size_memory() -> dict[str, float]:
-    """Peak resident memory, MiB, of commands with the network of the paper's recipe at B = 32."""
-    small = ["seed=0", f"batch_size={_BATCH}"]
+    """Peak resident memory, MiB, of commands with the untrained network of the paper's recipe at B = 32."""
+    few = ["regularisation.bank_size=64", "guard.scenes=32", "guard.samples=0", "logger.report_scenes=2"]
+    common = ["num_steps=4", "seed=0", f"batch_size={_BATCH}"]
     with TemporaryDirectory() as folder:
-        prior, tuned = f"{folder}/prior", f"{folder}/tuned"
-        steered = [
-            "algorithm=ddpo_sf",
-            "reward=object_count",
-            "iterations=1",
-            "num_steps=25",
-            "regularisation.bank_size=64",
-        ]
+        raw = get_grammar("dimsum_table").sample(np.random.default_rng(0), 64).tensor
+        build_prior(PretrainConfig(recipe="paper"), raw, Normalizer.fit(raw)).save(folder)
+        steered = ["algorithm=ddpo_sf", "reward=object_count", "iterations=1", *few]
         commands = {
-            "none, `import torchrl` alone": ["-c", "import torchrl"],
-            "`pretrain`, one step": [
-                *_CLI,
-                "pretrain",
-                "recipe=paper",
-                "data=grammar",
-                "iterations=1",
-                f"output={prior}",
-                *small,
-            ],
-            "`sample`, 25 steps": [*_CLI, "sample", f"prior={prior}", "num_steps=25", f"count={_BATCH}", *small],
-            "`post-train`, one iteration of 25 steps": [
-                *_CLI,
-                "post-train",
-                f"prior={prior}",
-                f"output={tuned}",
-                *steered,
-                *small,
-            ],
+            "none (`import torchrl`)": ["-c", "import torchrl"],
+            "`sample`": [*_CLI, "sample", f"prior={folder}", f"count={_BATCH}", f"output={folder}/scenes", *common],
+            "`post-train`": [*_CLI, "post-train", f"prior={folder}", f"output={folder}/run", *steered, *common],
         }
         return {name: _peak(command) for name, command in commands.items()}
 
 
 def _peak(command: Sequence[str]) -> float:
-    """Largest resident memory of a Python process, MiB."""
-    process = subprocess.Popen([sys.executable, *command], stdout=subprocess.DEVNULL)
-    _, status, usage = os.wait4(process.pid, 0)
-    if status:
-        raise SystemExit(f"{' '.join(command)} ended with status {os.waitstatus_to_exitcode(status)}")
-    return usage.ru_maxrss / 1024
+    """Largest resident memory of a Python process, MiB, as Linux knows it just before the end."""
+    process, peak = subprocess.Popen([sys.executable, *command], stdout=subprocess.DEVNULL), 0.0
+    while process.poll() is None:
+        status = Path(f"/proc/{process.pid}/status").read_text()
+        peak = max([peak, *(int(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmHWM"))])
+        time.sleep(0.05)
+    if process.returncode:
+        raise SystemExit(f"{' '.join(command)} ended with status {process.returncode}")
+    return peak
 
 
 def main() -> None:
