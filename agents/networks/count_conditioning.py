@@ -86,39 +86,39 @@ class CountConditioning(FluxModule):
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
 
-    def count_logits(self, asked: Tensor) -> Tensor:
-        """(B, G + 1, most + 1) logits of the numbers of each kind, and of all objects, from ``asked`` (B, G + 1, W)."""
-        result: Tensor = self.counts_out(asked)
+    def count_logits(self, tokens: Tensor) -> Tensor:
+        """(B, G + 1, most + 1) logits of the numbers of each kind and of all objects, from ``tokens`` (B, G + 1, W)."""
+        result: Tensor = self.counts_out(tokens)
         return result
 
-    def count_loss(self, asked: Tensor, states: Tensor) -> Tensor:
+    def count_loss(self, tokens: Tensor, states: Tensor) -> Tensor:
         """(B,) mean over kinds and objects of the cross-entropy of their numbers in scenes (B, N) of 0..K-1."""
         numbers = self._numbers(count_states(states, self.categories)).long().clamp(max=self.most)
-        return F.cross_entropy(self.count_logits(asked).transpose(1, 2), numbers, reduction="none").mean(dim=1)
+        return F.cross_entropy(self.count_logits(tokens).transpose(1, 2), numbers, reduction="none").mean(dim=1)
 
     def logits(self, scene: Scene) -> Tensor | None:
-        asked = scene.own_text.get(CountConditioningConfig.name)
-        if asked is None:
+        tokens = scene.own_text.get(CountConditioningConfig.name)
+        if tokens is None:
             return None
-        result: Tensor = self(scene.states, asked, scene.slot_mask)[:, None]
+        result: Tensor = self(scene.states, tokens, scene.slot_mask)[:, None]
         return result
 
-    def forward(self, states: Tensor, asked: Tensor, slot_mask: Tensor | None = None) -> Tensor:
+    def forward(self, states: Tensor, tokens: Tensor, slot_mask: Tensor | None = None) -> Tensor:
         """Logits (B, K).
 
         Args:
             states: (B, N) int64 in 0..K, K being the mask token.
-            asked: (B, G + 1, W) what the text encoder says of each kind, and last of all objects.
+            tokens: (B, G + 1, W) leading tokens of the text encoder, one for each kind and the last for all objects.
             slot_mask: (B, N) bool, False for filling; None where there is none.
         """
-        counts = count_states(states, self.categories, slot_mask).to(asked.dtype)
+        counts = count_states(states, self.categories, slot_mask).to(tokens.dtype)
         seen, masked = self._numbers(counts), counts[:, -1:]  # (B, G + 1), (B, 1)
-        wanted = still_to_come(self.count_logits(asked).detach(), seen)
+        wanted = still_to_come(self.count_logits(tokens).detach(), seen)
         wanted = torch.cat([wanted[:, :-1], masked - wanted[:, -1:]], dim=1).clamp(min=0.0)  # last, empty slots
         share = torch.log((wanted + _DELTA) / (masked + 1.0))
         around = torch.cat([masked, seen[:, -1:]], dim=1)[:, None].expand(-1, self.things, -1)
         facts = torch.cat([torch.stack([seen, wanted], dim=-1), around], dim=-1)  # (B, G + 1, 4)
-        inside = self.thing + self.asked_in(asked) + self.seen_in(torch.cat([facts / 8.0, facts.log1p()], dim=-1))
+        inside = self.thing + self.asked_in(tokens) + self.seen_in(torch.cat([facts / 8.0, facts.log1p()], dim=-1))
         correction: Tensor = self.out(F.silu(self.inner(F.silu(inside))))
         return (self.trust * share + correction[..., 0])[:, self.kinds]
 

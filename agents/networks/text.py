@@ -72,8 +72,8 @@ class TextConfig:
         max_tokens: longest prompt, its start token included.
         latents: tokens that a prompt is condensed to, so that long ones cost no more than short ones; 0 for none.
         window: neighbouring words that are read together before attention ("two tea bottles"), an odd number.
-        asked: leading tokens for count conditioning, one for each kind of object and one for all objects, before the
-            latents; needs latents.
+        count_tokens: leading tokens, one for each kind of object and one for all objects, for count conditioning; they
+            need latents.
         numbers: whether words that are numbers say how many they are (:func:`number_features`).
     """
 
@@ -84,11 +84,11 @@ class TextConfig:
     max_tokens: int = 128
     latents: int = 16
     window: int = 1
-    asked: int = 0
+    count_tokens: int = 0
     numbers: bool = False
 
     def __post_init__(self) -> None:
-        if self.asked and not self.latents:
+        if self.count_tokens and not self.latents:
             raise InvalidInputError("a text encoder without latents has no tokens for count conditioning; give latents")
         if self.window < 1 or self.window % 2 == 0:
             raise InvalidInputError(f"a text window of {self.window} words: give an odd number, 1 for single words")
@@ -135,7 +135,7 @@ class TextEncoder(nn.Module):
         )
         self.layers = nn.TransformerEncoder(layer, config.depth, enable_nested_tensor=False)
         self.norm = nn.LayerNorm(config.width)
-        questions = config.asked + config.latents
+        questions = config.count_tokens + config.latents
         self.questions = nn.Parameter(0.2 * torch.randn(questions, config.width)) if questions else None
         self.condense = nn.MultiheadAttention(config.width, config.heads, batch_first=True) if config.latents else None
         self.answer_norm = nn.LayerNorm(config.width) if config.latents else None
@@ -205,9 +205,9 @@ class TextEncoder(nn.Module):
         x = self.norm(self.layers(x, src_key_padding_mask=~mask))
         if self.condense is None or self.questions is None or self.answer_norm is None:
             return x, mask
-        asked = self.questions.expand(len(indices), -1, -1)
-        answers, _ = self.condense(asked, x, x, key_padding_mask=~mask, need_weights=False)
-        return self.answer_norm(answers + asked), mask.new_ones(answers.shape[:2])
+        queries = self.questions.expand(len(indices), -1, -1)
+        answers, _ = self.condense(queries, x, x, key_padding_mask=~mask, need_weights=False)
+        return self.answer_norm(answers + queries), mask.new_ones(answers.shape[:2])
 
 
 def warn_unknown(words: Sequence[str]) -> None:

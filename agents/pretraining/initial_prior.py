@@ -74,10 +74,10 @@ def _started(config: PretrainConfig, raw: Tensor, prompts: Sequence[Sequence[str
     slots = raw.shape[1]
     prior = ScenePrior.load(config.prior)
     found = (prior.scene_type.name, prior.config.slots, prior.conditional)
-    asked = (config.scene, slots, config.text.is_read)
-    if found != asked:
+    expected = (config.scene, slots, config.text.is_read)
+    if found != expected:
         names = ("scene type", "slots", "text")
-        wrong = ", ".join(f"{n} {f!r}, not {a!r}" for n, f, a in zip(names, found, asked, strict=True) if f != a)
+        wrong = ", ".join(f"{n} {f!r}, not {a!r}" for n, f, a in zip(names, found, expected, strict=True) if f != a)
         raise InvalidInputError(f"the prior {config.prior!r} cannot be trained further on this data: it has {wrong}")
     _check_constants(prior, raw[:FITTED_ON, len(prior.scene_type.fixed) :], config.prior)
     prior.warn_unknown_words(prompt for group in prompts for prompt in group)
@@ -176,7 +176,7 @@ def _text(config: PretrainConfig, prompts: Sequence[Sequence[str]]) -> AnyTextCo
             latents=text.latents,
             window=text.window,
             numbers=text.numbers,
-            asked=max(_kinds(config.scene)) + 2 if _conditions_counts(config) else 0,
+            count_tokens=max(_kinds(config.scene)) + 2 if _conditions_counts(config) else 0,
         )
     return encoder
 

@@ -40,13 +40,18 @@ def prior() -> MixedPrior:
     return made.eval()
 
 
-@pytest.mark.parametrize(("latents", "window", "asked"), [(0, 1, 0), (4, 1, 8), (0, 3, 0), (4, 5, 0)])
-def test_padding_changes_nothing_in_the_encoder(latents: int, window: int, asked: int) -> None:
-    size: dict[str, Any] = {"latents": latents, "window": window, "asked": asked, "numbers": bool(asked)}
+@pytest.mark.parametrize(("latents", "window", "count_tokens"), [(0, 1, 0), (4, 1, 8), (0, 3, 0), (4, 5, 0)])
+def test_padding_changes_nothing_in_the_encoder(latents: int, window: int, count_tokens: int) -> None:
+    size: dict[str, Any] = {
+        "latents": latents,
+        "window": window,
+        "count_tokens": count_tokens,
+        "numbers": count_tokens > 0,
+    }
     encoder = TextEncoder(TextConfig(vocabulary(PROMPTS), width=16, heads=2, **size)).eval()
     alone, _ = encoder(PROMPTS[:1])
     tokens, mask = encoder([PROMPTS[0], PROMPTS[1] + " " + PROMPTS[1]])
-    assert tokens.shape[1] == (latents + asked or 19)
+    assert tokens.shape[1] == (latents + count_tokens or 19)
     torch.testing.assert_close(tokens[:1, : alone.shape[1]], alone, atol=1e-5, rtol=1e-4)
     assert bool(mask[0].all()) == bool(latents)
 
@@ -193,7 +198,7 @@ def test_numbers_say_how_many_they_are_however_they_are_written() -> None:
 
 def test_what_is_asked_of_things_needs_latents() -> None:
     with pytest.raises(InvalidInputError, match="give latents"):
-        TextConfig(words=("cup",), latents=0, asked=8)
+        TextConfig(words=("cup",), latents=0, count_tokens=8)
 
 
 def test_a_window_of_words_is_odd() -> None:
