@@ -1,4 +1,4 @@
-"""MaskablePPO learns which mask to search with: SearchMask-v0 and sb3-contrib, in one file.
+"""Training of MaskablePPO to choose the mask of a search: SearchMask-v0 and sb3-contrib, in one file.
 
     python examples/maskable_ppo.py --objective feasible_objects --steps 20000
 

@@ -1,4 +1,4 @@
-"""``python -m benchmarks.paper_tables key=value …``: train and measure priors for the paper's tables."""
+"""Command ``python -m benchmarks.paper_tables key=value …``: training and measures of priors for the paper's tables."""
 
 from __future__ import annotations
 

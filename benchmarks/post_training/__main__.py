@@ -1,4 +1,4 @@
-"""``python -m benchmarks.post_training table=NAME key=value …``: train rows, measure their samples, print a table."""
+"""Command ``python -m benchmarks.post_training table=NAME key=value …``: training, measures and the table of rows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``python -m benchmarks.reliability [PART ...] [PART=COUNT ...] [rows=FILE] [seed=N]``.
+"""Command ``python -m benchmarks.reliability [PART ...] [PART=COUNT ...] [rows=FILE] [seed=N]``.
 
 Runs the parts that are named, or all at full size, a part of a few trials after the other in one process at a time, and
 appends a row of JSON to FILE after each. Rows that FILE has are not measured again, so a run that was cut off goes on.

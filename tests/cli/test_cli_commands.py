@@ -1,4 +1,4 @@
-"""Each command does its work on a very small case and leaves what it promises."""
+"""Output of each command on a very small case."""
 
 import json
 

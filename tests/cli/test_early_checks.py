@@ -1,4 +1,4 @@
-"""What cannot be is refused before torch is imported."""
+"""Refusal of wrong values before torch is imported."""
 
 from __future__ import annotations
 

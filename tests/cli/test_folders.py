@@ -1,4 +1,4 @@
-"""A command never writes over what another left, says who else writes, and ends in order when it is told to."""
+"""Output folders of commands: refusal of folders with other results or another writer, and the end on a signal."""
 
 import os
 import signal

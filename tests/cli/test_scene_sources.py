@@ -1,4 +1,4 @@
-"""What ``scenes=`` names is the same in every command."""
+"""Scene sources: one meaning of ``scenes=`` in every command."""
 
 from __future__ import annotations
 

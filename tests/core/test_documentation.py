@@ -1,4 +1,4 @@
-"""The documentation agrees with the code: API pages with public names, the drawing with imports, help with targets."""
+"""Agreement of documentation and code: API pages with public names, the drawing with imports, help with targets."""
 
 from __future__ import annotations
 

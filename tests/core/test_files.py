@@ -1,4 +1,4 @@
-"""Files are whole or absent, name themselves when they are damaged, and folders have one writer."""
+"""File integrity: checksums, complete writes, errors that name the damaged file, and one writer per folder."""
 
 import errno
 import json

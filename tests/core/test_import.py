@@ -1,4 +1,4 @@
-"""What an import loads: environments are registered, and nothing heavy comes with them."""
+"""Imports of the packages: environments are registered, and no heavy dependency is loaded."""
 
 from __future__ import annotations
 

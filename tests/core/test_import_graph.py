@@ -1,4 +1,4 @@
-"""Imports of the three packages point one way: no circles, no upward arrows, no test helpers in production code."""
+"""Import directions of the three packages: no circles, no upward imports, no test helpers in production code."""
 
 from __future__ import annotations
 

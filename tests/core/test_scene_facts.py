@@ -1,4 +1,4 @@
-"""What scenes know of their assets, against trimesh and against the facts that prompts state."""
+"""Sizes, masses, supports and groups of the assets in scenes, against trimesh and the facts that prompts state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Prompts are varied, seeded, grammatical, and of the kinds that were asked for."""
+"""Prompts of each kind: variety, seeds, grammar of the sentences, and names of assets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Prompts are read claim by claim, and each claim says whether it holds, and by how much it misses."""
+"""Claims of prompts: reading, truth values, and the distance of a false claim from a true one."""
 
 from __future__ import annotations
 

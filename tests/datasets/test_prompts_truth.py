@@ -1,4 +1,4 @@
-"""Every prompt is true: by the checker, by a second opinion, and false of scenes that were changed."""
+"""Truth of prompts: by the checker, by an independent check, and on changed scenes, where they are false."""
 
 from __future__ import annotations
 

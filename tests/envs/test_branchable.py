@@ -1,4 +1,4 @@
-"""What planners rely on: the search environment keeps it, and a broken one is told why."""
+"""Interface for planners: conformance of the search environment, and errors for environments that break it."""
 
 from __future__ import annotations
 

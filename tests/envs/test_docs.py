@@ -1,4 +1,4 @@
-"""The pages under docs/envs are the docstrings, and those follow Gymnasium's order."""
+"""Pages under docs/envs: agreement with the docstrings and with Gymnasium's order of sections."""
 
 from __future__ import annotations
 

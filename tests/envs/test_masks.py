@@ -1,4 +1,4 @@
-"""Which objects a search regenerates, on scenes whose overlaps are known."""
+"""Masks of the search: the objects they regenerate, on scenes whose overlaps are known."""
 
 from __future__ import annotations
 

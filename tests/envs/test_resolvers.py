@@ -1,4 +1,4 @@
-"""Names of rewards and priors are resolved by packages that the environments do not import."""
+"""Names of rewards and priors: resolution by packages that the environments do not import."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a breakfast table is laid with: cutlery on its side of the plate, things on plates, in bowls, in the crock."""
+"""Breakfast settings: cutlery on its side of the plate, and objects on plates, in bowls and in the crock."""
 
 from __future__ import annotations
 

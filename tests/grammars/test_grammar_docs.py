@@ -1,4 +1,4 @@
-"""The page on grammars is true: every example runs, and what it makes stands."""
+"""Examples of the page on grammars: each one runs, and its scenes pass the physics check."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A scene type of another installed package works by name, everywhere a built-in one does."""
+"""Scene types of other installed packages: use by name, as with a built-in type."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tiers that grammars fill are those of the shelf asset."""
+"""Tiers of shelves: agreement of the grammars with the shelf asset."""
 
 from __future__ import annotations
 

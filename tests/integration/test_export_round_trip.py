@@ -1,4 +1,4 @@
-"""What simulators and viewers make of an export: the same poses, the same overlaps, and scenes that stand still."""
+"""Exports in simulators and viewers: poses, masses, overlaps, and the rest of a laid table."""
 
 from __future__ import annotations
 

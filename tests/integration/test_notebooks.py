@@ -1,4 +1,4 @@
-"""The notebooks run from top to bottom, and are committed with the pictures that they draw."""
+"""Notebooks: a run from top to bottom, and the pictures in the committed files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ray makes the same dataset as one process."""
+"""Generation on Ray: the same dataset as with one process."""
 
 from __future__ import annotations
 

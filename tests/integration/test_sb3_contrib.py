@@ -1,4 +1,4 @@
-"""MaskablePPO of sb3-contrib trains in the search environment with a choice of masks."""
+"""Training of MaskablePPO of sb3-contrib in the search environment with a choice of masks."""
 
 from __future__ import annotations
 

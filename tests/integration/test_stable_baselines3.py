@@ -1,4 +1,4 @@
-"""Stable-Baselines3 trains in the denoising environments, with prompts and without."""
+"""Training with Stable-Baselines3 in the denoising environments, with prompts and without."""
 
 from __future__ import annotations
 

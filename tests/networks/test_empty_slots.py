@@ -1,4 +1,4 @@
-"""Slots known to be empty leave the network, and nothing else changes."""
+"""Omission of known empty slots from the network: unchanged results for all other slots."""
 
 from __future__ import annotations
 

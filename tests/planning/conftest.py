@@ -1,4 +1,4 @@
-"""Pictures that nobody looks at are blank."""
+"""Blank pictures and curves for runs whose pictures no test reads."""
 
 from __future__ import annotations
 

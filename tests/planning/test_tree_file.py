@@ -1,4 +1,4 @@
-"""What a search leaves behind: the tree on disk, and its page."""
+"""Trees of searches: the file on disk and its HTML page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What small runs of this folder share: real scenes of a grammar, and curves that nobody looks at."""
+"""Shared data of small runs: real scenes of a grammar, and blank curves where no test reads them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs that cannot learn end before anything is sampled."""
+"""Refusal of runs that cannot learn, before any scene is sampled."""
 
 from __future__ import annotations
 

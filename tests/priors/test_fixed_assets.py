@@ -1,4 +1,4 @@
-"""Assets of fixed objects never come up in another slot; log-probabilities are those of what is sampled."""
+"""Assets of fixed objects: absence from all other slots, and log-probabilities of the restricted distribution."""
 
 from __future__ import annotations
 

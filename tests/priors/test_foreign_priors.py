@@ -1,4 +1,4 @@
-"""A prior from elsewhere reads nothing outside its folder and builds nothing that its weights do not fill."""
+"""Priors from untrusted folders: no file read outside the folder, and no network larger than the stored weights."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What is told of a prior: the listing, the card, and a folder that can be shipped."""
+"""Descriptions of priors: the listing, the model card, and a folder for distribution."""
 
 from __future__ import annotations
 

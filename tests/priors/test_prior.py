@@ -1,4 +1,4 @@
-"""What a user relies on from a prior: equivariance, clamping, inpainting, files."""
+"""Properties of priors: equivariance, clamping, inpainting, files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ships with the package: priors that load, fit their scene types, and do what a prompt says."""
+"""Priors of the package: size of the files, model cards, and numbers of objects that follow the prompt."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A prior of several scene types makes scenes of one of them at a time."""
+"""Priors of several scene types: samples with the assets of one type at a time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Picture cameras see what matters, also of scene types that nobody has framed by hand."""
+"""Framing of picture cameras: visible supports and objects, also for scene types without a hand-set camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures show the scene that was asked for."""
+"""Pictures of scenes: class colours, positions, occlusion, batches and galleries."""
 
 from __future__ import annotations
 

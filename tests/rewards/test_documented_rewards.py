@@ -1,4 +1,4 @@
-"""The rewards that the README and the documentation show keep the contract, as they are printed there."""
+"""Rewards shown in the README and the documentation: conformance with the contract, as printed there."""
 
 import re
 from pathlib import Path

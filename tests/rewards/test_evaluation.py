@@ -1,4 +1,4 @@
-"""A bad reward cannot spoil a run: its scenes are invalid, and the reason is told once."""
+"""Evaluation of faulty rewards: invalid scenes, and one warning with the reason."""
 
 import logging
 

@@ -1,4 +1,4 @@
-"""A reward that exits, hangs, crashes, fills memory or talks without end costs its scenes and nothing else."""
+"""Hostile rewards that exit, hang, crash, fill memory or print without end: loss of their scenes alone."""
 
 import random
 import re

@@ -1,4 +1,4 @@
-"""A reward of another installed package works by name, everywhere a name is taken."""
+"""Rewards of other installed packages: use by name in commands, functions and environments."""
 
 import pytest
 import torch

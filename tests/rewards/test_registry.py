@@ -1,4 +1,4 @@
-"""Names, mappings, functions and objects all become rewards; what is wrong is said."""
+"""Rewards from names, mappings, functions and objects, and errors for wrong specifications."""
 
 import functools
 

@@ -1,4 +1,4 @@
-"""Rewards that judge the same scenes share their simulation, and nothing else changes."""
+"""Shared simulation of rewards that judge the same scenes, with unchanged values."""
 
 from __future__ import annotations
 
