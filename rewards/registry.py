@@ -159,7 +159,7 @@ def reward_name(reward: Any) -> str:
 def reward_label(reward: Any) -> str:
     """A reward's name in words, for headings: of a reward in a file, the name of the file and of the function.
 
-    >>> reward_label("object_count"), reward_label("/home/me/my_rewards.py:clutter")
+    >>> reward_label("object_count"), reward_label("rewards/my_rewards.py:clutter")
     ('object count', 'my_rewards.py:clutter')
     """
     name = reward_name(reward)
