@@ -52,8 +52,8 @@ class Registry(dict[str, Component]):
         self._load_plugins()
         if name not in self and name in self._modules:
             self._import(self._modules[name])
-        if name not in self and self._read is not None and name in self.points():
-            self.setdefault(name, self._read(self.points()[name]))
+        if name not in self and self._read is not None and (point := self.points().get(name)) is not None:
+            self.setdefault(name, self._read(point))
         if name not in self:
             raise unknown_name(self.kind, str(name), self.names())
         return self[name]

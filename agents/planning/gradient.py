@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from agents.planning.guidance import Guidance
     from scene_envs.scene import SceneBatch
 
-_PLANNER = "greedy"
 WEIGHTS = ("overlap",)
 """Differentiable log-weights of :mod:`agents.planning.guidance`."""
 
@@ -49,7 +48,7 @@ class GradientPlanner(PlannerSettings):
     name: str = "gradient"
     widens = True
     steers = True
-    planner: Any = _PLANNER
+    planner: Any = "greedy"
     weight: Any = "overlap"
     strength: float = 1.0
     begin: float = 0.5
