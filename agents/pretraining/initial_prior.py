@@ -65,6 +65,7 @@ def build_prior(
 def _started(config: PretrainConfig, raw: Tensor, prompts: Sequence[Sequence[str]]) -> ScenePrior:
     """The prior that ``config`` names, for raw scenes (M, N, D) of its type, which keep its normalizer.
 
+    Of its settings of process and loss only the share of masks that open all empty slots is that of ``config``.
     Its vocabulary stays as it is; words of ``prompts`` that it lacks are listed in a warning.
 
     Raises:
@@ -81,7 +82,7 @@ def _started(config: PretrainConfig, raw: Tensor, prompts: Sequence[Sequence[str
         raise InvalidInputError(f"the prior {config.prior!r} cannot be trained further on this data: it has {wrong}")
     _check_constants(prior, raw[:FITTED_ON, len(prior.scene_type.fixed) :], config.prior)
     prior.warn_unknown_words(prompt for group in prompts for prompt in group)
-    return prior
+    return prior.with_open_empty(config.loss.open_empty_share)
 
 
 def _check_constants(prior: ScenePrior, free: Tensor, name: str) -> None:
@@ -136,6 +137,7 @@ def _mixed(config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts:
         category_loss=config.loss.category,
         category_weight=config.loss.category_weight,
         observed_share=config.loss.observed_share,
+        open_empty_share=config.loss.open_empty_share,
         text=text,
         empty_slots=process.empty_slots,
         unmasking=process.unmasking,

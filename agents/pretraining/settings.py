@@ -157,6 +157,8 @@ class LossSettings:
         category_weight: weight of the loss of the categories beside that of the poses.
         observed_share: share of a mixed prior's training scenes in which some poses or categories are observed, for
             inpainting.
+        open_empty_share: share of those in which whole slots are observed that observe no empty slot. A prior trained
+            without them crowds a scene whose empty slots are all masked.
     """
 
     RENAMED: ClassVar[Mapping[str, str]] = {"given_share": "loss.observed_share"}
@@ -169,6 +171,7 @@ class LossSettings:
     category: str = "cross_entropy"
     category_weight: float = 2.0
     observed_share: float = 0.3
+    open_empty_share: float = 0.5
 
     def __post_init__(self) -> None:
         one_of(self, "timesteps", ("lognormal", "uniform", "both"), "distribution of timesteps")
@@ -177,7 +180,7 @@ class LossSettings:
         finite(self, "noise_mean")
         positive(self, "noise_std")
         at_least(self, 0, "translation_weight", "category_weight")
-        shares(self, "observed_share")
+        shares(self, "observed_share", "open_empty_share")
 
 
 @dataclass

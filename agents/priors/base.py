@@ -142,6 +142,13 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
             raise unknown_name("union", union, UNIONS)
         return self
 
+    def with_open_empty(self: Prior, share: float) -> Prior:
+        """This prior, ``share`` of whose training masks of whole slots open every empty slot.
+
+        A prior that is not told of observed entries has no such masks, and stays as it is.
+        """
+        return self
+
     def initial(self, count: int, slots: int, generator: Generator | None = None) -> Tensor:
         """x_T (count, slots, D): standard normal with the known entries clamped."""
         noise = torch.randn(count, slots, self.features, generator=generator, device=self._fixed.device)

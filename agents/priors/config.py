@@ -90,6 +90,8 @@ class MixedPriorConfig(PoseDiffusionConfig, DenoiserConfig):
         category_weight: weight of the category loss beside the pose loss.
         auxiliary: weight of the cross-entropy in the bound.
         observed_share: share of training scenes in which some poses or categories are observed, for inpainting.
+        open_empty_share: share of those in which whole slots are observed that observe no empty slot, as a mask of all
+            empty slots does.
         text: kind and size of the text encoder; None for a prior that reads no prompts.
         empty_slots: ``"dropped"`` leaves slots that are known to be empty out of the network, which saves most of the
             work at low noise and needs an absorbing kernel; ``"attended"`` is the paper's.
@@ -107,6 +109,7 @@ class MixedPriorConfig(PoseDiffusionConfig, DenoiserConfig):
     category_weight: float = 0.3
     auxiliary: float = 5e-4
     observed_share: float = 0.3
+    open_empty_share: float = 0.0
     text: AnyTextConfig | None = None
     empty_slots: str = "attended"
     unmasking: str = "even"

@@ -46,6 +46,11 @@ class MixedStates(PromptReader, ScenePrior):
         self.config = replace(self.config, union=union)
         return self
 
+    def with_open_empty(self: Prior, share: float) -> Prior:
+        """Set the share of training masks that open every empty slot, as :meth:`ScenePrior.with_open_empty` does."""
+        self.config = replace(self.config, open_empty_share=share)
+        return self
+
     @property
     def num_categories(self) -> int:
         """K = C + 1."""
