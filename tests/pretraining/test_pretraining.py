@@ -170,6 +170,16 @@ def test_what_an_older_prior_takes_as_constant_may_not_vary_where_it_is_trained_
         build_prior(further, turned, Normalizer.fit(turned))
 
 
+def test_masks_of_empty_slots_are_those_of_the_run_also_where_an_older_prior_is_trained_further(
+    config: PretrainConfig, raw: torch.Tensor
+) -> None:
+    fresh = build_prior(replace(config, process="mixed"), raw, Normalizer.fit(raw))
+    fresh.save(Path(config.output) / "older")
+    further = replace(config, prior=str(Path(config.output) / "older"), loss={"open_empty_share": 0.25})
+    shares = [vars(build_prior(c, raw, Normalizer.fit(raw)).config)["open_empty_share"] for c in (config, further)]
+    assert shares == [0.5, 0.25]
+
+
 @pytest.mark.slow
 def test_a_truncated_checkpoint_is_named(config: PretrainConfig, raw: torch.Tensor) -> None:
     run = make_run(config, raw)

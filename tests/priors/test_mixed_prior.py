@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -34,6 +35,26 @@ def prior() -> MixedPrior:
 @pytest.fixture(scope="module")
 def scenes() -> SceneBatch:
     return get_grammar("dimsum_table").sample(np.random.default_rng(0), 6)
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.0, 0.5), (0.5, 0.25), (1.0, 0.0)])
+def test_a_share_of_the_completions_in_training_observes_no_empty_slot(
+    prior: MixedPrior, share: float, expected: float
+) -> None:
+    """Completions observe whole slots, by shares that are uniform: half of the objects, and half of the empty slots."""
+    batch = get_grammar("dimsum_table").sample(np.random.default_rng(1), 8)
+    config, x0 = prior.config, prior.encode(batch).repeat(200, 1, 1)
+    try:
+        prior.config = replace(config, observed_share=1.0)
+        observed = prior.with_open_empty(share).draw_observed(x0, torch.Generator().manual_seed(0))
+    finally:
+        prior.config = config
+    alike = (observed.pose == observed.category).all(dim=1) & ~observed.category.all(dim=1)
+    completions = alike & observed.pose[:, 1:].any(dim=1)  # some by chance alone: 2 of 1,000 rows
+    empty = batch.is_empty.repeat(200, 1)[completions]
+    free = batch.is_free.repeat(200, 1)[completions]
+    assert float(observed.pose[completions][empty].float().mean()) == pytest.approx(expected, abs=0.05)
+    assert float(observed.pose[completions][free].float().mean()) == pytest.approx(0.5, abs=0.05)
 
 
 def test_scenes_survive_encoding_and_known_entries_are_clamped(prior: MixedPrior, scenes: SceneBatch) -> None:
