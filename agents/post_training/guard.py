@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -53,11 +54,12 @@ class Guard:
 
     Args:
         heldout: (K, N, D) normalised real scenes that the regularisation never sees.
-        limit: largest ratio of a checkpoint worth keeping.
+        limit: largest ratio before the run counts as over-optimised; no checkpoint beyond it is kept.
         seed: of the fixed timesteps and noise.
         prompts: one of each held-out scene; None measures without.
         samples: how to sample and measure; None looks at the loss alone.
         limits: by how much figures of samples may exceed those of the base prior, by name.
+        target: largest ratio of a checkpoint that is kept, where a run holds the ratio.
 
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior()
@@ -75,10 +77,11 @@ class Guard:
         prompts: Sequence[str] | None = None,
         samples: SampleCheck | None = None,
         limits: Mapping[str, float] | None = None,
+        target: float = math.inf,
     ) -> None:
         self.heldout = heldout
         self.prompts = prompts
-        self.limit = limit
+        self.limit, self.target = limit, target
         self.seed = seed
         self.samples = samples
         self.limits = dict(limits or {})
@@ -147,7 +150,7 @@ class Guard:
             reward = figures["sample_reward"]
             over += beyond(figures, self.base_figures, self.limits)
         counts = self.samples is None or sample
-        kept = counts and not over and reward > self.best_reward  # False for NaN
+        kept = counts and not over and ratio <= self.target and reward > self.best_reward  # False for NaN
         reading = GuardReading(iteration, loss, ratio, reward, realism or {}, kept, figures, tuple(over))
         self.readings.append(reading)
         if kept:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,9 @@ def make_guard(config: PostTrainConfig, learner: Learner, scenes: SceneBank) -> 
             config.guidance,
         )
     limits = config.guard.limits(config.algorithm.sample_limits)
-    return Guard(scenes.heldout, config.guard.limit, stream_seed(config.seed, "guard"), asked, check, limits)
+    held = config.regularisation.target
+    target = held.value if held is not None and held.figure == "guard" else math.inf
+    return Guard(scenes.heldout, config.guard.limit, stream_seed(config.seed, "guard"), asked, check, limits, target)
 
 
 class GuardFiles:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from scene_envs.errors import InvalidInputError, unknown_name
 
@@ -13,6 +13,10 @@ LOWEST, HIGHEST = 0.01, 100.0
 """Bounds of the factor."""
 GAIN = 0.05
 """Change of the factor's logarithm per iteration, for a figure whose excess is twice that of the target."""
+LOOK_AHEAD = 30.0
+"""Iterations ahead for which a measurement is extrapolated: weights act with a delay."""
+SMOOTHING = 10.0
+"""Iterations over which the figure's change per iteration is averaged."""
 LARGEST_ERROR = 3.0
 FAR = 0.5
 """Error of the last measurement from which a target counts as not held at the end."""
@@ -76,6 +80,7 @@ class HoldState:
         log_factor: logarithm of the factor on the weights of the regularisation.
         iteration: of the last measurement.
         measured: the last value; None before the first.
+        slope: its change per iteration, averaged.
         beyond: measurements in a row that were above the target while the factor was at its upper bound.
         lost_at: iteration from which the target counts as not held; None where it does not.
     """
@@ -83,6 +88,7 @@ class HoldState:
     log_factor: float = 0.0
     iteration: int = 0
     measured: float | None = None
+    slope: float = 0.0
     beyond: int = 0
     lost_at: int | None = None
 
@@ -96,7 +102,8 @@ def adjust(state: HoldState, target: Target, measured: float, iteration: int) ->
     """The state after a measurement: integral control of the factor's logarithm, within bounds.
 
     The KL controller of Ziegler et al. (2019, Eq. 4) with a gain per iteration, so that checks may come at any
-    distance. The error is bounded; one that is not a number counts as the largest.
+    distance, on the figure as it will be in ``LOOK_AHEAD`` iterations if it changes as before. The error is bounded;
+    one that is not a number counts as the largest.
 
     Args:
         state: before.
@@ -106,11 +113,15 @@ def adjust(state: HoldState, target: Target, measured: float, iteration: int) ->
 
     >>> state = adjust(HoldState(), Target("kl", 0.01), measured=0.02, iteration=1)
     >>> round(state.factor, 3)
-    1.051
+    1.162
     """
-    error = target.error(measured)
-    step = GAIN * max(1, iteration - state.iteration) * error
+    span = max(1, iteration - state.iteration)
+    before = BASE_VALUES[target.figure] if state.measured is None else state.measured
+    slope = state.slope + (1.0 - math.exp(-span / SMOOTHING)) * ((measured - before) / span - state.slope)
+    slope = slope if math.isfinite(slope) else 0.0
+    error = target.error(measured + LOOK_AHEAD * slope)
+    step = GAIN * span * error
     log_factor = max(math.log(LOWEST), min(state.log_factor + step, math.log(HIGHEST)))
-    beyond = state.beyond + 1 if error > 0 and log_factor >= math.log(HIGHEST) else 0
+    beyond = state.beyond + 1 if target.error(measured) > 0 and log_factor >= math.log(HIGHEST) else 0
     lost_at = iteration if state.lost_at is None and beyond >= PATIENCE else state.lost_at
-    return replace(state, log_factor=log_factor, iteration=iteration, measured=measured, beyond=beyond, lost_at=lost_at)
+    return HoldState(log_factor, iteration, measured, slope, beyond, lost_at)

@@ -49,6 +49,37 @@ def test_a_plant_is_brought_to_the_target(every: int, strength: float) -> None:
     assert state.lost_at is None
 
 
+@pytest.mark.parametrize("every", [1, 5])
+def test_a_run_that_speeds_up_passes_its_target_by_less_than_half(every: int) -> None:
+    """The distance from the base prior grows with a push that gets stronger, and the excess is its square.
+
+    Control of the last measurement alone brings this plant to an excess of 0.14 for a target of 0.05: the factor falls
+    to a tenth while the excess is small, and takes as long to come back.
+    """
+    target, state, distance, excess = Target("guard", 1.05), HoldState(), 0.0, []
+    for iteration in range(1, 301):
+        push = 0.0025 + 0.0042 * min(1.0, max(0.0, (iteration - 20) / 30))
+        distance += push - 0.029 * state.factor * distance
+        excess.append(distance**2)
+        if iteration % every == 0:
+            state = adjust(state, target, 1 + excess[-1], iteration)
+    assert 0.05 < max(excess) < 0.078
+    assert excess[-1] == pytest.approx(0.05, rel=0.02)
+
+
+@pytest.mark.parametrize(("hold", "kept"), [(None, True), ("guard:1.05", False), ("guard:1.2", True), ("kl:0.1", True)])
+def test_no_checkpoint_beyond_a_held_ratio_is_kept(tmp_path: Path, hold: str | None, kept: bool) -> None:
+    run = PostTrainer(_run(tmp_path, "ddpo_sf", guard__samples=0, regularisation__hold=hold), prior=tiny_prior())
+    run.prepare()
+    guard = run.guard
+    guard.start(run.prior)
+    guard.base_loss /= 1.1  # as if the base prior had been better
+    reading = guard.check(run.prior, 1, reward=1.0)
+    assert reading.ratio == pytest.approx(1.1)
+    assert reading.kept == kept
+    assert reading.beyond == ()  # within guard.limit the run is not over-optimised
+
+
 @pytest.mark.parametrize(
     ("measured", "bound", "lost"), [(0.5, HIGHEST, True), (0.0, LOWEST, False), (math.nan, HIGHEST, True)]
 )
