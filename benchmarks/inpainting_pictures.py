@@ -21,7 +21,7 @@ from scene_envs.grammars import get_grammar
 from scene_envs.physics import feasibility
 from scene_envs.render import gallery, picture_camera, render
 
-PRIORS = ("dimsum_table_feasible", "living_room_shelf_feasible", "pantry_shelf_feasible")
+PRIORS = ("dimsum_table_completion", "living_room_shelf_feasible", "pantry_shelf_feasible")
 COLUMNS = ("real scene", "a half of its objects", "the half completed", "the whole rearranged")
 
 
