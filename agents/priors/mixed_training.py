@@ -114,11 +114,11 @@ class TrainableMixedPrior(MixedStates):
         kind, share = torch.rand(2, batch, 1, generator=generator)
         kind = kind / max(self.config.observed_share, 1e-9)  # above 1: nothing is observed
         picks = torch.rand(2, batch, slots, generator=generator) < share
+        whole, rearrange, free = kind < 0.5, (kind >= 0.5) & (kind < 0.75), (kind >= 0.75) & (kind < 1.0)
         if self.config.open_empty_share > 0:
             empty = (x0[..., POSE_FEATURES:].argmax(dim=-1) == self.num_categories - 1).cpu()
             opened = torch.rand(batch, 1, generator=generator) < self.config.open_empty_share
-            picks[0] &= ~(empty & opened & (kind < 0.5))
-        whole, rearrange, free = kind < 0.5, (kind >= 0.5) & (kind < 0.75), (kind >= 0.75) & (kind < 1.0)
+            picks[0] &= ~(whole & opened & empty)
         pose = (whole & picks[0]) | (rearrange & picks[0] & (share < 0.5)) | (free & picks[0])
         category = (whole & picks[0]) | rearrange.expand(-1, slots) | (free & picks[1])
         fixed = torch.zeros(slots, dtype=torch.bool)
