@@ -221,12 +221,14 @@ def test_without_pybullet_only_settling_is_missing(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["breakfast_table_high_clutter", "dimsum_table", "pantry_shelf"])
-def test_projection_before_simulation_keeps_objects_closer_to_what_was_asked(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "factor"), [("breakfast_table_high_clutter", 1.0), ("dimsum_table", 1.0), ("pantry_shelf", 1.05)]
+)
+def test_projection_before_simulation_keeps_objects_closer_to_what_was_asked(name: str, factor: float) -> None:
     """Scenes moved by 1 cm along every axis (16 mm in the mean): projection and simulation move them less than that.
 
-    Simulation alone moves objects as far or further (at most 0.3 m counted per object), though none is thrown away. An
-    object more or less that topples is 2 mm in the mean of a scene type, and processors differ in which ones do.
+    Simulation alone moves objects further (at most 0.3 m counted per object), though none is thrown away. On the
+    pantry, whose objects stand free on boards, both move them alike: 8.7 and 8.6 mm, or 8.8 and 8.9 mm elsewhere.
     """
     clean = get_grammar(name).sample(np.random.default_rng(4), 8)
     noise = 0.01 * torch.randn(clean.translations.shape, generator=torch.Generator().manual_seed(1))
@@ -237,9 +239,8 @@ def test_projection_before_simulation_keeps_objects_closer_to_what_was_asked(nam
         return float(way.clamp(max=0.3).mean())
 
     alone, both = settle(given, duration=1.0).batch, settle(project(given).batch, duration=1.0).batch
-    assert mean_way(both) < 0.012
-    assert mean_way(alone) < 0.016
-    assert mean_way(both) < 1.05 * mean_way(alone)
+    assert max(mean_way(both), mean_way(alone)) < 0.012
+    assert mean_way(both) < factor * mean_way(alone)
     ready = feasibility(both).feasible & both.in_workspace
     assert int(ready.sum()) >= 0.97 * int(given.is_free.sum())
 
