@@ -199,6 +199,8 @@ def main() -> int:
     options = parser.parse_args()
     torch.set_num_threads(1)
     chosen = {name: compute for name, compute in cases().items() if options.only in name}
+    if not chosen:
+        parser.error(f"--only {options.only!r} names no case; the cases are {', '.join(cases())}")
     found = {name: json.loads(json.dumps(compute())) for name, compute in chosen.items()}
     known = json.loads(FILE.read_text()) if FILE.exists() else {}
     if options.write:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         DenoisingTorchRLEnv,
         DenoisingVectorEnv,
         SearchEnv,
+        SearchMaskEnv,
         check_branchable,
         list_masks,
         register_mask,
@@ -58,6 +59,7 @@ __all__ = [
     "SceneEnvsError",
     "SceneType",
     "SearchEnv",
+    "SearchMaskEnv",
     "UnknownNameError",
     "__version__",
     "check_branchable",
@@ -86,5 +88,10 @@ __all__ = [
 ]
 
 __getattr__ = lazy_names(__name__, __file__)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
 
 register_envs()

@@ -48,6 +48,8 @@ class StorageError(SceneEnvsError, OSError):
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
     """Build the error for an unknown ``kind`` called ``name``, offering the nearest known name.
 
+    A dotted name is offered to who gives its last part.
+
     Args:
         kind: what was looked up, in words a user knows ("scene type", "reward", "prior").
         name: the name that was asked for.
@@ -57,6 +59,7 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError
     "unknown reward 'object_cuont'; did you mean 'object_count'? Known: feasible_objects, object_count."
     """
     names = sorted(known)
-    near = difflib.get_close_matches(name, names, n=1, cutoff=0.4)
-    hint = f"; did you mean {near[0]!r}?" if near else "."
+    last = [known_name for known_name in names if known_name.rpartition(".")[2] == name]
+    near = last or difflib.get_close_matches(name, names, n=1, cutoff=0.4)
+    hint = f"; did you mean {' or '.join(map(repr, near))}?" if near else "."
     return UnknownNameError(f"unknown {kind} {name!r}{hint} Known: {', '.join(names) or '(none)'}.")

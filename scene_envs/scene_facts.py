@@ -104,7 +104,7 @@ class AssetFacts(ABC):
         >>> SceneBatch.empty("dimsum_table", 1, slots=2).supports
         tensor([[-1, -1]])
         """
-        from scene_envs.datasets.prompts.supports import Contacts, Placed
+        from scene_envs.supports import Contacts, Placed
 
         supports = torch.full(self.categories.shape, -1, dtype=torch.int64)
         for start in range(0, len(supports), _CHUNK):

@@ -191,8 +191,9 @@ def compose(command: str, config: type, words: Sequence[str], sources: Sources =
         word = f"{key}={value}"
         check_not_moved(config, word, command)
         head = key.partition(".")[0]
-        if head not in fields:
+        if head not in fields or head != key:
             check_not_moved(config, key, command)
+        if head not in fields:
             raise unknown_name(f"{command} key", key, dotted_keys(config()))
         if key == head and fields[key].metadata.get("folder"):
             read += _component(command, fields[key], value, sources.config_dir, late)

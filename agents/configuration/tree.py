@@ -108,8 +108,11 @@ def check_not_moved(kind: type, key: str, command: str = "") -> None:
         InvalidInputError: ``kind.RENAMED`` knows the key.
     """
     renamed: Mapping[str, str] = getattr(kind, "RENAMED", {})
-    if key in renamed:
-        raise InvalidInputError(f"the {command} key {key!r} has another name now: {renamed[key]}".replace("  ", " "))
+    group, _, last = key.rpartition(".")
+    now = renamed.get(last, "").partition(",")[0]
+    old = last if group and now.startswith(f"{group}.") and now != key else key  # an earlier name, below its group
+    if old in renamed:
+        raise InvalidInputError(f"the {command} key {key!r} has another name now: {renamed[old]}".replace("  ", " "))
 
 
 def changed(config: Config, changes: Mapping[str, Any]) -> Config:

@@ -50,12 +50,12 @@ class CountConditioning(FluxModule):
     """Logits (B, K) that are added to those of every slot: how much of each category is still wanted.
 
     A prompt asks for numbers: of objects, of cups, of whatever is named. Attention takes averages and learns exact
-    numbers very slowly, so they are taken by subtraction. The text says how likely each number of each kind of object
-    is (:meth:`count_logits`, trained on the counts of the scenes). Given what is seen, smaller numbers are ruled out,
-    and the mean of the rest is how many are still to come. Were slots independent but for these counts, a masked slot
-    would be of each kind with the share that is still to come of it among the masked slots. The logarithm of that share
-    is where this starts, and a small network, the same for all kinds, corrects it. Sums are over slots, so that the
-    network stays permutation-equivariant.
+    numbers very slowly, so this module subtracts. The text gives the probability of each number of each kind of object
+    (:meth:`count_logits`, trained on the counts of the scenes). Numbers below the visible count are impossible. The mean
+    of the other numbers minus the visible count is the number still missing. The missing objects of a kind,
+    divided by the masked slots, estimate the probability that a masked slot is of that kind. The logits start from the
+    logarithm of this probability, and a small network, the same for all kinds, corrects them. Sums are over slots, so
+    that the network stays permutation-equivariant.
 
     Args:
         kinds: (C,) the kind 0..G-1 of each category but *empty*: prompts call several assets by one name.
@@ -112,12 +112,12 @@ class CountConditioning(FluxModule):
             slot_mask: (B, N) bool, False for filling; None where there is none.
         """
         counts = count_states(states, self.categories, slot_mask).to(tokens.dtype)
-        seen, masked = self._numbers(counts), counts[:, -1:]  # (B, G + 1), (B, 1)
-        wanted = still_to_come(self.count_logits(tokens).detach(), seen)
+        visible, masked = self._numbers(counts), counts[:, -1:]  # (B, G + 1), (B, 1)
+        wanted = still_to_come(self.count_logits(tokens).detach(), visible)
         wanted = torch.cat([wanted[:, :-1], masked - wanted[:, -1:]], dim=1).clamp(min=0.0)  # last, empty slots
         share = torch.log((wanted + _DELTA) / (masked + 1.0))
-        around = torch.cat([masked, seen[:, -1:]], dim=1)[:, None].expand(-1, self.things, -1)
-        facts = torch.cat([torch.stack([seen, wanted], dim=-1), around], dim=-1)  # (B, G + 1, 4)
+        around = torch.cat([masked, visible[:, -1:]], dim=1)[:, None].expand(-1, self.things, -1)
+        facts = torch.cat([torch.stack([visible, wanted], dim=-1), around], dim=-1)  # (B, G + 1, 4)
         inside = self.thing + self.asked_in(tokens) + self.seen_in(torch.cat([facts / 8.0, facts.log1p()], dim=-1))
         correction: Tensor = self.out(F.silu(self.inner(F.silu(inside))))
         return (self.trust * share + correction[..., 0])[:, self.kinds]
@@ -129,13 +129,13 @@ class CountConditioning(FluxModule):
         return torch.cat([kinds, objects.sum(dim=1, keepdim=True)], dim=1)
 
 
-def still_to_come(logits: Tensor, seen: Tensor) -> Tensor:
-    """Expected number beyond what is seen: logits (..., M) of the numbers 0..M-1 and (...) seen to (...), 0 at least.
+def still_to_come(logits: Tensor, visible: Tensor) -> Tensor:
+    """Expected number beyond the visible one, at least 0: logits (..., M) of the numbers 0..M-1, (...) visible to (...).
 
     >>> still_to_come(torch.tensor([[0.0, 0.0, 0.0, 0.0]]), torch.tensor([1.0]))  # 1, 2 or 3, as likely
     tensor([1.])
     """
     number = torch.arange(logits.shape[-1], device=logits.device, dtype=logits.dtype)
-    beyond = number - seen[..., None]
+    beyond = number - visible[..., None]
     weight = logits.softmax(dim=-1) * (beyond >= 0)
     return (weight * beyond).sum(dim=-1) / weight.sum(dim=-1).clamp(min=1e-9)

@@ -16,7 +16,7 @@ from agents.networks.flux_modules import FluxModule, FluxSizes, ModuleConfig, Sc
 
 @dataclass(frozen=True)
 class CountEmbeddingConfig(ModuleConfig):
-    """Counts of what is seen, read together with the mean text token where there is text."""
+    """Counts of visible slots, read together with the mean text token where there is text."""
 
     name = "count_embedding"
     place = "condition"
@@ -46,7 +46,7 @@ def count_states(states: Tensor, categories: int, slot_mask: Tensor | None = Non
 
 
 class CountEmbedding(FluxModule):
-    """Counts of what is seen, beside what the prompt says, to one vector (B, H) that joins the condition.
+    """Counts of visible slots and the mean text token, to one vector (B, H) that joins the condition.
 
     Args:
         categories: K = C + 1.

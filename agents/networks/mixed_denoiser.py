@@ -83,7 +83,7 @@ class MixedDenoiser(nn.Module):
         if self.drops_empty and not categories.only_absorbs:
             raise InvalidInputError(
                 f"empty_slots='dropped' needs a kernel that only absorbs, not {categories.schedule.name!r}: "
-                "what is seen to be empty must be empty; take kernel='early_absorbing'"
+                "a slot that is visibly empty must be empty; take kernel='early_absorbing'"
             )
         by_category = poses.preconditioning.by_category
         mean, std = (None, None) if by_category is None else by_category.given_state(categories)
@@ -169,7 +169,7 @@ class MixedDenoiser(nn.Module):
         return run_packed(present, run, (POSE_FEATURES, self.categories.categories))
 
     def _certain(self, states: Tensor) -> Tensor:
-        """(B, N, K) logits of categories that are what they are seen to be."""
+        """(B, N, K) logits that are certain of the category that a state shows."""
         count = self.categories.categories
         return _CERTAIN * (F.one_hot(states.clamp(max=count - 1), count).float() - 1.0)
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from agents.configuration.fields import composed, moved, named, nested
+from agents.configuration.fields import composed, named, nested
 from agents.configuration.shared_keys import SamplingKeys
 from agents.planning.gradient import GradientPlanner
 from agents.planning.registry import PlannerSettings, list_planners, planner_settings
@@ -61,7 +61,9 @@ class SearchConfig(BudgetKeys, SamplingKeys):
         planner: what chooses the next scenes.
     """
 
-    RENAMED: ClassVar[Mapping[str, str]] = moved("planner", "exploration", "parallel")
+    RENAMED: ClassVar[Mapping[str, str]] = {
+        key: f"planner.{key}, of planner=uct" for key in ("exploration", "parallel")
+    }
     """Keys of earlier versions, and their names."""
 
     branching: int = 4

@@ -66,8 +66,9 @@ class Table:
 _TEXT: dict[str, Any] = {"process.name": "mixed", "text.encoder": "vocabulary", "text.dropout": 0.1}
 
 _OF_SIZE = (
-    *("recipe", "network.hidden", "network.depth", "network.heads", "network.double_blocks", "network.embedding"),
-    *("network.pose_head", "optimizer.lr", "optimizer.warmup", "optimizer.decay_share"),
+    *("recipe", "iterations", "batch_size", "network.hidden", "network.depth", "network.heads"),
+    *("network.double_blocks", "network.embedding", "network.pose_head"),
+    *("optimizer.lr", "optimizer.warmup", "optimizer.decay_share"),
 )
 """Keys of a recipe that belong to a network and a run of another size."""
 

@@ -41,7 +41,7 @@ SIZES: dict[str, Size] = {
     "tiny": Size(3, 4, 60_000, 6, 2, 1, {"network.depth": 1, "network.heads": 2, "optimizer.warmup": 1}),
     "small": Size(600, 64, 700_000, 256, pretraining={"network.depth": 4, "network.heads": 4, "optimizer.warmup": 50}),
     "paper": Size(
-        100_000, 256, 88_300_000, 2000,
+        _PAPER["iterations"], _PAPER["batch_size"], 88_300_000, 2000,
         pretraining={**{key: _PAPER[key] for key in _OF_SIZE}, "optimizer.matmul_precision": "high"},
     ),
 }  # fmt: skip

@@ -108,7 +108,7 @@ class DenoisingEnv(SpecMixin, gym.Env[Any, np.ndarray]):
     | `slots` | `None` | slots per scene; `None` is the scene type's number, more is allowed |
     | `action_mode` | `"next_sample"` | or `"noise"` |
     | `max_action` | `10.0` | bound of the action space |
-    | `workers` | `0` | worker processes for physics in the reward; 0 computes in the calling process |
+    | `workers` | `0` | processes for physics in the reward; 0: in the calling process; `"ray"`: on a Ray cluster |
     | `render_mode` | `None` | `"rgb_array"` renders the decoded current scene |
     | `prompt` | `None` | one prompt, a list to draw from, or `"grammar"` for descriptions of the grammar's scenes |
     | `guidance` | `0.0` | weight of classifier-free guidance in `noise` mode; needs a prompt |

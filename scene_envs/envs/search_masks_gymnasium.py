@@ -49,6 +49,7 @@ class SearchMaskEnv(SearchEnv):
     | `regenerate` | `MultiBinary((K, N))` | slots that each mask regenerates |
     | `depth` | `Box(0, max_depth, (1,), int64)` | actions taken |
     | `value` | `Box(0, 1, (1,), float32)` | Φ of the scene, see Rewards |
+    | `prompt` | `Box(0, V-1, (L,), int64)` | tokens of the prompt, padded with 0; only if `prompt=` is given |
 
     `info` has the same keys as in `Search-v0`; `regenerate` is the number of slots that are in any mask.
 
@@ -89,7 +90,7 @@ class SearchMaskEnv(SearchEnv):
     | `slots` | `None` | slots per scene; `None` is the scene type's number, more is allowed |
     | `objective_scale` | `None` | objective at which Φ = 1; `None` is the largest it declares, else the free slots |
     | `max_nfe` | `None` | denoiser evaluations per episode; `None` is any number |
-    | `workers` | `0` | worker processes for physics in the objective; 0 computes in the calling process |
+    | `workers` | `0` | processes for physics in the objective; 0: in the calling process; `"ray"`: on a Ray cluster |
     | `render_mode` | `None` | `"rgb_array"`: pictures, masked objects in red; `"human"`: a page in the browser |
     | `prompt` | `None` | text that all scenes should satisfy, for priors that read prompts; the objective gets it too |
     | `guidance` | `0.0` | weight of classifier-free guidance, which doubles the NFE; needs a prompt |

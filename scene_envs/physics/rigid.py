@@ -1,4 +1,8 @@
-"""Rotations of many bodies at once in numpy, in PyBullet's quaternion order."""
+"""Rotations of many bodies at once in numpy, in PyBullet's quaternion order.
+
+Every row is computed by the same operations whatever the other rows are, so a scene settles to the same bits alone and
+in a batch. scipy's ``Rotation`` picks its formula per batch and promises no such thing.
+"""
 
 from __future__ import annotations
 

@@ -36,8 +36,16 @@ ARCHITECTURE = load(ROOT / "docs" / "site_files" / "architecture.py")
 ROW = {room: row for row, rooms in enumerate(ARCHITECTURE.ROWS) for room in rooms}
 
 
+CORE = {
+    f"scene_envs.{name}" for name in ("normalizer", "rotations", "scene", "scene_distance", "scene_facts", "supports")
+}
+"""Single files that the box of SceneBatch stands for."""
+
+
 def room_of(module: str) -> str | None:
-    """The box that a module is drawn in, None for single files at the top of ``scene_envs`` and of ``agents``."""
+    """The box that a module is drawn in, None for other single files at the top of ``scene_envs`` and of ``agents``."""
+    if module in CORE:
+        return "scene_envs.scene"
     return next((room for room in ROW if module == room or module.startswith(f"{room}.")), None)
 
 

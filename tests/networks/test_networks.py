@@ -214,7 +214,7 @@ def test_gradients_reach_every_parameter(name: str, process: str, text: bool) ->
     assert dead == []
 
 
-def test_a_tally_counts_what_is_seen_and_no_filling() -> None:
+def test_counts_of_states_leave_filling_out() -> None:
     states = torch.tensor([[0, 3, 3, 7, 8, 8], [8, 8, 1, 1, 1, 2]])  # 7 is empty, 8 the mask
     mask = torch.tensor([[True] * 6, [False, True, False, True, True, True]])
     expected = [[1, 0, 0, 2, 0, 0, 0, 2], [0, 2, 1, 0, 0, 0, 0, 1]]

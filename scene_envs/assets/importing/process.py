@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 from scene_envs.assets.importing.entries import AssetEntry
 from scene_envs.assets.importing.limits import seconds_left, timed, too_slow
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, SceneEnvsError
+from scene_envs.files import replacing
 
 if TYPE_CHECKING:
     from scene_envs.assets.base import Asset
@@ -76,9 +77,8 @@ def main(request: str, result: str) -> None:
             outcome = build_asset(path, entry)
     except SceneEnvsError as error:
         outcome = (type(error).__name__, str(error))
-    partial = Path(result).with_suffix(".partial")
-    partial.write_bytes(pickle.dumps(outcome))
-    partial.replace(result)
+    with replacing(result) as partial:
+        partial.write_bytes(pickle.dumps(outcome))
 
 
 if __name__ == "__main__":

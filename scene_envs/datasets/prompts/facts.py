@@ -10,10 +10,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_envs.datasets.prompts.supports import CONTACT, LARGEST_CONTACT, Contacts, Holding, Placed
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
+from scene_envs.supports import CONTACT, LARGEST_CONTACT, Contacts, Holding, Placed
 
 Array = NDArray[np.float64]
 

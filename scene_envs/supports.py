@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_envs.datasets.prompts.shapes import LibraryShapes, library_shapes
+from scene_envs.assets.support_shapes import LibraryShapes, library_shapes
 from scene_envs.scene_types import SceneType
 
 Array = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""Asset shapes for facts: extreme points, height of the upper side, hollows and tiers."""
+"""Shapes of assets for supports: extreme points, height of the upper side, hollows and tiers."""
 
 from __future__ import annotations
 
