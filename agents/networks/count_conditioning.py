@@ -51,9 +51,9 @@ class CountConditioning(FluxModule):
 
     A prompt asks for numbers: of objects, of cups, of whatever is named. Attention takes averages and learns exact
     numbers very slowly, so this module subtracts. The text gives the probability of each number of each kind of object
-    (:meth:`count_logits`, trained on the counts of the scenes). Numbers below the visible count are impossible. The mean
+    (:meth:`count_logits`, trained on the counts of scenes). Numbers below the visible count are impossible. The mean
     of the other numbers minus the visible count is the number still missing. The missing objects of a kind,
-    divided by the masked slots, estimate the probability that a masked slot is of that kind. The logits start from the
+    over the number of masked slots, estimate the probability that a masked slot is of that kind. The logits start from the
     logarithm of this probability, and a small network, the same for all kinds, corrects them. Sums are over slots, so
     that the network stays permutation-equivariant.
 
@@ -130,7 +130,7 @@ class CountConditioning(FluxModule):
 
 
 def still_to_come(logits: Tensor, visible: Tensor) -> Tensor:
-    """Expected number beyond the visible one, at least 0: logits (..., M) of the numbers 0..M-1, (...) visible to (...).
+    """Expected number beyond the visible one, 0 at least: (..., M) logits of 0..M-1 and (...) visible to (...).
 
     >>> still_to_come(torch.tensor([[0.0, 0.0, 0.0, 0.0]]), torch.tensor([1.0]))  # 1, 2 or 3, as likely
     tensor([1.])

@@ -57,7 +57,7 @@ class SearchConfig(BudgetKeys, SamplingKeys):
         prompt: what all scenes should hold, for priors that read prompts; the objective sees it too. null for anything.
         num_steps: denoiser evaluations per scene.
         slots: slots per scene; null takes the scene type's.
-        seed: of the tree; the baseline's first scenes are those of the tree, unless the planner steers the denoising.
+        seed: of the search tree; the baseline has the tree's first scenes, unless the planner steers the denoising.
         planner: what chooses the next scenes.
     """
 

@@ -121,10 +121,10 @@ class ForwardProcessSettings(AlgorithmSettings):
     Attributes:
         updates: optimiser steps per batch.
         draws: timesteps and noises of every scene per optimiser step.
-        credit: of poses: ``scene`` gives every slot the scene's advantage, ``object`` its own (rewards with
+        credit: credit of poses: ``scene`` gives every slot the scene's advantage, ``object`` its own (rewards with
             ``per_object``), ``auto`` takes ``object`` where the reward allows it.
-        category_credit: of categories: ``scene`` for the scene's advantage, ``none`` to keep what is there, ``auto``
-            for ``none`` where poses have credit per object.
+        category_credit: credit of categories: ``scene`` for the scene's advantage, ``none`` to keep what is there,
+            ``auto`` for ``none`` where poses have credit per object.
         sampler_decay: of the weight average that samples, per iteration; rises from 0 to this.
         siblings: neighbouring scenes that share the first steps of their chain and are compared with each other; 1 for
             scenes that share nothing and are compared with the whole batch.

@@ -167,7 +167,7 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
             '["A scene with two cups.", "A scene with 9 objects."]', ``data`` for the prompts of the real scenes, or
             ``grammar`` for descriptions of the grammar's; null for anything.
         guidance: weight of classifier-free guidance in the policy, 0 for none; needs a prompt.
-        seed: of x_T, the chain's noise, the steps drawn and the real scenes.
+        seed: of the initial noise, the chain's noise, the steps drawn and the real scenes.
         algorithm: how rewards become a gradient.
         optimizer: of the weights.
         regularisation: on real scenes.
