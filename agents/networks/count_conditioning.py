@@ -52,8 +52,8 @@ class CountConditioning(FluxModule):
     A prompt asks for numbers: of objects, of cups, of whatever is named. Attention takes averages and learns exact
     numbers very slowly, so this module subtracts. The text gives the probability of each number of each kind of object
     (:meth:`count_logits`, trained on the counts of scenes). Numbers below the visible count are impossible. The mean
-    of the other numbers minus the visible count is the number still missing. The missing objects of a kind,
-    over the number of masked slots, estimate the probability that a masked slot is of that kind. The logits start from the
+    of the other numbers minus the visible count is the number still missing. The missing objects of a kind over the
+    number of masked slots estimate the probability that a masked slot is of that kind. The logits start from the
     logarithm of this probability, and a small network, the same for all kinds, corrects them. Sums are over slots, so
     that the network stays permutation-equivariant.
 
