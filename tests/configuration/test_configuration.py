@@ -18,6 +18,9 @@ from agents.cli.commands import COMMANDS
 from agents.cli.keys import compose, help_text, keys_of
 from agents.cli.sweep import expand_sweeps
 from agents.configuration import changed, config_text, dotted_values, group_options
+from agents.planning import list_planners
+from agents.planning.registry import planner_settings
+from agents.post_training.algorithms import algorithm_settings, list_algorithms
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -81,6 +84,14 @@ def test_groups_have_a_dozen_keys_at_most(kind: type) -> None:
     groups = [value for value in vars(kind()).values() if dataclasses.is_dataclass(value)]
     assert len(groups) >= 5
     assert all(len(dataclasses.fields(group)) <= 12 for group in groups)
+
+
+def test_components_have_a_dozen_settings_at_most_beside_their_name() -> None:
+    kinds = [algorithm_settings(name) for name in list_algorithms()]
+    kinds += [planner_settings(name) for name in list_planners()]
+    assert len(kinds) >= 15
+    own = {kind.__name__: {field.name for field in dataclasses.fields(kind)} - {"name"} for kind in kinds}
+    assert {name: len(keys) for name, keys in own.items() if len(keys) > 12} == {}
 
 
 @pytest.mark.parametrize("command", COMMANDS)
