@@ -41,13 +41,13 @@ class PretrainConfig(SceneKeys, TrainingKeys):
     Keys that are not listed are those of :class:`~agents.configuration.TrainingKeys`.
 
     Attributes:
-        scene: scene type; with several datasets it is their union, and this key is not read.
+        scene: scene type. This key is not read with several datasets, which make their union, nor with prior=.
         data: dataset directory of training scenes; several, joined by commas, train one prior on all their scene
             types with equal chances; ``grammar`` stands for fresh scenes of the grammar without end.
         heldout: dataset directory of held-out scenes; empty takes the last 2 % of ``data``, or 512 of the grammar;
             with several datasets it must be empty.
-        prior: shipped name, or folder of a prior or a run, that training starts from, whatever the keys of its size
-            and kind say; empty for a fresh one.
+        prior: shipped name, or folder of a prior or a run, that training starts from; its scene type, network, process
+            and text stay as they are. Empty for a fresh one.
         output: run directory; an interrupted run in it goes on where it stopped; empty for runs/COMMAND-TIME on the
             command line, runs/pretrain in Python.
         iterations: optimiser steps.

@@ -69,15 +69,14 @@ def _started(config: PretrainConfig, raw: Tensor, prompts: Sequence[Sequence[str
     Its vocabulary stays as it is; words of ``prompts`` that it lacks are listed in a warning.
 
     Raises:
-        InvalidInputError: its scene type, its slots or its reading of prompts are not those of the run, or what it
-            takes as constant varies in the scenes.
+        InvalidInputError: its scene type or its slots are not those of the data, or what it takes as constant varies in
+            the scenes.
     """
     slots = raw.shape[1]
     prior = ScenePrior.load(config.prior)
-    found = (prior.scene_type.name, prior.config.slots, prior.conditional)
-    expected = (config.scene, slots, config.text.is_read)
+    found, expected = (prior.scene_type.name, prior.config.slots), (config.scene, slots)
     if found != expected:
-        names = ("scene type", "slots", "text")
+        names = ("scene type", "slots")
         wrong = ", ".join(f"{n} {f!r}, not {a!r}" for n, f, a in zip(names, found, expected, strict=True) if f != a)
         raise InvalidInputError(f"the prior {config.prior!r} cannot be trained further on this data: it has {wrong}")
     _check_constants(prior, raw[:FITTED_ON, len(prior.scene_type.fixed) :], config.prior)

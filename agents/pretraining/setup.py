@@ -12,6 +12,7 @@ from agents.pretraining.config import PretrainConfig
 from agents.pretraining.data import PROMPTS_PER_SCENE, GrammarStream, SceneTable, TrainingData, UnionTable
 from agents.pretraining.initial_prior import FITTED_ON, build_prior
 from agents.priors.base import ScenePrior
+from agents.priors.facts import PriorFacts
 from scene_envs.datasets import SceneDataset, to_union
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.datasets.ranges import fixed_normalizer
@@ -28,15 +29,18 @@ _HELD_OUT = 512
 
 
 def prepare(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
-    """A fresh prior, its training scenes, and held-out scenes (K, N, D)."""
+    """The prior that a run starts from, its training scenes, and held-out scenes (K, N, D).
+
+    A run from an older prior has the scene type of its data, or of the prior where a grammar makes the data.
+    """
+    older = _older(config) if config.prior else None
     if config.data == "grammar":
+        if older is not None:
+            config = replace(config, scene=older.scene_type)
         grammar = get_grammar(config.scene)
         sample = grammar.sample(np.random.default_rng([config.seed, _SAMPLE]), _SAMPLE)
-        prompts = (
-            describe_all(sample, np.random.default_rng(config.seed), count=PROMPTS_PER_SCENE)
-            if config.text.is_read
-            else []
-        )
+        reads = config.text.is_read if older is None else bool(older.text)
+        prompts = describe_all(sample, np.random.default_rng(config.seed), count=PROMPTS_PER_SCENE) if reads else []
         prior = build_prior(config, sample.tensor, fixed_normalizer(grammar), prompts)
         if config.heldout:
             held_out = SceneBatch(SceneDataset.load(config.heldout).tensor[:2048], prior.scene_type)
@@ -46,9 +50,22 @@ def prepare(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
     if "," in config.data:
         return _prepare_union(config)
     dataset = SceneDataset.load(config.data)
+    if older is not None:
+        config = replace(config, scene=dataset.scene_type.name)
     if config.heldout:
         return prepare_from(config, dataset, SceneDataset.load(config.heldout))
     return prepare_from(config, *split_heldout(dataset))
+
+
+def _older(config: PretrainConfig) -> PriorFacts:
+    """The prior that the run starts from; raises InvalidInputError where it does not read the text asked for."""
+    older = PriorFacts.of(config.prior)
+    if config.text.is_read and not older.text:
+        raise InvalidInputError(
+            f"text={config.text.encoder} with prior={config.prior!r}, which reads no prompts; leave text= out, or "
+            "train a fresh prior"
+        )
+    return older
 
 
 def split_heldout(dataset: SceneDataset) -> tuple[SceneDataset, SceneDataset]:

@@ -17,6 +17,7 @@ from agents.pretraining.data import SceneTable
 from agents.pretraining.initial_prior import build_prior
 from agents.pretraining.setup import prepare
 from agents.pretraining.trainer import Pretrainer, learning_rate_at
+from agents.priors.testing import tiny_prior
 from agents.utils.seeds import derived_generator
 from agents.utils.weight_average import WeightAverage
 from scene_envs.datasets import generate
@@ -178,6 +179,28 @@ def test_masks_of_empty_slots_are_those_of_the_run_also_where_an_older_prior_is_
     further = replace(config, prior=str(Path(config.output) / "older"), loss={"open_empty_share": 0.25})
     shares = [vars(build_prior(c, raw, Normalizer.fit(raw)).config)["open_empty_share"] for c in (config, further)]
     assert shares == [0.5, 0.25]
+
+
+@pytest.mark.slow
+def test_a_prior_trained_further_reads_its_prompts_of_the_grammar() -> None:
+    prior, scenes, _ = prepare(PretrainConfig(prior="dimsum_table", data="grammar"))
+    assert prior.conditional
+    assert all(scenes.draw(2, torch.Generator().manual_seed(0), prompts=True)[1])
+
+
+def test_a_prior_trained_further_has_the_scene_type_of_its_data_and_reads_its_prompts(tmp_path: Path) -> None:
+    data = generate("living_room_shelf", 4, tmp_path, workers=0, progress=False).output
+    prior, scenes, _ = prepare(PretrainConfig(prior="living_room_shelf", data=str(data)))
+    assert (prior.scene_type.name, prior.conditional) == ("living_room_shelf", True)
+    assert all(scenes.draw(2, torch.Generator().manual_seed(0), prompts=True)[1])
+    with pytest.raises(InvalidInputError, match="it has scene type 'dimsum_table', not 'living_room_shelf'"):
+        prepare(PretrainConfig(prior="dimsum_table", data=str(data)))
+
+
+def test_text_that_an_older_prior_does_not_read_is_refused(tmp_path: Path) -> None:
+    tiny_prior("living_room_shelf", process="mixed").save(tmp_path / "older")
+    with pytest.raises(InvalidInputError, match="which reads no prompts; leave text= out"):
+        prepare(PretrainConfig(prior=str(tmp_path / "older"), data="grammar", text="vocabulary"))
 
 
 @pytest.mark.slow
