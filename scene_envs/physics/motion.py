@@ -133,7 +133,7 @@ def motion(
         moved = advance(physics, objects[rows], pairs.among(rows), rest[rows], duration, budgets[scene], tilt=tilt)
         if budgets[scene].is_spent or not moved.is_finite:
             why = "diverged" if not moved.is_finite else "takes more work than a scene may"
-            _LOGGER.warning("the simulation of a scene %s; its row is invalid", why)
+            _LOGGER.warning("the simulation of a scene %s; it was ended", why)
             lost.append(int(scene))
             continue
         displacement[rows] = np.linalg.norm(moved.translation - objects.translation[rows], axis=1)
