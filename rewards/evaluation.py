@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import linecache
 import logging
+import os
 from collections.abc import Mapping
 from contextlib import nullcontext
 from functools import partial
@@ -80,7 +81,7 @@ def reward_scorer(reward: Any) -> SceneScorer:
 def _evaluate(reward: Any, batch: SceneBatch, context: RewardContext) -> RewardOutput:
     name = reward_name(reward)
     version = batch.tensor._version
-    own = is_own(reward)
+    own, process = is_own(reward), os.getpid()
     before = None if own else batch.tensor.clone()
     try:
         with torch.no_grad(), nullcontext() if own else seeded_generators(context.seed, batch):
@@ -93,6 +94,9 @@ def _evaluate(reward: Any, batch: SceneBatch, context: RewardContext) -> RewardO
         ) from error
     except BaseException as error:
         raise RewardError(f"reward {name!r} raised {describe_error(error)}{_place(error.__traceback__)}") from error
+    finally:
+        if os.getpid() != process:  # a copy of this process that the reward forked: it must not go on with the run
+            os._exit(0)
     if batch.tensor._version != version or not (before is None or torch.equal(before, batch.tensor)):
         raise RewardError(f"reward {name!r} changed the scenes it was given; work on a clone of batch.tensor")
     return _checked(name, output, batch)
