@@ -67,6 +67,35 @@ def rewrites(batch):
     return batch.counts
 
 
+def shrinks(batch):
+    batch.tensor.resize_(0)
+    return torch.ones(2)
+
+
+def has_few(batch):
+    return batch.counts.float().to_sparse()
+
+
+def complex_numbers(batch):
+    return torch.ones(len(batch), dtype=torch.complex64)
+
+
+class Unnamed(type):
+    """A class whose name cannot be read."""
+
+    @property
+    def __name__(cls):
+        raise RuntimeError("no name")
+
+
+class Nameless(Exception, metaclass=Unnamed):
+    """An error whose type cannot be named."""
+
+
+def nameless(batch):
+    raise Nameless("x")
+
+
 class DrawsWhenMade:
     """A reward whose weight is random, as is that of its file."""
 

@@ -34,6 +34,10 @@ FILE = Path(hostile.__file__)
         (hostile.talks, r"'talks' raised ValueError: x+\.\.\. \(1048576 characters\).*hostile_rewards.py, line \d+"),
         (hostile.mumbles, r"'mumbles' raised Unspeakable: \(its text cannot be read\)"),
         (hostile.rewrites, r"'rewrites' changed the scenes"),
+        (hostile.shrinks, r"'shrinks' changed the scenes"),
+        (hostile.has_few, r"'has_few': value is torch.sparse_coo; use .to_dense"),
+        (hostile.complex_numbers, r"'complex_numbers': value has dtype torch.complex64, expected a float"),
+        (hostile.nameless, r"'nameless' raised Nameless: x"),
     ],
 )
 def test_a_hostile_reward_in_this_process_is_invalid_in_one_short_sentence(reward, message, cups):
@@ -41,7 +45,9 @@ def test_a_hostile_reward_in_this_process_is_invalid_in_one_short_sentence(rewar
         evaluate_reward(resolve_reward(reward), cups, strict=True)
     assert len(str(caught.value)) < 700
     assert str(caught.value).count(reward.__name__) == 1
+    before = cups.tensor.clone()
     assert evaluate_reward(resolve_reward(reward), cups).valid.tolist() == [False, False]
+    assert torch.equal(cups.tensor, before)
 
 
 def test_ctrl_c_is_not_taken_for_a_failure(cups):
@@ -52,9 +58,10 @@ def test_ctrl_c_is_not_taken_for_a_failure(cups):
         evaluate_reward(interrupted, cups)
 
 
-def test_check_reward_sees_what_is_written_through_numpy():
+@pytest.mark.parametrize("reward", [hostile.rewrites, hostile.shrinks])
+def test_check_reward_sees_what_is_written_through_numpy(reward):
     with pytest.raises(RewardError, match="changed the scenes"):
-        check_reward(hostile.rewrites)
+        check_reward(reward)
 
 
 def test_global_generators_are_seeded_from_the_run_and_left_as_they_were(cups):
