@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import linecache
 import logging
+import os
 from collections.abc import Mapping
 from contextlib import nullcontext
 from functools import partial
@@ -80,11 +81,11 @@ def reward_scorer(reward: Any) -> SceneScorer:
 def _evaluate(reward: Any, batch: SceneBatch, context: RewardContext) -> RewardOutput:
     name = reward_name(reward)
     version = batch.tensor._version
-    own = is_own(reward)
-    before = None if own else batch.tensor.clone()
+    own, process = is_own(reward), os.getpid()
+    given = batch if own else SceneBatch(batch.tensor.clone(), batch.scene_type)  # foreign code gets a copy
     try:
         with torch.no_grad(), nullcontext() if own else seeded_generators(context.seed, batch):
-            output = as_output(reward(batch, context))
+            output = as_output(reward(given, context))
     except (RewardError, KeyboardInterrupt):
         raise
     except SystemExit as error:
@@ -93,7 +94,10 @@ def _evaluate(reward: Any, batch: SceneBatch, context: RewardContext) -> RewardO
         ) from error
     except BaseException as error:
         raise RewardError(f"reward {name!r} raised {describe_error(error)}{_place(error.__traceback__)}") from error
-    if batch.tensor._version != version or not (before is None or torch.equal(before, batch.tensor)):
+    finally:
+        if os.getpid() != process:  # a copy of this process that the reward forked: it must not go on with the run
+            os._exit(0)
+    if batch.tensor._version != version or not (own or torch.equal(given.tensor, batch.tensor)):
         raise RewardError(f"reward {name!r} changed the scenes it was given; work on a clone of batch.tensor")
     return _checked(name, output, batch)
 
@@ -105,7 +109,8 @@ def describe_error(error: BaseException) -> str:
     ('ValueError: no', True)
     """
     text = _text(error)
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+    name = type.__dict__["__name__"].__get__(type(error))  # whatever its metaclass says
+    return f"{name}: {text}" if text else str(name)
 
 
 def _text(error: BaseException) -> str:
@@ -173,6 +178,8 @@ def _check_tensor(name: str, field: str, tensor: Any, shape: tuple[int, ...], de
     if tuple(tensor.shape) != shape:
         meaning = "(B,) = one number per scene" if len(shape) == 1 else "(B, N) = one entry per slot"
         raise RewardError(f"reward {name!r}: {field} has shape {tuple(tensor.shape)}, expected {shape}, {meaning}")
+    if tensor.layout != torch.strided:
+        raise RewardError(f"reward {name!r}: {field} is {tensor.layout}; use .to_dense()")
     if tensor.device != device:
         raise RewardError(f"reward {name!r}: {field} is on {tensor.device}, the scenes are on {device}")
 

@@ -47,7 +47,8 @@ def as_output(result: Any) -> Any:
     """A bare tensor as a RewardOutput, whole numbers as floats; anything else as it is."""
     if not isinstance(result, Tensor):
         return result
-    return RewardOutput(result if result.is_floating_point() else result.to(torch.float32))
+    is_whole = not result.is_floating_point() and not result.is_complex()
+    return RewardOutput(result.to(torch.float32) if is_whole else result)
 
 
 def _accepts(function: Callable[..., Any], count: int, settings: Mapping[str, Any], name: str) -> bool:

@@ -20,7 +20,7 @@ from rewards.registry import (
     reward_name,
 )
 from rewards.reward_process import RewardProcess, unpacked
-from rewards.seeding import current_draw
+from rewards.seeding import current_draw, seeded_generators
 from scene_envs.errors import InvalidInputError, SceneEnvsError
 from scene_envs.scene import SceneBatch
 
@@ -97,7 +97,7 @@ class IsolatedReward:
         if self._worker is None or not self._worker.alive:
             self._worker = RewardProcess(self.name, self.timeout, self.memory)
             try:
-                message = ("make", self._reward, allowed_targets(), allowed_files(), self.workers)
+                message = ("make", self._reward, allowed_targets(), allowed_files(), self.workers, self.seed)
                 self.depends_on_batch, self.averages_objects = map(bool, self._worker.ask(message, self.timeout))
             except BaseException:
                 self.close()
@@ -114,7 +114,8 @@ class SeededReward:
     """
 
     def __init__(self, reward: Any, seed: int) -> None:
-        self.reward = resolve_reward(reward)
+        with seeded_generators(seed):
+            self.reward = resolve_reward(reward)
         self.name = reward_name(self.reward)
         self.depends_on_batch = depends_on_batch(self.reward)
         self.averages_objects = averages_objects(self.reward)
@@ -145,7 +146,8 @@ def run_reward(reward: Any, *, seed: int = 0, timeout: float = 60.0, memory: flo
     check_limits(timeout, memory)
     if is_foreign(reward):
         return IsolatedReward(reward, timeout=timeout, memory=memory, seed=seed, workers=workers)
-    resolved = resolve_reward(reward)
+    with seeded_generators(seed):
+        resolved = resolve_reward(reward)
     return resolved if isinstance(reward, str) and is_own(resolved) else SeededReward(resolved, seed)
 
 

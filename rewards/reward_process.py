@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
-import pickle
 import signal
 import subprocess
-import sys
 import threading
 import weakref
 from collections.abc import Mapping
@@ -19,9 +17,12 @@ import torch
 
 from rewards.base import RewardOutput
 from scene_envs.errors import InvalidInputError, RewardError, SceneEnvsError, UnknownNameError
+from scene_envs.worker_processes import module_command, module_environment
 
 _START_UP = 120.0
 """Seconds that an empty worker may take to start."""
+_MOST_TEXT = 2000
+"""Characters of an error that the process tells."""
 _ERRORS: dict[str, type[SceneEnvsError]] = {
     kind.__name__: kind for kind in (InvalidInputError, UnknownNameError, RewardError)
 }
@@ -41,16 +42,16 @@ class RewardProcess:
 
     def __init__(self, name: str, timeout: float, memory: float) -> None:
         self.name, self.memory = name, memory
+        self._asked = 0
         self.alive = True
         child_reads, parent_writes = os.pipe()
         parent_reads, child_writes = os.pipe()
-        path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
         limits = [str(timeout), str(int(memory * 2**30)), str(torch.get_num_threads())]
         try:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "rewards.worker", str(child_reads), str(child_writes), *limits],
+                module_command("rewards.worker", str(child_reads), str(child_writes), *limits),
                 pass_fds=(child_reads, child_writes),
-                env=os.environ | {"PYTHONPATH": path, "PYTHONHASHSEED": "0"},
+                env=module_environment() | {"PYTHONHASHSEED": "0"},
                 stdin=subprocess.DEVNULL,
                 stdout=2,  # what a reward prints is no output of ours
                 start_new_session=True,
@@ -61,18 +62,19 @@ class RewardProcess:
         self.outbox = Connection(parent_writes, readable=False)
         self.inbox = Connection(parent_reads, writable=False)
         self._end = weakref.finalize(self, _end, self.process, self.outbox, self.inbox)
-        self._receive("started", _START_UP)
+        self._receive(None, _START_UP)
 
-    def ask(self, message: Any, timeout: float) -> Any:
+    def ask(self, message: tuple[Any, ...], timeout: float) -> Any:
         """The answer to a message; a worker that gives none within ``timeout`` seconds is ended."""
-        return self._receive(message, timeout)
+        self._asked += 1
+        return self._receive((self._asked, *message), timeout)
 
     def stop(self) -> None:
         """End the process and all that it started, and close the pipes."""
         self.alive = False
         self._end()
 
-    def _receive(self, message: Any, timeout: float) -> Any:
+    def _receive(self, message: tuple[Any, ...] | None, timeout: float) -> Any:
         late = threading.Event()
 
         def end() -> None:  # a process that hangs neither reads nor writes: only its end unblocks this one
@@ -83,12 +85,20 @@ class RewardProcess:
         clock.daemon = True
         clock.start()
         try:
-            if message != "started":
+            if message is not None:
                 self.outbox.send(message)
-            kind, body = self.inbox.recv()
-        except (EOFError, OSError, pickle.UnpicklingError):
+            number, kind, body = self.inbox.recv()
+            if number != self._asked or kind not in ("done", "failed"):
+                raise ValueError(number)
+        except (EOFError, OSError):
             self.stop()
             raise RewardError(f"reward {self.name!r} {self._how_it_ended(late.is_set(), timeout)}") from None
+        except Exception:
+            self.stop()
+            raise RewardError(
+                f"reward {self.name!r} disturbed the answers of its process, which was ended; a reward may write to no "
+                "file descriptor that it did not open"
+            ) from None
         except BaseException:
             self.stop()
             raise
@@ -97,7 +107,7 @@ class RewardProcess:
         if kind == "done":
             return body
         error, text = body
-        raise _ERRORS.get(error, RewardError)(text)
+        raise _ERRORS.get(error, RewardError)(str(text)[:_MOST_TEXT])
 
     def _how_it_ended(self, late: bool, timeout: float) -> str:
         status = self.process.returncode

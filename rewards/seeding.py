@@ -17,7 +17,7 @@ _local = threading.local()
 
 
 @contextmanager
-def seeded_generators(seed: int, batch: SceneBatch) -> Iterator[None]:
+def seeded_generators(seed: int, batch: SceneBatch | None = None) -> Iterator[None]:
     """Context in which the generators of torch (CPU), NumPy and Python start from a seed of their own.
 
     The seed hangs on ``seed`` and on the scenes alone: the same scenes meet the same numbers in every call, in every
@@ -25,10 +25,11 @@ def seeded_generators(seed: int, batch: SceneBatch) -> Iterator[None]:
 
     Args:
         seed: of the run.
-        batch: the scenes that are scored.
+        batch: the scenes that are scored; None while the reward is made.
     """
     states = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
-    digest = hashlib.blake2b(batch.tensor.detach().cpu().contiguous().numpy().tobytes(), digest_size=8)
+    scenes = b"" if batch is None else batch.tensor.detach().cpu().contiguous().numpy().tobytes()
+    digest = hashlib.blake2b(scenes, digest_size=8)
     digest.update(f"{seed} {current_draw()}".encode())
     number = int.from_bytes(digest.digest(), "little")
     torch.default_generator.manual_seed(number >> 1)

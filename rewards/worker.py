@@ -22,7 +22,7 @@ from rewards.evaluation import describe_error, evaluate_reward
 from rewards.local_files import allow_local_rewards
 from rewards.registry import RewardInfo, allow_reward_targets, resolve_reward, reward_info
 from rewards.reward_process import packed
-from rewards.seeding import other_draw
+from rewards.seeding import other_draw, seeded_generators
 from scene_envs.errors import SceneEnvsError
 from scene_envs.physics import PhysicsPool
 from scene_envs.scene import SceneBatch
@@ -34,11 +34,11 @@ _GRACE = 5
 
 def serve(inbox: Connection, outbox: Connection, timeout: float) -> None:
     """Answer messages until the other end closes."""
-    answer = _Answers()
-    outbox.send(("done", None))
+    answer, process = _Answers(), os.getpid()
+    outbox.send((0, "done", None))
     while True:
         try:
-            kind, *body = inbox.recv()
+            number, kind, *body = inbox.recv()
         except EOFError:
             return
         signal.setitimer(signal.ITIMER_REAL, timeout + _GRACE)  # the default action ends even what holds the GIL
@@ -51,8 +51,10 @@ def serve(inbox: Connection, outbox: Connection, timeout: float) -> None:
             reply = ("failed", (type(error).__name__, f"{error}{hint}"))
         except BaseException as error:
             reply = ("failed", ("RewardError", f"the reward raised {describe_error(error)}"))
+        if os.getpid() != process:  # a copy that the reward forked and that came back here: one alone answers
+            os._exit(0)
         signal.setitimer(signal.ITIMER_REAL, 0)
-        outbox.send(reply)
+        outbox.send((number, *reply))
 
 
 def _lacked_memory(error: BaseException) -> bool:
@@ -67,13 +69,17 @@ class _Answers:
         self.reward: Any = None
         self.pool: PhysicsPool | None = None
 
-    def make(self, reward: Any, targets: list[str], files: list[Any], workers: int) -> tuple[bool, bool]:
-        """Make the reward; returns whether it depends on the batch, and whether it averages objects."""
+    def make(self, reward: Any, targets: list[str], files: list[Any], workers: int, seed: int) -> tuple[bool, bool]:
+        """Make the reward, with generators seeded from the run's.
+
+        Returns whether it depends on the batch, and whether it averages objects.
+        """
         for target in targets:
             allow_reward_targets(target)
         for file in files:
             allow_local_rewards(file)
-        self.reward = resolve_reward(reward)
+        with seeded_generators(seed):
+            self.reward = resolve_reward(reward)
         self.pool = PhysicsPool(workers=workers) if workers else None
         return depends_on_batch(self.reward), averages_objects(self.reward)
 

@@ -95,7 +95,11 @@ class Normalizer:
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> Normalizer:
-        """Inverse of :meth:`state`."""
+        """Inverse of :meth:`state`.
+
+        Raises:
+            InvalidInputError: an entry is missing, or the four are not finite numbers, one of each for a feature.
+        """
         try:
             params = state["params"]
             stats = params["input_stats"]
@@ -104,4 +108,17 @@ class Normalizer:
             raise InvalidInputError(
                 f"normalizer_state lacks {error}; it needs params.scale, .min, .input_stats"
             ) from error
-        return cls(*(torch.tensor(v, dtype=torch.float32) for v in vectors))
+        try:
+            scale, offset, low, high = (torch.tensor(vector, dtype=torch.float32) for vector in vectors)
+        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+            raise InvalidInputError(f"normalizer_state holds what are no numbers: {str(error)[:200]}") from error
+        shapes = {tuple(vector.shape) for vector in (scale, offset, low, high)}
+        if len(shapes) > 1 or scale.ndim != 1 or not all(map(_is_finite, (scale, offset, low, high))):
+            raise InvalidInputError(
+                f"normalizer_state needs four lists of as many finite numbers, it has shapes {sorted(shapes)}"
+            )
+        return cls(scale, offset, low, high)
+
+
+def _is_finite(vector: Tensor) -> bool:
+    return bool(torch.isfinite(vector).all())

@@ -86,6 +86,7 @@ def _guarded(words: list[str], work: Callable[[list[str]], int]) -> int:
     signals: list[int] = []
     try:
         with terminable(signals):
+            _check_text(words)
             return work(words)
     except Terminated:
         return _ended(TERMINATED)
@@ -104,6 +105,13 @@ def _guarded(words: list[str], work: Callable[[list[str]], int]) -> int:
         if signals and not isinstance(error, StorageError | TrainingError):  # some code turns it into another error
             return _ended(TERMINATED)
         return _complain(*_verdict(error))
+
+
+def _check_text(words: Sequence[str]) -> None:
+    """Refuse words that no file can keep as text, such as names of files in another encoding."""
+    for word in words:
+        if not word.isprintable() and ("\0" in word or word.encode(errors="replace").decode() != word):
+            raise InvalidInputError(f"{ascii(word)[:200]} is no text in UTF-8; give files and folders another name")
 
 
 def _ended(status: int) -> int:

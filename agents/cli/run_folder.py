@@ -31,6 +31,16 @@ _RESULTS = (
     "viewer.html",
 )
 """Files that a command must not write over, unless they are its own."""
+_PARTS = (
+    "export.json",
+    "search.journal",
+    "log.csv",
+    "real_scenes.safetensors",
+    "adapter.safetensors",
+    "prior",
+    "clutter",
+)
+"""What a command that was ended early leaves of its results, in a folder that has its log."""
 _RESUMES = {
     "generate": "metadata.json",
     "pretrain": "checkpoint.pt",
@@ -38,7 +48,7 @@ _RESUMES = {
     "search": "best.safetensors",
 }
 """Commands that go on with what a run from Python left, and the file that says so."""
-_OWN_RULE = ("generate", "pretrain", "post-train", "search", "doctor", "demo", "evaluate")
+_OWN_RULE = ("generate", "pretrain", "post-train", "search", "demo", "evaluate")
 """Commands that compare their keys with what is there themselves, as do programs whose settings say
 ``compares_keys``."""
 _MAY_DIFFER = (
@@ -109,9 +119,13 @@ class Run:
     def _check_folder(self) -> bool:
         """Whether the folder holds results of this command; refuses those of another, or of other keys."""
         found = [name for name in _RESULTS if (self.directory / name).exists()]
+        writer = _writer(self.directory)
+        if not found and writer == self.command:
+            return False
+        if writer is not None:
+            found += [name for name in _PARTS if (self.directory / name).exists()]
         if not found:
             return False
-        writer = _writer(self.directory)
         if writer is None and _RESUMES.get(self.command) in found:
             return True
         if writer != self.command:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from scene_envs.errors import InvalidInputError, unknown_name
 
@@ -41,3 +42,25 @@ def one_of(settings: Any, name: str, known: Sequence[str], what: str = "") -> No
     """Refuse a word that is not known, as ``what``; the nearest known one is offered."""
     if getattr(settings, name) not in known:
         raise unknown_name(what or name, str(getattr(settings, name)), known)
+
+
+def check_types(kind: type, values: Mapping[str, Any]) -> None:
+    """Refuse values of the wrong type for the fields of a dataclass that are numbers, texts or booleans.
+
+    Raises:
+        InvalidInputError: a value of another type; names the field.
+
+    >>> from dataclasses import make_dataclass
+    >>> check_types(make_dataclass("Size", [("depth", int)]), {"depth": "deep"})
+    Traceback (most recent call last):
+    scene_envs.errors.InvalidInputError: depth='deep' must be of type int
+    """
+    for name, wanted in get_type_hints(kind).items():
+        plain = set(get_args(wanted) if get_origin(wanted) in (Union, UnionType) else (wanted,))
+        if name not in values or not plain <= {int, float, str, bool, NoneType}:
+            continue
+        value = values[name]
+        fits = any(type(value) is one or (one is float and type(value) is int) for one in plain)
+        if not fits or (isinstance(value, float) and not math.isfinite(value)):
+            told = " or ".join(sorted("null" if one is NoneType else one.__name__ for one in plain))
+            raise InvalidInputError(f"{name}={str(value)[:100]!r} must be of type {told}")

@@ -100,9 +100,13 @@ class Preconditioning:
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> Preconditioning:
-        """Inverse of :meth:`state`; raises KeyError on a missing entry."""
+        """Inverse of :meth:`state`; raises KeyError on a missing entry, ValueError where they cannot be moments."""
         own = state.get("by_category")
         by_category = (
             None if own is None else CategoryMoments(*(torch.tensor(own[k]) for k in ("share", "mean", "std")))
         )
-        return cls(torch.tensor(state["mean"]), torch.tensor(state["std"]), by_category)
+        mean, std = (torch.tensor(state[key], dtype=torch.float32) for key in ("mean", "std"))
+        known = [mean, std, *([] if by_category is None else (by_category.share, by_category.mean, by_category.std))]
+        if mean.shape != std.shape or mean.ndim != 1 or not all(bool(torch.isfinite(part).all()) for part in known):
+            raise ValueError("the moments of the preconditioning are not as many finite numbers")
+        return cls(mean, std, by_category)

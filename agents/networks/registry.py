@@ -8,6 +8,7 @@ from typing import Any
 
 from torch import nn
 
+from agents.configuration.checks import check_types
 from agents.networks.diffuscene import DiffuScene, DiffuSceneConfig, MixedDiffuScene, MixedDiffuSceneConfig
 from agents.networks.flux import FluxConfig, FluxDenoiser
 from agents.networks.flux_modules import ModuleConfig
@@ -220,6 +221,7 @@ def config_from_state(state: Mapping[str, Any], process: str) -> NetworkConfig:
         raise InvalidInputError(
             f"the configuration of a {process} {name} network has unknown fields {strange} and lacks {missing}"
         )
+    check_types(kind, values)
     config: NetworkConfig = kind(**values)
     return config
 

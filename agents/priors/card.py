@@ -6,19 +6,24 @@ import json
 import math
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from agents.configuration.prior_names import CONFIG_NAME
 from agents.priors.facts import PriorFacts
 from agents.priors.files import read_config, write_config
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.files import read_sealed, write_text
+from scene_envs.folders import claimed
 
 if TYPE_CHECKING:
     from agents.priors.base import ScenePrior
 
 README = "README.md"
+_TITLE = "# Prior `"
+"""What the first line of a model card starts with."""
 OWN_LICENSE = "MIT, as this package, whose grammars and assets made the scenes."
 """Of the data of priors that were trained on what ``scene-envs generate`` makes."""
 _OPTIMIZERS = {"adamw": "AdamW", "muon": "Muon and AdamW"}
@@ -39,7 +44,7 @@ def package_prior(
 
     Args:
         source: name, prior directory or run directory; a run's metrics tell how it was trained.
-        output: the folder; its name is the prior's. Files of an earlier prior in it are replaced.
+        output: the folder; its name is the prior's. An earlier packaged prior in it is replaced.
         evaluation: ``metrics.json`` of ``scene-envs evaluate``, or the folder it is in; None for a prior that was not
             measured.
         precision: of the weights, ``"float16"`` or ``"float32"``.
@@ -49,10 +54,13 @@ def package_prior(
         limits: what it is not good at, in sentences.
 
     Raises:
-        InvalidInputError: no such evaluation, or a weight that half precision cannot hold.
+        InvalidInputError: no such evaluation, a weight that half precision cannot hold, or a folder that holds
+            anything but a packaged prior.
         CorruptFileError: the evaluation is not what the command writes.
     """
     from agents.priors.base import ScenePrior
+
+    _check_folder(Path(output))
 
     measures = {} if evaluation is None else read_measures(evaluation)
     prior = ScenePrior.load(source)
@@ -65,12 +73,30 @@ def package_prior(
     if measures:
         prior.card["measures"] = measures
     try:
-        folder = prior.save(output, precision=precision)
-        write_config(folder, _without_folders(read_config(folder)))
-        write_text(folder / README, card_page(folder.name, prior, PriorFacts.of(folder)))
+        with claimed(output, "the packaging of a prior"):
+            _check_folder(Path(output))
+            folder = prior.save(output, precision=precision)
+            write_config(folder, _without_folders(read_config(folder)))
+            write_text(folder / README, card_page(folder.name, prior, PriorFacts.of(folder)))
     finally:
         prior.card = kept
     return folder
+
+
+def _check_folder(folder: Path) -> None:
+    """Refuse a folder that holds a run, a dataset or a prior that was not packaged."""
+    if not folder.is_dir():
+        return
+    found = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+    if not found:
+        return
+    runs = [name for name in found if name in ("config.yaml", "metadata.json", "checkpoint.pt", "log.txt")]
+    with suppress(OSError), (folder / README).open(encoding="utf-8", errors="replace") as file:
+        if CONFIG_NAME in found and not runs and file.readline().startswith(_TITLE):
+            return
+    raise InvalidInputError(
+        f"output={str(folder)!r} holds {(runs or found)[0]} and is no packaged prior; give a new folder"
+    )
 
 
 def read_measures(path: str | os.PathLike[str]) -> dict[str, float]:
@@ -111,7 +137,7 @@ def card_page(name: str, prior: ScenePrior, facts: PriorFacts) -> str:
     }
     table = "\n".join(["| | |", "|---|---|", *(f"| {key} | {text} |" for key, text in rows.items() if text)])
     parts = [
-        f"# Prior `{name}`",
+        f"{_TITLE}{name}`",
         f"{kind} {facts.process} diffusion prior over scenes of type `{facts.scene_type}`.",
         table,
         "## How good it is",

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
+from agents.configuration.checks import check_types
 from agents.diffusion import GaussianProcess, GaussianStep, Preconditioning, ResidualVariance, ReverseStep, StepTable
 from agents.diffusion.gaussian import timestep_weights
 from agents.diffusion.schedules import make_schedule
@@ -105,6 +106,7 @@ class ContinuousPrior(ScenePrior):
     ) -> ContinuousPrior:
         """From the ``prior`` entry of a configuration file."""
         fields = {**current_names(fields), "network": config_from_state(fields["network"], "continuous")}
+        check_types(PriorConfig, fields)
         return cls(PriorConfig(**fields), normalizer, preconditioning, card, residual)
 
     # -- scenes and numbers ---------------------------------------------------------------------

@@ -13,6 +13,7 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.nn import functional as F
 
+from agents.configuration.checks import check_types
 from agents.diffusion import (
     CategoricalProcess,
     GaussianProcess,
@@ -115,6 +116,7 @@ class MixedPrior(TrainableMixedPrior):
         """From the ``prior`` entry of a configuration file."""
         text = text_config_from_state(fields.get("text"))
         fields = {**current_names(fields), "network": config_from_state(fields["network"], "mixed"), "text": text}
+        check_types(MixedPriorConfig, fields)
         return cls(MixedPriorConfig(**fields), normalizer, preconditioning, card, residual)
 
     def weights(self) -> dict[str, Tensor]:

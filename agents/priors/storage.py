@@ -15,7 +15,7 @@ from torch import Tensor
 from agents.configuration.prior_names import find_prior
 from agents.diffusion import Preconditioning, ResidualVariance
 from agents.priors.files import read_prior, to_precision, write_prior
-from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
+from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError, UnknownNameError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene_types import SceneType, get_scene_type, register_scene_type
 
@@ -79,14 +79,24 @@ def explained(name: str | os.PathLike[str]) -> Iterator[None]:
     """Let errors of what a prior's files hold name the prior; those of Python become CorruptFileErrors."""
     try:
         yield
-    except (KeyError, TypeError) as error:
-        raise CorruptFileError(f"the configuration of the prior {str(name)!r} is not one of ours: {error}") from error
-    except RuntimeError as error:
-        raise CorruptFileError(f"the weights of the prior {str(name)!r} do not fit its network: {error}") from error
     except (InvalidInputError, UnknownNameError) as error:
         if str(name) in str(error):
             raise
         raise type(error)(f"prior {str(name)!r}: {error}") from error
+    except SceneEnvsError:
+        raise
+    except RuntimeError as error:
+        raise CorruptFileError(
+            f"the weights of the prior {str(name)!r} do not fit its network: {_cut(error)}"
+        ) from error
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        raise CorruptFileError(
+            f"the configuration of the prior {str(name)!r} is not one of ours: {type(error).__name__}: {_cut(error)}"
+        ) from error
+
+
+def _cut(error: BaseException) -> str:
+    return str(error)[:500]
 
 
 def write_stored(directory: str | os.PathLike[str], stored: StoredPrior, precision: str = "float32") -> Path:

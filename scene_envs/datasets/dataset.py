@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,6 +24,8 @@ from scene_envs.files import with_digest, write_json
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +81,7 @@ class SceneDataset:
 
         Categories are matched by model path, never by index; the scene type's fixed objects move to the first
         slots, and are added to scenes that lack them. A folder that is still being generated gives the shards
-        that are finished (see :attr:`complete`).
+        that are finished, with a warning (see :attr:`complete`).
 
         Args:
             path: folder of ``.parquet`` or ``.arrow`` files, one such file, or a folder that Hugging Face's
@@ -99,7 +102,17 @@ class SceneDataset:
         files = find_files(path)
         layout = make_layout(metadata or find_metadata(path), scene_type, aliases, fixed_tolerance, slots)
         blocks = (block for file in files for block in list_blocks(file))
-        return cls._collect((read_block(block, layout.info.features) for block in blocks), layout, limit)
+        dataset = cls._collect((read_block(block, layout.info.features) for block in blocks), layout, limit)
+        own = metadata is None and (Path(path) / store.METADATA).is_file()
+        if own and not dataset.complete and (limit is None or len(dataset) < limit):
+            logger.warning(
+                "%r holds %d of the %d scenes that were to be made: shards are missing, or are still being generated; "
+                "the scene-envs generate command that made it, given again, makes the rest",
+                str(path),
+                len(dataset),
+                int(dataset.metadata["count"]),
+            )
+        return dataset
 
     @classmethod
     def from_huggingface(

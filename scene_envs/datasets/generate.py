@@ -169,6 +169,7 @@ def _is_made(job: Job) -> bool:
     rows = store.read_notes(path)["rows"]
     if rows != job.size:
         raise CorruptFileError(f"{job.path!r} holds {rows} scenes, expected {job.size}; delete it and run again")
+    store.verify(path)
     return True
 
 

@@ -101,7 +101,10 @@ def read_metadata(path: str | os.PathLike[str]) -> DatasetInfo:
 
 
 def _parse(file: Path, metadata: dict[str, Any]) -> DatasetInfo:
-    paths = tuple(map(str, metadata["model_paths"]))
+    for key in ("model_paths", "welded_object_model_paths"):
+        if not isinstance(metadata.get(key) or [], list):
+            raise CorruptFileError(f"{str(file)!r}: {key} must be a list of paths, it is {str(metadata[key])[:100]}")
+    paths = tuple(map(str, metadata["model_paths"] or ()))
     try:
         normalizer = Normalizer.from_state(metadata["normalizer_state"])
         slots, count = (_whole(metadata, key) for key in ("max_num_objects_per_scene", "count"))

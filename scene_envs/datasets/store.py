@@ -111,6 +111,18 @@ def read_notes(path: Path) -> dict[str, Any]:
         ) from error
 
 
+def verify(path: Path) -> None:
+    """Read all of a shard, whose pages carry checksums; raises CorruptFileError."""
+    file = open_parquet(path)
+    try:
+        for _ in file.iter_batches(_ROW_GROUP):
+            pass
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise CorruptFileError(
+            f"{str(path)!r} is damaged ({str(error)[:200]}); delete it and generate again to remake it"
+        ) from error
+
+
 def open_parquet(path: Path) -> pq.ParquetFile:
     """The parquet file at ``path``; raises InvalidInputError (none there) or CorruptFileError."""
     try:

@@ -26,6 +26,7 @@ from scene_envs.errors import InvalidInputError, PhysicsError
 from scene_envs.grammars import Grammar
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene_types import SceneType, register_scene_type
+from scene_envs.worker_processes import no_current_folder
 
 _RESTARTS = 3
 
@@ -87,11 +88,13 @@ def run_processes(jobs: Sequence[Job], work: Work, workers: int, report: Report)
         )
     context = get_context("spawn")
     for _ in range(_RESTARTS):
-        queue, stop = context.Queue(), context.Event()
+        with no_current_folder():  # a process that counts semaphores starts with the first of them
+            queue, stop = context.Queue(), context.Event()
         left = [job for job in jobs if not Path(job.path).is_file()]
         executor = ProcessPoolExecutor(workers, context, _start_worker, (payload, queue, stop))
         try:
-            futures = [executor.submit(_work, job) for job in left]
+            with no_current_folder():  # the processes start when they are given work
+                futures = [executor.submit(_work, job) for job in left]
             _follow(futures, queue, report)
             return
         except BrokenProcessPool:

@@ -16,6 +16,9 @@ ACTION_MODES = ("next_sample", "noise")
 PROMPT_SOURCES = ("data", "grammar")
 """Values of ``prompt`` that stand for prompts of scenes; all others are prompts themselves."""
 
+_MOST_SLOTS = 100_000
+_LARGEST = 1e30
+
 Init = TypeVar("Init", bound=Callable[..., None])
 
 
@@ -46,11 +49,21 @@ class EnvSettings:
 
     def __post_init__(self) -> None:
         self._check_at_least_one("num_steps")
+        if self.slots is not None:
+            self._check_at_least_one("slots", _MOST_SLOTS)
+        if not _is_finite(self.guidance):
+            raise InvalidInputError(f"guidance={_shown(self.guidance)} must be a finite number; 0 for none")
 
-    def _check_at_least_one(self, name: str) -> None:
+    def _check_at_least_one(self, name: str, most: int = 2**31 - 1) -> None:
         number = getattr(self, name)
-        if not isinstance(number, int) or number < 1:
-            raise InvalidInputError(f"{name}={number!r} must be a whole number of at least 1")
+        if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= most:
+            beyond = isinstance(number, int) and number > most
+            at_most = f" and at most {most:,}" if beyond else ""
+            raise InvalidInputError(f"{name}={_shown(number)} must be a whole number of at least 1{at_most}")
+
+    def _check_positive(self, name: str) -> None:
+        if not _is_finite(number := getattr(self, name)) or number <= 0:
+            raise InvalidInputError(f"{name}={_shown(number)} must be positive and finite")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,8 +86,7 @@ class DenoisingSettings(EnvSettings):
     def __post_init__(self) -> None:
         if self.action_mode not in ACTION_MODES:
             raise unknown_name("action mode", str(self.action_mode), ACTION_MODES)
-        if not (np.isfinite(self.max_action) and self.max_action > 0):
-            raise InvalidInputError(f"max_action={self.max_action!r} must be positive and finite")
+        self._check_positive("max_action")
         super().__post_init__()
         if self.guidance and self.action_mode != "noise":
             raise InvalidInputError(
@@ -111,9 +123,8 @@ class TreeSettings(EnvSettings):
         if self.max_nfe is not None:
             self._check_at_least_one("max_nfe")
         super().__post_init__()
-        scale = self.objective_scale
-        if scale is not None and not (np.isfinite(scale) and scale > 0):
-            raise InvalidInputError(f"objective_scale={scale!r} must be positive and finite")
+        if self.objective_scale is not None:
+            self._check_positive("objective_scale")
         if self.prompt is not None and not isinstance(self.prompt, str):
             raise InvalidInputError(f"prompt={self.prompt!r}: a search follows one text, or None")
 
@@ -146,6 +157,19 @@ class SearchMaskSettings(TreeSettings):
         super().__post_init__()
         if isinstance(self.masks, str) or not isinstance(self.masks, Sequence) or not self.masks:
             raise InvalidInputError(f"masks={self.masks!r}: give a list of at least one mask, as ['culprits', 'empty']")
+
+
+def _is_finite(number: Any) -> bool:
+    """Whether a value is a number that a float holds."""
+    if isinstance(number, bool) or not isinstance(number, int | float | np.integer | np.floating):
+        return False
+    size: Any = abs(number)
+    return bool(size <= _LARGEST)
+
+
+def _shown(value: Any) -> str:
+    """A value in a message, of bounded length; Python refuses to write integers of thousands of digits."""
+    return "a very large number" if isinstance(value, int) and abs(value) > _LARGEST else repr(value)[:200]
 
 
 def takes(settings: type[EnvSettings]) -> Callable[[Init], Init]:

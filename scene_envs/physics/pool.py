@@ -7,7 +7,6 @@ import dataclasses
 import logging
 import os
 import subprocess
-import sys
 import threading
 import time
 from collections import deque
@@ -18,6 +17,7 @@ from typing import Any
 from scene_envs.errors import InvalidInputError, PhysicsError, SceneEnvsError
 from scene_envs.physics.kernels import KERNELS, Chunk
 from scene_envs.scene_types import SceneType
+from scene_envs.worker_processes import module_command, module_environment
 
 _LOGGER = logging.getLogger(__name__)
 _NO_MESH: Any = None
@@ -43,14 +43,10 @@ class _Worker:
     def __init__(self) -> None:
         child_reads, parent_writes = os.pipe()
         parent_reads, child_writes = os.pipe()
-        environment = (
-            os.environ | _SINGLE_THREADED | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
-        )
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "scene_envs.physics.worker", str(child_reads), str(child_writes)],
+            module_command("scene_envs.physics.worker", str(child_reads), str(child_writes)),
             pass_fds=(child_reads, child_writes),
-            env=environment,
-            cwd=os.getcwd(),
+            env=module_environment() | _SINGLE_THREADED,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
         )

@@ -88,20 +88,22 @@ def test_what_is_measured_already_is_not_measured_again(
 
 
 @pytest.mark.slow
-def test_other_settings_or_another_prior_are_measured_anew(
+def test_other_keys_are_refused_and_other_weights_of_the_prior_measured_anew(
     prior: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    words = ["evaluate", *QUICK, "measures=layout", f"output={tmp_path / 'out'}"]
-    assert main([*words, f"prior={prior}"]) == 0
-    assert main([*words, f"prior={prior}", "seed=1"]) == 0
-    assert log(tmp_path / "out").count("layout measured in") == 2
-    assert "measuring anew" in capsys.readouterr().out
-    moved = tmp_path / "same_name"
+    words, out = ["evaluate", *QUICK, "measures=layout", f"output={tmp_path / 'out'}"], tmp_path / "out"
+    moved = tmp_path / "moved"
     tiny_prior(slots=6, seed=1).save(moved)
     assert main([*words, f"prior={moved}"]) == 0
-    tiny_prior(slots=6, seed=2).save(moved)  # other weights in the same folder
+    before = {path.name: path.read_bytes() for path in out.iterdir() if path.name != "log.txt"}
+    for other, told in (([f"prior={moved}", "seed=1"], "seed was 0, is 1"), ([f"prior={prior}"], "prior was")):
+        assert main([*words, *other]) == 2
+        assert f"holds figures of other keys ({told}" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in out.iterdir() if path.name != "log.txt"} == before
+    tiny_prior(slots=6, seed=2).save(moved)
     assert main([*words, f"prior={moved}"]) == 0
-    assert log(tmp_path / "out").count("layout measured in") == 4
+    assert "measuring anew" in capsys.readouterr().out
+    assert log(out).count("layout measured in") == 2
 
 
 @pytest.mark.slow

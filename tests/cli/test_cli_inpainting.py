@@ -140,6 +140,16 @@ def test_wrong_input_is_said(files: tuple[Path, Path], tmp_path: Path, capsys: p
     assert "metadata.json" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", ["complete", "rearrange"])
+def test_a_file_without_scenes_is_refused(
+    command: str, files: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    SceneBatch.empty("dimsum_table", 2)[:0].save(tmp_path / "none.safetensors")
+    words = [command, f"prior={files[1]}", f"scenes={tmp_path / 'none.safetensors'}", f"output={tmp_path / 'out'}"]
+    assert main(words) == 2
+    assert "holds no scene" in capsys.readouterr().err
+
+
 def test_a_checkpoint_of_the_authors_becomes_a_prior(tmp_path: Path) -> None:
     checkpoint, metadata = write_checkpoint(tmp_path, random_state())
     words = ["import-checkpoint", str(checkpoint), str(metadata), "scene=dimsum_table", "num_steps=3", "count=2"]

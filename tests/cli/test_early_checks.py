@@ -7,6 +7,7 @@ import sys
 
 import pytest
 
+from agents.cli import main
 from agents.cli.early_checks import known_masks, known_rewards, known_scenes
 from agents.configuration.measure_names import MEASURE_NAMES
 from agents.priors import list_priors
@@ -141,3 +142,11 @@ def test_words_of_groups_are_those_of_the_parts_they_are_for():
     ):
         for word in known:
             assert getattr(make(**{key: word}), key) == word
+
+
+@pytest.mark.parametrize("word", ["output=\udcff", "prior=\udcff", "title=\udcff\n", "output=a\0b", "\ud800=1"])
+def test_words_that_are_no_text_are_refused(word, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["sample", word]) == 2
+    assert "is no text in UTF-8" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

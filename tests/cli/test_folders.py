@@ -55,6 +55,24 @@ def test_the_same_command_with_other_keys_is_refused_and_with_the_same_repeated(
     assert {name for name in before if before[name] != after[name]} <= {"metrics.json"}  # holds seconds
 
 
+def test_the_folder_of_another_command_that_was_ended_early_is_refused(tmp_path, capsys):
+    (tmp_path / "log.txt").write_text("2020-01-01 00:00:00 scene-envs search\n")
+    (tmp_path / "config.yaml").write_text("budget: 300\n")
+    (tmp_path / "search.journal").write_text("{}\n")
+    before = _contents(tmp_path)
+    assert main(["view", "scene=dimsum_table", "count=1", "pictures=0", f"output={tmp_path}"]) == 2
+    assert "holds search.journal of scene-envs search" in capsys.readouterr().err
+    assert _contents(tmp_path) == before
+
+
+def test_the_report_of_another_doctor_is_refused(tmp_path, capsys):
+    (tmp_path / "log.txt").write_text("2020-01-01 00:00:00 scene-envs doctor\n")
+    (tmp_path / "config.yaml").write_text("seed: 1\n")
+    (tmp_path / "metrics.json").write_text("{}\n")
+    assert main(["doctor", f"output={tmp_path}"]) == 2
+    assert "seed was 1, is 0" in capsys.readouterr().err
+
+
 def test_a_configuration_that_was_cut_off_is_named_and_nothing_is_written(drawn, capsys):
     path = drawn / "out" / "config.yaml"
     whole = path.read_bytes()

@@ -122,6 +122,19 @@ def test_a_truncated_parquet_file_is_named(folder: Path) -> None:
         SceneDataset.load(folder)
 
 
+def test_a_dataset_that_lost_scenes_says_so(
+    dataset: SceneDataset, folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    SceneDataset.load(folder)
+    assert not caplog.text
+    shard = sorted(folder.glob("*.parquet"))[-1]
+    pq.write_table(pq.read_table(shard).slice(1), shard)
+    assert len(SceneDataset.load(folder, limit=1)) == 1
+    assert not caplog.text
+    assert not SceneDataset.load(folder).complete
+    assert f"holds {len(dataset) - 1} of the {len(dataset)} scenes" in caplog.text
+
+
 def test_a_missing_column_is_named(folder: Path) -> None:
     path = folder / "scenes-00000.parquet"
     pq.write_table(pq.read_table(path).drop_columns(["language_annotation"]), path)

@@ -155,6 +155,24 @@ def test_a_model_path_that_is_no_asset_names_its_file(scenes: torch.Tensor, tmp_
         _load(tmp_path)
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"model_paths": None},
+        {"model_paths": 1},
+        {"welded_object_model_paths": True},
+        {"normalizer_state": {"params": {"scale": 1, "min": 1, "input_stats": {"min": 1, "max": 1}}}},
+        {"normalizer_state": {"params": {"scale": [0], "min": [""], "input_stats": {"min": [1], "max": [1]}}}},
+    ],
+    ids=str,
+)
+def test_metadata_of_wrong_type_names_its_file(scenes: torch.Tensor, tmp_path: Path, change: dict[str, object]) -> None:
+    _metadata(tmp_path, **change)
+    _write(_table(NORMALIZER.normalize(scenes).numpy(), "flat", pa.float32()), tmp_path / "scenes.parquet")
+    with pytest.raises(CorruptFileError, match=r"metadata.json'"):
+        _load(tmp_path)
+
+
 def test_a_scene_type_that_nobody_knows_names_the_file(scenes: torch.Tensor, tmp_path: Path) -> None:
     _metadata(tmp_path, scene_type="dimsum]table")
     _write(_table(NORMALIZER.normalize(scenes).numpy(), "list", pa.float32()), tmp_path / "a.parquet")

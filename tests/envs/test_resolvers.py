@@ -56,3 +56,22 @@ def test_the_scene_type_is_that_of_the_prior(name: str, tmp_path: Path) -> None:
     assert "scene" not in env.spec.kwargs
     with pytest.raises(InvalidInputError, match="makes scenes of 'pantry_shelf', the environment asks for"):
         gym.make(f"scene_envs:SceneEnvs/{name}", scene="dimsum_table", **made)
+
+
+_WRONG = {
+    "slots": [0, 10**9, 10**5000, True, "6"],
+    "num_steps": [0, 10**30, True, 1.5],
+    "guidance": ["1", None, [], float("nan"), 10**5000, object()],
+    "max_action": ["1", None, [1, 2], -1, 10**400],
+    "max_depth": [10**30, True, "a"],
+    "branching": [10**30, True],
+    "objective_scale": ["", [1], {"name": "a"}, 0, 10**400],
+}
+
+
+@pytest.mark.parametrize("name", _WRONG)
+def test_numbers_of_wrong_type_or_size_are_refused_in_words(name):
+    env = "Search-v0" if name in ("max_depth", "branching", "objective_scale") else "Denoising-v0"
+    for value in _WRONG[name]:
+        with pytest.raises(InvalidInputError, match=f"{name}=.* must be"):
+            gym.make(f"SceneEnvs/{env}", disable_env_checker=True, **{name: value})

@@ -26,7 +26,7 @@ def forked(function: Callable[..., Any], *args: Any) -> ForkProcess:
 
 
 class ForkedModule:
-    """``subprocess.Popen`` of ``python -m MODULE ...`` whose process is a copy of this one, and has its imports.
+    """``subprocess.Popen`` of a ``module_command`` whose process is a copy of this one, and has its imports.
 
     It has its own descriptors, session, signals, limits and memory. Its interpreter is not new: what this process
     registered is known there, so a test that asks what a new one finds starts a real one.
@@ -43,8 +43,8 @@ class ForkedModule:
         **_: Any,
     ) -> None:
         self.returncode: int | None = None
-        _, option, self._module, *self._words = command
-        assert option == "-m"
+        _, option, _, self._module, *self._words = command
+        assert option == "-c"
         sys.stdout.flush()
         sys.stderr.flush()
         self.pid = os.fork()

@@ -9,6 +9,8 @@ import time
 import numpy as np
 import torch
 
+DRAWN = random.random() + float(np.random.rand()) + float(torch.rand(()))  # noqa: NPY002
+
 
 class Unspeakable(Exception):
     """An error whose text cannot be read."""
@@ -62,6 +64,55 @@ def mumbles(batch):
 
 def rewrites(batch):
     batch.tensor.numpy()[0, 0, 0] += 1.0
+    return batch.counts
+
+
+def shrinks(batch):
+    batch.tensor.resize_(0)
+    return torch.ones(2)
+
+
+def has_few(batch):
+    return batch.counts.float().to_sparse()
+
+
+def complex_numbers(batch):
+    return torch.ones(len(batch), dtype=torch.complex64)
+
+
+class Unnamed(type):
+    """A class whose name cannot be read."""
+
+    @property
+    def __name__(cls):
+        raise RuntimeError("no name")
+
+
+class Nameless(Exception, metaclass=Unnamed):
+    """An error whose type cannot be named."""
+
+
+def nameless(batch):
+    raise Nameless("x")
+
+
+class DrawsWhenMade:
+    """A reward whose weight is random, as is that of its file."""
+
+    def __init__(self):
+        self.weight = DRAWN + random.random() + float(np.random.rand()) + float(torch.rand(()))  # noqa: NPY002
+
+    def __call__(self, batch, context):
+        return torch.full((len(batch),), self.weight)
+
+
+def forks(batch):
+    os.fork()
+    return honest(batch)
+
+
+def writes_into_pipes(batch):
+    os.write(int(sys.argv[2]), b"\0\0\0\7garbage")  # the pipe of the worker's answers
     return batch.counts
 
 

@@ -8,7 +8,7 @@ import pytest
 from agents.priors import ScenePrior
 from agents.priors.storage import ASSET_FOLDERS
 from agents.priors.testing import tiny_prior
-from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
 
 
 @pytest.fixture
@@ -76,6 +76,34 @@ def test_a_configuration_that_is_none_names_the_prior(foreign, text):
 def test_a_normaliser_that_lacks_a_part_names_the_prior(foreign):
     with pytest.raises(InvalidInputError, match=r"prior '.*prior'.*normalizer_state lacks 'input_stats'"):
         ScenePrior.load(foreign(normalizer_state={"params": {"scale": [1.0], "min": [0.0]}}))
+
+
+_NO_PRIORS = [
+    {"preconditioning": "text"},
+    {"preconditioning": {"mean": [0.0]}},
+    {"preconditioning": {"mean": [float("nan")] * 20}},
+    {"normalizer_state": {"params": {"scale": 1.0, "min": 0.0, "input_stats": {"min": 0.0, "max": 1.0}}}},
+    {"normalizer_state": {"params": {"scale": ["a"], "min": [0.0], "input_stats": {"min": [0.0], "max": [1.0]}}}},
+    {"prior": {"network": None}},
+    {"prior": {"network": [1]}},
+    {"prior": {"slots": "many"}},
+    {"prior": {"noise_mean": [1.0]}},
+    {"prior": {"scene_type": "of_nobody"}, "scene_type": 3},
+    {"process": None},
+]
+
+
+@pytest.mark.parametrize("changes", _NO_PRIORS, ids=str)
+def test_values_of_wrong_type_name_the_prior(foreign, changes):
+    with pytest.raises((CorruptFileError, InvalidInputError, UnknownNameError), match=r"prior'"):
+        ScenePrior.load(foreign(**changes))
+
+
+@pytest.mark.parametrize("change", [{"heads": 0}, {"mlp_ratio": "~"}, {"time_scale": None}, {"hidden": 1.5}], ids=str)
+def test_sizes_of_wrong_type_of_a_network_name_the_prior(foreign, tmp_path, change):
+    network = json.loads((tmp_path / "prior" / "config.json").read_text())["prior"]["network"]
+    with pytest.raises((CorruptFileError, InvalidInputError), match=r"prior'"):
+        ScenePrior.load(foreign(prior={"network": {**network, **change}}))
 
 
 @pytest.mark.parametrize("prompt", [3, ["a", 3], {"a": 1}, 2.5])

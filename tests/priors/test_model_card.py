@@ -152,3 +152,16 @@ def test_wrong_input_is_named(run_folder: Path, tmp_path: Path) -> None:
         read_measures(tmp_path / "broken.json")
     with pytest.raises(UnknownNameError, match="float16"):
         package_prior(run_folder, tmp_path / "y", precision="half")
+
+
+def test_a_packaged_prior_replaces_its_like_alone(run_folder: Path, tmp_path: Path) -> None:
+    other = tiny_prior(seed=1).save(tmp_path / "other")
+    for taken in (run_folder, run_folder / "prior", other):
+        before = {path: path.read_bytes() for path in taken.iterdir() if path.is_file()}
+        with pytest.raises(InvalidInputError, match="is no packaged prior; give a new folder"):
+            package_prior(run_folder, taken)
+        assert {path: path.read_bytes() for path in taken.iterdir() if path.is_file()} == before
+    for source in (other, run_folder):
+        folder = package_prior(source, tmp_path / "packaged")
+    assert ScenePrior.load(folder).card["trained_steps"] == 1200
+    assert not [path for path in folder.iterdir() if path.name.startswith(".")]

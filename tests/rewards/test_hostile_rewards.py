@@ -1,5 +1,6 @@
 """Hostile rewards that exit, hang, crash, fill memory or print without end: loss of their scenes alone."""
 
+import os
 import random
 import re
 import time
@@ -33,6 +34,10 @@ FILE = Path(hostile.__file__)
         (hostile.talks, r"'talks' raised ValueError: x+\.\.\. \(1048576 characters\).*hostile_rewards.py, line \d+"),
         (hostile.mumbles, r"'mumbles' raised Unspeakable: \(its text cannot be read\)"),
         (hostile.rewrites, r"'rewrites' changed the scenes"),
+        (hostile.shrinks, r"'shrinks' changed the scenes"),
+        (hostile.has_few, r"'has_few': value is torch.sparse_coo; use .to_dense"),
+        (hostile.complex_numbers, r"'complex_numbers': value has dtype torch.complex64, expected a float"),
+        (hostile.nameless, r"'nameless' raised Nameless: x"),
     ],
 )
 def test_a_hostile_reward_in_this_process_is_invalid_in_one_short_sentence(reward, message, cups):
@@ -40,7 +45,9 @@ def test_a_hostile_reward_in_this_process_is_invalid_in_one_short_sentence(rewar
         evaluate_reward(resolve_reward(reward), cups, strict=True)
     assert len(str(caught.value)) < 700
     assert str(caught.value).count(reward.__name__) == 1
+    before = cups.tensor.clone()
     assert evaluate_reward(resolve_reward(reward), cups).valid.tolist() == [False, False]
+    assert torch.equal(cups.tensor, before)
 
 
 def test_ctrl_c_is_not_taken_for_a_failure(cups):
@@ -51,9 +58,10 @@ def test_ctrl_c_is_not_taken_for_a_failure(cups):
         evaluate_reward(interrupted, cups)
 
 
-def test_check_reward_sees_what_is_written_through_numpy():
+@pytest.mark.parametrize("reward", [hostile.rewrites, hostile.shrinks])
+def test_check_reward_sees_what_is_written_through_numpy(reward):
     with pytest.raises(RewardError, match="changed the scenes"):
-        check_reward(hostile.rewrites)
+        check_reward(reward)
 
 
 def test_global_generators_are_seeded_from_the_run_and_left_as_they_were(cups):
@@ -68,6 +76,30 @@ def test_global_generators_are_seeded_from_the_run_and_left_as_they_were(cups):
     assert before[2] == after[2]
     assert torch.equal(first, scores(3))
     assert not torch.equal(first, scores(4))
+
+
+def test_a_reward_is_made_with_generators_seeded_from_the_run(cups):
+    def scores(seed):
+        return [evaluate_reward(make(hostile.DrawsWhenMade, seed), cups).value for make in (SeededReward, _made)]
+
+    def _made(reward, seed):
+        return run_reward(reward, seed=seed)
+
+    random.seed(1)
+    before = random.getstate()
+    first, again, other = scores(3), scores(3), scores(4)
+    assert random.getstate() == before
+    assert torch.equal(first[0], first[1])
+    assert torch.equal(torch.stack(first), torch.stack(again))
+    assert not torch.equal(first[0], other[0])
+
+
+def test_a_copy_of_the_process_that_a_reward_forks_does_not_go_on(cups, tmp_path):
+    assert evaluate_reward(resolve_reward(hostile.forks), cups).valid.tolist() == [True, True]
+    with (tmp_path / "processes").open("a") as file:
+        file.write(f"{os.getpid()}\n")
+    assert os.waitpid(-1, 0)[1] == 0  # the copy
+    assert len((tmp_path / "processes").read_text().split()) == 1
 
 
 def test_a_part_of_a_composite_is_named_once(cups):
@@ -152,6 +184,7 @@ def worker():
         ("fills_memory", "memory"),
         ("talks", "1048576 characters"),
         ("rewrites", "changed the scenes"),
+        ("writes_into_pipes", "disturbed the answers of its process"),
     ],
 )
 def test_a_hostile_reward_costs_its_scenes_and_nothing_else(name, message, cups, worker):
@@ -165,6 +198,26 @@ def test_a_hostile_reward_costs_its_scenes_and_nothing_else(name, message, cups,
     assert output.valid.tolist() == [False, False]
     assert re.search(message, output.problem)
     assert torch.equal(before, cups.tensor)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("copied_workers")
+def test_a_reward_that_forks_answers_once_for_each_batch(cups, worker):
+    for batch in (cups, cups.with_slots(9), cups[:1]):
+        names = ("forks",) * len(batch)
+        assert torch.equal(
+            evaluate_reward(worker, batch, RewardContext(prompts=names)).value, hostile.honest(batch).float()
+        )
+
+
+@pytest.mark.slow
+def test_a_file_that_draws_when_it_is_imported_gives_the_same_in_every_process(cups):
+    allow_local_rewards(FILE)
+    values = []
+    for _ in range(2):
+        with IsolatedReward(f"{FILE}:DrawsWhenMade", seed=5) as reward:
+            values.append(evaluate_reward(reward, cups).value)
+    assert torch.equal(*values)
 
 
 @pytest.mark.slow

@@ -195,7 +195,11 @@ class _Results:
 
     @classmethod
     def of(cls, run: Run, identity: dict[str, Any]) -> _Results:
-        """Go on with what the folder holds, as far as it depends on the same."""
+        """Go on with what the folder holds, as far as it depends on the same.
+
+        Raises:
+            InvalidInputError: its figures are of other keys, those of the prompts alone aside.
+        """
         path = run.directory / "metrics.json"
         known, groups = _read_figures(path)
         changed = {key for key in {*known, *identity} if known.get(key) != identity.get(key)}
@@ -205,10 +209,17 @@ class _Results:
         if known and changed <= _OF_PROMPTS:
             if groups.pop("prompts", None) is not None:
                 run.say(f"{path} has other {' and '.join(sorted(changed))}: measuring the prompts anew")
+        elif known and changed != {"digest"}:
+            told = "; ".join(
+                f"{key} was {known.get(key)!r}, is {identity.get(key)!r}" for key in sorted(changed - {"digest"})
+            )
+            raise InvalidInputError(
+                f"output={str(run.directory)!r} holds figures of other keys ({told[:500]}); give another output"
+            )
         else:
             groups, stale = {}, [_SAMPLES, _PROMPTED]
             if known:
-                run.say(f"{path} is of other settings or of another prior: measuring anew")
+                run.say(f"{path} is of other weights of this prior: measuring anew")
         for name in stale:
             (run.directory / name).unlink(missing_ok=True)
         results = cls(run, identity, groups)

@@ -67,6 +67,8 @@ def load_prior_and_scenes(command: str, settings: InpaintingConfig) -> tuple[Sce
         count = _FRESH if settings.count is None else settings.count
         return fresh, fresh.sample(count, num_steps=settings.num_steps, seed=settings.seed).to("cpu")
     batch = load_scenes(Path(settings.scenes), settings.count)
+    if not len(batch):
+        raise InvalidInputError(f"{command}: scenes={settings.scenes!r} holds no scene")
     prior = ScenePrior.load(settings.prior or batch.scene_type.name).to(settings.device)
     if prior.scene_type.name != batch.scene_type.name:
         raise InvalidInputError(

@@ -12,7 +12,6 @@ import json
 import logging
 import os
 import subprocess
-import sys
 import tempfile
 from collections.abc import Sequence
 from importlib.util import find_spec
@@ -27,6 +26,7 @@ from scene_envs.assets.importing.limits import seconds_left, too_slow
 from scene_envs.assets.importing.mesh_files import bare
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.files import replacing
+from scene_envs.worker_processes import module_command, module_environment
 
 if TYPE_CHECKING:
     import trimesh
@@ -185,11 +185,10 @@ def run_coacd(vertices: Array, faces: Array, settings: dict[str, Any], what: str
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "mesh.npz", Path(folder) / "parts.npz"
         np.savez(source, vertices=vertices, faces=faces, settings=np.array(json.dumps(settings)))
-        path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
         try:
             done = subprocess.run(
-                [sys.executable, "-m", "scene_envs.assets.importing.coacd_worker", str(source), str(target)],
-                env=os.environ | {"PYTHONPATH": path},
+                module_command("scene_envs.assets.importing.coacd_worker", str(source), str(target)),
+                env=module_environment(),
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
                 timeout=left,

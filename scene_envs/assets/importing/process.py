@@ -19,6 +19,7 @@ from scene_envs.assets.importing.entries import AssetEntry
 from scene_envs.assets.importing.limits import seconds_left, timed, too_slow
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, SceneEnvsError
 from scene_envs.files import replacing
+from scene_envs.worker_processes import module_command, module_environment
 
 if TYPE_CHECKING:
     from scene_envs.assets.base import Asset
@@ -38,10 +39,10 @@ def build_apart(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
     with tempfile.TemporaryDirectory() as folder:
         request, result = Path(folder) / "request", Path(folder) / "result"
         request.write_bytes(pickle.dumps((path, entry)))
-        command = [sys.executable, "-m", "scene_envs.assets.importing.process", str(request), str(result)]
+        command = module_command("scene_envs.assets.importing.process", str(request), str(result))
         child = subprocess.Popen(
             command,
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(entry or os.getcwd() for entry in sys.path)},
+            env=module_environment(),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
