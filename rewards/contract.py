@@ -13,7 +13,7 @@ from rewards.evaluation import evaluate_reward
 from rewards.registry import resolve_reward, reward_name
 from rewards.seeding import other_draw
 from rewards.verdicts import forget_verdicts
-from scene_envs.errors import RewardError
+from scene_envs.errors import RewardError, RewardTimeoutError
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
@@ -39,7 +39,8 @@ def check_reward(
         ``depends_on_batch = True``.
 
     Raises:
-        RewardError: one line per broken clause, each saying what was found and what would be right.
+        RewardError: one line per broken clause, each saying what was found and what would be right. The clauses after
+            one in which the reward took too long are not tried.
 
     >>> check_reward("object_count")[0]
     'scores scenes that hold nothing but welded objects'
@@ -54,6 +55,8 @@ def check_reward(
             check(subject)
         except RewardError as error:
             failures.append(f"  {title}: no. {error}")
+            if isinstance(error, RewardTimeoutError):
+                break
     if failures:
         name = reward_name(subject.reward)
         raise RewardError(f"reward {name!r} breaks {len(failures)} of {len(checks)} clauses:\n" + "\n".join(failures))

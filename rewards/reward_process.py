@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from rewards.base import RewardOutput
-from scene_envs.errors import InvalidInputError, RewardError, SceneEnvsError, UnknownNameError
+from scene_envs.errors import InvalidInputError, RewardError, RewardTimeoutError, SceneEnvsError, UnknownNameError
 from scene_envs.worker_processes import module_command, module_environment
 
 _START_UP = 120.0
@@ -92,7 +92,7 @@ class RewardProcess:
                 raise ValueError(number)
         except (EOFError, OSError):
             self.stop()
-            raise RewardError(f"reward {self.name!r} {self._how_it_ended(late.is_set(), timeout)}") from None
+            raise self._ended(late.is_set(), timeout) from None
         except Exception:
             self.stop()
             raise RewardError(
@@ -109,14 +109,15 @@ class RewardProcess:
         error, text = body
         raise _ERRORS.get(error, RewardError)(str(text)[:_MOST_TEXT])
 
-    def _how_it_ended(self, late: bool, timeout: float) -> str:
-        status = self.process.returncode
+    def _ended(self, late: bool, timeout: float) -> RewardError:
+        """What the end of the process says of the reward."""
+        status, reward = self.process.returncode, f"reward {self.name!r}"
         if late or status == -signal.SIGALRM:
-            return f"took longer than reward_timeout={timeout:g} s; its process was ended"
+            return RewardTimeoutError(f"{reward} took longer than reward_timeout={timeout:g} s; its process was ended")
         if status is not None and status < 0:
             with contextlib.suppress(ValueError):
-                return f"crashed its process ({signal.Signals(-status).name})"
-        return f"ended its process (exit status {status}) instead of returning scores"
+                return RewardError(f"{reward} crashed its process ({signal.Signals(-status).name})")
+        return RewardError(f"{reward} ended its process (exit status {status}) instead of returning scores")
 
 
 def _end(process: subprocess.Popen[bytes], outbox: Connection, inbox: Connection) -> None:

@@ -37,6 +37,10 @@ class RewardError(SceneEnvsError):
     """A reward broke its contract."""
 
 
+class RewardTimeoutError(RewardError):
+    """A reward took longer than it may."""
+
+
 class TrainingError(SceneEnvsError):
     """A training run cannot go on; what was done so far is on disk."""
 

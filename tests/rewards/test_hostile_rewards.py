@@ -20,7 +20,7 @@ from rewards import (
     resolve_reward,
 )
 from rewards.isolation import SeededReward, is_foreign, run_reward
-from scene_envs.errors import InvalidInputError, RewardError
+from scene_envs.errors import InvalidInputError, RewardError, RewardTimeoutError
 from tests.helpers import hostile_rewards as hostile
 from tests.helpers.forked import forked_workers
 
@@ -233,3 +233,15 @@ def test_a_file_that_exits_or_hangs_when_it_is_imported_is_one_sentence(line, me
     allow_local_rewards(path)
     with pytest.raises(RewardError, match=message):
         IsolatedReward(f"{path}:few", timeout=4)
+
+
+def test_a_reward_that_hangs_is_waited_for_once_by_its_check():
+    calls = []
+
+    def slow(batch):
+        calls.append(len(batch))
+        raise RewardTimeoutError("reward 'slow' took longer than reward_timeout=1 s; its process was ended")
+
+    with pytest.raises(RewardError, match="took longer"):
+        check_reward(slow)
+    assert len(calls) == 1
