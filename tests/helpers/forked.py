@@ -26,7 +26,7 @@ def forked(function: Callable[..., Any], *args: Any) -> ForkProcess:
 
 
 class ForkedModule:
-    """``subprocess.Popen`` of a ``module_command`` whose process is a copy of this one, and has its imports.
+    """``subprocess.Popen`` of ``python -m MODULE ...``, or of a ``module_command``, as a copy of this process.
 
     It has its own descriptors, session, signals, limits and memory. Its interpreter is not new: what this process
     registered is known there, so a test that asks what a new one finds starts a real one.
@@ -43,8 +43,9 @@ class ForkedModule:
         **_: Any,
     ) -> None:
         self.returncode: int | None = None
-        _, option, _, self._module, *self._words = command
-        assert option == "-c"
+        option = command[1]
+        assert option in ("-c", "-m")
+        self._module, *self._words = command[2 if option == "-m" else 3 :]
         sys.stdout.flush()
         sys.stderr.flush()
         self.pid = os.fork()
