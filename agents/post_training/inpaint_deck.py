@@ -13,7 +13,7 @@ from agents.post_training.inpaint_settings import InpaintSettings
 from agents.post_training.prompts import PromptSets
 from agents.priors.base import ScenePrior
 from agents.utils.seeds import derived_seed
-from scene_envs.envs.masks import MaskGenerator, mask_for_prompt, resolve_mask
+from scene_envs.envs.masks import MaskGenerator, mask_for_prompt, masked_slots, resolve_mask
 from scene_envs.envs.scoring import RewardScorer, Score
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
@@ -121,7 +121,7 @@ class InpaintDeck:
         generator = mask_for_prompt(self.generator, prompt)
         changeable = ~scene.is_welded[0]
         changeable[: len(scene.scene_type.fixed)] = False
-        slots = changeable & generator(scene, score, rng).to(changeable.device)
+        slots = changeable & masked_slots(generator, scene, score, rng).to(changeable.device)
         poses_alone = self.settings.entries == "poses"
         poses = slots & scene.is_free[0] if poses_alone else slots
         return torch.stack([poses, torch.zeros_like(slots) if poses_alone else slots], dim=-1)

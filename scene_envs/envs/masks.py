@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from scene_envs.envs import mask_generators as shipped
 from scene_envs.envs.scoring import Score
-from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.errors import InvalidInputError, SceneEnvsError, unknown_name
 from scene_envs.plugins import load_plugin
 from scene_envs.registry import Registry
 from scene_envs.scene import SceneBatch
@@ -108,6 +110,30 @@ def mask_for_prompt(generator: MaskGenerator, prompt: str | None) -> MaskGenerat
     """
     bind: Callable[[str | None], MaskGenerator] | None = getattr(generator, "for_prompt", None)
     return generator if bind is None else bind(prompt)
+
+
+def masked_slots(generator: MaskGenerator, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+    """(N,) bool: what a mask generator says of a batch of one.
+
+    Raises:
+        InvalidInputError: it raised an error, or returned something else.
+    """
+    name = getattr(generator, "__name__", type(generator).__name__)
+    slots = scene.tensor.shape[1]
+    try:
+        mask = generator(scene, score, rng)
+    except SceneEnvsError:
+        raise
+    except Exception as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        raise InvalidInputError(
+            f"mask {name!r} raised {type(error).__name__}: {error} ({place.filename}, line {place.lineno}); a mask is "
+            f"a function (scene, score, rng) that returns a bool tensor of shape ({slots},)"
+        ) from error
+    if not (isinstance(mask, Tensor) and mask.dtype == torch.bool and mask.shape == (slots,)):
+        what = f"{mask.dtype} of shape {tuple(mask.shape)}" if isinstance(mask, Tensor) else type(mask).__name__
+        raise InvalidInputError(f"mask {name!r} returned {what}; return a bool tensor of shape ({slots},)")
+    return mask
 
 
 def _with_settings(generator: MaskGenerator, settings: Mapping[str, Any], mask: Mapping[str, Any]) -> MaskGenerator:

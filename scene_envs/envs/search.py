@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scene_envs.envs.masks import MaskGenerator, mask_for_prompt, resolve_mask
+from scene_envs.envs.masks import MaskGenerator, mask_for_prompt, masked_slots, resolve_mask
 from scene_envs.envs.prompts import EnvPrompts
 from scene_envs.envs.scoring import RewardScorer, Score
 from scene_envs.envs.settings import SearchSettings, TreeSettings, takes
@@ -315,7 +315,7 @@ class SearchProblem:
         """(N,) bool: what ``generator`` masks at this node, welded objects left out; all without free objects."""
         changeable = self._changeable() & ~scene.is_welded[0]
         if bool(scene.is_free.any()):
-            changeable &= generator(scene, score, NodeRandomness.at(seed, path).mask)
+            changeable &= masked_slots(generator, scene, score, NodeRandomness.at(seed, path).mask)
         return changeable
 
     def close(self) -> None:

@@ -266,3 +266,24 @@ def test_a_mask_of_an_installed_package_works_by_name(monkeypatch: pytest.Monkey
 def test_the_environment_and_the_search_run_have_one_default(prior: ToyPrior, free_objects: Any) -> None:
     env = gym.make(ID, prior=prior, objective=free_objects, num_steps=1).unwrapped
     assert env.problem.mask_generator is resolve_mask(SearchConfig().mask) is blamed_or_empty_mask
+
+
+def fails(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Any:
+    raise ValueError("no such shelf")
+
+
+@pytest.mark.parametrize(
+    ("generator", "said"),
+    [
+        (fails, r"mask 'fails' raised ValueError: no such shelf \(.*test_masks.py, line \d+\)"),
+        (lambda scene: None, r"raised TypeError: .*takes 1 positional argument.*\(scene, score, rng\)"),
+        (lambda scene, score, rng: None, r"returned NoneType; return a bool tensor of shape \(34,\)"),
+        (lambda scene, score, rng: [True] * 34, "returned list"),
+        (lambda scene, score, rng: scene.is_empty, r"returned torch.bool of shape \(1, 34\)"),
+        (lambda scene, score, rng: scene.is_empty[0].float(), r"returned torch.float32 of shape \(34,\)"),
+    ],
+)
+def test_a_mask_that_breaks_its_contract_is_told_so(generator: Any, said: str, free_objects: Any) -> None:
+    problem = SearchProblem(prior=tiny_prior(), objective=free_objects, mask=generator, num_steps=2)
+    with pytest.raises(InvalidInputError, match=said):
+        problem.root(0, table_with(("teacup", 0.0, 0.0, 0.0)))
