@@ -41,6 +41,8 @@ def serve(inbox: Connection, outbox: Connection, timeout: float) -> None:
             number, kind, *body = inbox.recv()
         except EOFError:
             return
+        except OSError:  # the reward closed the pipe
+            os._exit(1)
         signal.setitimer(signal.ITIMER_REAL, timeout + _GRACE)  # the default action ends even what holds the GIL
         try:
             reply: tuple[str, Any] = ("done", getattr(answer, kind)(*body))
@@ -54,7 +56,10 @@ def serve(inbox: Connection, outbox: Connection, timeout: float) -> None:
         if os.getpid() != process:  # a copy that the reward forked and that came back here: one alone answers
             os._exit(0)
         signal.setitimer(signal.ITIMER_REAL, 0)
-        outbox.send((number, *reply))
+        try:
+            outbox.send((number, *reply))
+        except OSError:
+            os._exit(1)
 
 
 def _lacked_memory(error: BaseException) -> bool:

@@ -16,11 +16,14 @@ from agents.post_training.run_files import REPLAY_NAME, SCENES_NAME, writing
 from agents.priors.base import ScenePrior
 from agents.utils.process_group import ProcessGroup
 from scene_envs.errors import InvalidInputError
+from scene_envs.progress import Progress
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_sources import find_scenes, load_scenes
 
 _WITHHELD = 0.1
 """Share of real scenes whose prompt is withheld, as in pretraining."""
+_DRAWN = 64
+"""Scenes of the grammar between two updates of the progress."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +106,14 @@ class SceneBank:
 
 
 def kept_scenes(
-    directory: Path, prior: ScenePrior, settings: RegularisationSettings, seed: int, slots: int, *, reuse: bool
+    directory: Path,
+    prior: ScenePrior,
+    settings: RegularisationSettings,
+    seed: int,
+    slots: int,
+    *,
+    reuse: bool,
+    progress: str = "none",
 ) -> SceneBatch:
     """The real scenes of a run, kept in its folder with the prompts of a dataset; the first process draws them.
 
@@ -112,10 +122,12 @@ def kept_scenes(
         prior, seed, slots: as for :func:`real_scenes`.
         settings: where they come from, and how many.
         reuse: take those that are there, as a resumed run does.
+        progress: how the drawing is shown, a style of :class:`~scene_envs.progress.Progress`.
     """
     path, texts, processes = directory / SCENES_NAME, directory / PROMPTS_NAME, ProcessGroup.current()
     if processes.is_first and not (reuse and path.exists()):
-        batch, found = real_scenes(prior, settings.scenes, settings.bank_size, seed=seed, slots=slots)
+        count = settings.bank_size
+        batch, found = real_scenes(prior, settings.scenes, count, seed=seed, slots=slots, progress=progress)
         writing(f"the real scenes {str(path)!r}", lambda: batch.save(path))
         texts.unlink(missing_ok=True)  # of other scenes, by a run that never reached a checkpoint
         if found is not None and prior.conditional:
@@ -162,7 +174,7 @@ def kept_replay(
 
 
 def real_scenes(
-    prior: ScenePrior, source: str, count: int, *, seed: int, slots: int | None = None
+    prior: ScenePrior, source: str, count: int, *, seed: int, slots: int | None = None, progress: str = "none"
 ) -> tuple[SceneBatch, list[tuple[str, ...]] | None]:
     """``count`` real scenes of the prior's scene type, and the prompts of each if they have any.
 
@@ -173,13 +185,19 @@ def real_scenes(
         seed: of the grammar, or of the choice of rows.
         slots: slots per scene at least; None takes as many as the prior was trained on. Real scenes keep all
             their slots: a prior reads any number.
+        progress: how the drawing is shown, a style of :class:`~scene_envs.progress.Progress`.
     """
     slots = max(prior.scene_type.slots, prior.config.slots if slots is None else slots)
     if source == "grammar":
         from scene_envs.grammars import get_grammar
 
-        rng = np.random.default_rng(seed)
-        return get_grammar(prior.scene_type).sample(rng, count).with_slots(slots), None
+        rng, grammar, parts, title = np.random.default_rng(seed), get_grammar(prior.scene_type), [], "real scenes"
+        with Progress(title, count, style=progress) as shown:
+            for first in range(0, count, _DRAWN):
+                parts.append(grammar.sample(rng, min(_DRAWN, count - first)))
+                done = first + len(parts[-1])
+                shown.update(done, "", f"{title} {done}/{count}")
+        return SceneBatch.concatenate(parts).with_slots(slots), None
     from scene_envs.datasets import SceneDataset
 
     if not Path(source).is_dir():

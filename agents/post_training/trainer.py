@@ -176,7 +176,10 @@ class PostTrainer:
     def prepare(self, *, reuse_scenes: bool = False) -> None:
         """Draw the real scenes, or reuse those kept beside a run that is resumed, and make the guard."""
         config, seed, slots = self.config, stream_seed(self.config.seed, "bank"), self.learner.slots
-        batch = kept_scenes(self.directory, self.prior, config.regularisation, seed, slots, reuse=reuse_scenes)
+        shown = config.logger.progress if self.processes.is_first else "none"
+        batch = kept_scenes(
+            self.directory, self.prior, config.regularisation, seed, slots, reuse=reuse_scenes, progress=shown
+        )
         prompts: PromptSets | None = None
         if self.prior.conditional:
             prompts = prompts_beside(self.directory, batch, seed)
@@ -193,7 +196,7 @@ class PostTrainer:
             check_it_can_learn(self.learner, batch, prompts)
         base = self.learner.regularisation.base
         if base is not None and config.regularisation.objective == "discriminative":
-            samples = kept_base_samples(self.directory, base, self.scenes, config, reuse=reuse_scenes)
+            samples = kept_base_samples(self.directory, base, self.scenes, config, reuse=reuse_scenes, progress=shown)
             self.scenes = replace(self.scenes, base=samples)
         self.guard = make_guard(config, self.learner, self.scenes)
 

@@ -34,7 +34,9 @@ def _scenes_drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """The same scenes of a grammar, which take longer than an iteration, are drawn once per process."""
     draw = scene_bank.real_scenes
 
-    def once(prior: ScenePrior, source: str, count: int, *, seed: int, slots: int | None = None) -> tuple[Any, Any]:
+    def once(
+        prior: ScenePrior, source: str, count: int, *, seed: int, slots: int | None = None, progress: str = "none"
+    ) -> tuple[Any, Any]:
         if source != "grammar":
             return draw(prior, source, count, seed=seed, slots=slots)
         key = (prior.scene_type, prior.config.slots, count, seed, slots)

@@ -185,6 +185,7 @@ def worker():
         ("talks", "1048576 characters"),
         ("rewrites", "changed the scenes"),
         ("writes_into_pipes", "disturbed the answers of its process"),
+        ("closes_pipes", r"ended its process \(exit status 1\)"),
     ],
 )
 def test_a_hostile_reward_costs_its_scenes_and_nothing_else(name, message, cups, worker):
@@ -198,6 +199,15 @@ def test_a_hostile_reward_costs_its_scenes_and_nothing_else(name, message, cups,
     assert output.valid.tolist() == [False, False]
     assert re.search(message, output.problem)
     assert torch.equal(before, cups.tensor)
+
+
+@pytest.mark.slow
+def test_a_reward_that_closes_its_pipes_prints_no_traceback(cups, capfd):
+    allow_local_rewards(FILE)
+    with IsolatedReward(f"{FILE}:named", timeout=60) as reward:
+        output = evaluate_reward(reward, cups, RewardContext(prompts=("closes_pipes", "closes_pipes")))
+    assert output.valid.tolist() == [False, False]
+    assert "Traceback" not in capfd.readouterr().err
 
 
 @pytest.mark.slow
