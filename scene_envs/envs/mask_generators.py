@@ -148,8 +148,8 @@ class RegionMask:
 
 
 @dataclass(frozen=True)
-class GivenMask:
-    """Slots that the user names.
+class ExplicitMask:
+    """Slots that the user lists.
 
     Args:
         slots: their indices.
@@ -162,7 +162,7 @@ class GivenMask:
         mask = torch.zeros_like(scene.is_empty[0])
         outside = [slot for slot in self.slots if not 0 <= slot < len(mask)]
         if outside or not self.slots:
-            raise InvalidInputError(f"mask=given: slots={list(self.slots)} must be some of 0..{len(mask) - 1}")
+            raise InvalidInputError(f"mask=explicit: slots={list(self.slots)} must be some of 0..{len(mask) - 1}")
         mask[list(self.slots)] = True
         return mask
 
