@@ -34,10 +34,10 @@ class EvolutionPlanner(PlannerSettings):
     are the next population; of equal values the newer scene stays.
 
     Attributes:
-        population: scenes that are kept, and fresh samples in the beginning.
+        population: number of scenes that are kept, and of fresh samples at the start.
         children: offspring per round, one batch of the denoiser; null takes ``branching``.
-        crossover: chance that an offspring has two parents.
-        seed: of parents and cuts, with the seed of the root.
+        crossover: probability that an offspring has two parents.
+        seed: seed of parents and cuts, together with the seed of the root.
     """
 
     name: str = "evolution"

@@ -37,11 +37,11 @@ class GradientPlanner(PlannerSettings):
     one gradient of the weight more, and no evaluation of the denoiser.
 
     Attributes:
-        planner: the other planner: its name, or a mapping of its ``name`` and keys; it must accept any number of
+        planner: the other planner: its name, or a mapping of its ``name`` and keys. It must accept any number of
             children of a state, and must not steer the denoising itself.
         weight: a differentiable log-weight: ``overlap``, or in Python a function.
-        strength: of the weight; 0 is the other planner alone.
-        begin: share of the denoising steps before guidance.
+        strength: factor on the weight; 0 is the other planner alone.
+        begin: share of the denoising steps that come before guidance.
         children: inpaintings per round of the other planner, one batch of the denoiser; null takes ``branching``.
     """
 

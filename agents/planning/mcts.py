@@ -33,11 +33,11 @@ class MCTSPlanner(PlannerSettings):
     are removed from what is returned, where the problem has ``without_masked`` and the objective does not fall.
 
     Attributes:
-        exploration: weight of the bound. The values are in [0, 1], and siblings differ by a few hundredths: with the
-            textbook's 1 the bound outweighs them, and the tree grows in breadth.
+        exploration: weight of the bound. Values are in [0, 1] and siblings differ by a few hundredths. With the
+            textbook value, 1, the bound outweighs these differences and the tree grows in breadth.
         children: children of a leaf; null takes ``branching``.
-        rollout: ``random`` backs up one new child, ``all`` each of them.
-        seed: of the choice of the child, with the seed of the root.
+        rollout: value that is backed up: ``random`` for that of one new child, ``all`` for that of each.
+        seed: seed of the choice of the child, together with the seed of the root.
     """
 
     name: str = "mcts"

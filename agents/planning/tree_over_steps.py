@@ -58,7 +58,8 @@ class TreeOverStepsPlanner(PlannerSettings):
         stops: shares of the denoising steps at which scenes can be branched from.
         rounds: rounds per state.
         exploration: weight of the bound.
-        widening: a node of n visits has n^widening branches before its branches are searched.
+        widening: exponent of progressive widening: a node of n visits has n^widening branches before the search goes
+            below them.
     """
 
     name: str = "tree_over_steps"
