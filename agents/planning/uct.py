@@ -14,10 +14,11 @@ from agents.planning.tree import Node, Tree
 class UCTPlanner(PlannerSettings):
     """Upper confidence bounds applied to trees (Kocsis & Szepesvári 2006), for states that score themselves.
 
-    Every state of the search MDP is a whole scene, so its objective is its value and there are no random rollouts:
-    one iteration selects by UCB1, expands one action, evaluates the child and backs its value up. A branch whose
-    actions are all spent is closed; the search ends early when the tree is. A child that holds the same scene as
-    another node, or that scores less than its parent by more than ``max_loss``, counts and is not searched below.
+    Every state of the search MDP is a whole scene, so its objective is its value, and there are no random rollouts. One
+    iteration selects by UCB1, expands one action, evaluates the child and backs its value up. A branch is closed when
+    all its actions are tried; the search ends early when the root is closed. A child that holds the same scene as
+    another node, or that scores less than its parent by more than ``max_loss``, is added, but the search does not
+    continue below it.
 
     Attributes:
         exploration: weight of the UCB1 bound. The textbook value sqrt(2) is for independent values over the whole of
