@@ -220,7 +220,7 @@ class RewardWeightedSettings(ForwardProcessSettings):
     """Reward-weighted fine-tuning: good samples pull, none pushes; the baseline of the other algorithms.
 
     Attributes:
-        temperature: of the weights exp(A / temperature), A in standard deviations.
+        temperature: temperature of the weights exp(A / temperature), in standard deviations of the reward.
     """
 
     name: str = "reward_weighted"
@@ -237,9 +237,9 @@ class NeonSettings(AlgorithmSettings):
 
     Attributes:
         updates: optimiser steps per batch.
-        draws: timesteps and noises of every own sample per optimiser step.
-        w: length of the extrapolation away from the copy that is trained on own samples.
-        period: iterations of a round, which ends with an extrapolation.
+        draws: number of timesteps and noises of every own sample per optimiser step.
+        w: length of the step away from the copy that is trained on own samples.
+        period: number of iterations of a round; a round ends with an extrapolation.
     """
 
     learning_rate: ClassVar[float] = 1e-4
