@@ -6,8 +6,8 @@ The prior may be continuous or mixed. The reward must say how good each object i
 ``feasible_share`` does. Scenes are drawn without prompts.
 
 Negative-aware fine-tuning (NFT, Zheng et al. 2025, arXiv 2509.16117) of the poses, with credit per object, and with
-the pretraining loss on real scenes as regularisation (Pfaff et al. 2025, Sec. 4.3). Nothing is said about the reverse
-chain: finished scenes are noised again, as in pretraining, and the denoiser is pulled toward the good objects and
+the pretraining loss on real scenes as regularisation (Pfaff et al. 2025, Sec. 4.3). The reverse chain plays no part:
+finished scenes are noised again, as in pretraining, and the denoiser is pulled toward the good objects and
 pushed away from the bad ones.
 
 Details that matter, in the order in which they appear below:
@@ -15,16 +15,17 @@ Details that matter, in the order in which they appear below:
     of the trained one's weights; it is what is saved. The *expectation* is trained on the sampler's scenes with the
     plain pretraining loss, so that it knows their mean.
  2. Credit per object: an object's advantage is its own verdict, standardised over all objects of the batch. In a noised
-    scene every slot sees the others, so the loss of a slot's pose can take the slot's own advantage. Empty and welded
-    slots have none. Categories have no credit either: good and bad halves of their loss cancel but for a pull of their
-    logits to the sampler's, so which objects there are stays as it was.
+    scene every slot sees the others, so the loss of a slot's pose can use the slot's own advantage. Empty and welded
+    slots have no advantage. Categories have no credit: the good and bad halves of their loss cancel, except for a pull
+    of the logits to those of the sampler, so the number and kinds of objects stay the same.
  3. The advantage becomes an optimality r in [0, 1]; with the sampler's output `old` and the trained output `new`,
 
         loss = r |old + beta (new - old) - target|^2 + (1 - r) |old - beta (new - old) - target|^2
 
- 4. `target - old` is replaced by `target - expectation`. NFT takes the sampler's output for the mean of its own
-    samples' targets. It is not: where all samples are bad, the difference pushes the sampler off, and grows, and after
-    about 100 iterations the run falls. With the exact mean only the covariance of target and advantage is left.
+ 4. `target - old` is replaced by `target - expectation`. NFT assumes that the sampler's output is the mean of the
+    targets of its own samples. This does not hold: where all samples are bad, the difference pushes the sampler away
+    and grows, and after about 100 iterations the run collapses. With the exact mean only the covariance of target and
+    advantage is left.
  5. Weights and reductions are those of the pretraining loss: a mean over the entries of a scene that are not known.
  6. The sampler follows after every iteration, quickly at first: its decay is k / (k + 10), at most `sampler_decay`.
 """

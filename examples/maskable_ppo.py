@@ -2,18 +2,18 @@
 
     python examples/maskable_ppo.py --objective feasible_objects --steps 20000
 
-A search regenerates some slots of a scene again and again. Which slots (the mask) is the agent's choice here: the
-faults of the scene, its empty slots, or more at once. An episode is a chain of `max_depth` inpaintings that starts
-from a sample of the prior. A search returns its best scene, so the reward of a step is what it adds to the best value
-so far; the sum over an episode is the gain over the first sample. Masks without slots in the current scene are not
-legal: the environment says so in `action_masks()`, and MaskablePPO gives them no probability.
+A search regenerates some slots of a scene again and again. Here the agent chooses these slots (the mask): the faults of
+the scene, its empty slots, or more at once. An episode is a chain of `max_depth` inpaintings that starts from a sample
+of the prior. A search returns its best scene, so the reward of a step is the increase of the best value so far; the sum
+over an episode is the gain over the first sample. Masks without slots in the current scene are not legal:
+`action_masks()` of the environment excludes them, and MaskablePPO gives them no probability.
 
-The agent sees a summary of the observation, since a few thousand steps are few: the value of the scene and the best so
-far, the depth, the number of objects, and the number of slots that each mask would regenerate.
+The agent sees a summary of the observation, because it learns from a few thousand steps only: the value of the scene
+and the best value so far, the depth, the number of objects, and the number of slots that each mask would regenerate.
 
 After training the agent is compared with random masks and with each mask alone. All start from the same scenes and
-spend the same number of denoiser evaluations (NFE); an episode that comes to its end early spends less. A mask alone
-gives way to a random legal one where it has no slot.
+spend the same number of denoiser evaluations (NFE); an episode that ends early spends fewer. Where a single mask has no
+slot, a random legal mask replaces it.
 
     pip install "scene-envs[sb3]"
 

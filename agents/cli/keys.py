@@ -40,7 +40,7 @@ class KeyHelp:
 ADAPTER = KeyHelp(
     "adapter",
     "",
-    "low-rank updates of the prior, the folder of a run with adapter.rank or an adapter.safetensors; A+0.5*B adds two.",
+    "low-rank updates of the prior: the folder of a run with adapter.rank or an adapter.safetensors; A+0.5*B adds two.",
 )
 """The key that every command with ``prior=`` has besides its own."""
 

@@ -49,7 +49,7 @@ usage: scene-envs COMMAND key=value ...
 scene-envs COMMAND --help lists the keys of a command; --traceback shows where an error came from.
 --cfg job prints the keys and runs nothing; --config FILE starts the run of a config.yaml again;
 --config-dir FOLDER adds groups and experiments (+experiment=NAME); --multirun seed=0,1,2 makes a run of each.
---allow-local lets reward=./my_rewards.py:clutter run that file.
+--allow-local allows reward=./my_rewards.py:clutter to run that file without a question.
 A command writes into output=FOLDER, by default runs/COMMAND-TIME.
 """
 

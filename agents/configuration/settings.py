@@ -16,12 +16,12 @@ class OptimizerSettings:
     """An optimiser of weights.
 
     Attributes:
-        name: ``adamw``.
+        name: name of the optimiser: ``adamw``.
         lr: peak learning rate.
         warmup: steps over which the learning rate rises linearly.
         weight_decay: decoupled weight decay.
-        clip: largest norm of a gradient.
-        ema: decay of the weight average that is evaluated and saved; 0 takes the weights themselves.
+        clip: largest norm of a gradient; longer gradients are scaled down.
+        ema: decay of the averaged weights, which are evaluated and saved; 0 uses the weights themselves.
     """
 
     KNOWN: ClassVar[Sequence[str]] = ("adamw",)
@@ -47,7 +47,8 @@ class LoggerSettings:
     """Files of a run, and how often they are written.
 
     Attributes:
-        name: ``csv`` for log.csv alone, which every run has; ``tensorboard`` or ``wandb`` (offline) besides.
+        name: ``csv`` writes log.csv, which every run has; ``tensorboard`` and ``wandb`` (offline) write their own files
+            as well.
         checkpoint_every: steps or iterations between resumable checkpoints.
     """
 

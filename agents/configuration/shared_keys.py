@@ -10,11 +10,11 @@ class SamplingKeys:
     """Sampling of scenes.
 
     Attributes:
-        prompt: what the scenes should hold, for priors that read prompts; null for anything.
+        prompt: text that the scenes should match, for priors that read prompts; null for no prompt.
         guidance: weight of classifier-free guidance, 0 for none; needs a prompt.
         num_steps: denoising steps per scene.
-        slots: slots per scene, more than trained is allowed; null means as trained.
-        seed: of the noise.
+        slots: slots per scene, which may exceed the number in training; null takes the number in training.
+        seed: seed of the noise.
     """
 
     prompt: str | None = None
@@ -26,11 +26,12 @@ class SamplingKeys:
 
 @dataclass
 class RewardLimits:
-    """Limits of a reward from outside this package, which runs in a process of its own.
+    """Limits of a reward from outside this package; it runs in its own process.
 
     Attributes:
-        reward_timeout: seconds that it may take for a batch; then the scenes of that batch are invalid.
-        reward_memory: GiB that it may allocate.
+        reward_timeout: most seconds that the reward may take for a batch; after that the scenes of the batch are
+            invalid.
+        reward_memory: most memory that the reward may allocate, GiB.
     """
 
     reward_timeout: float = 60.0
@@ -42,10 +43,10 @@ class OutputKeys:
     """Computation and output.
 
     Attributes:
-        output: folder for what the command writes.
-        pictures: how many scenes the galleries show; 0 draws none.
+        output: folder for the files that the command writes.
+        pictures: number of scenes in the galleries; 0 draws none.
         batch_size: scenes denoised at once.
-        workers: physics worker processes; 0 computes in this one.
+        workers: physics worker processes; 0 computes physics in this process.
         device: torch device.
     """
 
@@ -61,9 +62,9 @@ class TrainingKeys:
     """Recipe, output and device of a training run.
 
     Attributes:
-        recipe: a named set of the other keys; keys given beside it win.
-        output: run directory; an interrupted run found there goes on where it stopped; empty for runs/COMMAND-TIME on
-            the command line.
+        recipe: a named set of values for the other keys; keys that are given as well override it.
+        output: run folder; a run that was interrupted there is resumed; empty for runs/COMMAND-TIME on the command
+            line.
         device: torch device.
     """
 

@@ -51,24 +51,24 @@ def classifier_accuracy(
 ) -> Accuracy:
     """Accuracy, on held-out scenes, of a classifier trained to tell real scenes from samples.
 
-    A set transformer on the objects of a scene: categories, poses standardised per asset, Fourier features of
-    the translation, and offsets and gaps to the nearest neighbours standardised per pair of assets; means and standard
-    deviations are those of the real training part. Welded objects are objects
-    like any other; empty slots and the order of slots mean nothing.
+    A set transformer reads the objects of a scene: categories, poses standardised per asset, Fourier features of the
+    translation, and offsets and gaps to the nearest neighbours, standardised per pair of assets. Means and standard
+    deviations are those of the real training part. Welded objects are treated as all others; the result does not depend
+    on empty slots or on the order of slots.
 
-    Samples carry noise that no grammar has, so that at full float precision every sampler is told apart by it and
-    the accuracy says nothing. Both classes therefore get Gaussian noise of the ``resolution``, once.
+    Samples contain noise that grammar scenes do not have. At full precision this noise alone would identify the samples
+    of every prior. Gaussian noise of the ``resolution`` is therefore added once to both classes.
 
     Args:
         real: real scenes; the two batches should share none.
-        fake: samples of the same scene type. Of the larger batch as many as the smaller has are drawn.
+        fake: samples of the same scene type. The larger batch is subsampled to the size of the smaller one.
         seeds: repetitions with other splits and weights.
         seed: the first of them.
         resolution: standard deviation of the noise (m, rad); (0, 0) compares at full precision.
         config: sizes of the parts, and how the classifier is trained; it trains on at most 50,000 objects.
 
     Returns:
-        Accuracy as a fraction: 0.5 when nothing tells them apart.
+        Accuracy as a fraction; 0.5 is chance.
 
     Raises:
         InvalidInputError: other scene types, fewer than 20 scenes in one batch, no seeds, a negative resolution.

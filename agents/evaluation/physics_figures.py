@@ -72,8 +72,8 @@ def collision_rate(result: PenetrationResult) -> float:
 def stable_fraction(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> float:
     """Share of free objects that move at most 1 mm and turn at most 0.01 rad in 0.1 s of simulation.
 
-    Overlap up to 1 cm is no reason to fail. Objects deeper than that in another count as not stable and are taken
-    out before the others are simulated.
+    Overlaps up to 1 cm are allowed. Objects with deeper overlaps count as not stable, and are removed before the others
+    are simulated.
 
     Raises:
         InvalidInputError: no scene that the physics could judge holds a free object.

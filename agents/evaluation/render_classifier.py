@@ -45,7 +45,7 @@ def render_classifier_accuracy(
 
     Args:
         real: real scenes; the two batches should share none.
-        fake: samples of the same scene type. Of the larger batch as many as the smaller has are drawn.
+        fake: samples of the same scene type. The larger batch is subsampled to the size of the smaller one.
         seeds: repetitions with other splits and weights.
         seed: the first of them.
         width: of the renders, pixels, at least 16.
@@ -53,7 +53,7 @@ def render_classifier_accuracy(
         config: sizes of the parts, and how the classifier is trained.
 
     Returns:
-        Accuracy as a fraction: 0.5 when nothing tells them apart.
+        Accuracy as a fraction; 0.5 is chance.
 
     Raises:
         MissingDependencyError: PyBullet is not installed.

@@ -11,11 +11,11 @@ from agents.planning.registry import PlannerSettings, check_at_least, register_p
 @register_planner("beam")
 @dataclass(frozen=True)
 class BeamPlanner(PlannerSettings):
-    """Beam search that keeps parents beside their children.
+    """Beam search in which parents compete with their children.
 
-    A round expands ``children`` inpaintings of each of the ``width`` best states. States that were expanded compete
-    with the new ones and are inpainted further while they stay among the best; of equal values the newer state is kept.
-    A scene is in the beam once.
+    A round expands ``children`` inpaintings of each of the ``width`` best states. Expanded states compete with the new
+    ones, and are inpainted again while they are among the best. If two states have equal values, the newer one is kept.
+    A scene is in the beam only once.
 
     Attributes:
         width: states that are kept.

@@ -11,10 +11,10 @@ from agents.planning.registry import PlannerSettings, check_at_least, register_p
 @register_planner("best_of")
 @dataclass(frozen=True)
 class BestOfPlanner(PlannerSettings):
-    """Best of N independent samples: expands the root alone, every action once, in order.
+    """Best of N independent samples: expands only the root, every action once, in order.
 
-    The baseline of a search at equal NFE. Give it a root with at least ``budget`` actions; when the problem seeds
-    children by their path, its first samples are those of any other planner.
+    This is the baseline of a search at equal NFE. The root needs at least ``budget`` actions. If the problem seeds
+    children by their path, the first samples are the same as with any other planner.
 
     Attributes:
         parallel: scenes per batch of the denoiser.

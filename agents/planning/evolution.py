@@ -27,17 +27,17 @@ from scene_envs.errors import InvalidInputError
 class EvolutionPlanner(PlannerSettings):
     """Evolution with cut and splice as crossover (Deaven and Ho 1995).
 
-    The population begins with fresh samples, or with the scene that the search starts from and inpaintings of it. A
-    round makes ``children`` offspring. A parent is the better of two members at random. Offspring of one parent is
-    an inpainting of it. Offspring of two is a splice of them (:func:`~agents.planning.splice.spliced`), gets a mask
-    of its own and is inpainted; the splice costs no denoiser evaluation. The best different scenes, old and new,
-    are the next population; of equal values the newer scene stays.
+    The population begins with fresh samples, or with the start scene of the search and inpaintings of it. A round makes
+    ``children`` offspring. A parent is the better of two random members. With one parent, the offspring is an
+    inpainting of the parent. With two parents, it is a splice of them (:func:`~agents.planning.splice.spliced`), which
+    gets its own mask and is inpainted; the splice costs no denoiser evaluation. The best distinct scenes, old and new,
+    are the next population. If two scenes have equal values, the newer one stays.
 
     Attributes:
-        population: scenes that are kept, and fresh samples in the beginning.
+        population: number of scenes that are kept, and of fresh samples at the start.
         children: offspring per round, one batch of the denoiser; null takes ``branching``.
-        crossover: chance that an offspring has two parents.
-        seed: of parents and cuts, with the seed of the root.
+        crossover: probability that an offspring has two parents.
+        seed: seed of parents and cuts, together with the seed of the root.
     """
 
     name: str = "evolution"

@@ -88,16 +88,16 @@ class Particles:
 class FeynmanKacPlanner(PlannerSettings):
     """Feynman-Kac steering of every inpainting (Singhal et al. 2025), in rounds of iterated repair.
 
-    A round denoises ``particles`` inpaintings of the current state side by side. On the way the objective scores what
-    the network expects each to become, and particles that promise more take the places of others. What comes out is
-    kept as in :class:`~agents.planning.GreedyPlanner`. Resampling costs evaluations of the objective, none of the
-    denoiser.
+    A round denoises ``particles`` inpaintings of the current state side by side. During the denoising, the objective
+    scores the scene that the network expects of each particle, and particles with higher scores replace others. The
+    finished scenes are treated as in :class:`~agents.planning.GreedyPlanner`. Resampling costs evaluations of the
+    objective, but none of the denoiser.
 
     Attributes:
         particles: inpaintings per round, one batch of the denoiser.
-        resamplings: how often they are resampled.
+        resamplings: number of resamplings per round.
         begin: share of the denoising steps before the first resampling.
-        strength: weight of a particle is exp(strength * Φ); 0 leaves all particles alone.
+        strength: λ in the weight exp(λ Φ) of a particle; 0 resamples nothing.
     """
 
     name: str = "feynman_kac"

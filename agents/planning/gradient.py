@@ -32,16 +32,16 @@ WEIGHTS = ("overlap",)
 class GradientPlanner(PlannerSettings):
     """Gradient guidance of every inpainting that another planner makes.
 
-    Scenes follow the prior times exp(strength * weight), to first order about the scene that the network expects. The
-    objective scores the finished scenes, and the other planner chooses the scene that is inpainted next. A step costs
-    one gradient of the weight more, and no evaluation of the denoiser.
+    Scenes follow the prior times exp(strength * weight), to first order around the scene that the network expects. The
+    objective scores the finished scenes, and the other planner chooses the scene that is inpainted next. Guidance adds
+    one gradient of the weight to a step, and no evaluation of the denoiser.
 
     Attributes:
-        planner: the other planner: its name, or a mapping of its ``name`` and keys; it must accept any number of
+        planner: the other planner: its name, or a mapping of its ``name`` and keys. It must accept any number of
             children of a state, and must not steer the denoising itself.
         weight: a differentiable log-weight: ``overlap``, or in Python a function.
-        strength: of the weight; 0 is the other planner alone.
-        begin: share of the denoising steps before guidance.
+        strength: factor on the weight; 0 is the other planner alone.
+        begin: share of the denoising steps that come before guidance.
         children: inpaintings per round of the other planner, one batch of the denoiser; null takes ``branching``.
     """
 

@@ -15,8 +15,8 @@ class GreedyPlanner(PlannerSettings):
     """Iterated repair of one state.
 
     A round takes the next ``children`` inpaintings of the current state. The best of them becomes the current state
-    unless it scores less; one that scores the same is taken, since another mask may lead further. A state whose actions
-    are spent gives way to the best earlier one that has some.
+    unless it scores less. A child with the same score becomes the current state, because its mask regenerates other
+    slots. If the current state has no action left, the best earlier state with an action left replaces it.
 
     Attributes:
         children: inpaintings per round, one batch of the denoiser; null takes ``branching``.

@@ -22,8 +22,8 @@ Progress = Callable[[int, float], None]
 class SearchStoppedError(SceneEnvsError):
     """A search environment expands nothing more: the time is over, or the user interrupted.
 
-    Planners built on a :class:`Ledger` end with what they have. Where another planner lets it through, the run that
-    started the planner keeps the best state it saw.
+    Planners built on a :class:`Ledger` return their best state. If another planner does not catch this error, the run
+    that started the planner keeps the best state that it saw.
     """
 
 
@@ -126,7 +126,7 @@ def best_different(pool: Sequence[Member], count: int) -> list[Member]:
 class Ledger:
     """Spends a budget of expansions on a problem and keeps account: the planners' common part.
 
-    Nothing is left when the budget is spent, when a state of value 1 was found (the most there is), or when the problem
+    Nothing is left when the budget is spent, when a state of value 1 (the largest value) was found, or when the problem
     stops the search.
 
     Args:

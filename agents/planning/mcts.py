@@ -27,17 +27,17 @@ class _Node:
 class MCTSPlanner(PlannerSettings):
     """Monte Carlo tree search of Pfaff et al. (2025), inference-time search.
 
-    An iteration descends by ``mean + exploration * sqrt(2 ln(visits of the parent) / visits)``, children without a
-    visit first, to a leaf; makes all its ``children`` in one batch; and backs up the value of a random one of them, or
-    of all. The search stops at a state in which nothing is masked. The objects that are still masked in the best state
-    are removed from what is returned, where the problem has ``without_masked`` and the objective does not fall.
+    An iteration descends to a leaf by ``mean + exploration * sqrt(2 ln(visits of the parent) / visits)``; children
+    without a visit come first. It makes all ``children`` of the leaf in one batch, and backs up the value of a random
+    child, or of all children. The search stops at a state in which nothing is masked. Objects that are still masked in
+    the best state are removed from the result, if the problem has ``without_masked`` and the objective does not fall.
 
     Attributes:
-        exploration: weight of the bound. The values are in [0, 1], and siblings differ by a few hundredths: with the
-            textbook's 1 the bound outweighs them, and the tree grows in breadth.
+        exploration: weight of the bound. Values are in [0, 1] and siblings differ by a few hundredths. With the
+            textbook value, 1, the bound outweighs these differences and the tree grows in breadth.
         children: children of a leaf; null takes ``branching``.
-        rollout: ``random`` backs up one new child, ``all`` each of them.
-        seed: of the choice of the child, with the seed of the root.
+        rollout: value that is backed up: ``random`` for that of one new child, ``all`` for that of each.
+        seed: seed of the choice of the child, together with the seed of the root.
     """
 
     name: str = "mcts"

@@ -22,7 +22,7 @@ class PlannerSettings:
     """A planner by name, and its keys.
 
     Attributes:
-        name: a registered planner.
+        name: name of a registered planner.
     """
 
     name: str = ""

@@ -74,13 +74,13 @@ def run_search(
 ) -> SearchOutcome:
     """Search for scenes that score high, starting from nothing but the prior, or from given scenes.
 
-    The root is the scene with fixed welded objects alone, so its children are fresh samples. From there the planner
-    regenerates what the objective blames (Pfaff et al. 2025, inference-time search). With ``scenes`` there is one
-    search for each of them, up to ``count``: it regenerates what is blamed in that scene, and what it gives scores
-    no less. The same seed and settings give the same scenes. An interrupt (Ctrl-C, SIGTERM) ends the search with
-    the best so far, as does ``max_seconds``. With an output folder, the same call goes on where an earlier one was
-    killed or ended; a larger budget may be given. Of more than ``side_by_side`` searches the scenes that are
-    finished are in the folder at any time.
+    The root is the scene with only fixed welded objects, so its children are fresh samples. The planner then
+    regenerates the objects that the objective blames (Pfaff et al. 2025, inference-time search). With ``scenes`` there
+    is one search for each scene, up to ``count``. It regenerates the blamed objects of that scene, and its result
+    scores no less than the scene. The same seed and settings give the same scenes. An interrupt (Ctrl-C, SIGTERM) ends
+    the search with the best scene so far, as does ``max_seconds``. With an output folder, the same call resumes a
+    search that was killed or has ended; the budget may then be larger. If there are more than ``side_by_side``
+    searches, the folder always has the scenes of the finished ones.
 
     Args:
         prior: a prior, or the name or path of one.

@@ -83,9 +83,9 @@ class Lane:
 class Session:
     """Runs plans over one environment until they are done, time is over, or the user interrupts.
 
-    The rounds of all plans are joined into one batch of the environment. With a journal, every round is written to the
-    disk before a plan sees it, and a session that was killed takes what is written instead of expanding anew, so that
-    it goes on where it was.
+    The rounds of all plans are joined into one batch of the environment. With a journal, every round is written to disk
+    before a plan sees it. A session that was killed reads these rounds instead of expanding them again, so it continues
+    where it stopped.
 
     Args:
         problem: the environment.

@@ -48,17 +48,19 @@ class _Stop:
 class TreeOverStepsPlanner(PlannerSettings):
     """Diffusion tree sampling (Jain et al. 2025), in rounds of iterated repair.
 
-    The inpaintings of a state are a tree. Its nodes are scenes at a few stops on the way, its leaves finished scenes.
-    A round takes ``children`` new scenes from one node, chosen by UCB, each with noise of its own; the steps before
-    that node are not taken again. A node is worth the mean of the finished scenes below it and of its own promise.
-    After ``rounds`` rounds the best finished scene becomes the state unless it scores less; else the tree grows on.
+    The inpaintings of a state form a tree. Its nodes are half-finished scenes at a few stops of the denoising, and its
+    leaves are finished scenes. A round continues ``children`` new scenes from one node, chosen by UCB, each with its
+    own noise; the steps before that node are not repeated. The value of a node is the mean over the finished scenes
+    below it and its own expected scene. After ``rounds`` rounds the best finished scene becomes the current state,
+    unless it scores less; in that case the tree grows further.
 
     Attributes:
         children: scenes per round, one batch of the denoiser; null takes ``branching``.
         stops: shares of the denoising steps at which scenes can be branched from.
-        rounds: rounds per state.
+        rounds: rounds per current state.
         exploration: weight of the bound.
-        widening: a node of n visits has n^widening branches before its branches are searched.
+        widening: exponent of progressive widening: a node of n visits has n^widening branches before the search goes
+            below them.
     """
 
     name: str = "tree_over_steps"

@@ -14,19 +14,21 @@ from agents.planning.tree import Node, Tree
 class UCTPlanner(PlannerSettings):
     """Upper confidence bounds applied to trees (Kocsis & Szepesvári 2006), for states that score themselves.
 
-    Every state of the search MDP is a whole scene, so its objective is its value and there are no random rollouts:
-    one iteration selects by UCB1, expands one action, evaluates the child and backs its value up. A branch whose
-    actions are all spent is closed; the search ends early when the tree is. A child that holds the same scene as
-    another node, or that scores less than its parent by more than ``max_loss``, counts and is not searched below.
+    Every state of the search MDP is a whole scene, so its objective is its value, and there are no random rollouts. One
+    iteration selects by UCB1, expands one action, evaluates the child and backs its value up. A branch is closed when
+    all its actions are tried; the search ends early when the root is closed. A child that holds the same scene as
+    another node, or that scores less than its parent by more than ``max_loss``, is added, but the search does not
+    continue below it.
 
     Attributes:
-        exploration: weight of the UCB1 bound. sqrt(2) is the textbook value for independent values over the whole of
-            [0, 1]; siblings of one scene differ by a few hundredths, hence the smaller default.
-        parallel: expansions selected before any is evaluated, by virtual loss: they become one batch of the
-            denoiser. Every value gives its own tree, the same one each time. null takes ``branching``.
-        children: children of a state before its children are searched; null takes ``branching``.
-        widening: exponent of progressive widening: a state of n visits may have n^widening children; 0 for never.
-        max_loss: how much less than its parent's a child's value may be; 1 prunes nothing but the same scenes.
+        exploration: weight of the UCB1 bound. The textbook value sqrt(2) is for independent values over the whole of
+            [0, 1]; siblings of one scene differ by a few hundredths, so the default is smaller.
+        parallel: number of expansions that are selected, by virtual loss, before any is evaluated; they are one batch
+            of the denoiser. Each number gives its own tree, and the same tree each time. null takes ``branching``.
+        children: number of children of a state before the search goes below them; null takes ``branching``.
+        widening: exponent of progressive widening: a state of n visits may have n^widening children; 0 for no widening.
+        max_loss: most by which the value of a child may be below its parent's; the search does not go below a worse
+            child. 1 excludes no child, except repeated scenes.
     """
 
     name: str = "uct"

@@ -27,9 +27,9 @@ class AlgorithmSettings:
     """Settings that all algorithms share.
 
     Attributes:
-        name: the algorithm, a registered name.
-        scenes_per_prompt: scenes of a batch that share a prompt, and the observed part of an inpainting; advantages are
-            taken among them.
+        name: name of a registered algorithm.
+        scenes_per_prompt: number of scenes of a batch that share a prompt, or the observed part in inpainting;
+            advantages are computed within such a group.
     """
 
     learning_rate: ClassVar[float] = 5e-5
@@ -56,15 +56,17 @@ class DDPOSFSettings(AlgorithmSettings):
     """DDPO-SF: the score-function policy gradient (Black et al. 2024, Eq. 3).
 
     Attributes:
-        gradient_steps: how many of the eligible steps are drawn into the gradient per iteration.
-        min_std: steps with a smaller sigma (normalised units) stay out of the gradient.
-        skip_first: fraction of the chain, from its noisy end, that stays out of the gradient.
-        step_weighting: ``uniform``, or weights proportional to a step's ``std`` or ``variance``.
-        log_prob_reduction: ``mean`` or ``sum`` of log p over the random entries of a scene.
-        credit: ``scene`` gives every slot the scene's advantage, ``object`` its own (rewards with ``per_object``),
-            ``auto`` takes ``object`` where the reward allows it.
-        baseline: ``leave_one_out`` or ``mean``.
-        advantage_clip: advantages are kept within plus and minus this.
+        gradient_steps: number of denoising steps per iteration that contribute to the gradient, drawn from the eligible
+            steps.
+        min_std: smallest sigma of an eligible step, in normalised units; steps with less noise are excluded from the
+            gradient.
+        skip_first: first fraction of the chain, with the most noise, that is excluded from the gradient.
+        step_weighting: weight of a step: ``uniform``, or proportional to its ``std`` or ``variance``.
+        log_prob_reduction: reduction of log p over the random entries of a scene: ``mean`` or ``sum``.
+        credit: ``scene`` gives every slot the advantage of the scene, ``object`` gives it its own (for rewards with
+            ``per_object``), ``auto`` uses ``object`` if the reward allows it.
+        baseline: baseline of the advantages: ``leave_one_out`` or ``mean``.
+        advantage_clip: largest absolute value of an advantage.
     """
 
     name: str = "ddpo_sf"
@@ -120,15 +122,15 @@ class ForwardProcessSettings(AlgorithmSettings):
 
     Attributes:
         updates: optimiser steps per batch.
-        draws: timesteps and noises of every scene per optimiser step.
-        credit: credit of poses: ``scene`` gives every slot the scene's advantage, ``object`` its own (rewards with
-            ``per_object``), ``auto`` takes ``object`` where the reward allows it.
-        category_credit: credit of categories: ``scene`` for the scene's advantage, ``none`` to keep what is there,
-            ``auto`` for ``none`` where poses have credit per object.
-        sampler_decay: of the weight average that samples, per iteration; rises from 0 to this.
-        siblings: neighbouring scenes that share the first steps of their chain and are compared with each other; 1 for
-            scenes that share nothing and are compared with the whole batch.
-        shared_steps: share of the chain that siblings have in common; when it ends all categories should be drawn.
+        draws: number of timesteps and noises of every scene per optimiser step.
+        credit: credit of poses: ``scene`` gives every slot the advantage of the scene, ``object`` gives it its own (for
+            rewards with ``per_object``), ``auto`` uses ``object`` if the reward allows it.
+        category_credit: credit of categories: ``scene`` uses the advantage of the scene, ``none`` keeps the categories
+            as they are, ``auto`` is ``none`` if poses have credit per object, else ``scene``.
+        sampler_decay: final decay of the averaged weights that sample, per iteration; it rises from 0.
+        siblings: number of neighbouring scenes that share the first steps of their chain and are compared with each
+            other; with 1 scenes share nothing and are compared with the whole batch.
+        shared_steps: share of the chain that siblings have in common; all categories should be drawn at its end.
     """
 
     learning_rate: ClassVar[float] = 2e-4
@@ -218,7 +220,7 @@ class RewardWeightedSettings(ForwardProcessSettings):
     """Reward-weighted fine-tuning: good samples pull, none pushes; the baseline of the other algorithms.
 
     Attributes:
-        temperature: of the weights exp(A / temperature), A in standard deviations.
+        temperature: temperature of the weights exp(A / temperature), in standard deviations of the reward.
     """
 
     name: str = "reward_weighted"
@@ -235,9 +237,9 @@ class NeonSettings(AlgorithmSettings):
 
     Attributes:
         updates: optimiser steps per batch.
-        draws: timesteps and noises of every own sample per optimiser step.
-        w: length of the extrapolation away from the copy that is trained on own samples.
-        period: iterations of a round, which ends with an extrapolation.
+        draws: number of timesteps and noises of every own sample per optimiser step.
+        w: length of the step away from the copy that is trained on own samples.
+        period: number of iterations of a round; a round ends with an extrapolation.
     """
 
     learning_rate: ClassVar[float] = 1e-4

@@ -31,7 +31,7 @@ class PostTrainOptimizerSettings(OptimizerSettings):
     """The optimiser of a post-training run; its steps are updates.
 
     Attributes:
-        lr: peak learning rate; null takes the algorithm's own, ten times that with an adapter.
+        lr: peak learning rate; null takes the default of the algorithm, or ten times that with an adapter.
         chunk: scenes per forward and backward pass; null takes the whole batch at once.
     """
 
@@ -53,19 +53,19 @@ class GuardSettings:
     """Settings of the guard.
 
     Attributes:
-        every: iterations between guard checks.
-        scenes: held-out real scenes of the guard.
-        limit: largest held-out loss, as a ratio to the base prior's, of a checkpoint worth keeping.
-        action: ``report`` goes on beyond a limit, ``stop`` ends the run there, ``rollback`` takes the best checkpoint's
-            weights again and goes on with half the learning rate.
-        samples: scenes that are sampled, from the same noise at each check, for the limits below, at most as many as
-            ``scenes``; 0, or fewer than 20, looks at the loss alone.
+        every: iterations between checks.
+        scenes: number of held-out real scenes.
+        limit: largest held-out loss of a checkpoint that may be kept, as a ratio to that of the base prior.
+        action: what happens beyond a limit: ``report`` continues, ``stop`` ends the run, ``rollback`` returns to the
+            weights of the best checkpoint and continues with half the learning rate.
+        samples: number of scenes that a check samples, always from the same noise, for the limits below; at most as
+            many as ``scenes``. With fewer than 20, a check measures the loss alone.
         samples_every: iterations between checks that sample.
-        count_limit: by how many objects the distance (Wasserstein-1) of the samples' counts from those of real scenes
-            may exceed the base prior's; null takes the algorithm's.
-        category_limit: the same for the KL divergence of the categories, nats.
-        classifier_limit: the same for the accuracy of a classifier that tells samples from real scenes.
-        max_invalid: consecutive batches without one valid reward after which the run stops.
+        count_limit: limit of the Wasserstein-1 distance between object counts of samples and of real scenes: the number
+            of objects by which it may exceed the base prior's distance; null takes the default of the algorithm.
+        category_limit: the same limit for the KL divergence of the categories, in nats.
+        classifier_limit: the same limit for the accuracy of a classifier that tells samples from real scenes.
+        max_invalid: number of consecutive batches without a valid reward after which the run stops.
     """
 
     every: int = 5
@@ -106,9 +106,9 @@ class PostTrainLoggerSettings(LoggerSettings):
     """Settings of the progress display and the report of a post-training run.
 
     Attributes:
-        progress: ``bar``, ``lines`` or ``none``.
-        report_scenes: fresh samples of the prior before and after that the command measures and pictures in
-            report.html; 0 for no report.
+        progress: progress display: ``bar``, ``lines`` or ``none``.
+        report_scenes: number of fresh samples, before and after the run, that report.html measures and shows; 0 for no
+            report.
     """
 
     progress: str = "bar"
@@ -153,28 +153,28 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
     :class:`~agents.configuration.TrainingKeys` and :class:`~agents.configuration.RewardLimits`.
 
     Attributes:
-        prior: the prior to start from, a shipped name or a path.
-        reward: registered name, or a mapping with ``name`` and settings; in Python a function or reward object as
-            well, which runs in this process: a hang or crash of it is the run's.
-        iterations: policy updates, that is batches of fresh scenes.
+        prior: prior from which the run starts: a shipped name or a path.
+        reward: a registered name, or a mapping with ``name`` and settings. In Python also a function or a reward
+            object; it runs in the calling process, so its crash or hang ends or stops the run.
+        iterations: number of iterations; each samples one batch of scenes.
         batch_size: scenes sampled per iteration.
-        workers: physics worker processes; 0 computes physics in this process, ``ray`` on a Ray cluster, with as many
-            as that has CPUs.
-        recipe: a named set of the other keys: ``ours``, ``demo_clutter``, ``demo_feasible``; keys beside it win.
-        output: run directory; an interrupted run found there goes on where it stopped; empty for runs/COMMAND-TIME
-            on the command line, runs/post-train in Python.
-        prompt: what the scenes should hold, for priors that read prompts: one text, a list such as
-            '["A scene with two cups.", "A scene with 9 objects."]', ``data`` for the prompts of the real scenes, or
-            ``grammar`` for descriptions of the grammar's; null for anything.
+        workers: physics worker processes; 0 computes physics in this process; ``ray`` uses the CPUs of a Ray cluster.
+        recipe: a named set of values for the other keys: ``ours``, ``demo_clutter`` or ``demo_feasible``. Keys that are
+            given as well override it.
+        output: run folder; a run that was interrupted there is resumed; empty for runs/COMMAND-TIME on the command
+            line, runs/post-train in Python.
+        prompt: text that the scenes should match, for priors that read prompts: one text, a list such as '["A scene
+            with two cups.", "A scene with 9 objects."]', ``data`` for the prompts of the real scenes, or ``grammar``
+            for descriptions of grammar scenes; null for no prompt.
         guidance: weight of classifier-free guidance in the policy, 0 for none; needs a prompt.
-        seed: of the initial noise, the chain's noise, the steps drawn and the real scenes.
-        algorithm: how rewards become a gradient.
-        optimizer: of the weights.
-        regularisation: on real scenes.
-        guard: held-out real scenes.
+        seed: seed of the initial noise, the chain's noise, the choice of steps and the real scenes.
+        algorithm: the post-training algorithm.
+        optimizer: the optimiser of the weights.
+        regularisation: losses that keep the prior near real scenes and near its base.
+        guard: checks on held-out real scenes.
         adapter: low-rank updates, off by default.
-        inpaint: observed parts of scenes, off by default.
-        logger: files and screen.
+        inpaint: post-training inside inpainting, off by default.
+        logger: log files and progress display.
     """
 
     RENAMED: ClassVar[Mapping[str, str]] = {

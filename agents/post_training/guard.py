@@ -45,7 +45,7 @@ class GuardReading:
 
 
 class Guard:
-    """Watches the held-out pretraining loss and samples, and knows the best checkpoint within all limits.
+    """Monitors the held-out pretraining loss and samples, and keeps the best checkpoint within all limits.
 
     The best checkpoint has the largest reward among the checks within all limits. If the guard samples, the reward of a
     check is that of the samples, which start from the same noise at every check; checks of the loss alone then keep
@@ -55,11 +55,11 @@ class Guard:
     Args:
         heldout: (K, N, D) normalised real scenes that the regularisation never sees.
         limit: largest ratio before the run counts as over-optimised; no checkpoint beyond it is kept.
-        seed: of the fixed timesteps and noise.
-        prompts: one of each held-out scene; None measures without.
-        samples: how to sample and measure; None looks at the loss alone.
-        limits: by how much figures of samples may exceed those of the base prior, by name.
-        target: largest ratio of a checkpoint that is kept, where a run holds the ratio.
+        seed: seed of the fixed timesteps and noise.
+        prompts: one prompt of each held-out scene; None measures without prompts.
+        samples: how to sample and measure; None measures the loss alone.
+        limits: most by which figures of samples may exceed those of the base prior, by name.
+        target: largest ratio of a checkpoint that is kept, if the run holds the ratio.
 
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior()

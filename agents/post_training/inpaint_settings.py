@@ -18,12 +18,12 @@ class InpaintSettings:
     """Settings of post-training inside inpainting: a part of each scene is observed, and the rest is the action.
 
     Attributes:
-        mask: which slots are regenerated: a registered mask generator, or a mapping of its name and settings; null for
-            whole scenes.
-        scenes: whose other slots are observed: ``real`` for the real scenes of the regularisation, ``samples`` for
-            fresh samples of the sampling policy.
-        entries: what is regenerated of a masked slot: ``slots`` for pose and category, ``poses`` for the poses of its
-            object alone, whose category is observed.
+        mask: mask generator that chooses the slots to regenerate: a registered name, or a mapping of its name and
+            settings; null samples whole scenes.
+        scenes: source of the observed slots: ``real`` for the real scenes of the regularisation, ``samples`` for fresh
+            samples of the sampling policy.
+        entries: entries of a masked slot that are regenerated: ``slots`` for pose and category, ``poses`` for the pose
+            alone, while the category is observed.
     """
 
     mask: Any = None

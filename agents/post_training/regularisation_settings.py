@@ -17,21 +17,22 @@ class RegularisationSettings:
     """Settings of the regularisation: pretraining loss on real scenes, and KL divergence from the base prior.
 
     Attributes:
-        objective: ``pretraining`` for the pretraining loss on real scenes; ``discriminative`` for a loss that raises
-            the likelihood of real scenes over the base prior's, and lowers that of samples of the base prior.
-        weight: coefficient of this loss; null takes the algorithm's own.
-        sharpness: of the discriminative loss; a larger value moves the prior less from its base.
-        base_samples: samples of the base prior that the discriminative loss compares with real scenes; drawn once.
-        kl: coefficient of the KL divergence from the base prior, on own samples, in nats per random variable of a
-            scene; null for none, or 1 with ``hold=kl:VALUE``.
-        hold: target that is held by a factor on both coefficients: ``guard:1.05`` for the held-out loss as a ratio to
-            the base prior's, ``kl:0.01`` for the KL divergence; null keeps the coefficients as they are.
+        objective: ``pretraining`` is the pretraining loss on real scenes. ``discriminative`` raises the likelihood of
+            real scenes relative to the base prior and lowers that of samples of the base prior.
+        weight: coefficient of this loss; null takes the default of the algorithm.
+        sharpness: scale of the discriminative loss; with a larger value the prior moves less far from its base.
+        base_samples: number of samples of the base prior in the discriminative loss; they are drawn once.
+        kl: coefficient of the KL divergence from the base prior, measured on own samples, in nats per random variable
+            of a scene; null for none, or 1 with ``hold=kl:VALUE``.
+        hold: target that the run holds by adjusting both coefficients. ``guard:1.05`` is the held-out loss as a ratio
+            to the base prior's, ``kl:0.01`` the KL divergence; null keeps the coefficients constant.
         batch_size: real scenes per update.
-        scenes: ``grammar``, or the directory of a dataset.
-        bank_size: how many real scenes are drawn (grammar) or read (dataset), the held-out ones included.
-        replay: scenes that the pretraining loss sees beside the real ones, such as the winners of a search: the folder
-            of a run, a scene file or a dataset; null for none.
-        replay_share: of the scenes of each batch of the pretraining loss, if there is a replay.
+        scenes: source of the real scenes: ``grammar``, or a dataset folder.
+        bank_size: number of real scenes that are drawn from the grammar or read from the dataset, including the
+            held-out scenes.
+        replay: further scenes for the pretraining loss, such as the winners of a search: the folder of a run, a scene
+            file or a dataset; null for none.
+        replay_share: share of replayed scenes in each batch of the pretraining loss, if there is a replay.
     """
 
     objective: str = "pretraining"
@@ -84,8 +85,8 @@ class AdapterSettings:
     """Low-rank updates of the attention and MLP matrices, which are trained in place of all weights.
 
     Attributes:
-        rank: of the updates; 0 trains all weights.
-        alpha: updates are scaled by alpha / rank.
+        rank: rank of the updates; 0 trains all weights.
+        alpha: scale of the updates, times the rank: they are multiplied by alpha / rank.
     """
 
     rank: int = 0

@@ -67,7 +67,7 @@ class PostTrainResult:
 def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> PostTrainResult:
     """Post-train a prior with DDPO-SF and regularisation on real scenes; resumes a run found in ``config.output``.
 
-    Processes that ``torchrun`` started share each batch and take the steps of one; the first alone writes.
+    Processes that ``torchrun`` started share each batch and take the steps of one process. Only the first one writes.
 
     Args:
         config: the run.

@@ -41,25 +41,27 @@ class PretrainConfig(SceneKeys, TrainingKeys):
     Keys that are not listed are those of :class:`~agents.configuration.TrainingKeys`.
 
     Attributes:
-        scene: scene type. This key is not read with several datasets, which make their union, nor with prior=.
-        data: dataset directory of training scenes; several, joined by commas, train one prior on all their scene
-            types with equal chances; ``grammar`` stands for fresh scenes of the grammar without end.
-        heldout: dataset directory of held-out scenes; empty takes the last 2 % of ``data``, or 512 of the grammar;
-            with several datasets it must be empty.
-        prior: shipped name, or folder of a prior or a run, that training starts from; its scene type, network, process
-            and text stay as they are. Empty for a fresh one.
-        output: run directory; an interrupted run in it goes on where it stopped; empty for runs/COMMAND-TIME on the
-            command line, runs/pretrain in Python.
+        scene: scene type. This key is ignored with ``prior=`` and with several datasets, which define the union of
+            their scene types.
+        data: dataset folder of training scenes. Several folders, joined by commas, train one prior on all their scene
+            types with equal probability; ``grammar`` draws fresh scenes from the grammar without end.
+        heldout: dataset folder of held-out scenes. Empty takes the last 2 % of ``data``, or 512 scenes of the grammar.
+            It must be empty if there are several datasets.
+        prior: prior from which training starts: a shipped name, or the folder of a prior or a run. Its scene type,
+            network, process and text encoder stay as they are. Empty for a fresh prior.
+        output: run folder; a run that was interrupted there is resumed; empty for runs/COMMAND-TIME on the command
+            line, runs/pretrain in Python.
         iterations: optimiser steps.
         batch_size: scenes per step, over all processes and parts.
-        seed: of weights, batches and noise.
-        recipe: a named set of the other keys: ``ours``, or ``paper`` for the paper's setting; keys given beside it win.
-        network: what denoises.
-        process: of noise and denoising.
-        loss: what is learned.
-        text: what is read.
-        optimizer: of the weights.
-        logger: files.
+        seed: seed of weights, batches and noise.
+        recipe: a named set of values for the other keys: ``ours``, or ``paper`` for the paper's setting. Keys that are
+            given as well override it.
+        network: the denoiser network.
+        process: the diffusion process.
+        loss: the training loss.
+        text: the text encoder.
+        optimizer: the optimiser of the weights.
+        logger: log files.
     """
 
     RENAMED: ClassVar[Mapping[str, str]] = {

@@ -17,15 +17,15 @@ class ModuleSettings:
     """Modules that are added to the core of the mixed flux network; other networks do not read them.
 
     Attributes:
-        observed_flags: the network is told which poses and categories are observed, for inpainting.
-        pooled_text: the mean of the text tokens also modulates every block.
-        count_embedding: the network is told how many slots it sees of each category, and how many are masked.
-        relations: slots see where others stand, blurred along x, y and z by the noise of the ``axis`` itself, or of the
-            one where it is ``largest``; ``none`` for plain attention.
-        rotation_features: the network is told how far each rotation is off SO(3), and off upright, in units of the
+        observed_flags: give the network flags that say which poses and categories are observed in inpainting.
+        pooled_text: also modulate every block by the mean of the text tokens.
+        count_embedding: give the network the numbers of visible slots of each category and of masked slots.
+        relations: give attention the relative positions of slots. ``axis`` blurs them along x, y and z by the noise of
+            that axis, ``largest`` by the largest noise of the three; ``none`` is plain attention.
+        rotation_features: give the network the difference of each rotation from SO(3) and from upright, in units of the
             noise.
-        contacts: the network learns at what distance two objects touch, and is told the gap that is left in units of
-            the noise; only with relations.
+        contacts: predict the distances at which two objects touch, and give the network the remaining gaps in units of
+            the noise; needs relations.
     """
 
     RENAMED: ClassVar[Mapping[str, str]] = {"given_flags": "network.modules.observed_flags"}
@@ -52,18 +52,18 @@ class NetworkSettings:
     """The network of a fresh prior.
 
     Attributes:
-        name: ``flux`` (ours), ``midiffusion``, ``diffuscene``, or a registered one.
+        name: name of the network: ``flux`` (ours), ``midiffusion``, ``diffuscene``, or a registered network.
         hidden: width of the network.
-        depth: its blocks; single-stream ones where there are both.
-        heads: attention heads.
+        depth: number of blocks; of single-stream blocks if the network has both kinds.
+        heads: number of attention heads.
         frequencies: octaves of Fourier features of each translation (flux only); 0 for none.
-        double_blocks: double-stream blocks of the mixed flux network with text; null for a third of depth.
-        embedding: width of the embedding of a slot (mixed flux only); null for hidden.
+        double_blocks: number of double-stream blocks of the mixed flux network with text; null for a third of depth.
+        embedding: width of the embedding of a slot (mixed flux only); null takes hidden.
         pose_head: hidden width of the pose output (mixed flux only).
-        time_scale: what the time is multiplied by before it is embedded (mixed flux only).
-        text_reach: of the mixed flux network: text meets slots in its ``double``-stream blocks alone, which is quicker,
-            or in ``all``, as in the paper's.
-        modules: what is added to the core of the mixed flux network.
+        time_scale: factor on the time before it is embedded (mixed flux only).
+        text_reach: blocks of the mixed flux network in which text and slots attend to each other: ``double`` for the
+            double-stream blocks, which is faster, or ``all``, as in the paper.
+        modules: modules that are added to the core of the mixed flux network.
     """
 
     name: str = "flux"
@@ -92,21 +92,23 @@ class ProcessSettings:
 
     Attributes:
         name: ``mixed`` (categories as discrete states) or ``continuous`` (categories as numbers).
-        prediction: what the network predicts (``edm``, the preconditioning of Karras et al. 2022, ``epsilon``, ``x0``,
-            ``v``).
-        schedule: noise schedule (``karras``, ``linear``, ``cosine``).
+        prediction: target of the network: ``edm`` (preconditioning of Karras et al. 2022), ``epsilon``, ``x0`` or
+            ``v``.
+        schedule: noise schedule: ``karras``, ``linear`` or ``cosine``.
         noise_floor: lowest noise-to-signal ratio of the karras schedule, in normalised units.
         noise_ceiling: highest noise-to-signal ratio of the karras schedule.
-        moments: whose mean and spread scale what the network says: those of each ``category`` (of each feature, where
-            the process is continuous), of each ``feature``, or of the ``scene`` as a whole.
-        rotation: what a continuous prior diffuses as rotation: ``matrix``, ``quaternion`` or ``axis_angle``.
-        kernel: of the categories of a mixed prior (``mask_and_replace``, ``absorbing``, ``early_absorbing``,
-            ``squared_absorbing``, ``uniform``).
-        empty_slots: whether slots known to be empty are ``attended`` (the paper's) or ``dropped`` from the network of a
-            mixed prior, which needs an absorbing kernel and saves most of the work.
-        unmasking: which masked slots a sampling step of an absorbing kernel unmasks: ``even``, as near to the expected
-            number as can be, so that few categories are decided at once, or ``independent``.
-        denoised_clip: bound on denoised scenes while sampling, normalised units; 0 for none.
+        moments: mean and standard deviation that scale the network's output: of each ``category`` (of each feature in a
+            continuous process), of each ``feature``, or of the whole ``scene``.
+        rotation: numbers that a continuous prior diffuses for a rotation: ``matrix``, ``quaternion`` or ``axis_angle``.
+        kernel: noise kernel of the categories of a mixed prior: ``mask_and_replace``, ``absorbing``,
+            ``early_absorbing``, ``squared_absorbing`` or ``uniform``.
+        empty_slots: treatment of slots that are known to be empty. ``attended`` keeps them in the network, as in the
+            paper; ``dropped`` leaves them out, which saves most of the work and needs a mixed prior with an absorbing
+            kernel.
+        unmasking: choice of the slots that a sampling step of an absorbing kernel unmasks. ``even`` unmasks the
+            expected number, rounded, so that a step decides few categories at once; ``independent`` draws each slot on
+            its own.
+        denoised_clip: bound on denoised scenes during sampling, in normalised units; 0 for no bound.
     """
 
     name: str = "mixed"
@@ -146,19 +148,20 @@ class LossSettings:
     """The pretraining loss.
 
     Attributes:
-        noise_mean: mean of ln(noise-to-signal) over training timesteps. Rooms, whose normalised unit is metres, need
-            less noise than tables: about -2.6, with a floor of 0.0004.
-        noise_std: its standard deviation.
-        timesteps: distribution of training timesteps, ``lognormal`` (of the noise-to-signal ratio), ``uniform``, or
-            ``both`` in equal parts: categories are decided at high noise, which the first rarely draws.
-        weighting: of the loss by timestep, ``none`` or ``min_snr``.
-        translation_weight: weight of x, y, z in the loss, rotations having 1.
-        category: of a mixed prior, ``cross_entropy`` of the clean category, or ``bound``, the paper's.
-        category_weight: weight of the loss of the categories beside that of the poses.
-        observed_share: share of a mixed prior's training scenes in which some poses or categories are observed, for
-            inpainting.
-        open_empty_share: share of those in which whole slots are observed that observe no empty slot. A prior trained
-            without them crowds a scene whose empty slots are all masked.
+        noise_mean: mean of ln(noise-to-signal ratio) of the training timesteps. The normalised unit of a room is metres
+            long, so rooms need less noise than tables: about -2.6, with a noise floor of 0.0004.
+        noise_std: standard deviation of ln(noise-to-signal ratio) of the training timesteps.
+        timesteps: distribution of training timesteps: ``lognormal`` (of the noise-to-signal ratio), ``uniform``, or
+            ``both`` in equal parts. Categories are decided at high noise, which ``lognormal`` rarely draws.
+        weighting: weight of the loss by timestep: ``none`` or ``min_snr``.
+        translation_weight: weight of x, y and z in the loss; the weight of rotations is 1.
+        category: category loss of a mixed prior: ``cross_entropy`` of the clean category, or ``bound``, the paper's
+            variational bound.
+        category_weight: weight of the category loss; the weight of the pose loss is 1.
+        observed_share: share of the training scenes of a mixed prior in which some poses or categories are observed, as
+            in inpainting.
+        open_empty_share: among training scenes in which whole slots are observed, the share in which all empty slots
+            are masked. A prior that is trained with 0 adds too many objects when all empty slots are masked.
     """
 
     RENAMED: ClassVar[Mapping[str, str]] = {"given_share": "loss.observed_share"}
@@ -189,20 +192,20 @@ class TextSettings:
 
     Attributes:
         encoder: ``none`` for a prior that reads no prompts; ``vocabulary`` for a small encoder with a closed
-            vocabulary, trained with the prior; or the folder or hub name of a BERT model, which stays as it is.
+            vocabulary, which is trained with the prior; or the folder or hub name of a BERT model, which is frozen.
         width: width of the small text encoder.
-        depth: its blocks.
-        latents: tokens that it condenses a prompt to; 0 for one per word.
-        window: of the small text encoder: words that are read together before they attend to each other, odd; 1
-            reads each by itself.
+        depth: number of blocks of the small text encoder.
+        latents: number of tokens to which the small text encoder condenses a prompt; 0 for one token per word.
+        window: number of neighbouring words that the small text encoder combines before attention, odd; 1 reads each
+            word alone.
         lr_share: learning rate of the small text encoder, as a fraction of optimizer.lr.
-        count_conditioning: whether the small text encoder also says what is asked of each kind of object, which
-            joins the logits of the mixed flux network beside what it sees; needs latents.
-        warmup: steps in which the text encoder learns how many of each kind its prompts ask for, before a fresh
-            prior takes the first of its own; at most iterations.
-        numbers: of the small text encoder: whether words that are numbers say how many they are, so that counts
-            need not be learned number by number.
-        dropout: share of training scenes whose prompt is withheld, for classifier-free guidance.
+        count_conditioning: the small text encoder predicts how many objects of each kind the prompt asks for; these
+            numbers, less the visible objects, are added to the logits of the mixed flux network; needs latents.
+        warmup: steps in which only the text encoder is trained, to predict the numbers of its prompts, before the first
+            step of a fresh prior; at most iterations.
+        numbers: embeddings of number words in the small text encoder contain their value, so that counts need not be
+            learned number by number.
+        dropout: share of training scenes that get no prompt, for classifier-free guidance.
     """
 
     encoder: str = "none"
@@ -232,13 +235,15 @@ class PretrainOptimizerSettings(OptimizerSettings):
     """The optimiser of a pretraining run.
 
     Attributes:
-        name: ``adamw``, or ``muon`` for Muon on the matrices inside blocks and AdamW on the rest.
-        final_lr: where the learning rate ends, as a fraction of the peak; 1 for no decay.
-        decay_share: share of the steps, the last ones, over which it goes there along a cosine; 1 from the warm-up on.
-        accumulate: parts in which a process takes its scenes, one after the other, to save memory.
-        precision: number format of the network in training, ``float32`` or ``bfloat16`` (autocast).
-        matmul_precision: of float32 products on GPUs, ``highest``, ``high`` (TF32) or ``medium``.
-        compile: compile the network with ``torch.compile`` (needs a C++ compiler on CPU).
+        name: ``adamw``, or ``muon``, which trains the matrices inside blocks with Muon and all other weights with
+            AdamW.
+        final_lr: final learning rate, as a fraction of the peak; 1 for no decay.
+        decay_share: last share of the steps, in which the learning rate decays along a cosine; 1 decays from the
+            warm-up on.
+        accumulate: number of parts into which a process splits its batch, to save memory.
+        precision: number format of the network in training: ``float32`` or ``bfloat16`` (autocast).
+        matmul_precision: precision of float32 products on GPUs: ``highest``, ``high`` (TF32) or ``medium``.
+        compile: compile the network with ``torch.compile`` (needs a C++ compiler on a CPU).
     """
 
     KNOWN = ("adamw", "muon")
@@ -267,8 +272,8 @@ class PretrainLoggerSettings(LoggerSettings):
     """Files of a pretraining run, and how often they are written.
 
     Attributes:
-        log_every: steps between log rows.
-        evaluate_every: steps between held-out evaluations.
+        log_every: steps between rows of log.csv.
+        evaluate_every: steps between evaluations on held-out scenes.
         pictures_every: steps between pictures of samples; 0 draws none.
     """
 

@@ -64,23 +64,24 @@ class TablesConfig:
     """The tables of the paper, and that of the precision of a prior, from one training run per row.
 
     Attributes:
-        scene: scene type, which must be that of data.
-        data: dataset directory of training scenes, with prompts, or grammar for fresh scenes without end.
-        heldout: dataset directory of real scenes to compare with; empty takes the last 2 % of data.
-        tables: any of unconditional, conditional, objective, rotation and precision.
-        rows: patterns of row names that are trained and shown, such as [ours, paper*]; empty for all.
+        scene: scene type, which must be the type of data.
+        data: dataset folder of training scenes with prompts, or grammar for fresh scenes without end.
+        heldout: dataset folder of real scenes for comparison; empty takes the last 2 % of data.
+        tables: one or several of unconditional, conditional, objective, rotation and precision.
+        rows: patterns of the names of rows to train and show, such as [ours, paper*]; empty for all.
         size: tiny (for tests, seconds), small (for a CPU) or paper (88.3 M parameters, for a GPU).
-        iterations: optimiser steps of each row; null takes the size's.
-        batch_size: scenes per step; null takes the size's.
-        parameters: trained numbers of each row's network, met by its width; null takes the size's.
-        count: samples of each prior that are measured, and real scenes to compare with; null takes the size's.
-        num_steps: denoising steps per sample; null takes the size's.
-        guidance: w of classifier-free guidance where prompts are followed, 0 for none.
+        iterations: optimiser steps of each row; null takes the number of the size.
+        batch_size: scenes per step; null takes the number of the size.
+        parameters: number of trained parameters of each row's network, reached by its width; null takes the number of
+            the size.
+        count: number of samples of each prior, and of real scenes for comparison; null takes the number of the size.
+        num_steps: denoising steps per sample; null takes the number of the size.
+        guidance: weight of classifier-free guidance for the samples with prompts, 0 for none.
         pretraining: further keys of pretrain for every row, such as {optimizer: {lr: 5e-4}}; null for none.
-        seed: of weights, batches, noise and samples.
+        seed: seed of weights, batches, noise and samples.
         device: torch device.
-        workers: physics worker processes; 0 computes in this one.
-        output: folder for the runs, tables.md, tables.csv and plot.png; the same command goes on in it.
+        workers: physics worker processes; 0 computes physics in this process.
+        output: folder for the runs, tables.md, tables.csv and plot.png; the same command resumes there.
     """
 
     compares_keys: ClassVar[bool] = True

@@ -21,12 +21,12 @@ class PostTrainingTables:
 
     Attributes:
         table: stability, placement, counts, prompts, realism or frontier.
-        rows: patterns of row names that are run and shown, such as [dimsum_table-nft-*]; empty for all.
-        iterations: of every run; null takes the table's.
-        count: samples that are measured of each prior.
+        rows: patterns of the names of rows to run and show, such as [dimsum_table-nft-*]; empty for all.
+        iterations: iterations of every run; null takes the number of the table.
+        count: number of measured samples of each prior.
         keys: further keys of post-train for every run, such as ["batch_size=8"].
-        train: whether runs are begun; false tabulates what the folder has.
-        output: folder of the runs, the figures and table.md; a second call goes on there.
+        train: train missing rows; false only tabulates the results in the folder.
+        output: folder of the runs, the figures and table.md; a second call resumes there.
     """
 
     table: str = "stability"

@@ -148,8 +148,8 @@ class RegionMask:
 
 
 @dataclass(frozen=True)
-class GivenMask:
-    """Slots that the user names.
+class ExplicitMask:
+    """Slots that the user lists.
 
     Args:
         slots: their indices.
@@ -162,17 +162,17 @@ class GivenMask:
         mask = torch.zeros_like(scene.is_empty[0])
         outside = [slot for slot in self.slots if not 0 <= slot < len(mask)]
         if outside or not self.slots:
-            raise InvalidInputError(f"mask=given: slots={list(self.slots)} must be some of 0..{len(mask) - 1}")
+            raise InvalidInputError(f"mask=explicit: slots={list(self.slots)} must be some of 0..{len(mask) - 1}")
         mask[list(self.slots)] = True
         return mask
 
 
 @dataclass(frozen=True)
 class OffPromptMask:
-    """Objects that contradict a prompt, and empty slots for those that it asks for.
+    """Objects that contradict a prompt, and empty slots for objects that are missing.
 
-    These are the objects beyond the number it gives, both things of a relation that does not hold, and as many empty
-    slots as objects are missing.
+    These are the objects beyond the numbers in the prompt, both objects of a relation that does not hold, and one empty
+    slot for each missing object.
 
     Args:
         prompt: the text; None takes the prompt of the search.
@@ -216,14 +216,15 @@ class OffPromptMask:
 class CulpritsMask:
     """The fewest objects whose replacement ends all overlaps, and a few empty slots.
 
-    An objective that counts feasible objects blames both objects of an overlapping pair; replacing one of them is
-    enough. Objects that overlap most others go first, until no kept pair overlaps. Blamed objects that overlap nothing
-    (they fall or slide) go too. Where that is fewer than ``at_least`` slots, random empty ones join, so that good
-    scenes can grow. An objective that says nothing about single objects gets ``at_least`` random slots.
+    An objective that counts feasible objects blames both objects of an overlapping pair, but it is enough to replace
+    one of them. Objects with most overlaps are masked first, until no two unmasked objects overlap. Blamed objects that
+    overlap nothing (they fall or slide) are masked too. If these are fewer than ``at_least`` slots, random empty slots
+    are added, so that good scenes can grow. With an objective that says nothing about single objects, ``at_least``
+    random slots are masked.
 
-    Few slots at a time matter. While the noise is high the kept objects are hidden in it too, so the masked slots take
-    their usual share of objects whatever is already there: with all empty slots masked, inpainting by clamping crowds
-    the scene and spoils what was kept.
+    The number of masked slots should be small. At high noise the observed objects are noisy as well, so the masked
+    slots get their usual share of objects, whatever is already there. If all empty slots are masked, inpainting by
+    clamping therefore adds too many objects and spoils the observed ones.
 
     Args:
         at_least: slots regenerated, when the scene has as many.
@@ -256,11 +257,10 @@ class CulpritsMask:
 
 @dataclass(frozen=True)
 class BalancedMask:
-    """The culprits of :class:`CulpritsMask`, and as large a share of the empty slots as of the objects.
+    """The culprits of :class:`CulpritsMask`, and random slots until the shares of objects and of empty slots are equal.
 
-    Such a mask says nothing about what it hides, as the masks of training: the masked slots take as many objects as
-    the prior puts beside those that stay. A mask of all empty slots says that few objects stand outside it, and the
-    prior crowds the scene.
+    Such a mask does not depend on the content of slots, like the masks of training, so the number of objects stays the
+    same. A mask of all empty slots depends on the content, and the prior then adds too many objects.
 
     Args:
         at_least: slots regenerated, when the scene has as many; the share grows until there are.

@@ -94,7 +94,7 @@ def feasibility_kernel(
     duration: float,
     tilt: tuple[float, float] = (0.0, 0.0),
 ) -> dict[str, Any]:
-    """See :func:`scene_envs.physics.feasibility`; gravity leans by ``tilt`` (rad) toward the x and the y axis."""
+    """See :func:`scene_envs.physics.feasibility`; gravity is tilted by ``tilt`` (rad) toward the x and the y axis."""
     physics = physics_of(chunk.scene_type)
     objects = _objects(physics, chunk)
     pairs = physics.collider.pairs(objects)

@@ -120,7 +120,7 @@ def motion(
         pairs: their near pairs.
         duration: s.
         budgets: units of simulation that each scene may spend.
-        tilt: (x, y) rad by which gravity leans in simulations.
+        tilt: (x, y) rad by which gravity is tilted in simulations.
 
     Returns:
         displacement (n,) m, rotation (n,) rad, and the scenes whose simulation diverged or was too much work.
@@ -168,7 +168,7 @@ def advance(
         duration: s.
         budget: units of simulation; when they are spent, objects stay where they have got to.
         settling: solver iterations per step of a damped motion; None judges undamped, and looks again in doubt.
-        tilt: (x, y) rad by which gravity leans in simulations.
+        tilt: (x, y) rad by which gravity is tilted in simulations.
     """
     translation = objects.translation.copy()
     translation[:, 2] += rest.rise

@@ -48,8 +48,8 @@ def make_ready(
 
     A free object is ready when it is inside the workspace, overlaps nothing deeper than 0.1 mm, and stays within 1 mm
     and 0.01 rad of its pose for 2 s of simulation, also after the objects that are not ready are removed. It also has
-    to stay within 2 mm and 0.02 rad for half a second when gravity leans by 0.12 rad, in each of four directions. This
-    test rejects leaning stacks that barely hold. Objects whose rest has a closed form need no simulation.
+    to stay within 2 mm and 0.02 rad for half a second when gravity is tilted by 0.12 rad, in each of four directions.
+    This test rejects leaning stacks that barely hold. Objects whose rest has a closed form need no simulation.
 
     Scenes with unready objects in the workspace go through projection and settling again, with more solver iterations,
     up to ``rounds`` times in all. They stop after two rounds in a row without more ready objects. The round with most

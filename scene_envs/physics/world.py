@@ -35,7 +35,7 @@ class SolverSettings:
         iterations: of the sequential-impulse solver per step.
         linear_damping: fraction of velocity lost per second.
         angular_damping: fraction of angular velocity lost per second.
-        tilt: (x, y) rad by which gravity leans toward the x and the y axis.
+        tilt: (x, y) rad by which gravity is tilted toward the x and the y axis.
     """
 
     time_step: float = 1.0 / 240.0

@@ -40,6 +40,7 @@ LINES = {
     "search scenes=nowhere": "no scene file, run or dataset is there",
     "search planner=baem": "did you mean 'beam'",
     "search planner=gradient planner.planner=baem": "did you mean 'beam'",
+    "search mask=given": "the mask 'given' has another name now: explicit",
     "search mask=culprit": "did you mean 'culprits'",
     "search mask={name:culprit,at_least:2}": "did you mean 'culprits'",
     "post-train inpaint.mask=culprit": "did you mean 'culprits'",
@@ -103,7 +104,7 @@ def test_the_names_that_are_known_without_torch_are_those_of_the_packages():
     assert own <= set(known_rewards())
     assert len(list_priors()) > 8
     assert set(known_masks()) <= set(list_masks())
-    assert {"culprits", "given", "region"} <= set(known_masks())
+    assert {"culprits", "explicit", "region"} <= set(known_masks())
     assert set(known_scenes()) <= set(list_grammars())
 
 

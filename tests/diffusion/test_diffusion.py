@@ -132,7 +132,7 @@ def test_half_of_both_distributions_of_timesteps_is_uniform() -> None:
     assert float(weights[0].sum()) == pytest.approx(1.0)
 
 
-def test_training_timesteps_follow_the_lognormal_law() -> None:
+def test_training_timesteps_follow_the_lognormal_distribution() -> None:
     """ln(noise-to-signal) of drawn timesteps has the asked mean and std."""
     schedule = make_schedule("karras")
     weights = lognormal_timesteps(schedule, -1.2, 1.0)

@@ -22,7 +22,7 @@ from scene_envs.envs.mask_generators import (
     BalancedMask,
     CulpritsMask,
     EmptyMask,
-    GivenMask,
+    ExplicitMask,
     LowestScoringMask,
     OffPromptMask,
     RegionMask,
@@ -164,14 +164,16 @@ def test_masks_with_settings() -> None:
     assert masked(scene, EmptyMask()) == ([], 30)
     assert masked(scene, EmptyMask(count=3)) == ([], 3)
     assert masked(scene, RegionMask(low=(0, -1, -1), high=(1, 1, 1), empty=2)) == ([1, 3], 2)
-    assert masked(scene, resolve_mask({"name": "given", "slots": [2, 5]})) == ([2], 1)
+    assert masked(scene, resolve_mask({"name": "explicit", "slots": [2, 5]})) == ([2], 1)
     score = Score(torch.zeros(1), torch.ones(1, dtype=torch.bool), per_object=torch.arange(34.0).flip(0)[None])
     lowest = LowestScoringMask(count=2)(scene, score, np.random.default_rng(0))
     assert lowest.nonzero().flatten().tolist() == [2, 3]
     with pytest.raises(InvalidInputError, match="needs an objective with credit per object"):
         LowestScoringMask()(scene, RewardScorer(lambda b, c: b.counts.float())(scene), np.random.default_rng(0))
     with pytest.raises(InvalidInputError, match=r"slots=\[99\] must be some of 0\.\.33"):
-        masked(scene, GivenMask((99,)))
+        masked(scene, ExplicitMask((99,)))
+    with pytest.raises(InvalidInputError, match="the mask 'given' has another name now: explicit"):
+        resolve_mask({"name": "given", "slots": [2, 5]})
     with pytest.raises(InvalidInputError, match="no corners"):
         RegionMask(low=(0, 0), high=(1, 1, 1))
     with pytest.raises(UnknownNameError, match="did you mean 'count'"):
@@ -239,7 +241,7 @@ def test_names_are_resolved_and_unknown_ones_get_an_offer() -> None:
     assert resolve_mask("infeasible") is infeasible_mask
     with pytest.raises(UnknownNameError, match="did you mean 'culprits'"):
         resolve_mask("culprit")
-    with pytest.raises(InvalidInputError, match="balanced, blamed_or_empty, culprits, empty, given"):
+    with pytest.raises(InvalidInputError, match="balanced, blamed_or_empty, culprits, empty, explicit"):
         resolve_mask(3)
 
 

@@ -83,7 +83,7 @@ def test_every_scene_gets_a_search_that_scores_no_less(prior: ScenePrior, scenes
     roots = [record.nodes[search["root"]].objective for search in record.searches]
     assert sorted(roots) == sorted(before.tolist())
     page = (tmp_path / "tree.html").read_text()
-    assert "from the scene it was given" in page
+    assert "from the start scene" in page
     assert "the empty scene" not in page
 
 

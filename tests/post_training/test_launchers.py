@@ -63,7 +63,7 @@ def test_accelerate_gives_the_run_of_torchrun(tmp_path: Path) -> None:
     pytest.importorskip("accelerate")
     tiny_prior().save(tmp_path / "base")
     assert in_processes(train_as_accelerate_does, tmp_path, count=1) == [0]
-    assert (tmp_path / "told").read_text().count("sample it: scene-envs sample") == 1  # one writer, one speaker
+    assert (tmp_path / "told").read_text().count("sample it: scene-envs sample") == 1  # one writer
     assert in_processes(train_as_torchrun_does, tmp_path) == [0, 0]
     one, other = (
         torch.load(tmp_path / name / CHECKPOINT_NAME, weights_only=True)["learner"]["prior"]

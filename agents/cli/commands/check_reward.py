@@ -15,10 +15,10 @@ class CheckRewardConfig:
     """A reward under test.
 
     Attributes:
-        reward: its name, or a mapping such as '{name: clip, reward: object_count, high: 20}'.
-        scene: the scene type to try it on.
-        seed: of the scenes it is tried on.
-        reward_timeout: seconds that a reward from outside this package, which runs in a process of its own, may take.
+        reward: name of the reward, or a mapping such as '{name: clip, reward: object_count, high: 20}'.
+        scene: scene type of the test scenes.
+        seed: seed of the test scenes.
+        reward_timeout: most seconds that a reward from outside this package may take; it runs in its own process.
     """
 
     reward: Any = named("object_count", "reward")

@@ -15,10 +15,10 @@ __all__ = ["check", "run"]
 
 @dataclass
 class CompleteConfig(InpaintingConfig):
-    """Scenes filled up: what is there stays, bit for bit.
+    """Completion of scenes; their objects stay bit-identical.
 
     Attributes:
-        slots: slots of the result; null keeps those of the scenes.
+        slots: slots of the result; null keeps the number of the scenes.
         fill: most objects to add to a scene; null for as many as there are empty slots.
     """
 

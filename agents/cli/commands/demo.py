@@ -15,7 +15,7 @@ class DemoConfig:
 
     Attributes:
         output: folder for report.html, samples.png, ready.png, metrics.json and the two runs, clutter and feasible.
-        seed: of training and of the samples.
+        seed: seed of training and of the samples.
         workers: physics worker processes.
     """
 

@@ -32,10 +32,10 @@ class RealSceneKeys:
     """Real scenes to compare with.
 
     Attributes:
-        data: dataset folder that the prior was trained on, several joined by commas for a prior of their union;
-            empty compares with fresh scenes of the grammar, without novelty.
+        data: dataset folder on which the prior was trained; several, joined by commas, for a prior of several scene
+            types. Empty compares with fresh scenes of the grammar and leaves out novelty.
         heldout: dataset folder of held-out scenes; empty takes the last scenes of data.
-        training_scenes: scenes of data among which novelty looks for the nearest, drawn at random.
+        training_scenes: number of random scenes of data among which novelty looks for the nearest.
     """
 
     data: str = ""
@@ -49,18 +49,18 @@ class EvaluateConfig(RealSceneKeys, OutputKeys):
 
     Attributes:
         prior: a shipped name, or the folder of a prior or a run.
-        count: samples, and real scenes of each of two sets to compare with.
-        prompt_count: samples with prompts, each of a held-out scene, at most count; null takes count.
+        count: number of samples, and of real scenes in each of the two sets for comparison.
+        prompt_count: number of samples with prompts of held-out scenes, at most count; null takes count.
         num_steps: denoising steps per sample.
         guidance: weight of classifier-free guidance for the samples with prompts, 0 for none.
-        seed: of the samples, the real scenes and the classifiers.
-        measures: all, or some of layout, physics, ready, fsd, novelty, prompts, classifier, renders, fid, as
+        seed: seed of the samples, the real scenes and the classifiers.
+        measures: all, or some of layout, physics, ready, fsd, novelty, prompts, classifier, renders, fid, written as
             layout or [layout, physics].
-        project: whether all includes ready, the measures after projection and settling.
-        fid_weights: path of the weights of an Inception-v3, for fid.
-        pictures: how many samples gallery.png shows; 0 draws none.
-        output: folder for metrics.json, metrics.md, scenes.safetensors and gallery.png; with the same keys again,
-            groups that are measured already are not measured anew.
+        project: include ready, the measures after projection and settling, in all.
+        fid_weights: file with the weights of an Inception-v3, for fid.
+        pictures: number of samples in gallery.png; 0 draws none.
+        output: folder for metrics.json, metrics.md, scenes.safetensors and gallery.png; the same command again measures
+            only the missing groups.
     """
 
     prior: str = "dimsum_table"

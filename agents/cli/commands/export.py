@@ -25,17 +25,17 @@ class ExportConfig:
     """Scenes for simulators and viewers.
 
     Attributes:
-        scenes: a scene file or a folder of them, the folder of a sample or project run (its simulation-ready scenes if
-            it has any), or a dataset.
-        prior: draw the scenes from this prior instead, a shipped name or a folder.
-        formats: one or several of urdf, sdf, drake, mjcf, usd, glb, npz, pickle, as in [drake, mjcf]; all for all
-            that can be written here.
-        count: how many scenes; null for all of them, or 16 from a prior.
+        scenes: a scene file, a folder of scene files, the folder of a sample or project run (its simulation-ready
+            scenes if it has any), or a dataset.
+        prior: a prior from which scenes are drawn, in place of scenes=: a shipped name or a folder.
+        formats: one or several of urdf, sdf, drake, mjcf, usd, glb, npz, pickle, written as [drake, mjcf]; all for
+            every format whose packages are installed.
+        count: number of scenes; null for all of them, or 16 from a prior.
         project: make the scenes simulation-ready first (project out of penetration, then settle).
         friction: coefficient of friction of all surfaces.
-        num_steps: denoising steps per scene, from a prior.
-        seed: of the noise, from a prior.
-        workers: physics worker processes; 0 computes in this one.
+        num_steps: denoising steps per scene, with prior=.
+        seed: seed of the noise, with prior=.
+        workers: physics worker processes; 0 computes physics in this process.
         output: folder for assets/ and scene_000/, scene_001/, ...
     """
 

@@ -18,14 +18,15 @@ class GenerateConfig:
 
     Attributes:
         scene: scene type whose grammar is used.
-        count: scenes to keep.
-        seed: of the grammar; with the same seed and shard_size, the same dataset.
-        workers: worker processes; 0 works in this one. With Ray, CPUs of the cluster that is started here.
+        count: number of scenes to keep.
+        seed: seed of the grammar; the same seed and shard_size give the same dataset.
+        workers: worker processes; 0 uses this process. With Ray, the number of CPUs of a cluster that this command
+            starts.
         verify: keep only scenes that pass physics.
         shard_size: scenes per parquet file.
-        progress: show a progress bar with scenes/s and why scenes were thrown away.
-        backend: processes of this machine, or ray.
-        address: of a running Ray cluster; null starts one on this machine.
+        progress: show a progress bar with scenes per second and the reasons of rejections.
+        backend: processes, for processes of this machine, or ray.
+        address: address of a running Ray cluster; null starts one on this machine.
         output: the dataset folder; finished shards found there are kept.
     """
 

@@ -21,14 +21,14 @@ class ImportCheckpointConfig:
 
     Attributes:
         checkpoint: the Lightning .ckpt of a mixed Flux model; the first word without =.
-        metadata: the metadata.json of the data it was trained on; the second word without =.
-        scene: scene type whose assets its model paths name; empty makes one from the metadata.
-        aliases: model path or its stem to asset name, as in {their_cup: teacup}; null for none.
-        text_encoder: folder or hub name of the BERT that the checkpoint reads prompts with; empty takes BERT-base where
-            it is at hand, and else makes a prior without prompts.
-        count: scenes to sample as a trial; 0 for none.
+        metadata: the metadata.json of its training data; the second word without =.
+        scene: scene type whose assets the model paths name; empty makes a scene type from the metadata.
+        aliases: asset name for each model path or its stem, as in {their_cup: teacup}; null for none.
+        text_encoder: folder or hub name of the BERT with which the checkpoint reads prompts. Empty takes BERT-base if
+            it is on this machine; otherwise the prior reads no prompts.
+        count: number of scenes to sample as a trial; 0 for none.
         num_steps: denoising steps of the trial.
-        seed: of the trial.
+        seed: seed of the trial.
         output: folder for prior/ and, with a trial, scenes.safetensors.
     """
 

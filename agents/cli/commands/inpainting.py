@@ -21,18 +21,18 @@ _FRESH = 12
 
 @dataclass
 class InpaintingConfig:
-    """Scenes of which a prior generates a part anew.
+    """Scenes that a prior completes or rearranges.
 
     Attributes:
-        scenes: a scene file or a folder of them, the folder of a sample or project run (its simulation-ready scenes if
-            it has any), or a dataset; empty for fresh samples of ``prior``.
+        scenes: a scene file, a folder of scene files, the folder of a sample or project run (its simulation-ready
+            scenes if it has any), or a dataset; empty takes fresh samples of ``prior``.
         prior: a shipped name, or the folder of a prior or a run; empty means the shipped prior of the scene type.
-        count: how many of the scenes, from the first; null for all, or for 12 fresh samples.
-        prompt: what the whole scenes should hold, for priors that read prompts; null for anything.
+        count: number of scenes, from the first; null for all, or for 12 fresh samples.
+        prompt: text that the whole scenes should match, for priors that read prompts; null for no prompt.
         guidance: weight of classifier-free guidance, 0 for none; needs a prompt.
         num_steps: denoising steps per scene.
-        seed: of the noise.
-        pictures: how many scenes the galleries show; 0 draws none.
+        seed: seed of the noise.
+        pictures: number of scenes in the galleries; 0 draws none.
         device: torch device.
         output: folder for scenes.safetensors, before.png and gallery.png.
     """

@@ -11,17 +11,17 @@ WRITES = False
 
 @dataclass
 class PackagePriorConfig:
-    """A prior as a folder to give away: configuration, weights in half precision, model card.
+    """A prior as a folder to publish: configuration, weights in half precision, model card.
 
     Attributes:
         prior: the folder of a run or of a prior, or a shipped name.
-        output: the new prior's folder, whose last part is its name, as agents/priors/shipped/dimsum_table.
-        evaluation: metrics.json of scene-envs evaluate, or the folder of that run; empty for a prior not measured.
-        precision: of the weights, float16 or float32.
-        data: what it was trained on, for the card.
-        license: of the data, for the card; empty means that of this package, unless the prior was imported.
-        machine: what it was trained on, for the card.
-        limits: what it is not good at, for the card.
+        output: folder of the new prior; its last part is the prior's name, as in agents/priors/shipped/dimsum_table.
+        evaluation: metrics.json of scene-envs evaluate, or the folder of that run; empty if the prior was not measured.
+        precision: number format of the weights, float16 or float32.
+        data: sentence of the card about the training data.
+        license: licence of the data, for the card; empty takes that of this package, unless the prior was imported.
+        machine: sentence of the card about the machine of the training.
+        limits: sentence of the card about the limits of the prior.
     """
 
     NO_PATHS: ClassVar[Sequence[str]] = ("data",)

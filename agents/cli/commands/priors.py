@@ -9,11 +9,11 @@ WRITES = False
 
 @dataclass
 class PriorsConfig:
-    """The priors that ship with the package, and how good they are.
+    """The shipped priors and their figures.
 
     Attributes:
-        prior: show the whole model card of this one, a shipped name or the folder of a prior or a run; empty lists
-            all that ship.
+        prior: prior whose model card is shown: a shipped name, or the folder of a prior or a run; empty lists all
+            shipped priors.
     """
 
     prior: str = ""

@@ -18,10 +18,10 @@ class ProjectConfig:
     """Scenes made simulation-ready.
 
     Attributes:
-        scenes: a scene file or a folder of them, the folder of a sample or search run, or a dataset.
-        count: how many of the scenes, from the first; null for all.
-        pictures: how many scenes the galleries show; 0 draws none.
-        workers: physics worker processes; 0 computes in this one.
+        scenes: a scene file, a folder of scene files, the folder of a sample or search run, or a dataset.
+        count: number of scenes, from the first; null for all.
+        pictures: number of scenes in the galleries; 0 draws none.
+        workers: physics worker processes; 0 computes physics in this process.
         output: folder for ready.safetensors, before.png and ready.png.
     """
 

@@ -9,10 +9,10 @@ WRITES = False
 
 @dataclass
 class RewardsConfig:
-    """What may be listed.
+    """Settings of the listing.
 
     Attributes:
-        reward_timeout: seconds that the import of an installed reward, which runs in a process of its own, may take.
+        reward_timeout: most seconds that the import of an installed reward may take; it runs in its own process.
     """
 
     reward_timeout: float = 60.0

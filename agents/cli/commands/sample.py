@@ -23,16 +23,16 @@ class SampleConfig(SamplingKeys, OutputKeys):
 
     Attributes:
         prior: a shipped name, or the folder of a prior or a run.
-        count: scenes to draw.
-        eta: scale of the noise of the Gaussian steps, 1 for the ancestral chain, 0 for a deterministic one (DDIM).
-        union: what a scene of a prior of several scene types may hold, one_type (objects of one of them) or any.
-        reward: scores the samples, for metrics.json; null for none.
-        reward_timeout: seconds that a reward from outside this package, which runs in a process of its own, may take.
+        count: number of scenes to draw.
+        eta: scale of the noise of the Gaussian steps: 1 for the ancestral chain, 0 for a deterministic chain (DDIM).
+        union: objects in a scene of a prior of several scene types: one_type (only objects of one type) or any.
+        reward: reward that scores the samples for metrics.json; null for none.
+        reward_timeout: most seconds that a reward from outside this package may take; it runs in its own process.
         project: also make the samples simulation-ready (project out of penetration, then settle).
-        export: formats to write the scenes in, as drake or [drake, mjcf], the simulation-ready ones with
-            project=true; null for none. See scene-envs export.
-        output: folder for scenes.safetensors, gallery.png and, with project=true, ready.safetensors and ready.png;
-            exported scenes go to export/ in it.
+        export: formats of the exported scenes, as drake or [drake, mjcf]; null for none. With project=true the
+            simulation-ready scenes are exported. See scene-envs export.
+        output: folder for scenes.safetensors and gallery.png, with project=true also ready.safetensors and ready.png;
+            exported scenes are in its folder export/.
     """
 
     prior: str = "dimsum_table"

@@ -26,15 +26,16 @@ FRESH_PRIOR = "dimsum_table"
 @composed
 @dataclass
 class SearchKeys(SearchConfig, RewardLimits):
-    """What to search.
+    """Inputs and output of a search.
 
     Attributes:
-        scenes: what the search starts from, one search per scene: a scene file or a folder of them, the folder of a run
-            that holds scenes, or a dataset; empty for fresh samples.
-        prior: a shipped name, or the folder of a prior or a run; empty means the shipped prior of the scenes' type, and
+        scenes: scenes from which the search starts, one search for each: a scene file, a folder of scene files, the
+            folder of a run that holds scenes, or a dataset; empty for fresh samples.
+        prior: a shipped name, or the folder of a prior or a run; empty takes the shipped prior of the scenes' type, or
             dimsum_table without scenes.
-        objective: what the scene should score high on: any reward.
-        output: folder for best.safetensors, tree.html, tree.json and pictures; the same command goes on there.
+        objective: reward that the search maximises.
+        output: folder for best.safetensors, tree.html, tree.json and pictures; the same command resumes an interrupted
+            search.
     """
 
     scenes: str = ""

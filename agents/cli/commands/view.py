@@ -19,16 +19,16 @@ class ViewConfig:
     """Scenes in a browser.
 
     Attributes:
-        scenes: a scene file, a folder of such files, the folder of a run that holds one, a dataset folder or a .parquet
-            file.
-        prior: a shipped name, or the folder of a prior or a run, to draw samples from.
-        scene: scene type to draw from its grammar; with scenes=, the type of a dataset that names none.
-        count: scenes to show.
+        scenes: a scene file, a folder of scene files, the folder of a run that holds scenes, a dataset folder or a
+            .parquet file.
+        prior: prior from which samples are drawn: a shipped name, or the folder of a prior or a run.
+        scene: scene type from whose grammar scenes are drawn; with scenes=, the type of a dataset that names none.
+        count: number of scenes to show.
         first: the first scene of scenes= to show, counted from 0.
         num_steps: denoising steps per scene, with prior=.
-        seed: of the grammar or the prior.
-        title: heading of the page; null names where the scenes come from.
-        pictures: how many scenes gallery.png shows; 0 draws none.
+        seed: seed of the grammar or the prior.
+        title: heading of the page; null for a heading that names the source of the scenes.
+        pictures: number of scenes in gallery.png; 0 draws none.
         open: also open the page in the browser.
         device: torch device, with prior=.
         output: folder for viewer.html and gallery.png.

@@ -35,10 +35,10 @@ _DESCRIPTIONS = (".urdf", ".sdf")
 def load_library(folder: str | os.PathLike[str]) -> AssetLibrary:
     """All assets of a folder of URDF, SDF, OBJ, STL, GLB, PLY, OFF or COLLADA files.
 
-    ``library.yaml`` in the folder lists the assets; see :class:`AssetEntry` for its keys. Without it every
-    file that can be read becomes an asset called after it, but for meshes that a URDF or SDF of the folder
-    uses; files that cannot be read are left out, and all of this is logged. What had to be put right is
-    logged, and told by :func:`import_report`. Each file is read once per process.
+    ``library.yaml`` in the folder lists the assets; see :class:`AssetEntry` for its keys. Without it, every file that
+    can be read becomes an asset with the name of the file, except meshes that a URDF or SDF of the folder uses. Files
+    that cannot be read are left out. The log and :func:`import_report` list these choices and all corrections. Each
+    file is read once per process.
 
     Args:
         folder: path of the folder.
