@@ -1,18 +1,18 @@
-"""Rotation representations: small pure functions on torch tensors.
+"""Rotation representations: the conversions of ``roma`` in this project's conventions.
 
 All matrices map body-frame vectors to the frame they are expressed in. Angles are in radians, quaternions are (w, x, y,
-z). All functions run in batches on the device of their argument and can be differentiated, which priors that diffuse
-quaternions need; ``scipy.spatial.transform`` does neither.
+z). All functions run in batches on the device of their argument and can be differentiated.
 """
 
 from __future__ import annotations
 
+import roma
 import torch
 from torch import Tensor
 
 
 def project_to_so3(matrices: Tensor) -> Tensor:
-    """Nearest rotation matrix in the Frobenius norm, by SVD (Levinson et al. 2020).
+    """Nearest rotation matrix in the Frobenius norm, by SVD in float64 (Levinson et al. 2020).
 
     Args:
         matrices: (..., 3, 3) real matrices, finite.
@@ -25,11 +25,8 @@ def project_to_so3(matrices: Tensor) -> Tensor:
             [0., 1., 0.],
             [0., 0., 1.]])
     """
-    u, _, vt = torch.linalg.svd(matrices.double())
-    det = torch.linalg.det(u @ vt)
-    sign = torch.ones(*matrices.shape[:-2], 3, dtype=torch.float64, device=matrices.device)
-    sign[..., 2] = torch.where(det < 0, -1.0, 1.0)
-    return ((u * sign.unsqueeze(-2)) @ vt).to(matrices.dtype)
+    nearest: Tensor = roma.special_procrustes(matrices.double())
+    return nearest.to(matrices.dtype)
 
 
 def yaw_matrix(yaw: Tensor) -> Tensor:
@@ -41,40 +38,23 @@ def yaw_matrix(yaw: Tensor) -> Tensor:
 
 
 def geodesic_angle(a: Tensor, b: Tensor) -> Tensor:
-    """Angle in [0, pi] between rotations ``a`` and ``b``, both (..., 3, 3).
-
-    Computed from the chordal distance, which stays accurate for tiny angles where acos does not.
-    """
-    chord = (a.double() - b.double()).flatten(-2).norm(dim=-1) / (2.0 * 2.0**0.5)
-    return (2.0 * torch.asin(chord.clamp(max=1.0))).to(a.dtype)
+    """Angle in [0, pi] between rotations ``a`` and ``b``, both (..., 3, 3); accurate for tiny angles."""
+    angle: Tensor = roma.rotmat_geodesic_distance(a.double(), b.double())
+    return angle.to(a.dtype)
 
 
 def matrix_to_quaternion(matrices: Tensor) -> Tensor:
     """Unit quaternions (w, x, y, z) with w >= 0 of rotation matrices (..., 3, 3)."""
-    m = matrices.double()
-    m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
-    # Four algebraically equal forms; each row is accurate where its own component is large.
-    x_diff, y_diff, z_diff = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
-    xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
-    candidates = torch.stack(
-        [
-            torch.stack([1 + m00 + m11 + m22, x_diff, y_diff, z_diff], dim=-1),
-            torch.stack([x_diff, 1 + m00 - m11 - m22, xy, xz], dim=-1),
-            torch.stack([y_diff, xy, 1 - m00 + m11 - m22, yz], dim=-1),
-            torch.stack([z_diff, xz, yz, 1 - m00 - m11 + m22], dim=-1),
-        ],
-        dim=-2,
-    )  # (..., 4, 4)
-    best = torch.stack([m00 + m11 + m22, m00, m11, m22], dim=-1).argmax(dim=-1)
-    index = best[..., None, None].expand(*best.shape, 1, 4)
-    quaternion = torch.gather(candidates, -2, index).squeeze(-2)
-    quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)
-    quaternion = torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
-    return quaternion.to(matrices.dtype)
+    quaternion = roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(matrices.double()))
+    return torch.where(quaternion[..., :1] < 0, -quaternion, quaternion).to(matrices.dtype)
 
 
 def quaternion_to_matrix(quaternions: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) of quaternions (w, x, y, z), normalised first."""
+    """Rotation matrices (..., 3, 3) of quaternions (w, x, y, z), normalised first.
+
+    Written out, since ``roma`` rounds otherwise in float32, and priors with quaternion codes give the same bits as when
+    they were trained.
+    """
     w, x, y, z = (quaternions / quaternions.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
