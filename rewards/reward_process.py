@@ -21,6 +21,8 @@ from scene_envs.worker_processes import module_command, module_environment
 
 _START_UP = 120.0
 """Seconds that an empty worker may take to start."""
+_GRACE = 2.0
+"""Seconds that a worker whose answers ended has to end by itself, so that its exit status is its own."""
 _MOST_TEXT = 2000
 """Characters of an error that the process tells."""
 _ERRORS: dict[str, type[SceneEnvsError]] = {
@@ -91,14 +93,14 @@ class RewardProcess:
             if number != self._asked or kind not in ("done", "failed"):
                 raise ValueError(number)
         except (EOFError, OSError):
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.process.wait(_GRACE)  # before the pipes close, at which the worker ends itself
+            ended = self.process.returncode is not None
             self.stop()
-            raise self._ended(late.is_set(), timeout) from None
+            raise self._ended(late.is_set(), timeout) if ended else self._disturbed() from None
         except Exception:
             self.stop()
-            raise RewardError(
-                f"reward {self.name!r} disturbed the answers of its process, which was ended; a reward may write to no "
-                "file descriptor that it did not open"
-            ) from None
+            raise self._disturbed() from None
         except BaseException:
             self.stop()
             raise
@@ -108,6 +110,12 @@ class RewardProcess:
             return body
         error, text = body
         raise _ERRORS.get(error, RewardError)(str(text)[:_MOST_TEXT])
+
+    def _disturbed(self) -> RewardError:
+        return RewardError(
+            f"reward {self.name!r} disturbed the answers of its process, which was ended; a reward may write to and "
+            "close no file descriptor that it did not open"
+        )
 
     def _ended(self, late: bool, timeout: float) -> RewardError:
         """What the end of the process says of the reward."""

@@ -48,6 +48,11 @@ class Registry(dict[str, Component]):
         super().__init__(components or {})
         self.kind, self.group, self._modules, self._read = kind, group, modules or {}, read
 
+    def __getitem__(self, name: Any) -> Component:
+        if not isinstance(name, str):
+            raise InvalidInputError(f"{self.kind} {str(name)[:200]!r}: give a name; known: {', '.join(self.names())}")
+        return super().__getitem__(name)
+
     def __missing__(self, name: Any) -> Component:
         self._load_plugins()
         if name not in self and name in self._modules:

@@ -63,7 +63,7 @@ def check_early(settings: Any, config_dir: str = "", module: ModuleType | None =
         _check_prior(prior)
     for key in ("reward", "objective"):
         _check_name("reward", getattr(settings, key, None), known_rewards, "rewards.registry", config_dir)
-    if isinstance(scene := getattr(settings, "scene", None), list):
+    if (scene := getattr(settings, "scene", None)) is not None and not isinstance(scene, str):
         raise InvalidInputError(f"scene={str(scene)[:200]}: give the name of one scene type, or several joined by +")
     for scene in str(getattr(settings, "scene", "") or "").split("+"):
         _check_name("scene type", scene, known_scenes, "scene_envs.grammars", config_dir)

@@ -18,6 +18,7 @@ from scene_envs.grammars import list_grammars
 
 LINES = {
     "view scene=[1,2]": "give the name of one scene type",
+    "generate scene={a:b}": "give the name of one scene type",
     "evaluate data=,": "names no dataset",
     f"sample guidance={'9' * 400}": "guidance=",
     f"pretrain loss.noise_mean={'9' * 400}": "noise_mean=",

@@ -120,6 +120,16 @@ def closes_pipes(batch):
     os.closerange(int(sys.argv[1]), int(sys.argv[2]) + 1)  # both pipes of the worker
 
 
+def closes_pipes_and_works(batch):
+    closes_pipes(batch)
+    time.sleep(0.5)
+
+
+def closes_pipes_and_hangs(batch):
+    closes_pipes(batch)
+    time.sleep(3600)
+
+
 def named(batch, context):
     """The reward of this file whose name is the first prompt."""
     return globals()[context.prompts[0]](batch)

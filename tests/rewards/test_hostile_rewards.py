@@ -186,6 +186,8 @@ def worker():
         ("rewrites", "changed the scenes"),
         ("writes_into_pipes", "disturbed the answers of its process"),
         ("closes_pipes", r"ended its process \(exit status 1\)"),
+        ("closes_pipes_and_works", r"ended its process \(exit status 1\)"),
+        ("closes_pipes_and_hangs", "disturbed the answers of its process"),
     ],
 )
 def test_a_hostile_reward_costs_its_scenes_and_nothing_else(name, message, cups, worker):
