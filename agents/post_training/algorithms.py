@@ -170,8 +170,6 @@ class NFTSettings(ForwardProcessSettings):
     Attributes:
         beta: strength; smaller ones step further from the sampling policy.
         advantage_clip: advantage, in standard deviations, at which a sample is fully good or bad.
-        push_limit: a bad pose pushes only while the squared error of the sampling policy on it is at most this many
-            times that of the base prior; 0 for no limit.
         expectation_lr: learning rate of the copy of the denoiser that learns the mean of own samples; 0 takes the
             sampling policy for it.
     """
@@ -179,13 +177,12 @@ class NFTSettings(ForwardProcessSettings):
     name: str = "nft"
     beta: float = 0.5
     advantage_clip: float = 2.0
-    push_limit: float = 0.0
     expectation_lr: float = 3e-4
 
     def __post_init__(self) -> None:
         super().__post_init__()
         positive(self, "beta", "advantage_clip")
-        at_least(self, 0, "push_limit", "expectation_lr")
+        at_least(self, 0, "expectation_lr")
 
 
 @dataclass
@@ -195,20 +192,18 @@ class AWMSettings(ForwardProcessSettings):
     Attributes:
         beta: strength of the pull to the sampling policy, above 1.
         advantage_clip: largest advantage, in standard deviations.
-        push_limit: as for ``nft``.
         expectation_lr: as for ``nft``.
     """
 
     name: str = "awm"
     beta: float = 2.0
     advantage_clip: float = 2.0
-    push_limit: float = 0.0
     expectation_lr: float = 3e-4
 
     def __post_init__(self) -> None:
         super().__post_init__()
         positive(self, "advantage_clip")
-        at_least(self, 0, "push_limit", "expectation_lr")
+        at_least(self, 0, "expectation_lr")
         if not self.beta > 1:
             raise InvalidInputError(f"beta={self.beta} must be above 1: below, a bad sample pushes without bound")
 
