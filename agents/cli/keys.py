@@ -61,8 +61,7 @@ class Sources:
 def keys_of(command: Any) -> type:
     """The dataclass of a command's keys: what ``settings``, the argument of its ``run``, is annotated with."""
     annotation = command.run.__annotations__["settings"]
-    keys: type = command.run.__globals__[annotation] if isinstance(annotation, str) else annotation
-    return keys
+    return command.run.__globals__[annotation] if isinstance(annotation, str) else annotation
 
 
 def describe_fields(config: type | Any, prefix: str = "") -> list[KeyHelp]:

@@ -135,8 +135,7 @@ def _close_pairs(positions: list[Array]) -> NDArray[np.int64]:
     if len(positions) < 2:
         return np.empty((0, 2), dtype=np.int64)
     centers = np.stack([scene.mean(axis=0) if len(scene) else np.zeros(3) for scene in positions])
-    pairs: NDArray[np.int64] = KDTree(centers).query_pairs(DUPLICATE * 1.001, output_type="ndarray")
-    return pairs
+    return KDTree(centers).query_pairs(DUPLICATE * 1.001, output_type="ndarray")
 
 
 # -- features --------------------------------------------------------------------------------------

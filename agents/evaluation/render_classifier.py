@@ -67,8 +67,7 @@ def render_classifier_accuracy(
 
     def prepare(split: Split) -> tuple[nn.Module, Forward]:
         def forward(network: nn.Module, rows: Tensor) -> Tensor:
-            logits: Tensor = network(images[rows].long())
-            return logits
+            return network(images[rows].long())
 
         return _RenderNetwork(colors), forward
 
@@ -97,8 +96,7 @@ def class_images(batches: list[SceneBatch], width: int, height: int) -> tuple[Te
 def _codes(images: NDArray[np.uint8]) -> NDArray[np.int32]:
     """(B, H, W) colours as 0xRRGGBB."""
     red, green, blue = np.moveaxis(images.astype(np.int32), -1, 0)
-    codes: NDArray[np.int32] = (red << 16) | (green << 8) | blue
-    return codes
+    return (red << 16) | (green << 8) | blue
 
 
 class _RenderNetwork(nn.Module):

@@ -77,8 +77,7 @@ class _Residual(nn.Module):
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
         """Channels (B, C, N) and the time embedding (B, H) to (B, H, N)."""
         h = self.convolution(F.silu(self.norm(x))) + self.time(F.silu(condition))[..., None]
-        result: Tensor = self.skip(x) + self.out(F.silu(self.inner_norm(h)))
-        return result
+        return self.skip(x) + self.out(F.silu(self.inner_norm(h)))
 
 
 class _Attend(nn.Module):
@@ -113,8 +112,7 @@ class _Level(nn.Module):
     def forward(self, x: Tensor, condition: Tensor, text: Tensor | None, mask: Tensor | None) -> Tensor:
         for block in self.blocks:
             x = block(x, condition)
-        result: Tensor = self.attend(x, text, mask)
-        return result
+        return self.attend(x, text, mask)
 
 
 class _UNet(nn.Module):

@@ -183,8 +183,7 @@ def network_config(
         "rotations": rotations,
     }
     entry = _entry(name, process)
-    config: NetworkConfig = entry.config(**entry.sizes(keys))
-    return config
+    return entry.config(**entry.sizes(keys))
 
 
 def config_state(config: NetworkConfig) -> dict[str, Any]:
@@ -222,8 +221,7 @@ def config_from_state(state: Mapping[str, Any], process: str) -> NetworkConfig:
             f"the configuration of a {process} {name} network has unknown fields {strange} and lacks {missing}"
         )
     check_types(kind, values)
-    config: NetworkConfig = kind(**values)
-    return config
+    return kind(**values)
 
 
 def _entry(name: str, process: str) -> _Entry:

@@ -55,8 +55,7 @@ class ExportFormat:
         if not isinstance(self.write, str):
             return self.write
         module, _, function = self.write.partition(":")
-        writer: SceneWriter = getattr(import_module(module), function)
-        return writer
+        return getattr(import_module(module), function)
 
 
 _HERE = "scene_envs.export"

@@ -39,8 +39,7 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
 
 def asset_usd(asset: Asset, files: AssetFiles) -> Path:
     """``<name>.usda``: a coloured mesh, and convex colliders of purpose *guide*; the scene makes it a body."""
-    path: Path = files.once(asset, "usd", lambda folder: _write_asset(asset, files, folder))
-    return path
+    return files.once(asset, "usd", lambda folder: _write_asset(asset, files, folder))
 
 
 def _write_asset(asset: Asset, files: AssetFiles, folder: Path) -> Path:

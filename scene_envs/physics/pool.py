@@ -66,8 +66,7 @@ class _Worker:
 
     def receive(self) -> tuple[str, Any]:
         """The reply to the last message; raises EOFError or OSError when the process died."""
-        reply: tuple[str, Any] = self.inbox.recv()
-        return reply
+        return self.inbox.recv()
 
     @property
     def process_id(self) -> int:

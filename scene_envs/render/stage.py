@@ -168,7 +168,7 @@ class Stage:
         cells = np.searchsorted(self._palette, _color_codes(asset) & self._mask)
         uv = np.stack([(cells % _CELLS + 0.5) / _CELLS, 1.0 - (cells // _CELLS + 0.5) / _CELLS], axis=1)
         gloss = 0.0 if asset.static else 0.35
-        shape: int = self._bullet.createVisualShape(
+        return self._bullet.createVisualShape(
             self._bullet.GEOM_MESH,
             vertices=asset.visual.vertices.tolist(),
             indices=asset.visual.faces.ravel().tolist(),
@@ -178,7 +178,6 @@ class Stage:
             specularColor=(gloss, gloss, gloss),
             physicsClientId=self._client,
         )
-        return shape
 
 
 @cache
@@ -213,5 +212,4 @@ def vertex_colors(asset: Asset) -> NDArray[np.uint8]:
 
 def _color_codes(asset: Asset) -> NDArray[np.int64]:
     rgb = vertex_colors(asset).astype(np.int64)
-    codes: NDArray[np.int64] = (rgb[:, 0] << 16) | (rgb[:, 1] << 8) | rgb[:, 2]
-    return codes
+    return (rgb[:, 0] << 16) | (rgb[:, 1] << 8) | rgb[:, 2]
