@@ -115,18 +115,6 @@ def random_scenes(scene_type: SceneType, count: int, generator: Generator) -> Sc
     return SceneBatch.from_parts(translations, rotations, categories, scene_type)
 
 
-def _scores_empty(subject: _Subject) -> None:
-    _require_some_valid(subject.score(subject.empty), "scenes without free objects")
-
-
-def _scores_clutter(subject: _Subject) -> None:
-    _require_some_valid(subject.random_output, "scenes of strewn, overlapping objects")
-
-
-def _is_deterministic(subject: _Subject) -> None:
-    _require_equal(subject.random_output, subject.score(subject.random), "a second call on the same scenes")
-
-
 def _rows_are_independent(subject: _Subject) -> None:
     for row in (0, len(subject.random) - 1):
         alone = subject.score(subject.random[row])
@@ -153,9 +141,15 @@ def _ignores_empty_slots(subject: _Subject) -> None:
 
 _ALONE = "scores a scene the same alone and in a batch"
 _CHECKS: dict[str, Check] = {
-    "scores scenes that hold nothing but welded objects": _scores_empty,
-    "scores crowded scenes with overlapping objects": _scores_clutter,
-    "gives the same scores when called again": _is_deterministic,
+    "scores scenes that hold nothing but welded objects": lambda subject: _require_some_valid(
+        subject.score(subject.empty), "scenes without free objects"
+    ),
+    "scores crowded scenes with overlapping objects": lambda subject: _require_some_valid(
+        subject.random_output, "scenes of strewn, overlapping objects"
+    ),
+    "gives the same scores when called again": lambda subject: _require_equal(
+        subject.random_output, subject.score(subject.random), "a second call on the same scenes"
+    ),
     _ALONE: _rows_are_independent,
     "does not depend on the order of the slots": _ignores_slot_order,
     "does not depend on the number of empty slots": _ignores_empty_slots,

@@ -139,14 +139,10 @@ class _UNet(nn.Module):
         x = self.middle_out(self.middle(self.middle_in(x, condition), text, mask), condition)
         for index, level in enumerate(self.up):
             skip = skips.pop()
-            x = self.to_fine[index - 1](_doubled(x, skip.shape[-1])) if index else x
+            if index:
+                x = self.to_fine[index - 1](x.repeat_interleave(2, dim=-1)[..., : skip.shape[-1]])
             x = level(torch.cat([x, skip], dim=1), condition, text, mask)
         return x.transpose(1, 2)
-
-
-def _doubled(x: Tensor, count: int) -> Tensor:
-    """Each of the slots of ``x`` (B, H, M) twice, the first ``count`` of them."""
-    return x.repeat_interleave(2, dim=-1)[..., :count]
 
 
 class DiffuScene(ContinuousBaseline):

@@ -47,8 +47,8 @@ class AlgorithmSettings:
 
     @property
     def optimiser_steps(self) -> int:
-        """Optimiser steps per batch."""
-        return 1
+        """Optimiser steps per batch: the key ``updates`` of algorithms that have it."""
+        return getattr(self, "updates", 1)
 
 
 @dataclass
@@ -108,11 +108,6 @@ class DDPOISSettings(DDPOSFSettings):
         if not 0 < self.clip_epsilon < 1:
             raise InvalidInputError(f"clip_epsilon={self.clip_epsilon} must lie between 0 and 1")
 
-    @property
-    def optimiser_steps(self) -> int:
-        """Optimiser steps per batch."""
-        return self.updates
-
 
 @dataclass
 class ForwardProcessSettings(AlgorithmSettings):
@@ -156,11 +151,6 @@ class ForwardProcessSettings(AlgorithmSettings):
         one_of(self, "category_credit", CATEGORY_CREDITS)
         if not 0 <= self.sampler_decay < 1:
             raise InvalidInputError(f"sampler_decay={self.sampler_decay} must lie in [0, 1)")
-
-    @property
-    def optimiser_steps(self) -> int:
-        """Optimiser steps per batch."""
-        return self.updates
 
 
 @dataclass
@@ -249,11 +239,6 @@ class NeonSettings(AlgorithmSettings):
         super().__post_init__()
         at_least(self, 1, "updates", "draws", "period")
         positive(self, "w")
-
-    @property
-    def optimiser_steps(self) -> int:
-        """Optimiser steps per batch."""
-        return self.updates
 
 
 @dataclass(frozen=True)

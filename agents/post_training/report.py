@@ -104,9 +104,5 @@ def _template() -> Template:
 
     loader = PackageLoader("agents", "post_training")
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, keep_trailing_newline=True)
-    environment.filters["png"] = _png
+    environment.filters["png"] = lambda path: base64.b64encode(path.read_bytes()).decode("ascii")
     return environment.get_template("report.html")
-
-
-def _png(path: Path) -> str:
-    return base64.b64encode(path.read_bytes()).decode("ascii")

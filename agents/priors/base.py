@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, TypeVar
 
 import torch
@@ -218,11 +218,11 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
             prompt, guidance, count, scene_type=self.scene_type, slots=wide, conditional=self.conditional
         )
         generator = Generator(str(self._fixed.device)).manual_seed(seed)
-        chunks, done = [], 0
-        for size in _chunk_sizes(count, batch_size):
-            texts = None if prompts is None else prompts[done : done + size]
+        chunks = []
+        for start in range(0, count, batch_size):
+            texts = None if prompts is None else prompts[start : start + batch_size]
+            size = min(batch_size, count - start)
             chunks.append(self._sample_chunk(size, texts, guidance, num_steps, slots, generator, eta))
-            done += size
         return self.decode(torch.cat(chunks))
 
     def _sample_chunk(
@@ -262,9 +262,3 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
     def normalised(self, batch: SceneBatch) -> Tensor:
         """(B, N, D) scenes as this process sees them, before known entries are clamped."""
         return batch.to_tensor(normalised=self.normalizer)
-
-
-def _chunk_sizes(total: int, size: int) -> Iterator[int]:
-    while total > 0:
-        yield min(size, total)
-        total -= size

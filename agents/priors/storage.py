@@ -126,7 +126,8 @@ def _known_scene_type(state: dict[str, Any], directory: Path) -> SceneType:
         if "scene_type" not in state:
             raise
         found = SceneType.from_dict(state["scene_type"])
-        allowed = [directory.resolve(), *_named_folders()]
+        named = [Path(name).expanduser() for name in os.environ.get(ASSET_FOLDERS, "").split(os.pathsep) if name]
+        allowed = [folder.resolve() for folder in (directory, *named)]
         kept = tuple(folder for folder in found.asset_folders if _within(Path(folder).resolve(), allowed))
         left = [folder for folder in found.asset_folders if folder not in kept]
         if left:
@@ -139,10 +140,6 @@ def _known_scene_type(state: dict[str, Any], directory: Path) -> SceneType:
                 os.pathsep,
             )
         return register_scene_type(replace(found, asset_folders=kept))
-
-
-def _named_folders() -> list[Path]:
-    return [Path(name).expanduser().resolve() for name in os.environ.get(ASSET_FOLDERS, "").split(os.pathsep) if name]
 
 
 def _within(folder: Path, parents: list[Path]) -> bool:

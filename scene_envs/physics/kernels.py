@@ -81,10 +81,6 @@ def _budgets(chunk: Chunk, objects: Objects, pairs: ObjectPairs) -> list[Budget]
     return [Budget(simulation_units(objects[rows], pairs.among(rows))) for rows in scenes]
 
 
-def _spent(budgets: list[Budget]) -> Array:
-    return np.array([budget.spent for budget in budgets])
-
-
 def feasibility_kernel(
     chunk: Chunk,
     *,
@@ -115,7 +111,7 @@ def feasibility_kernel(
         "displacement": _scatter(chunk, objects, displacement),
         "rotation": _scatter(chunk, objects, rotation),
         "valid": valid,
-        "spent": _spent(budgets),
+        "spent": np.array([budget.spent for budget in budgets]),
     }
 
 
