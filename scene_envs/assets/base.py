@@ -9,14 +9,12 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scene_envs.arrays import Array, Index
 from scene_envs.errors import InvalidInputError, unknown_name
 
 if TYPE_CHECKING:
     import trimesh
-
-Array = NDArray[np.float64]
 
 
 def indefinite_article(name: str) -> str:
@@ -52,7 +50,7 @@ class ConvexPart:
     """
 
     vertices: Array
-    faces: NDArray[np.int64]
+    faces: Index
 
     @cached_property
     def bounds(self) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from scene_envs.assets.base import Array
+from scene_envs.arrays import Array
 from scene_envs.assets.shapes import Profile, circle
 
 Color = tuple[int, int, int]

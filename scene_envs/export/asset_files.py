@@ -11,7 +11,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from scene_envs.assets.base import Array, Asset, ConvexPart
+from scene_envs.arrays import Array
+from scene_envs.assets.base import Asset, ConvexPart
 from scene_envs.assets.shapes import convex_hull
 from scene_envs.export.placed import identifiers
 

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from scene_envs.assets.base import Array, Asset
+from scene_envs.arrays import Array
+from scene_envs.assets.base import Asset
 from scene_envs.errors import InvalidInputError
 from scene_envs.rotations import matrix_to_quaternion, project_to_so3
 from scene_envs.scene import SceneBatch

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from scene_envs.assets.base import Array, Asset
+from scene_envs.arrays import Array
+from scene_envs.assets.base import Asset
 from scene_envs.export.asset_files import AssetFiles, face_colors, visual_mesh
 from scene_envs.export.placed import PlacedScene, principal_inertia, quaternion
 from scene_envs.export.urdf import relative

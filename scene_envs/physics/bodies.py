@@ -9,15 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from scene_envs.arrays import Array
 from scene_envs.errors import MissingDependencyError, PhysicsError
 from scene_envs.physics.constants import FRICTION
 from scene_envs.physics.geometry import LevelGeometry, LibraryGeometry, inset_hull
 from scene_envs.silence import silence
 
-Array = NDArray[np.float64]
 BodyKey = tuple[int, str]
 """Asset category and level of detail ("fine" or "coarse") of a body."""
 

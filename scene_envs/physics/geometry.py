@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from scene_envs.arrays import Array, Index
 from scene_envs.assets.base import Asset, ConvexPart
 from scene_envs.physics.contact_faces import ContactFace, contact_face
 from scene_envs.physics.parts import SIZE_CLASSES, PartGeometry
-
-Array = NDArray[np.float64]
 
 _CONTAINED = 1e-6
 """A fine corner this far (m) outside every coarse part still counts as inside."""
@@ -31,9 +29,9 @@ class LevelGeometry:
     """
 
     parts: tuple[PartGeometry, ...]
-    ids: NDArray[np.int64]
+    ids: Index
     vertices: Array
-    starts: NDArray[np.int64]
+    starts: Index
 
 
 @dataclass(frozen=True, eq=False)

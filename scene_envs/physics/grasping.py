@@ -8,9 +8,9 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from scene_envs.arrays import Array, Index, Mask
 from scene_envs.assets.base import Asset, AssetLibrary, ConvexPart
 from scene_envs.assets.shapes import box
 from scene_envs.errors import InvalidInputError
@@ -20,10 +20,6 @@ from scene_envs.physics.geometry import library_geometry
 from scene_envs.physics.placement import Objects, flatten, object_boxes, part_pairs, place
 from scene_envs.physics.separation import separations
 from scene_envs.scene import SceneBatch
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 TOUCHING = 1e-4
 """Overlap (m) of the gripper with anything up to which it only touches."""

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.budget import Budget
 from scene_envs.physics.collision import Collider
 from scene_envs.physics.geometry import LibraryGeometry, library_geometry
@@ -18,10 +18,6 @@ from scene_envs.physics.rest import Rest, Statics
 from scene_envs.physics.support import Support, clusters, company
 from scene_envs.physics.world import SolverSettings, World
 from scene_envs.scene_types import SceneType
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 _LOGGER = logging.getLogger(__name__)
 

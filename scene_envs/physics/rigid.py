@@ -7,9 +7,8 @@ in a batch. scipy's ``Rotation`` picks its formula per batch and promises no suc
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from scene_envs.arrays import Array
 
 
 def apply(rotation: Array, vector: Array) -> Array:

@@ -11,12 +11,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scene_envs.arrays import Array, Index
 from scene_envs.physics.geometry import LibraryGeometry
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _BLOCK = 1 << 16
 """Face-corner combinations looked at together: their arrays stay in the cache."""

@@ -5,18 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics import rigid
 from scene_envs.physics.bodies import SCALE, BodyKey, BodyPool
 from scene_envs.physics.budget import Budget
 from scene_envs.physics.constants import GRAVITY
 from scene_envs.physics.geometry import LibraryGeometry
 from scene_envs.physics.placement import Objects
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 _LOOK = 12
 """Steps after which to see whether everything is at rest."""

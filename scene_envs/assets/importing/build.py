@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scene_envs.assets.base import Array, Asset, ConvexPart
+from scene_envs.arrays import Array
+from scene_envs.assets.base import Asset, ConvexPart
 from scene_envs.assets.importing.entries import AssetEntry, Axis
 from scene_envs.assets.importing.hulls import enclosing_hull, thickness
 from scene_envs.assets.importing.inertials import weigh

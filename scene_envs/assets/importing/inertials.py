@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scene_envs.assets.base import Array, ConvexPart
+from scene_envs.arrays import Array
+from scene_envs.assets.base import ConvexPart
 from scene_envs.assets.importing.model import Inertial
 from scene_envs.assets.shapes import MassProperties, mass_properties
 
