@@ -279,12 +279,7 @@ def register_algorithm(
         InvalidInputError: the name is not one word.
     """
     _ALGORITHMS.check_name(name, "my_ddpo")
-
-    def register(algorithm: Algorithm) -> Algorithm:
-        _ALGORITHMS[name] = _Entry(settings, algorithm)
-        return algorithm
-
-    return register
+    return _ALGORITHMS.adding(name, lambda algorithm: _Entry(settings, algorithm))
 
 
 def list_algorithms() -> list[str]:
