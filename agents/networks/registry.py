@@ -165,23 +165,7 @@ def network_config(
     >>> network_config("midiffusion", "mixed", features=20, categories=8, hidden=64, depth=4, heads=4).hidden
     64
     """
-    keys: dict[str, Any] = {
-        "features": features,
-        "categories": categories,
-        "hidden": hidden,
-        "depth": depth,
-        "heads": heads,
-        "text_width": text_width,
-        "frequencies": frequencies,
-        "double_blocks": double_blocks,
-        "embedding": embedding,
-        "pose_head": pose_head,
-        "time_scale": time_scale,
-        "text_reach": text_reach,
-        "modules": modules,
-        "unit": unit,
-        "rotations": rotations,
-    }
+    keys = {key: value for key, value in locals().items() if key not in ("name", "process")}
     entry = _entry(name, process)
     return entry.config(**entry.sizes(keys))
 
