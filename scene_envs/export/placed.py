@@ -174,14 +174,6 @@ def angle_axis(rotation: Array) -> tuple[float, Array]:
     return float(np.degrees(2.0 * np.arctan2(length, w))), np.array(vector) / length
 
 
-def principal_inertia(inertia: Array) -> tuple[Array, Array]:
-    """Principal moments (3,) kg m^2, ascending, and the rotation (3, 3) from their axes to the asset's."""
-    moments, axes = np.linalg.eigh(np.asarray(inertia, dtype=np.float64))
-    if np.linalg.det(axes) < 0:
-        axes[:, 0] *= -1.0
-    return moments, axes
-
-
 def number(value: float) -> str:
     """The shortest text that reads back as exactly this double (17 digits at most).
 

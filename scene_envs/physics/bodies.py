@@ -8,13 +8,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from scipy.spatial import ConvexHull
 
 from scene_envs.arrays import Array
 from scene_envs.errors import MissingDependencyError, PhysicsError
 from scene_envs.physics.constants import FRICTION
 from scene_envs.physics.geometry import LevelGeometry, LibraryGeometry, inset_hull
+from scene_envs.physics.rigid import principal_inertia
 from scene_envs.silence import silence
 
 BodyKey = tuple[int, str]
@@ -60,16 +60,13 @@ class BodyPool:
         self._library = library
         self._bodies: dict[BodyKey, list[int]] = {}
         self._parking: dict[int, tuple[float, float, float]] = {}
-        self._frames: dict[int, tuple[Array, Array]] = {}  # category -> principal axes, moments
+        self._frames: dict[int, tuple[Array, Array]] = {}  # category -> principal moments, axes
         self._wavefronts: dict[BodyKey, str] = {}
 
     def principal(self, category: int) -> tuple[Array, Array]:
-        """Principal axes (3, 3, columns) and moments (3,) kg m^2 of an asset's inertia."""
+        """Principal moments (3,) kg m^2 and axes (3, 3, columns) of an asset's inertia."""
         if category not in self._frames:
-            moments, axes = np.linalg.eigh(np.asarray(self._library.assets[category].asset.inertia))
-            if np.linalg.det(axes) < 0:
-                axes[:, 0] *= -1.0
-            self._frames[category] = axes, moments
+            self._frames[category] = principal_inertia(self._library.assets[category].asset.inertia)
         return self._frames[category]
 
     def take(self, needed: Mapping[BodyKey, int]) -> dict[BodyKey, list[int]]:
@@ -163,7 +160,7 @@ class BodyPool:
         category, level = key
         if key not in self._wavefronts:
             geometry: LevelGeometry = getattr(self._library.assets[category], level)
-            axes, center = self.principal(category)[0], self._library.center_of_mass[category]
+            axes, center = self.principal(category)[1], self._library.center_of_mass[category]
             self._wavefronts[key] = _wavefront(
                 [SCALE * (inset_hull(part, MARGIN) - center) @ axes for part in geometry.parts]
             )
@@ -178,7 +175,7 @@ class BodyPool:
         return shape
 
     def _inertia(self, category: int) -> list[float]:
-        return (SCALE**2 * self.principal(category)[1]).tolist()  # type: ignore[no-any-return]
+        return (SCALE**2 * self.principal(category)[0]).tolist()  # type: ignore[no-any-return]
 
     def _body(self, category: int, shape: int, visual: int, place: tuple[float, float, float]) -> int:
         static = bool(self._library.static[category])

@@ -125,11 +125,6 @@ def reachable(batch: SceneBatch, approaches: Sequence[Sequence[float]], gripper:
     return ReachResult((found & valid[:, None]).to(device), valid.to(device))
 
 
-@lru_cache(maxsize=16)
-def _hand(library: AssetLibrary, gripper: Gripper) -> _Hand:
-    return _Hand(library, gripper)
-
-
 class _Hand:
     """A gripper among the assets of a library, of which it is the last but one; the space in it is the last."""
 
@@ -215,6 +210,9 @@ class _Hand:
         depth, _ = self.collider.depth(placed.parts, a, b)
         overlap[pair[depth > TOUCHING]] = True
         return overlap
+
+
+_hand = lru_cache(maxsize=16)(_Hand)
 
 
 def _frames(rotation: Array, back: Array) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -69,15 +70,12 @@ class Physics:
         return self._world
 
 
-_PHYSICS: dict[int, Physics] = {}
+_physics = cache(Physics)
 
 
 def physics_of(scene_type: SceneType) -> Physics:
     """The physics of a scene type's assets, shared within this process."""
-    library = library_geometry(scene_type.library.assets)
-    if id(library) not in _PHYSICS:
-        _PHYSICS[id(library)] = Physics(library)
-    return _PHYSICS[id(library)]
+    return _physics(library_geometry(scene_type.library.assets))
 
 
 @dataclass(frozen=True, eq=False)

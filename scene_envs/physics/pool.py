@@ -282,11 +282,6 @@ def run_here(
             _retry(task, tasks, f"failed ({type(error).__name__}: {error})")
 
 
-def run_in_process(kernel: str, chunks: Sequence[Chunk], options: Mapping[str, Any]) -> list[dict[str, Any] | None]:
-    """As :meth:`PhysicsPool.run`, without a pool."""
-    return PhysicsPool(workers=0).run(kernel, chunks, options)
-
-
 def _store(task: _Task, result: dict[str, Any], results: list[dict[str, Any] | None]) -> None:
     for index, row in enumerate(task.rows):
         results[row] = {name: values[index] for name, values in result.items()}

@@ -77,7 +77,7 @@ class World:
         """
         bullet, client = self._pool.bullet, self._pool.client
         category, fixed, count = objects.category, objects.fixed, len(objects)
-        axes = np.array([self._pool.principal(c)[0] for c in category.tolist()])
+        axes = np.array([self._pool.principal(c)[1] for c in category.tolist()])
         center = self._library.center_of_mass[category]
         start_quaternion = rigid.quaternions(rigid.times(objects.rotation, axes))
         start_position = SCALE * (objects.translation + rigid.apply(objects.rotation, center))
