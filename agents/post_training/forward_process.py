@@ -15,8 +15,8 @@ from agents.post_training.algorithms import AWMSettings, ForwardProcessSettings,
 from agents.post_training.expectation import Expectation
 from agents.post_training.forward_losses import AWMLoss, NFTLoss, RewardWeightedLoss
 from agents.post_training.forward_process_loss import ForwardProcessLoss
-from agents.post_training.gradients import credited_reward
-from agents.post_training.own_samples import OwnSampleAlgorithm, OwnSampleGradient
+from agents.post_training.gradients import BatchGradient, credited_reward
+from agents.post_training.own_samples import OwnSampleAlgorithm
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import Branching, Rollout, rollout_groups
 from agents.priors.base import ScenePrior
@@ -99,10 +99,10 @@ class ForwardProcess(OwnSampleAlgorithm):
         """Mean square of the trained denoiser's output minus the sampling policy's."""
         return {"distance": float(result["distance"]) ** 2}
 
-    def accumulate(self, rollout: Rollout, advantage: TensorDict, generator: Generator) -> OwnSampleGradient:
+    def accumulate(self, rollout: Rollout, advantage: TensorDict, generator: Generator) -> BatchGradient:
         """See :class:`OwnSampleAlgorithm`; ``distance`` is a root mean square."""
         gradient = super().accumulate(rollout, advantage, generator)
-        return replace(gradient, means={**gradient.means, "distance": gradient.means["distance"] ** 0.5})
+        return replace(gradient, columns={**gradient.columns, "distance": gradient.columns["distance"] ** 0.5})
 
     def end_iteration(self) -> None:
         """Move the sampling policy towards the prior in training."""
