@@ -58,6 +58,12 @@ class ConvexPart:
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
 
+def bounds_of(parts: Sequence[ConvexPart]) -> Array:
+    """(2, 3) m: lowest and highest corner of the box around ``parts``."""
+    corners = np.stack([part.bounds for part in parts])
+    return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
+
+
 @dataclass(frozen=True, eq=False)
 class Asset:
     """One model of the library. Frame: z up, base at z = 0 unless the notes of its recipe say otherwise.
@@ -96,8 +102,7 @@ class Asset:
     @cached_property
     def bounds(self) -> Array:
         """(2, 3): lowest and highest corner of the fine parts, m."""
-        corners = np.stack([part.bounds for part in self.fine])
-        return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
+        return bounds_of(self.fine)
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,14 +54,6 @@ def run(settings: PackagePriorConfig) -> None:
     from agents.priors.card import package_prior
     from agents.priors.facts import PriorFacts
 
-    folder = package_prior(
-        settings.prior,
-        settings.output,
-        evaluation=settings.evaluation or None,
-        precision=settings.precision,
-        data=settings.data,
-        license=settings.license,
-        machine=settings.machine,
-        limits=settings.limits,
-    )
+    keys = {**vars(settings), "evaluation": settings.evaluation or None}
+    folder = package_prior(keys.pop("prior"), **keys)
     print("\n".join(PriorFacts.of(folder).lines()))
