@@ -11,11 +11,11 @@ from typing import Any
 from scipy.spatial import ConvexHull
 
 from scene_envs.arrays import Array
-from scene_envs.errors import MissingDependencyError, PhysicsError
+from scene_envs.errors import PhysicsError
 from scene_envs.physics.constants import FRICTION
 from scene_envs.physics.geometry import LevelGeometry, LibraryGeometry, inset_hull
 from scene_envs.physics.rigid import principal_inertia
-from scene_envs.silence import silence
+from scene_envs.silence import quiet_pybullet
 
 BodyKey = tuple[int, str]
 """Asset category and level of detail ("fine" or "coarse") of a body."""
@@ -53,7 +53,10 @@ class BodyPool:
     """
 
     def __init__(self, library: LibraryGeometry) -> None:
-        self.bullet = _import_bullet()
+        self.bullet = quiet_pybullet(
+            "settling and equilibrium need pybullet, whose wheels exist for Python 3.10 and 3.11; "
+            "install it there with: pip install pybullet"
+        )
         self.client: int = self.bullet.connect(self.bullet.DIRECT)
         if self.client < 0:
             raise PhysicsError("PyBullet has no free client slot; close clients that are no longer used")
@@ -198,18 +201,6 @@ class BodyPool:
             settings["activationState"] = self.bullet.ACTIVATION_STATE_SLEEP
         self.bullet.changeDynamics(body, -1, physicsClientId=self.client, **settings)
         return int(body)
-
-
-def _import_bullet() -> Any:
-    try:
-        with silence():
-            import pybullet
-    except ImportError as error:
-        raise MissingDependencyError(
-            "settling and equilibrium need pybullet, whose wheels exist for Python 3.10 and 3.11; "
-            "install it there with: pip install pybullet"
-        ) from error
-    return pybullet
 
 
 def _wavefront(hulls: list[Array]) -> str:

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_envs.assets import Asset, get_library
-from scene_envs.errors import MissingDependencyError
 from scene_envs.scene_types import Camera
+from scene_envs.silence import quiet_pybullet
 
 _AWAY = (0.0, 0.0, -1000.0)
 _CELL, _CELLS = 8, 32
@@ -45,17 +45,10 @@ class Frame:
 
 def load_pybullet() -> ModuleType:
     """The PyBullet module; raises MissingDependencyError where it is not installed."""
-    from scene_envs.silence import silence
-
-    try:
-        with silence():
-            import pybullet
-    except ImportError as error:
-        raise MissingDependencyError(
-            "pictures need PyBullet, which is not installed; install it with `pip install pybullet` "
-            "(its wheels exist for Python 3.10 and 3.11)"
-        ) from error
-    return pybullet  # type: ignore[no-any-return]
+    return quiet_pybullet(
+        "pictures need PyBullet, which is not installed; install it with `pip install pybullet` "
+        "(its wheels exist for Python 3.10 and 3.11)"
+    )
 
 
 class Stage:
