@@ -14,6 +14,7 @@ from rewards.registry import resolve_reward, reward_name
 from rewards.seeding import other_draw
 from rewards.verdicts import forget_verdicts
 from scene_envs.errors import RewardError, RewardTimeoutError
+from scene_envs.rotations import yaw_matrix
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
@@ -102,9 +103,7 @@ def random_scenes(scene_type: SceneType, count: int, generator: Generator) -> Sc
     taken = fixed + (torch.linspace(0, 1, count) * (slots - fixed)).long()
     categories[torch.arange(slots) >= taken.unsqueeze(-1)] = scene_type.num_assets
     yaw = 2 * torch.pi * torch.rand(count, slots, generator=generator)
-    zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
-    rows = (yaw.cos(), -yaw.sin(), zero, yaw.sin(), yaw.cos(), zero, zero, zero, one)
-    rotations = torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    rotations = yaw_matrix(yaw)
     translations = low + (high - low) * torch.rand(count, slots, 3, generator=generator)
     for target, source in (
         (categories, batch.categories),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 from scene_envs.arrays import Array, Index
 from scene_envs.assets.base import Asset, ConvexPart
@@ -146,7 +146,6 @@ def inset_hull(part: PartGeometry, distance: float) -> Array:
     A part too thin for the whole distance is inset by two fifths of its thickness.
     """
     from scipy.optimize import linprog
-    from scipy.spatial import HalfspaceIntersection
 
     count = len(part.normals)
     deepest = linprog(

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
+from scene_envs.errors import InvalidInputError
+
 WRITES = False
 
 
@@ -40,7 +42,6 @@ class PackagePriorConfig:
 def check(settings: PackagePriorConfig) -> None:
     """Refuse what cannot be, before the prior is read."""
     from agents.configuration.checks import one_of
-    from scene_envs.errors import InvalidInputError
 
     if not settings.prior or not settings.output:
         raise InvalidInputError(
