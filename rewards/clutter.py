@@ -7,19 +7,17 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from rewards.base import RewardContext, RewardOutput
 from rewards.registry import register_reward
+from scene_envs.arrays import Array, Index
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_facts import hull_corners
 
 if TYPE_CHECKING:
     from scene_envs.datasets.prompts import SceneFacts
-
-Array = NDArray[np.float64]
 
 _PARALLEL = 1e-12
 
@@ -151,7 +149,7 @@ def _chords(corners: Array, y: Array) -> tuple[Array, Array]:
     return np.where(hit, crossing, np.inf).min(axis=1), np.where(hit, crossing, -np.inf).max(axis=1)
 
 
-def _standing(facts: SceneFacts, support: int) -> list[NDArray[np.int64]]:
+def _standing(facts: SceneFacts, support: int) -> list[Index]:
     """Indices of what stands on each surface of a welded object: its tiers, or its top."""
     here, tiers = facts.held.place == support, int(facts.tiers[support])
     if tiers == 0:

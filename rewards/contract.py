@@ -14,6 +14,7 @@ from rewards.registry import resolve_reward, reward_name
 from rewards.seeding import other_draw
 from rewards.verdicts import forget_verdicts
 from scene_envs.errors import RewardError, RewardTimeoutError
+from scene_envs.rotations import yaw_matrix
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
@@ -102,9 +103,7 @@ def random_scenes(scene_type: SceneType, count: int, generator: Generator) -> Sc
     taken = fixed + (torch.linspace(0, 1, count) * (slots - fixed)).long()
     categories[torch.arange(slots) >= taken.unsqueeze(-1)] = scene_type.num_assets
     yaw = 2 * torch.pi * torch.rand(count, slots, generator=generator)
-    zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
-    rows = (yaw.cos(), -yaw.sin(), zero, yaw.sin(), yaw.cos(), zero, zero, zero, one)
-    rotations = torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    rotations = yaw_matrix(yaw)
     translations = low + (high - low) * torch.rand(count, slots, 3, generator=generator)
     for target, source in (
         (categories, batch.categories),
@@ -113,18 +112,6 @@ def random_scenes(scene_type: SceneType, count: int, generator: Generator) -> Sc
     ):
         target[:, :fixed] = source[:, :fixed]
     return SceneBatch.from_parts(translations, rotations, categories, scene_type)
-
-
-def _scores_empty(subject: _Subject) -> None:
-    _require_some_valid(subject.score(subject.empty), "scenes without free objects")
-
-
-def _scores_clutter(subject: _Subject) -> None:
-    _require_some_valid(subject.random_output, "scenes of strewn, overlapping objects")
-
-
-def _is_deterministic(subject: _Subject) -> None:
-    _require_equal(subject.random_output, subject.score(subject.random), "a second call on the same scenes")
 
 
 def _rows_are_independent(subject: _Subject) -> None:
@@ -153,9 +140,15 @@ def _ignores_empty_slots(subject: _Subject) -> None:
 
 _ALONE = "scores a scene the same alone and in a batch"
 _CHECKS: dict[str, Check] = {
-    "scores scenes that hold nothing but welded objects": _scores_empty,
-    "scores crowded scenes with overlapping objects": _scores_clutter,
-    "gives the same scores when called again": _is_deterministic,
+    "scores scenes that hold nothing but welded objects": lambda subject: _require_some_valid(
+        subject.score(subject.empty), "scenes without free objects"
+    ),
+    "scores crowded scenes with overlapping objects": lambda subject: _require_some_valid(
+        subject.random_output, "scenes of strewn, overlapping objects"
+    ),
+    "gives the same scores when called again": lambda subject: _require_equal(
+        subject.random_output, subject.score(subject.random), "a second call on the same scenes"
+    ),
     _ALONE: _rows_are_independent,
     "does not depend on the order of the slots": _ignores_slot_order,
     "does not depend on the number of empty slots": _ignores_empty_slots,

@@ -261,15 +261,12 @@ def _build(maker: Callable[..., Any], name: str, settings: dict[str, Any]) -> Re
     try:
         inspect.signature(maker).bind(**settings)
     except TypeError as error:
-        raise InvalidInputError(f"reward {name!r}: {error}; its settings are {_signature(maker)}") from error
+        known = str(inspect.signature(maker)).split(" -> ")[0]
+        raise InvalidInputError(f"reward {name!r}: {error}; its settings are {known}") from error
     reward = maker(**settings)
     if not callable(reward):
         raise RewardError(f"reward {name!r}: {maker.__qualname__} has no __call__(batch, context) method")
     return reward  # type: ignore[no-any-return]
-
-
-def _signature(maker: Callable[..., Any]) -> str:
-    return str(inspect.signature(maker)).split(" -> ")[0]
 
 
 def _origin(maker: Any) -> str:

@@ -81,6 +81,15 @@ class Registry(dict[str, Component]):
             import_module(module)
         self.update(registered)
 
+    def adding(self, name: str, entry: Callable[[Any], Component] | None = None) -> Callable[[Any], Any]:
+        """A decorator that makes what it decorates, or ``entry`` of it, the component ``name``."""
+
+        def add(made: Any) -> Any:
+            self[name] = made if entry is None else entry(made)
+            return made
+
+        return add
+
     def points(self) -> dict[str, EntryPoint]:
         """The entry points of installed packages, by name."""
         return plugin_entry_points(self.group)

@@ -6,16 +6,14 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from scene_envs.arrays import Array, Index
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
 
-Array = NDArray[np.float64]
-
-PlacedObjects = tuple[NDArray[np.int64], Array]
+PlacedObjects = tuple[Index, Array]
 """Objects of one scene: categories (n,), ascending, and positions (n, 3) m."""
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from scene_envs.errors import InvalidInputError
+
 if TYPE_CHECKING:
     from scene_envs.scene import SceneBatch
 
@@ -20,7 +22,6 @@ def find_scenes(path: Path, key: str = "scenes") -> Path:
     Raises:
         InvalidInputError: there is nothing, or a prior and no scenes.
     """
-    from scene_envs.errors import InvalidInputError
     from scene_envs.files import exists
 
     if not exists(path):
@@ -54,7 +55,6 @@ def load_scenes(path: Path, count: int | None = None) -> SceneBatch:
         InvalidInputError: ``count`` below 1, nothing there, or files of several scene types.
     """
     from scene_envs.datasets import SceneDataset
-    from scene_envs.errors import InvalidInputError
     from scene_envs.scene import SceneBatch
 
     if count is not None and count < 1:

@@ -6,6 +6,9 @@ import contextlib
 import os
 import sys
 from collections.abc import Iterator
+from typing import Any
+
+from scene_envs.errors import MissingDependencyError
 
 
 @contextlib.contextmanager
@@ -23,3 +26,13 @@ def silence() -> Iterator[None]:
             for copy, descriptor in zip(kept, (1, 2), strict=True):
                 os.dup2(copy, descriptor)
                 os.close(copy)
+
+
+def quiet_pybullet(otherwise: str) -> Any:
+    """The module pybullet; raises MissingDependencyError with the text ``otherwise`` where it is not installed."""
+    try:
+        with silence():
+            import pybullet
+    except ImportError as error:
+        raise MissingDependencyError(otherwise) from error
+    return pybullet

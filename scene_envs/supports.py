@@ -6,14 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scene_envs.arrays import Array, Index, Mask
 from scene_envs.assets.support_shapes import LibraryShapes, library_shapes
 from scene_envs.scene_types import SceneType
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 CONTACT = 0.01
 """Surfaces this far (m) apart, or into each other, touch."""

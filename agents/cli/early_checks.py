@@ -113,15 +113,12 @@ def _check_numbers(settings: Any) -> None:
     for key, least in {**_LEAST, **getattr(settings, "LEAST", {})}.items():
         value = getattr(settings, key, None)
         if isinstance(value, int | float) and not least <= value < math.inf:
-            null = ", or null" if _may_be_none(settings, key) else ""
+            may_be_none = any(field.name == key and field.default is None for field in dataclasses.fields(settings))
+            null = ", or null" if may_be_none else ""
             raise InvalidInputError(f"{key}={value} must be at least {least}{null}")
     for key in _POSITIVE:
         if isinstance(value := getattr(settings, key, None), int | float) and not value > 0:
             raise InvalidInputError(f"{key}={value} must be more than 0")
-
-
-def _may_be_none(settings: Any, key: str) -> bool:
-    return next((field.default is None for field in dataclasses.fields(settings) if field.name == key), False)
 
 
 def _check_prior(name: str) -> None:

@@ -61,8 +61,7 @@ class Sources:
 def keys_of(command: Any) -> type:
     """The dataclass of a command's keys: what ``settings``, the argument of its ``run``, is annotated with."""
     annotation = command.run.__annotations__["settings"]
-    keys: type = command.run.__globals__[annotation] if isinstance(annotation, str) else annotation
-    return keys
+    return command.run.__globals__[annotation] if isinstance(annotation, str) else annotation
 
 
 def describe_fields(config: type | Any, prefix: str = "") -> list[KeyHelp]:
@@ -172,7 +171,9 @@ def compose(command: str, config: type, words: Sequence[str], sources: Sources =
         InvalidInputError: a word is not ``key=value``, or the value is not of the key's type.
     """
     fields = {field.name: field for field in dataclasses.fields(config)}
-    base = _without_output(read_config(sources.config)) if sources.config else None
+    base = read_config(sources.config) if sources.config else None
+    if base is not None:
+        base.pop("output", None)  # a run that is started again has a folder of its own
     late: dict[str, Any] = {}
     read = []
     adapter = ""
@@ -236,11 +237,6 @@ def read_config(path: str) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise CorruptFileError(f"--config {path} holds no keys")
     return found
-
-
-def _without_output(values: dict[str, Any]) -> dict[str, Any]:
-    """A run that is started again has a folder of its own."""
-    return {key: value for key, value in values.items() if key != "output"}
 
 
 def _component(

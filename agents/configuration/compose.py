@@ -46,7 +46,9 @@ def compose_tree(
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
-    folders = {field.name: field.metadata["folder"] for field in dataclasses.fields(kind) if _folder(field)}
+    folders = {
+        field.name: field.metadata["folder"] for field in dataclasses.fields(kind) if field.metadata.get("folder")
+    }
     whole = {field.name for field in dataclasses.fields(kind) if field.metadata.get("named")}
     chosen: dict[str, str] = {}
     values, overrides = [], []
@@ -189,10 +191,6 @@ def choice_word(field: dataclasses.Field[Any], value: str, config_dir: str = "")
         return f"{field.name}={value}"
     check_option(folder, value, config_dir, field.metadata["registered"]())
     return f"{field.name}.name={value}"
-
-
-def _folder(field: dataclasses.Field[Any]) -> bool:
-    return bool(field.metadata.get("folder"))
 
 
 def _group(folder: str, key: str) -> str:

@@ -199,8 +199,7 @@ class CategoricalProcess:
         states = back * (keep_s * weight + _replaced(keep_s, mask_s) / k)
         mask = torch.where(masked, mask_s, torch.zeros_like(mask_s))
         joint = torch.cat([states, mask.expand(*states.shape[:-1], 1)], dim=-1)
-        result: Tensor = (joint / joint.sum(dim=-1, keepdim=True).clamp(min=_TINY)).to(x0_probs.dtype)
-        return result
+        return (joint / joint.sum(dim=-1, keepdim=True).clamp(min=_TINY)).to(x0_probs.dtype)
 
     def _rates_at(self, t: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
         """Cumulative keep and mask at ``t``, shaped (B, ..., 1) for states ``like`` (B, ...)."""

@@ -5,15 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from agents.evaluation.set_encoder import SetEncoder
     from scene_envs.scene import SceneBatch
-
-Array = NDArray[np.float64]
 
 
 def frechet_scene_distance(a: SceneBatch, b: SceneBatch, *, encoder: SetEncoder | None = None) -> float:

@@ -108,7 +108,7 @@ def evaluate(
     Returns:
         The figures of :func:`measure_samples`, and ``num_steps``.
     """
-    sampler = _load(prior)
+    sampler = cast(Sampler, resolve_prior(prior))
     if reference is None:
         reference = grammar_scenes(sampler.scene_type, count, seed=seed)
     samples = sampler.sample(count, num_steps=num_steps, seed=seed, batch_size=batch_size)
@@ -149,9 +149,3 @@ def layout_figures(batch: SceneBatch, reference: SceneBatch) -> dict[str, float]
             figures[f"height_error_{kind}_mm"] = 1e3 * float(errors.quantile(0.5))
             figures[f"height_error_{kind}_p95_mm"] = 1e3 * float(errors.quantile(0.95))
     return figures
-
-
-def _load(prior: Sampler | str) -> Sampler:
-    if not isinstance(prior, str):
-        return prior
-    return cast(Sampler, resolve_prior(prior))

@@ -67,18 +67,6 @@ def _beside_floor(measure: Callable[[SceneBatch], Figures], inputs: EvaluationIn
     return {**measure(inputs.samples), **real}
 
 
-def _layout(inputs: EvaluationInputs) -> Figures:
-    return _beside_floor(lambda batch: layout_figures(batch, inputs.real.reference), inputs)
-
-
-def _physics(inputs: EvaluationInputs) -> Figures:
-    return _beside_floor(lambda batch: physics_figures(batch, inputs.pool), inputs)
-
-
-def _ready(inputs: EvaluationInputs) -> Figures:
-    return _beside_floor(lambda batch: ready_figures(batch, inputs.pool), inputs)
-
-
 def _classifier(inputs: EvaluationInputs) -> Figures:
     from agents.evaluation.classifier import classifier_accuracy
 
@@ -113,11 +101,10 @@ def _fid(inputs: EvaluationInputs) -> Figures:
     if not inputs.fid_weights:
         raise InvalidInputError("FID needs fid_weights=, the path of an Inception-v3's weights")
 
-    def measure(batch: SceneBatch) -> Figures:
-        distance = frechet_inception_distance(batch, inputs.real.reference, inputs.fid_weights)
-        return {"frechet_inception_distance": distance}
-
-    return _beside_floor(measure, inputs)
+    real, weights = inputs.real.reference, inputs.fid_weights
+    return _beside_floor(
+        lambda batch: {"frechet_inception_distance": frechet_inception_distance(batch, real, weights)}, inputs
+    )
 
 
 def _prompts(inputs: EvaluationInputs) -> Figures:
@@ -147,9 +134,9 @@ def _novelty(inputs: EvaluationInputs) -> Figures:
 
 
 MEASURES: dict[str, Callable[[EvaluationInputs], Figures]] = {
-    "layout": _layout,
-    "physics": _physics,
-    "ready": _ready,
+    "layout": lambda inputs: _beside_floor(lambda batch: layout_figures(batch, inputs.real.reference), inputs),
+    "physics": lambda inputs: _beside_floor(lambda batch: physics_figures(batch, inputs.pool), inputs),
+    "ready": lambda inputs: _beside_floor(lambda batch: ready_figures(batch, inputs.pool), inputs),
     "fsd": _fsd,
     "novelty": _novelty,
     "prompts": _prompts,

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from scene_envs.arrays import Array, Index
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_distance import (
@@ -30,8 +30,6 @@ _ROWS = 256
 """Scenes whose features are compared with all others at once."""
 _WAVES = 12
 """Test functions of the position, for each asset."""
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -128,15 +126,14 @@ def _is_copy(first: PlacedObjects, second: PlacedObjects) -> bool:
     return bool((maximum_bipartite_matching(csr_matrix(near)) >= 0).all())
 
 
-def _close_pairs(positions: list[Array]) -> NDArray[np.int64]:
+def _close_pairs(positions: list[Array]) -> Index:
     """(P, 2): scenes of the same assets whose centres are near enough for them to be copies."""
     from scipy.spatial import KDTree
 
     if len(positions) < 2:
         return np.empty((0, 2), dtype=np.int64)
     centers = np.stack([scene.mean(axis=0) if len(scene) else np.zeros(3) for scene in positions])
-    pairs: NDArray[np.int64] = KDTree(centers).query_pairs(DUPLICATE * 1.001, output_type="ndarray")
-    return pairs
+    return KDTree(centers).query_pairs(DUPLICATE * 1.001, output_type="ndarray")
 
 
 # -- features --------------------------------------------------------------------------------------

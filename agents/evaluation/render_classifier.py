@@ -6,7 +6,6 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from agents.evaluation.two_sample_test import (
@@ -67,8 +66,7 @@ def render_classifier_accuracy(
 
     def prepare(split: Split) -> tuple[nn.Module, Forward]:
         def forward(network: nn.Module, rows: Tensor) -> Tensor:
-            logits: Tensor = network(images[rows].long())
-            return logits
+            return network(images[rows].long())
 
         return _RenderNetwork(colors), forward
 
@@ -89,16 +87,10 @@ def class_images(batches: list[SceneBatch], width: int, height: int) -> tuple[Te
     """
     from scene_envs.render import render
 
-    codes = np.concatenate([_codes(render(b, style="semantic", width=width, height=height)) for b in batches])
-    colors, index = np.unique(codes, return_inverse=True)
-    return torch.from_numpy(index.reshape(codes.shape).astype(np.uint8)), len(colors)
-
-
-def _codes(images: NDArray[np.uint8]) -> NDArray[np.int32]:
-    """(B, H, W) colours as 0xRRGGBB."""
+    images = np.concatenate([render(b, style="semantic", width=width, height=height) for b in batches])
     red, green, blue = np.moveaxis(images.astype(np.int32), -1, 0)
-    codes: NDArray[np.int32] = (red << 16) | (green << 8) | blue
-    return codes
+    colors, index = np.unique((red << 16) | (green << 8) | blue, return_inverse=True)
+    return torch.from_numpy(index.reshape(images.shape[:-1]).astype(np.uint8)), len(colors)
 
 
 class _RenderNetwork(nn.Module):

@@ -75,14 +75,15 @@ def scene_tokens(batch: SceneBatch, neighbours: int = NEIGHBOURS) -> SceneTokens
         batch: B scenes.
         neighbours: K.
     """
-    _check_not_empty(batch)
+    if not len(batch):
+        raise InvalidInputError("a learned measure needs at least one scene, got none")
     parts = [_tokens(batch[start : start + _CHUNK], neighbours) for start in range(0, len(batch), _CHUNK)]
     width = max(part.poses.shape[1] for part in parts)
     empty = batch.scene_type.num_assets
     joined = []
     for field in fields(SceneTokens):
         fill = empty if field.name in ("categories", "neighbours") else 0
-        joined.append(torch.cat([_padded(getattr(part, field.name), width, fill) for part in parts]))
+        joined.append(torch.cat([_padded(getattr(part, field.name), 1, width, fill) for part in parts]))
     return SceneTokens(*joined)
 
 
@@ -141,8 +142,8 @@ def _tokens(batch: SceneBatch, neighbours: int) -> SceneTokens:
         _waves(translations) * present[..., None],
         categories,
         2.0 * half,
-        _padded_neighbours(offsets * there[..., None], neighbours, 0.0),
-        _padded_neighbours(names, neighbours, batch.scene_type.num_assets),
+        _padded(offsets * there[..., None], 2, neighbours, 0.0),
+        _padded(names, 2, neighbours, batch.scene_type.num_assets),
         present,
     )
 
@@ -163,18 +164,7 @@ def _at(values: Tensor, index: Tensor) -> Tensor:
     return values.gather(1, rows).unflatten(1, index.shape[1:])
 
 
-def _padded(values: Tensor, width: int, fill: float) -> Tensor:
-    """``values`` (B, N, ...) with rows of ``fill`` up to N = ``width``."""
-    extra = values.new_full((values.shape[0], width - values.shape[1], *values.shape[2:]), fill)
-    return torch.cat([values, extra], dim=1)
-
-
-def _padded_neighbours(values: Tensor, count: int, fill: float) -> Tensor:
-    """``values`` (B, N, k, ...) with ``fill`` up to ``count`` neighbours."""
-    extra = values.new_full((*values.shape[:2], count - values.shape[2], *values.shape[3:]), fill)
-    return torch.cat([values, extra], dim=2)
-
-
-def _check_not_empty(batch: SceneBatch) -> None:
-    if not len(batch):
-        raise InvalidInputError("a learned measure needs at least one scene, got none")
+def _padded(values: Tensor, dim: int, size: int, fill: float) -> Tensor:
+    """``values`` with ``fill`` up to ``size`` along ``dim``."""
+    extra = values.new_full((*values.shape[:dim], size - values.shape[dim], *values.shape[dim + 1 :]), fill)
+    return torch.cat([values, extra], dim=dim)

@@ -71,10 +71,7 @@ class SetEncoder(nn.Module):
         """Features (B, F) before whitening; ``names`` (C + 1,) gives the token of each category."""
         size = (tokens.extents.clamp(min=1e-3) / 0.1).log() * tokens.present[..., None]
         own = torch.cat([tokens.poses, tokens.waves, size], dim=-1)
-        result: Tensor = self.network(
-            own, names[tokens.categories], tokens.offsets, names[tokens.neighbours], tokens.present
-        )
-        return result
+        return self.network(own, names[tokens.categories], tokens.offsets, names[tokens.neighbours], tokens.present)
 
     @torch.no_grad()
     def features(self, batch: SceneBatch) -> Tensor:

@@ -61,8 +61,7 @@ class _Attention(nn.Module):
         key, value = self.key_value(self.key_norm(keys)).unflatten(-1, (2, self.heads, -1)).permute(2, 0, 3, 1, 4)
         attended = F.scaled_dot_product_attention(query, key, value, attn_mask=mask).transpose(1, 2).flatten(-2)
         queries = queries + self.out(attended)
-        result: Tensor = queries + self.mlp(self.mlp_norm(queries))
-        return result
+        return queries + self.mlp(self.mlp_norm(queries))
 
 
 class _InducedBlock(nn.Module):
@@ -77,8 +76,7 @@ class _InducedBlock(nn.Module):
     def forward(self, tokens: Tensor, mask: Tensor) -> Tensor:
         """Tokens (B, N, H) to the same."""
         summary = self.gather(self.points.expand(tokens.shape[0], -1, -1), tokens, mask)
-        result: Tensor = self.spread(tokens, summary)
-        return result
+        return self.spread(tokens, summary)
 
 
 class SetNetwork(nn.Module):
@@ -145,5 +143,4 @@ class SetNetwork(nn.Module):
         count = there.sum(dim=1).clamp(min=1.0)
         highest = tokens.masked_fill(~present[..., None], -1e4).amax(dim=1) * somewhere
         summary = torch.cat([pooled, total / count, highest, total / 20.0], dim=-1)
-        result: Tensor = self.leave(self.norm(summary))
-        return result
+        return self.leave(self.norm(summary))

@@ -90,8 +90,7 @@ class Attention(nn.Module):
         query = self.query(tokens).unflatten(-1, (self.heads, -1)).transpose(1, 2)
         key, value = self.key_value(source).unflatten(-1, (2, self.heads, -1)).permute(2, 0, 3, 1, 4)
         attended = F.scaled_dot_product_attention(query, key, value, attn_mask=mask)
-        result: Tensor = self.out(attended.transpose(1, 2).flatten(-2))
-        return result
+        return self.out(attended.transpose(1, 2).flatten(-2))
 
 
 def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
@@ -125,8 +124,7 @@ class _Baseline(nn.Module):
         """Tokens (B, N, H) through the trunk; ``time`` (B,)."""
         condition = self.time_in(timestep_embedding(time, _TIME_WIDTH).to(tokens.dtype))
         if self.text_in is None:
-            result: Tensor = self.trunk(tokens, condition, None, None)
-            return result
+            return self.trunk(tokens, condition, None, None)
         if text is None:
             text, text_mask = tokens.new_zeros(len(tokens), 1, self.text_in.in_features), None
         mask = None
@@ -134,8 +132,7 @@ class _Baseline(nn.Module):
             text = text * text_mask[..., None]
             somewhere = text_mask.any(dim=-1, keepdim=True)
             mask = (text_mask | ~somewhere)[:, None, None]  # a row of padding alone is read as no text
-        result = self.trunk(tokens, condition, self.text_in(text), mask)
-        return result
+        return self.trunk(tokens, condition, self.text_in(text), mask)
 
     def _with_octaves(self, features: Tensor, position: Tensor | None, noise_level: Tensor | None) -> Tensor:
         """Features (B, N, D) and, where asked for, those of the translations, with which ``position`` begins."""
@@ -174,8 +171,7 @@ class ContinuousBaseline(_Baseline):
         """
         levels = noise_level[:, None].expand(x.shape[:2])
         tokens = self.scene_in(self._with_octaves(x, position, levels))
-        result: Tensor = self.scene_out(self._tokens(tokens, 250.0 * noise_level.log(), text, text_mask))
-        return result
+        return self.scene_out(self._tokens(tokens, 250.0 * noise_level.log(), text, text_mask))
 
 
 class MixedBaseline(_Baseline):

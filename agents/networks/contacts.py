@@ -96,8 +96,7 @@ class Contacts(FluxModule):
         with torch.autocast(metres.device.type, enabled=False):  # half of a percent of a metre is too much
             messages, moves = self(metres, rotation, scene.states, scene.metres_noise, scene.pairs, scene.slot_mask)
         scene.kept[ContactsConfig.name] = moves
-        result: Tensor = messages
-        return result
+        return messages
 
     def pose_output(self, scene: Scene, features: Tensor) -> Tensor | None:
         moves = scene.kept.get(ContactsConfig.name)

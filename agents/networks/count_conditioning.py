@@ -88,8 +88,7 @@ class CountConditioning(FluxModule):
 
     def count_logits(self, tokens: Tensor) -> Tensor:
         """(B, G + 1, most + 1) logits of the numbers of each kind and of all objects, from ``tokens`` (B, G + 1, W)."""
-        result: Tensor = self.counts_out(tokens)
-        return result
+        return self.counts_out(tokens)
 
     def count_loss(self, tokens: Tensor, states: Tensor) -> Tensor:
         """(B,) mean over kinds and objects of the cross-entropy of their numbers in scenes (B, N) of 0..K-1."""
@@ -100,8 +99,7 @@ class CountConditioning(FluxModule):
         tokens = scene.own_text.get(CountConditioningConfig.name)
         if tokens is None:
             return None
-        result: Tensor = self(scene.states, tokens, scene.slot_mask)[:, None]
-        return result
+        return self(scene.states, tokens, scene.slot_mask)[:, None]
 
     def forward(self, states: Tensor, tokens: Tensor, slot_mask: Tensor | None = None) -> Tensor:
         """Logits (B, K).

@@ -66,8 +66,7 @@ class CountEmbedding(FluxModule):
         )
 
     def condition(self, scene: Scene) -> Tensor | None:
-        result: Tensor = self(scene.states, scene.summary, scene.slot_mask)
-        return result
+        return self(scene.states, scene.summary, scene.slot_mask)
 
     def forward(self, states: Tensor, text: Tensor | None = None, slot_mask: Tensor | None = None) -> Tensor:
         """Embed the numbers of :func:`count_states` with ``text`` (B, W), the mean text token; zeros when None."""
@@ -75,5 +74,4 @@ class CountEmbedding(FluxModule):
         inputs = [counts / 8.0, counts.log1p()]
         if self.text_width:
             inputs.append(counts.new_zeros(len(counts), self.text_width) if text is None else text)
-        result: Tensor = self.layers(torch.cat(inputs, dim=1))
-        return result
+        return self.layers(torch.cat(inputs, dim=1))

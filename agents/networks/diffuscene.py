@@ -77,8 +77,7 @@ class _Residual(nn.Module):
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
         """Channels (B, C, N) and the time embedding (B, H) to (B, H, N)."""
         h = self.convolution(F.silu(self.norm(x))) + self.time(F.silu(condition))[..., None]
-        result: Tensor = self.skip(x) + self.out(F.silu(self.inner_norm(h)))
-        return result
+        return self.skip(x) + self.out(F.silu(self.inner_norm(h)))
 
 
 class _Attend(nn.Module):
@@ -113,8 +112,7 @@ class _Level(nn.Module):
     def forward(self, x: Tensor, condition: Tensor, text: Tensor | None, mask: Tensor | None) -> Tensor:
         for block in self.blocks:
             x = block(x, condition)
-        result: Tensor = self.attend(x, text, mask)
-        return result
+        return self.attend(x, text, mask)
 
 
 class _UNet(nn.Module):
@@ -141,14 +139,10 @@ class _UNet(nn.Module):
         x = self.middle_out(self.middle(self.middle_in(x, condition), text, mask), condition)
         for index, level in enumerate(self.up):
             skip = skips.pop()
-            x = self.to_fine[index - 1](_doubled(x, skip.shape[-1])) if index else x
+            if index:
+                x = self.to_fine[index - 1](x.repeat_interleave(2, dim=-1)[..., : skip.shape[-1]])
             x = level(torch.cat([x, skip], dim=1), condition, text, mask)
         return x.transpose(1, 2)
-
-
-def _doubled(x: Tensor, count: int) -> Tensor:
-    """Each of the slots of ``x`` (B, H, M) twice, the first ``count`` of them."""
-    return x.repeat_interleave(2, dim=-1)[..., :count]
 
 
 class DiffuScene(ContinuousBaseline):

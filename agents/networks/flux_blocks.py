@@ -122,5 +122,4 @@ class _Stream(nn.Module):
         """The two gated residuals."""
         x = x + rates[2] * self.out(attended)
         inner = (1 + rates[4]) * F.layer_norm(x, (self.hidden,), eps=1e-6) + rates[3]
-        result: Tensor = x + rates[5] * self.mlp(inner)
-        return result
+        return x + rates[5] * self.mlp(inner)

@@ -72,8 +72,7 @@ class _AdaptiveNorm(nn.Module):
 
     def forward(self, tokens: Tensor, condition: Tensor) -> Tensor:
         shift, scale = self.modulation(F.silu(condition)).unsqueeze(1).chunk(2, dim=-1)
-        result: Tensor = (1 + scale) * F.layer_norm(tokens, (self.hidden,)) + shift
-        return result
+        return (1 + scale) * F.layer_norm(tokens, (self.hidden,)) + shift
 
 
 class _Block(nn.Module):
@@ -95,8 +94,7 @@ class _Block(nn.Module):
         tokens = tokens + self.attention(normal, normal)
         if self.text_norm is not None and self.text_attention is not None and text is not None:
             tokens = tokens + self.text_attention(self.text_norm(tokens, condition), text, mask)
-        result: Tensor = tokens + self.feed(self.feed_norm(tokens, condition))
-        return result
+        return tokens + self.feed(self.feed_norm(tokens, condition))
 
 
 class _Transformer(nn.Module):

@@ -153,8 +153,7 @@ class MixedFlux(nn.Module):
     def _words(self, text: Tensor | None, pose: Tensor) -> Tensor | None:
         if self.text_in is None:
             return None
-        result: Tensor = self.text_in(pose.new_zeros(len(pose), 1, self.config.text_width) if text is None else text)
-        return result
+        return self.text_in(pose.new_zeros(len(pose), 1, self.config.text_width) if text is None else text)
 
     # -- modules ----------------------------------------------------------------------------------
 

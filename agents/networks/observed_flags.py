@@ -31,5 +31,4 @@ class ObservedFlags(FluxModule):
     def slot_features(self, scene: Scene) -> Tensor | None:
         if scene.observed is None:
             return None
-        result: Tensor = self.embedding(scene.observed)
-        return result
+        return self.embedding(scene.observed)

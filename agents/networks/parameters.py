@@ -58,8 +58,7 @@ def match_parameters(name: str, process: str, target: int, **sizes: Any) -> Netw
         if ratio_field is None:
             return config
         ratio = getattr(config, ratio_field) * (1 + step * _RATIO_STEP)
-        changed: NetworkConfig = replace(config, **{ratio_field: ratio})
-        return changed
+        return replace(config, **{ratio_field: ratio})
 
     smallest = parameter_count(at_width(1))
     if target < smallest:

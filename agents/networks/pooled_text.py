@@ -31,5 +31,4 @@ class PooledText(FluxModule):
     def condition(self, scene: Scene) -> Tensor | None:
         if scene.summary is None:
             return None
-        result: Tensor = self.linear(scene.summary)
-        return result
+        return self.linear(scene.summary)

@@ -165,26 +165,9 @@ def network_config(
     >>> network_config("midiffusion", "mixed", features=20, categories=8, hidden=64, depth=4, heads=4).hidden
     64
     """
-    keys: dict[str, Any] = {
-        "features": features,
-        "categories": categories,
-        "hidden": hidden,
-        "depth": depth,
-        "heads": heads,
-        "text_width": text_width,
-        "frequencies": frequencies,
-        "double_blocks": double_blocks,
-        "embedding": embedding,
-        "pose_head": pose_head,
-        "time_scale": time_scale,
-        "text_reach": text_reach,
-        "modules": modules,
-        "unit": unit,
-        "rotations": rotations,
-    }
+    keys = {key: value for key, value in locals().items() if key not in ("name", "process")}
     entry = _entry(name, process)
-    config: NetworkConfig = entry.config(**entry.sizes(keys))
-    return config
+    return entry.config(**entry.sizes(keys))
 
 
 def config_state(config: NetworkConfig) -> dict[str, Any]:
@@ -222,8 +205,7 @@ def config_from_state(state: Mapping[str, Any], process: str) -> NetworkConfig:
             f"the configuration of a {process} {name} network has unknown fields {strange} and lacks {missing}"
         )
     check_types(kind, values)
-    config: NetworkConfig = kind(**values)
-    return config
+    return kind(**values)
 
 
 def _entry(name: str, process: str) -> _Entry:

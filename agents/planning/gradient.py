@@ -70,8 +70,7 @@ class GradientPlanner(PlannerSettings):
             InvalidInputError: the expansions of ``problem`` cannot be steered.
         """
         steered = Steered(problem, self.name, self._guide)
-        plan: PlanResult = self._guided().make(self.children or 1).plan(steered, budget, progress)
-        return plan
+        return self._guided().make(self.children or 1).plan(steered, budget, progress)
 
     def _guided(self) -> PlannerSettings:
         """The other planner."""

@@ -45,23 +45,11 @@ class PlannerSettings:
         return replace(self, **unset) if unset else self
 
 
+_SHIPPED = ("beam", "best_of", "evolution", "feynman_kac", "gradient", "greedy", "mcts", "tree_over_steps", "uct")
 _PLANNERS: Registry[type[PlannerSettings]] = Registry(
     "planner",
     ENTRY_POINT_GROUP,
-    modules={
-        name: f"agents.planning.{name}"
-        for name in (
-            "beam",
-            "best_of",
-            "evolution",
-            "feynman_kac",
-            "gradient",
-            "greedy",
-            "mcts",
-            "tree_over_steps",
-            "uct",
-        )
-    },
+    modules={name: f"agents.planning.{name}" for name in _SHIPPED},
 )
 Settings = TypeVar("Settings", bound=type[PlannerSettings])
 
@@ -73,12 +61,7 @@ def register_planner(name: str) -> Callable[[Settings], Settings]:
         InvalidInputError: the name is not one word.
     """
     _PLANNERS.check_name(name, "beam")
-
-    def register(settings: Settings) -> Settings:
-        _PLANNERS[name] = settings
-        return settings
-
-    return register
+    return _PLANNERS.adding(name)
 
 
 def list_planners() -> list[str]:

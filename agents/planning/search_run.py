@@ -148,7 +148,7 @@ def _search(
             searches.sort(key=loss_of)
         for lane in session.lanes:
             if starts is not None or lane.first:
-                first = _best_first(lane.first[: config.branching]) if starts is None else lane.root
+                first = max(lane.first[: config.branching], key=_value_of) if starts is None else lane.root
                 firsts[lane.root.seed] = first
         if folder is not None and len(parts) > 1 and searches:
             _scenes(env, searches).save(folder / "best.safetensors")
@@ -270,9 +270,8 @@ def _fitting(scenes: SceneBatch, prior: Any, slots: int | None) -> SceneBatch:
     return scenes.with_slots(max(prior.scene_type.slots, scenes.tensor.shape[1]) if slots is None else slots)
 
 
-def _best_first(states: Sequence[SearchState]) -> SearchState:
-    """The best of the first children of a root."""
-    return max(states, key=lambda state: state.value if state.valid else -1.0)
+def _value_of(state: SearchState) -> float:
+    return state.value if state.valid else -1.0
 
 
 def _write(outcome: SearchOutcome, config: SearchConfig, best: SceneBatch, first: SearchState, output: Path) -> None:

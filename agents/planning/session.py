@@ -235,10 +235,9 @@ def _reason(interrupt: KeyboardInterrupt) -> str:
 
 def _plan(planner: Any, lane: Lane, told: Progress | None) -> PlanResult:
     try:
-        result: PlanResult = planner.plan(lane, lane.budget, told)
+        return planner.plan(lane, lane.budget, told)
     except SearchStoppedError:  # a planner that leaves it to us to keep the best
         return lane.result()
-    return result
 
 
 def _overall(lanes: Sequence[Lane]) -> tuple[int, float]:

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -127,7 +127,7 @@ class SearchRecord:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the record as JSON with a digest of its content, whole or not at all."""
-        content = self._content()
+        content = finite({**vars(self), "nodes": [asdict(node) for node in self.nodes]})
         write_json(path, {"format": _FORMAT, "sha256": _digest(content), **content}, indent=None)
 
     @classmethod
@@ -154,10 +154,6 @@ class SearchRecord:
             )
         nodes = [TreeNode(**{**node, "mask": tuple(node["mask"])}) for node in content["nodes"]]
         return cls(content["settings"], content["searches"], nodes)
-
-    def _content(self) -> dict[str, Any]:
-        content = {field.name: getattr(self, field.name) for field in fields(self)}
-        return dict(finite({**content, "nodes": [asdict(node) for node in self.nodes]}))
 
 
 def _digest(content: Mapping[str, Any]) -> str:

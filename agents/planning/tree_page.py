@@ -6,19 +6,15 @@ import heapq
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
-from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from agents.planning.tree_file import SearchRecord, TreeNode
 from scene_envs.files import finite, write_text
+from scene_envs.pages import page_part, page_template
 from scene_envs.scene import SceneBatch
-
-if TYPE_CHECKING:
-    from jinja2 import Template
 
 LONGEST_PATH = 60
 """Scenes of the best path that are shown; a longer path has some of its steps left out."""
@@ -119,10 +115,10 @@ def write_tree_page(
         "nfe": record.settings["nfe_per_scene"],
         "from_scene": not _first(record),
     }
-    style = "".join(_text(*place) for place in (("agents.utils", "report.css"), ("agents.planning", "tree.css")))
-    page = _template().render(
+    style = "".join(page_part(*place) for place in (("agents.utils", "report.css"), ("agents.planning", "tree.css")))
+    page = page_template("agents.planning", "tree.html", trim_blocks=True).render(
         style=Markup(style),
-        script=Markup(_text("agents.planning", "tree.js")),
+        script=Markup(page_part("agents.planning", "tree.js")),
         data=htmlsafe_json_dumps(finite(data), separators=(",", ":"), allow_nan=False),
         viewer=viewer_page(batch, captions=captions, title="The best scenes"),
         cards=cards,
@@ -139,15 +135,6 @@ def write_tree_page(
     )
     write_text(path, page)
     return path
-
-
-@cache
-def _template() -> Template:
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    loader = PackageLoader("agents", "planning")
-    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
-    return environment.get_template("tree.html")
 
 
 def _cards(record: SearchRecord, shown: Sequence[int], way: Sequence[int]) -> list[Card]:
@@ -198,7 +185,3 @@ def _baseline(metrics: Mapping[str, Any]) -> list[float | None]:
 
 def _words(name: object) -> str:
     return str(name).replace("_", " ")
-
-
-def _text(package: str, name: str) -> str:
-    return resources.files(package).joinpath(name).read_text(encoding="utf-8")

@@ -47,8 +47,8 @@ class AlgorithmSettings:
 
     @property
     def optimiser_steps(self) -> int:
-        """Optimiser steps per batch."""
-        return 1
+        """Optimiser steps per batch: the key ``updates`` of algorithms that have it."""
+        return getattr(self, "updates", 1)
 
 
 @dataclass
@@ -110,11 +110,6 @@ class DDPOISSettings(DDPOSFSettings):
         if not 0 < self.clip_epsilon < 1:
             raise InvalidInputError(f"clip_epsilon={self.clip_epsilon} must lie between 0 and 1")
 
-    @property
-    def optimiser_steps(self) -> int:
-        """Optimiser steps per batch."""
-        return self.updates
-
 
 @dataclass
 class ForwardProcessSettings(AlgorithmSettings):
@@ -159,11 +154,6 @@ class ForwardProcessSettings(AlgorithmSettings):
         if not 0 <= self.sampler_decay < 1:
             raise InvalidInputError(f"sampler_decay={self.sampler_decay} must lie in [0, 1)")
 
-    @property
-    def optimiser_steps(self) -> int:
-        """Optimiser steps per batch."""
-        return self.updates
-
 
 @dataclass
 class NFTSettings(ForwardProcessSettings):
@@ -172,8 +162,6 @@ class NFTSettings(ForwardProcessSettings):
     Attributes:
         beta: strength; smaller ones step further from the sampling policy.
         advantage_clip: advantage, in standard deviations, at which a sample is fully good or bad.
-        push_limit: a bad pose pushes only while the squared error of the sampling policy on it is at most this many
-            times that of the base prior; 0 for no limit.
         expectation_lr: learning rate of the copy of the denoiser that learns the mean of own samples; 0 takes the
             sampling policy for it.
     """
@@ -181,13 +169,12 @@ class NFTSettings(ForwardProcessSettings):
     name: str = "nft"
     beta: float = 0.5
     advantage_clip: float = 2.0
-    push_limit: float = 0.0
     expectation_lr: float = 3e-4
 
     def __post_init__(self) -> None:
         super().__post_init__()
         positive(self, "beta", "advantage_clip")
-        at_least(self, 0, "push_limit", "expectation_lr")
+        at_least(self, 0, "expectation_lr")
 
 
 @dataclass
@@ -197,20 +184,18 @@ class AWMSettings(ForwardProcessSettings):
     Attributes:
         beta: strength of the pull to the sampling policy, above 1.
         advantage_clip: largest advantage, in standard deviations.
-        push_limit: as for ``nft``.
         expectation_lr: as for ``nft``.
     """
 
     name: str = "awm"
     beta: float = 2.0
     advantage_clip: float = 2.0
-    push_limit: float = 0.0
     expectation_lr: float = 3e-4
 
     def __post_init__(self) -> None:
         super().__post_init__()
         positive(self, "advantage_clip")
-        at_least(self, 0, "push_limit", "expectation_lr")
+        at_least(self, 0, "expectation_lr")
         if not self.beta > 1:
             raise InvalidInputError(f"beta={self.beta} must be above 1: below, a bad sample pushes without bound")
 
@@ -257,11 +242,6 @@ class NeonSettings(AlgorithmSettings):
         at_least(self, 1, "updates", "draws", "period")
         positive(self, "w")
 
-    @property
-    def optimiser_steps(self) -> int:
-        """Optimiser steps per batch."""
-        return self.updates
-
 
 @dataclass(frozen=True)
 class _Entry:
@@ -301,12 +281,7 @@ def register_algorithm(
         InvalidInputError: the name is not one word.
     """
     _ALGORITHMS.check_name(name, "my_ddpo")
-
-    def register(algorithm: Algorithm) -> Algorithm:
-        _ALGORITHMS[name] = _Entry(settings, algorithm)
-        return algorithm
-
-    return register
+    return _ALGORITHMS.adding(name, lambda algorithm: _Entry(settings, algorithm))
 
 
 def list_algorithms() -> list[str]:

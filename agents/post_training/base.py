@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from typing import Any, Generic, Protocol, TypeVar, cast
+from collections.abc import Iterator
+from typing import Any, Generic, TypeVar, cast
 
 from torch import Generator, Tensor
 from torchrl.objectives import LossModule
 
 from agents.post_training.base_kl import forward_kl
+from agents.post_training.gradients import BatchGradient
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import Branching, Rollout
 from agents.priors.base import ScenePrior
@@ -17,17 +18,6 @@ from agents.utils.weight_average import WeightAverage
 
 Credit = TypeVar("Credit")
 """Advantages of a batch, in the form that the algorithm's loss reads."""
-
-
-class BatchGradient(Protocol):
-    """Statistics of the gradient that a batch added to ``.grad``."""
-
-    @property
-    def loss(self) -> float:
-        """Value of the objective, over the scenes of all processes."""
-
-    def figures(self) -> Mapping[str, float]:
-        """Further columns of the log."""
 
 
 class Algorithm(ABC, Generic[Credit]):

@@ -17,7 +17,7 @@ from agents.post_training.report import Page, Picture, Section, Tile, write_repo
 from agents.post_training.run_files import write_metrics
 from agents.post_training.trainer import PostTrainResult
 from agents.priors.base import ScenePrior
-from rewards import PromptMatch, RewardContext, evaluate_reward, reward_label
+from rewards import PromptMatch, RewardContext, RewardOutput, evaluate_reward, reward_label
 from scene_envs.scene import SceneBatch
 
 if TYPE_CHECKING:
@@ -302,16 +302,17 @@ def _reward_figures(
 ) -> dict[str, float]:
     """Mean of ``reward`` over the scenes that it can score, and the number of the others."""
     output = evaluate_reward(reward, batch, RewardContext(None if prompts is None else tuple(prompts), pool))
-    value = output.value[output.is_valid].double()
-    lost = {"reward_invalid": float(len(batch) - len(value))}
-    return {"reward": float(value.mean()), "reward_sem": _standard_error(value), **lost} if len(value) else lost
+    return {**_mean("reward", output), "reward_invalid": float((~output.is_valid).sum())}
 
 
 def _prompt_figures(batch: SceneBatch, prompts: Sequence[str]) -> dict[str, float]:
     """Mean of the reward ``prompt_match``; nothing when no prompt can be read."""
-    output = PromptMatch()(batch, RewardContext(prompts=tuple(prompts)))
+    return _mean("prompt_match", PromptMatch()(batch, RewardContext(prompts=tuple(prompts))))
+
+
+def _mean(name: str, output: RewardOutput) -> dict[str, float]:
     value = output.value[output.is_valid].double()
-    return {"prompt_match": float(value.mean()), "prompt_match_sem": _standard_error(value)} if len(value) else {}
+    return {name: float(value.mean()), f"{name}_sem": _standard_error(value)} if len(value) else {}
 
 
 def _standard_error(values: Tensor) -> float:

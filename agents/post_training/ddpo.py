@@ -10,7 +10,7 @@ from agents.post_training.advantages import compute_advantages
 from agents.post_training.algorithms import DDPOISSettings, DDPOSFSettings
 from agents.post_training.base import Algorithm
 from agents.post_training.base_kl import chain_kl
-from agents.post_training.gradients import PolicyGradient, accumulate_policy_gradient, credited_reward, draw_steps
+from agents.post_training.gradients import BatchGradient, accumulate_policy_gradient, credited_reward, draw_steps
 from agents.post_training.losses import DDPOSFLoss
 from agents.post_training.policy import DenoisingPolicy, gradient_weights
 from agents.post_training.rollouts import Rollout, rollout_groups
@@ -50,7 +50,7 @@ class DDPO(Algorithm[Tensor]):
             reward, valid, baseline=settings.baseline, clip=settings.advantage_clip, groups=groups
         )
 
-    def accumulate(self, rollout: Rollout, advantage: Tensor, generator: Generator) -> PolicyGradient:
+    def accumulate(self, rollout: Rollout, advantage: Tensor, generator: Generator) -> BatchGradient:
         """Add the policy gradient of a batch to ``.grad``; ``generator`` draws the steps that enter it."""
         steps, scale = draw_steps(self.loss.step_weights.cpu(), self.settings.gradient_steps, generator)
         return accumulate_policy_gradient(self.loss, rollout, advantage, steps, scale=scale)

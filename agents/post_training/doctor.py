@@ -161,7 +161,7 @@ def _step_rows(learner: Learner, rollout: Rollout, advantage: Any) -> tuple[list
         if weight > 0:
             learner.optimizer.zero_grad(set_to_none=True)
             found = accumulate_policy_gradient(loss, rollout, advantage, [step])
-            norm, largest = gradient_norm(learner.parameters), max(largest, found.log_ratio)
+            norm, largest = gradient_norm(learner.parameters), max(largest, found.columns["log_ratio"])
         rows.append(StepRow(step, timesteps[step], float(learner.stds[step]), weight, norm))
     learner.optimizer.zero_grad(set_to_none=True)
     return rows, largest

@@ -24,7 +24,7 @@ class NFTLoss(ForwardProcessLoss):
     o_minus combine outputs.
 
     Args:
-        prior, sampler, base, push_limit, expectation, generator: as in :class:`ForwardProcessLoss`.
+        prior, sampler, expectation, generator: as in :class:`ForwardProcessLoss`.
         beta: strength; smaller ones step further from the sampling policy.
         clip: c, the advantage at which a sample is fully good or bad.
 
@@ -35,7 +35,7 @@ class NFTLoss(ForwardProcessLoss):
     >>> scenes = TensorDict({"scene": prior.encode(prior.sample(2, num_steps=3)), "advantage": torch.ones(2, 34)}, [2])
     >>> loss = NFTLoss(prior, prior)(scenes)
     >>> sorted(loss.keys()), float(loss["distance"])
-    (['distance', 'limited', 'loss_expectation', 'loss_objective'], 0.0)
+    (['distance', 'loss_expectation', 'loss_objective'], 0.0)
     >>> loss["loss_objective"].backward()
     """
 
@@ -46,12 +46,10 @@ class NFTLoss(ForwardProcessLoss):
         *,
         beta: float = 0.5,
         clip: float = 1.0,
-        base: ScenePrior | None = None,
-        push_limit: float = 0.0,
         expectation: Expectation | None = None,
         generator: Generator | None = None,
     ) -> None:
-        super().__init__(prior, sampler, base=base, push_limit=push_limit, expectation=expectation, generator=generator)
+        super().__init__(prior, sampler, expectation=expectation, generator=generator)
         _positive(beta=beta, clip=clip)
         self.beta, self.clip = beta, clip
 
@@ -80,7 +78,7 @@ class AWMLoss(ForwardProcessLoss):
     that of :class:`NFTLoss` divided by the latter's beta.
 
     Args:
-        prior, sampler, base, push_limit, expectation, generator: as in :class:`ForwardProcessLoss`.
+        prior, sampler, expectation, generator: as in :class:`ForwardProcessLoss`.
         beta: strength of the pull, above 1.
         clip: c, the largest advantage.
     """
@@ -92,12 +90,10 @@ class AWMLoss(ForwardProcessLoss):
         *,
         beta: float = 2.0,
         clip: float = 1.0,
-        base: ScenePrior | None = None,
-        push_limit: float = 0.0,
         expectation: Expectation | None = None,
         generator: Generator | None = None,
     ) -> None:
-        super().__init__(prior, sampler, base=base, push_limit=push_limit, expectation=expectation, generator=generator)
+        super().__init__(prior, sampler, expectation=expectation, generator=generator)
         _positive(clip=clip)
         if not beta > 1:
             raise InvalidInputError(f"beta={beta} must be above 1: below, a bad sample pushes without bound")

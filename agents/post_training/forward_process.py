@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -16,8 +15,8 @@ from agents.post_training.algorithms import AWMSettings, ForwardProcessSettings,
 from agents.post_training.expectation import Expectation
 from agents.post_training.forward_losses import AWMLoss, NFTLoss, RewardWeightedLoss
 from agents.post_training.forward_process_loss import ForwardProcessLoss
-from agents.post_training.gradients import credited_reward
-from agents.post_training.own_samples import OwnSampleAlgorithm, OwnSampleGradient
+from agents.post_training.gradients import BatchGradient, credited_reward
+from agents.post_training.own_samples import OwnSampleAlgorithm
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import Branching, Rollout, rollout_groups
 from agents.priors.base import ScenePrior
@@ -52,9 +51,7 @@ class ForwardProcess(OwnSampleAlgorithm):
         settings, pair = self.settings, (self.prior, self.sampler)
         if isinstance(settings, NFTSettings | AWMSettings):
             kind = NFTLoss if isinstance(settings, NFTSettings) else AWMLoss
-            base = deepcopy(self.sampler) if settings.push_limit else None
-            limits: dict[str, Any] = {"base": base, "push_limit": settings.push_limit, "expectation": self.copy}
-            return kind(*pair, beta=settings.beta, clip=settings.advantage_clip, **limits)
+            return kind(*pair, beta=settings.beta, clip=settings.advantage_clip, expectation=self.copy)
         assert isinstance(settings, RewardWeightedSettings)
         return RewardWeightedLoss(*pair, temperature=settings.temperature)
 
@@ -99,13 +96,13 @@ class ForwardProcess(OwnSampleAlgorithm):
         return compute_advantages(rollout.reward, rollout.valid, clip=math.inf, groups=groups)[:, None]
 
     def measure(self, result: TensorDict) -> dict[str, float]:
-        """Mean square of the trained denoiser's output minus the sampling policy's, and share of limited bad poses."""
-        return {"distance": float(result["distance"]) ** 2, "limited": float(result["limited"])}
+        """Mean square of the trained denoiser's output minus the sampling policy's."""
+        return {"distance": float(result["distance"]) ** 2}
 
-    def accumulate(self, rollout: Rollout, advantage: TensorDict, generator: Generator) -> OwnSampleGradient:
+    def accumulate(self, rollout: Rollout, advantage: TensorDict, generator: Generator) -> BatchGradient:
         """See :class:`OwnSampleAlgorithm`; ``distance`` is a root mean square."""
         gradient = super().accumulate(rollout, advantage, generator)
-        return replace(gradient, means={**gradient.means, "distance": gradient.means["distance"] ** 0.5})
+        return replace(gradient, columns={**gradient.columns, "distance": gradient.columns["distance"] ** 0.5})
 
     def end_iteration(self) -> None:
         """Move the sampling policy towards the prior in training."""

@@ -45,15 +45,11 @@ class ForwardProcessLoss(OwnSampleLoss):
     Args:
         prior: what is trained.
         sampler: what made the scenes, such as a slower copy of ``prior``; its weights get no gradient.
-        base: what training began with; needed for ``push_limit``.
         expectation: of the targets over own samples, trained by ``loss_expectation``; None takes o_old for it.
-        push_limit: a bad pose pushes only while the squared error of o_old on it is at most this many times that of
-            the base prior; 0 for no limit.
         generator: source of timesteps, noise and observed entries (CPU); None for torch's own.
 
     Returns (``forward``): ``loss_objective`` (); ``loss_expectation`` (), its pretraining loss on the scenes, 0 without
-        one; and detached ``distance`` (), the root mean square of o - o_old, and ``limited`` (), the share of bad poses
-        that do not push any more.
+        one; and detached ``distance`` (), the root mean square of o - o_old.
     """
 
     @dataclass
@@ -63,36 +59,24 @@ class ForwardProcessLoss(OwnSampleLoss):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    out_keys = ["loss_objective", "loss_expectation", "distance", "limited"]  # noqa: RUF012  (torchrl reads lists)
+    out_keys = ["loss_objective", "loss_expectation", "distance"]  # noqa: RUF012  (torchrl reads lists)
 
     def __init__(
         self,
         prior: ScenePrior,
         sampler: ScenePrior,
         *,
-        base: ScenePrior | None = None,
-        push_limit: float = 0.0,
         expectation: Expectation | None = None,
         generator: Generator | None = None,
     ) -> None:
         super().__init__(prior, generator=generator)
-        if push_limit < 0:
-            raise InvalidInputError(f"push_limit={push_limit} must not be negative; 0 is for no limit")
-        if push_limit and base is None:
-            raise InvalidInputError(f"push_limit={push_limit} compares with the base prior; give base=")
-        self.push_limit = push_limit
         self.expectation = expectation
-        self._others = (sampler, base)  # in a tuple: not modules of the loss, whose parameters are the prior's
+        self._sampler = (sampler,)  # in a tuple: no module of the loss, whose parameters are the prior's
 
     @property
     def sampler(self) -> ScenePrior:
         """The prior that sampled the scenes."""
-        return self._others[0]
-
-    @property
-    def base(self) -> ScenePrior | None:
-        """The prior that training began with."""
-        return self._others[1]
+        return self._sampler[0]
 
     @property
     def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
@@ -132,14 +116,13 @@ class ForwardProcessLoss(OwnSampleLoss):
         return found
 
     def of_scenes(self, noised: NoisedScenes, text: Text | None, flat: TensorDictBase) -> Mapping[str, Tensor]:
-        """(B,) losses, (B,) those of the expectation, (B,) mean squares of o - o_old, and the limited share ()."""
+        """(B,) losses, (B,) those of the expectation, and (B,) mean squares of o - o_old."""
         scene = flat.get(self.tensor_keys.scene)
         advantage = self._advantage(flat, self.tensor_keys.advantage, scene)
         credit = self._advantage(flat, self.tensor_keys.category_advantage, scene)
         output = self.prior.output(noised, text)
         with torch.no_grad():
             old = self.sampler.output(noised, text)
-            advantage, limited = self._limited(noised, text, advantage, old.continuous)
         features, poses = output.continuous.shape[-1], self.prior.pose_width
         of_entries = advantage[..., None].expand(-1, output.continuous.shape[1], features)
         if features > poses:  # a continuous prior: categories are entries, too
@@ -159,21 +142,7 @@ class ForwardProcessLoss(OwnSampleLoss):
             slots = self.category_loss(output.logits, old.logits, noised.category, credit)
             mean = (slots * noised.drawn).sum(dim=1) / noised.drawn.sum(dim=1).clamp(min=1.0)
             losses = losses + self.prior.config.category_weight * mean
-        return {"loss_objective": losses, "loss_expectation": expectation, "distance": distance, "limited": limited}
-
-    def _limited(
-        self, noised: NoisedScenes, text: Text | None, advantage: Tensor, old: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Advantages of poses, those of bad ones 0 beyond ``push_limit``, and the share () of the latter."""
-        if not self.push_limit or self.base is None:
-            return advantage, advantage.new_zeros(())
-        poses = self.prior.pose_width
-        weight = noised.weight[..., :poses]
-        first = self.base.output(noised, text).continuous
-        now, then = (((noised.target - said)[..., :poses].square() * weight).sum(dim=-1) for said in (old, first))
-        bad = (advantage < 0) & (weight.sum(dim=-1) > 0)
-        beyond = bad & (now > self.push_limit * then)
-        return torch.where(beyond, 0.0, advantage), beyond.sum() / bad.sum().clamp(min=1)
+        return {"loss_objective": losses, "loss_expectation": expectation, "distance": distance}
 
     def _advantage(self, flat: TensorDictBase, key: NestedKey, scene: Tensor) -> Tensor:
         """(B, 1) or (B, N); zeros where the key is missing."""

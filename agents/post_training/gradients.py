@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Generator, Tensor, nn
@@ -21,22 +21,20 @@ SceneLoss = Callable[[NoisedScenes, Text | None], Tensor]
 
 
 @dataclass(frozen=True)
-class PolicyGradient:
-    """Statistics of an accumulated policy gradient.
+class BatchGradient:
+    """Statistics of the gradient that a batch added to ``.grad``.
 
     Attributes:
-        loss: value of the objective, summed over the steps taken.
-        log_ratio: largest |log p_now - log p_sampling| of a scene's step; 0 before the first update.
-        clip_fraction: mean share of clipped ratios.
+        loss: value of the objective, over the scenes of all processes.
+        columns: further columns of the log.
     """
 
     loss: float
-    log_ratio: float
-    clip_fraction: float
+    columns: Mapping[str, float] = field(default_factory=dict)
 
     def figures(self) -> Mapping[str, float]:
         """Further columns of the log."""
-        return {"log_ratio": self.log_ratio, "clip_fraction": self.clip_fraction}
+        return self.columns
 
 
 class GradientSum:
@@ -84,7 +82,7 @@ def draw_steps(weights: Tensor, count: int, generator: Generator) -> tuple[list[
 
 def accumulate_policy_gradient(
     loss: DDPOSFLoss, rollout: Rollout, advantage: Tensor, steps: Sequence[int], *, scale: float = 1.0
-) -> PolicyGradient:
+) -> BatchGradient:
     """Add the policy gradient of a rollout to ``.grad``, one chunk of scenes and one step at a time.
 
     No graph outlives its step, so memory does not depend on the number of steps. On several processes ``.grad`` holds
@@ -116,7 +114,7 @@ def accumulate_policy_gradient(
         gradient.add_part()
     gradient.write()
     total, clipped = processes.sum_numbers(total, clipped)
-    return PolicyGradient(total, processes.largest(largest), clipped)
+    return BatchGradient(total, {"log_ratio": processes.largest(largest), "clip_fraction": clipped})
 
 
 def add_regularisation_gradient(

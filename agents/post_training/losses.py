@@ -8,15 +8,15 @@ import torch
 from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.objectives import LossModule
 
+from agents.post_training.own_sample_loss import PlainLoss
 from agents.post_training.policy import DenoisingPolicy
 from scene_envs.errors import InvalidInputError
 
 REDUCTIONS = ("sum", "mean")
 
 
-class DDPOSFLoss(LossModule):
+class DDPOSFLoss(PlainLoss):
     """Denoising diffusion policy optimisation (Black et al. 2024), Eq. 3 (score function) or Eq. 4 (clipped).
 
     For transitions (x_t, t, x_{t-1}) with advantage A, the loss is
@@ -116,18 +116,10 @@ class DDPOSFLoss(LossModule):
         self._entries: dict[int, int] = {}
 
     @property
-    def functional(self) -> bool:
-        """False: the policy's own parameters receive the gradient."""
-        return False
-
-    @property
     def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
         """Keys that must be present."""
         keys = self.tensor_keys
         return [keys.scene, keys.timestep, keys.action, keys.advantage]
-
-    def _forward_value_estimator_keys(self, **kwargs: object) -> None:
-        """This loss has no value estimator."""
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """The loss of a batch of transitions; rows may be at different steps.

@@ -17,7 +17,19 @@ from agents.priors.base import ScenePrior
 from agents.priors.forward import NoisedScenes
 
 
-class OwnSampleLoss(LossModule):
+class PlainLoss(LossModule):
+    """A torchrl loss whose gradient goes to the modules' own parameters, and which has no value estimator."""
+
+    @property
+    def functional(self) -> bool:
+        """False: the modules' own parameters receive the gradient."""
+        return False
+
+    def _forward_value_estimator_keys(self, **kwargs: object) -> None:
+        """There is no value estimator."""
+
+
+class OwnSampleLoss(PlainLoss):
     """A loss of finished scenes x_0, of which every scene is noised once per call.
 
     A subclass defines the losses of noised scenes. Their mean is over the valid scenes.
@@ -59,17 +71,9 @@ class OwnSampleLoss(LossModule):
         self.generator = generator
 
     @property
-    def functional(self) -> bool:
-        """False: the modules' own parameters receive the gradient."""
-        return False
-
-    @property
     def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
         """Keys that must be present."""
         return [self.tensor_keys.scene]
-
-    def _forward_value_estimator_keys(self, **kwargs: object) -> None:
-        """These losses have no value estimator."""
 
     @abstractmethod
     def of_scenes(self, noised: NoisedScenes, text: Text | None, flat: TensorDictBase) -> Mapping[str, Tensor]:

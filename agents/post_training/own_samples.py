@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections import defaultdict
-from collections.abc import Mapping
 from copy import deepcopy
-from dataclasses import dataclass, field
 from typing import Any
 
 from tensordict import TensorDict
@@ -14,30 +12,13 @@ from torch import Generator
 
 from agents.post_training.base import Algorithm
 from agents.post_training.expectation import TrainedCopy
-from agents.post_training.gradients import GradientSum
+from agents.post_training.gradients import BatchGradient, GradientSum
 from agents.post_training.own_sample_loss import OwnSampleLoss
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import Rollout
 from agents.priors.base import ScenePrior
 from agents.utils.process_group import ProcessGroup, gather_rows
 from agents.utils.weight_average import WeightAverage
-
-
-@dataclass(frozen=True)
-class OwnSampleGradient:
-    """Statistics of an accumulated gradient.
-
-    Attributes:
-        loss: value of the objective of the prior in training.
-        means: over the parts of the batch, of what the algorithm measures.
-    """
-
-    loss: float
-    means: Mapping[str, float] = field(default_factory=dict)
-
-    def figures(self) -> Mapping[str, float]:
-        """Further columns of the log."""
-        return self.means
 
 
 class OwnSampleAlgorithm(Algorithm[TensorDict]):
@@ -82,7 +63,7 @@ class OwnSampleAlgorithm(Algorithm[TensorDict]):
         """Figures of a part of the batch, from its loss."""
         return {}
 
-    def accumulate(self, rollout: Rollout, advantage: TensorDict, generator: Generator) -> OwnSampleGradient:
+    def accumulate(self, rollout: Rollout, advantage: TensorDict, generator: Generator) -> BatchGradient:
         """Add the gradient of a batch to ``.grad``: ``draws`` timesteps and noises of every scene.
 
         On several processes ``.grad`` holds the part of this one's scenes in the mean over all.
@@ -117,4 +98,4 @@ class OwnSampleAlgorithm(Algorithm[TensorDict]):
         if self.copy is not None:
             self.copy.step()
         total, *means = processes.sum_numbers(total, *sums.values())
-        return OwnSampleGradient(total, dict(zip(sums, means, strict=True)))
+        return BatchGradient(total, dict(zip(sums, means, strict=True)))

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
-from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from agents.post_training.run_files import write_text
-
-if TYPE_CHECKING:
-    from jinja2 import Template
+from scene_envs.pages import page_part, page_template
 
 
 @dataclass(frozen=True)
@@ -94,19 +89,5 @@ def render_page(page: Page) -> str:
     """
     from markupsafe import Markup
 
-    style = resources.files("agents.utils").joinpath("report.css").read_text(encoding="utf-8")
-    return _template().render(page=page, style=Markup(style))
-
-
-@cache
-def _template() -> Template:
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    loader = PackageLoader("agents", "post_training")
-    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, keep_trailing_newline=True)
-    environment.filters["png"] = _png
-    return environment.get_template("report.html")
-
-
-def _png(path: Path) -> str:
-    return base64.b64encode(path.read_bytes()).decode("ascii")
+    style = Markup(page_part("agents.utils", "report.css"))
+    return page_template("agents.post_training", "report.html").render(page=page, style=style)

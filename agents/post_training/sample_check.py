@@ -14,8 +14,6 @@ from agents.utils.seeds import derived_seed
 from scene_envs.envs.scoring import RewardScorer
 from scene_envs.scene import SceneBatch
 
-FIGURES = ("count_distance", "category_kl", "classifier_accuracy")
-"""Figures that are compared with those of the base prior."""
 _AT_ONCE = 32
 """Scenes sampled together."""
 _CLASSIFIERS = 3
@@ -77,7 +75,7 @@ class SampleCheck:
         return batch.tensor.cpu()
 
     def figures(self, batch: SceneBatch) -> dict[str, float]:
-        """Mean reward, and each of :data:`FIGURES`: objects, nats, and a share of scenes.
+        """Mean reward, and in objects, nats and a share of scenes: counts, categories, accuracy of a classifier.
 
         Those that have no meaning, such as the categories of empty scenes, are NaN.
         """

@@ -208,13 +208,7 @@ class Pretrainer:
 
     def _save(self) -> None:
         if self.processes.is_first:
-            self._save_checkpoint()
-        self.save_prior()
-
-    def _save_checkpoint(self) -> None:
-        save_checkpoint(
-            self.checkpoint_path,
-            {
+            state = {
                 "config": asdict(self.config),
                 "network": self.network.state_dict(),
                 "average": self.average.tensors,
@@ -223,8 +217,9 @@ class Pretrainer:
                 "step": self.step,
                 "seconds": self.seconds,
                 "evaluations": self.evaluations,
-            },
-        )
+            }
+            save_checkpoint(self.checkpoint_path, state)
+        self.save_prior()
 
     def _load(self) -> None:
         state = load_checkpoint(self.checkpoint_path)
@@ -285,16 +280,12 @@ def pretrain(config: PretrainConfig) -> dict[str, Any]:
         The numbers of ``metrics.json``, which is written beside the prior and ``config.yaml``.
     """
     with claimed(config.directory, "pretrain") if is_first_process() else nullcontext():
-        return _pretrain(config)
-
-
-def _pretrain(config: PretrainConfig) -> dict[str, Any]:
-    prior, data, heldout = prepare(config)
-    trainer = Pretrainer(config, data, heldout, prior)
-    trained = trainer.run()
-    metrics = {**trained.card, "evaluations": trainer.evaluations}
-    if not trainer.processes.is_first:
+        prior, data, heldout = prepare(config)
+        trainer = Pretrainer(config, data, heldout, prior)
+        trained = trainer.run()
+        metrics = {**trained.card, "evaluations": trainer.evaluations}
+        if not trainer.processes.is_first:
+            return metrics
+        write_text(trainer.directory / "config.yaml", sealed(config_text(config)))
+        write_json(trainer.directory / "metrics.json", metrics)
         return metrics
-    write_text(trainer.directory / "config.yaml", sealed(config_text(config)))
-    write_json(trainer.directory / "metrics.json", metrics)
-    return metrics

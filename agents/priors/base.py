@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, TypeVar
 
 import torch
@@ -172,12 +172,17 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
         self,
         count: int,
         *,
+        prompts: Sequence[str] | None = None,
+        guidance: float = 0.0,
         num_steps: int = 50,
         slots: int | None = None,
         generator: Generator | None = None,
         eta: float = 1.0,
     ) -> Tensor:
-        """``count`` denoised scenes x_0 (count, slots, D), normalised, from one batch."""
+        """``count`` denoised scenes x_0 (count, slots, D), normalised, from one batch; arguments as in :meth:`sample`.
+
+        Priors that read prompts override it.
+        """
         table = self.step_table(num_steps)
         x = self.initial(count, self.config.slots if slots is None else slots, generator)
         for step in range(len(table)):
@@ -218,25 +223,15 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
             prompt, guidance, count, scene_type=self.scene_type, slots=wide, conditional=self.conditional
         )
         generator = Generator(str(self._fixed.device)).manual_seed(seed)
-        chunks, done = [], 0
-        for size in _chunk_sizes(count, batch_size):
-            texts = None if prompts is None else prompts[done : done + size]
-            chunks.append(self._sample_chunk(size, texts, guidance, num_steps, slots, generator, eta))
-            done += size
+        chunks = []
+        for start in range(0, count, batch_size):
+            texts = None if prompts is None else prompts[start : start + batch_size]
+            size = min(batch_size, count - start)
+            x0 = self.sample_tensor(
+                size, prompts=texts, guidance=guidance, num_steps=num_steps, slots=slots, generator=generator, eta=eta
+            )
+            chunks.append(x0)
         return self.decode(torch.cat(chunks))
-
-    def _sample_chunk(
-        self,
-        count: int,
-        prompts: list[str] | None,
-        guidance: float,
-        num_steps: int,
-        slots: int | None,
-        generator: Generator,
-        eta: float,
-    ) -> Tensor:
-        """A chunk of :meth:`sample`; priors that read prompts override it."""
-        return self.sample_tensor(count, num_steps=num_steps, slots=slots, generator=generator, eta=eta)
 
     def decode(self, x: Tensor) -> SceneBatch:
         """Scenes from normalised x_0 (B, N, D); known entries take their exact values."""
@@ -262,9 +257,3 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
     def normalised(self, batch: SceneBatch) -> Tensor:
         """(B, N, D) scenes as this process sees them, before known entries are clamped."""
         return batch.to_tensor(normalised=self.normalizer)
-
-
-def _chunk_sizes(total: int, size: int) -> Iterator[int]:
-    while total > 0:
-        yield min(size, total)
-        total -= size

@@ -199,20 +199,7 @@ class ContinuousPrior(ScenePrior):
         start: Start | None = None,
     ) -> Tensor:
         """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; used by :meth:`inpaint`."""
-        x0 = self.encode(batch)
-        return self._chain_with_noised(x0, self._entries(~mask), table, generators, resample, hook, start)
-
-    def _chain_with_noised(
-        self,
-        x0: Tensor,
-        keep: Tensor,
-        table: StepTable,
-        generators: Sequence[Generator],
-        resample: int,
-        hook: Hook | None,
-        start: Start | None,
-    ) -> Tensor:
-        """x_0 from a chain in which entries ``keep`` (B, N, D) of ``x0`` are put in with each level's noise."""
+        x0, keep = self.encode(batch), self._entries(~mask)
         x = self.clamp(draw_noise(x0, generators))
         first, x = (0, x) if start is None else (start[0], start[1].to(x))
         for step in range(first, len(table)):
@@ -222,7 +209,7 @@ class ContinuousPrior(ScenePrior):
                 if again:
                     x = self.process.renoise(x, after, int(level), draw_noise(x0, generators))
                 noised = self.process.add_noise(x0, level, draw_noise(x0, generators))
-                x = self.clamp(torch.where(keep, noised, x))
+                x = self.clamp(torch.where(keep, noised, x))  # what is kept has the noise of every level
                 reverse: ReverseStep = self.transition(x, step, table)
                 if hook is not None and again == rounds - 1:
                     reverse = hook(step, x, reverse)

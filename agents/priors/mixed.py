@@ -268,16 +268,18 @@ class MixedPrior(TrainableMixedPrior):
         return self.clamp(self.with_states(pose, rows, noise))
 
     @torch.no_grad()
-    def _sample_chunk(
+    def sample_tensor(
         self,
         count: int,
-        prompts: list[str] | None,
-        guidance: float,
-        num_steps: int,
-        slots: int | None,
-        generator: Generator,
-        eta: float,
+        *,
+        prompts: Sequence[str] | None = None,
+        guidance: float = 0.0,
+        num_steps: int = 50,
+        slots: int | None = None,
+        generator: Generator | None = None,
+        eta: float = 1.0,
     ) -> Tensor:
+        """``count`` denoised scenes x_0 (count, slots, D), as :meth:`ScenePrior.sample_tensor` describes."""
         text = None if prompts is None else self.encode_prompts(prompts)
         start = self.initial(count, self.config.slots if slots is None else slots, generator)
         return self.run_chain(start, self.step_table(num_steps), generator, text=text, guidance=guidance, eta=eta)

@@ -126,8 +126,11 @@ def _known_scene_type(state: dict[str, Any], directory: Path) -> SceneType:
         if "scene_type" not in state:
             raise
         found = SceneType.from_dict(state["scene_type"])
-        allowed = [directory.resolve(), *_named_folders()]
-        kept = tuple(folder for folder in found.asset_folders if _within(Path(folder).resolve(), allowed))
+        named = [Path(name).expanduser() for name in os.environ.get(ASSET_FOLDERS, "").split(os.pathsep) if name]
+        allowed = [folder.resolve() for folder in (directory, *named)]
+        kept = tuple(
+            folder for folder in found.asset_folders if any(map(Path(folder).resolve().is_relative_to, allowed))
+        )
         left = [folder for folder in found.asset_folders if folder not in kept]
         if left:
             logger.warning(
@@ -139,14 +142,6 @@ def _known_scene_type(state: dict[str, Any], directory: Path) -> SceneType:
                 os.pathsep,
             )
         return register_scene_type(replace(found, asset_folders=kept))
-
-
-def _named_folders() -> list[Path]:
-    return [Path(name).expanduser().resolve() for name in os.environ.get(ASSET_FOLDERS, "").split(os.pathsep) if name]
-
-
-def _within(folder: Path, parents: list[Path]) -> bool:
-    return any(folder == parent or parent in folder.parents for parent in parents)
 
 
 def check_sizes(fields: Any, weights: int, name: str | os.PathLike[str]) -> None:

@@ -43,8 +43,7 @@ class PromptReader:
     @property
     def prompt_space(self) -> tuple[int, int]:
         """Largest number of tokens of a prompt, and size of the vocabulary; 0 is padding."""
-        space: tuple[int, int] = self._encoder("").token_space
-        return space
+        return self._encoder("").token_space
 
     def read_prompts(self, prompts: Sequence[str], slots: int) -> Tensor:
         """Token indices (B, L) int64 on the CPU, padded to the longest prompt there can be.

@@ -9,14 +9,12 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scene_envs.arrays import Array, Index
 from scene_envs.errors import InvalidInputError, unknown_name
 
 if TYPE_CHECKING:
     import trimesh
-
-Array = NDArray[np.float64]
 
 
 def indefinite_article(name: str) -> str:
@@ -52,12 +50,18 @@ class ConvexPart:
     """
 
     vertices: Array
-    faces: NDArray[np.int64]
+    faces: Index
 
     @cached_property
     def bounds(self) -> Array:
         """(2, 3): lowest and highest corner, m."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+
+def bounds_of(parts: Sequence[ConvexPart]) -> Array:
+    """(2, 3) m: lowest and highest corner of the box around ``parts``."""
+    corners = np.stack([part.bounds for part in parts])
+    return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,8 +102,7 @@ class Asset:
     @cached_property
     def bounds(self) -> Array:
         """(2, 3): lowest and highest corner of the fine parts, m."""
-        corners = np.stack([part.bounds for part in self.fine])
-        return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
+        return bounds_of(self.fine)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from scene_envs.assets.base import Array
+from scene_envs.arrays import Array
 from scene_envs.assets.surfaces import Color, fan, grid_faces, join, quad_faces, surface
 
 Face = Literal["-x", "+x", "-y", "+y", "bottom", "top"]

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes, grey_dilation
 
+from scene_envs.arrays import Array, Index, Mask
 from scene_envs.assets.base import Asset, AssetLibrary, ConvexPart
-
-Array = NDArray[np.float64]
 
 _GRID = 48
 """Cells along each side of a height map."""
@@ -49,15 +47,15 @@ class LibraryShapes:
     bounds: Array
     top: Array
     wide: Array
-    covered: NDArray[np.bool_]
+    covered: Mask
     low: Array
     cell: Array
     rim: Array
     well: Array
     tiers: Array
-    static: NDArray[np.bool_]
+    static: Mask
 
-    def cells(self, category: NDArray[np.int64], points: Array) -> tuple[NDArray[np.int64], ...]:
+    def cells(self, category: Index, points: Array) -> tuple[Index, ...]:
         """Indices (category, i, j) of asset-frame ``points`` (..., 3) into the maps; the edge is empty."""
         where = np.floor((points[..., :2] - self.low[category]) / self.cell[category])
         where = np.clip(where, 0, _GRID - 1).astype(np.int64)
@@ -94,7 +92,7 @@ def library_shapes(library: AssetLibrary) -> LibraryShapes:
 class _Maps:
     top: Array
     wide: Array
-    covered: NDArray[np.bool_]
+    covered: Mask
     low: Array
     cell: Array
 

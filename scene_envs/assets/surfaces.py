@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from scene_envs.assets.base import Array
+from scene_envs.arrays import Array
 from scene_envs.assets.shapes import Profile, circle
 
 Color = tuple[int, int, int]
@@ -39,14 +38,9 @@ def join(*meshes: trimesh.Trimesh) -> trimesh.Trimesh:
         vertices=np.concatenate([mesh.vertices for mesh in meshes]),
         faces=np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]),
         vertex_normals=np.concatenate([mesh.vertex_normals for mesh in meshes]),
-        vertex_colors=np.concatenate([_colors(mesh) for mesh in meshes]),
+        vertex_colors=np.concatenate([mesh.visual.vertex_colors for mesh in meshes]),  # type: ignore[union-attr]
         process=False,
     )
-
-
-def _colors(mesh: trimesh.Trimesh) -> Any:
-    visual: Any = mesh.visual
-    return visual.vertex_colors
 
 
 def quad_faces(count: int) -> NDArray[np.int64]:

@@ -120,14 +120,10 @@ def _draw(grammar: Grammar, job: Job, first: int, count: int) -> tuple[Tensor, l
 
 def _judge(scenes: Tensor, grammar: Grammar, normalizer: Normalizer, verify: bool) -> list[str]:
     batch = SceneBatch(scenes, grammar.scene_type)
-    fits = _fits(scenes, normalizer)
+    error = (normalizer.unnormalize(normalizer.normalize(scenes)) - scenes).abs().amax(dim=(1, 2))
+    fits = error < 1e-4  # it does not where a constant feature varies
     verdicts = judge_scenes(batch) if verify else [KEPT] * len(batch)
     return [v if v != KEPT or ok else _UNFIT for v, ok in zip(verdicts, fits.tolist(), strict=True)]
-
-
-def _fits(scenes: Tensor, normalizer: Normalizer) -> Tensor:
-    """(B,) bool: whether normalising and back gives the scene; it does not where a constant feature varies."""
-    return ((normalizer.unnormalize(normalizer.normalize(scenes)) - scenes).abs().amax(dim=(1, 2))) < 1e-4
 
 
 def shard_journal(job: Job) -> Journal:

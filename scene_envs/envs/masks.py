@@ -65,12 +65,7 @@ def register_mask(name: str) -> Callable[[Generator], Generator]:
     True
     """
     _MASKS.check_name(name, "top_shelf")
-
-    def register(generator: Generator) -> Generator:
-        _MASKS[name] = _checked(name, generator)
-        return generator
-
-    return register
+    return _MASKS.adding(name, lambda generator: _checked(name, generator))
 
 
 def _checked(name: str, generator: Any) -> Any:

@@ -22,8 +22,7 @@ def resolve_reward(reward: Any) -> SceneScorer:
         UnknownNameError: no reward has that name; the nearest known one is offered.
         MissingDependencyError: no installed package resolves rewards.
     """
-    scorer: SceneScorer = _resolver("reward")(reward)
-    return scorer
+    return _resolver("reward")(reward)
 
 
 def resolve_prior(prior: Any) -> PriorLike:
@@ -33,8 +32,7 @@ def resolve_prior(prior: Any) -> PriorLike:
         UnknownNameError: no shipped prior has that name; the nearest known one is offered.
         MissingDependencyError: no installed package resolves priors.
     """
-    resolved: PriorLike = _resolver("prior")(prior) if isinstance(prior, str) else prior
-    return resolved
+    return _resolver("prior")(prior) if isinstance(prior, str) else prior
 
 
 @cache

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -34,23 +34,19 @@ class Score:
 
     def to(self, device: torch.device) -> Score:
         """The same verdict on another torch device."""
-        return Score(
-            self.value.to(device),
-            self.valid.to(device),
-            {name: term.to(device) for name, term in self.terms.items()},
-            None if self.per_object is None else self.per_object.to(device),
-            {name: flag.to(device) for name, flag in self.object_flags.items()},
-        )
+        return self._each(lambda values: values.to(device))
 
     def row(self, index: int) -> Score:
         """The verdict on one scene, as a batch of one."""
-        row = slice(index, index + 1)
+        return self._each(lambda values: values[index : index + 1])
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> Score:
         return Score(
-            self.value[row],
-            self.valid[row],
-            {name: term[row] for name, term in self.terms.items()},
-            None if self.per_object is None else self.per_object[row],
-            {name: flag[row] for name, flag in self.object_flags.items()},
+            change(self.value),
+            change(self.valid),
+            {name: change(term) for name, term in self.terms.items()},
+            None if self.per_object is None else change(self.per_object),
+            {name: change(flag) for name, flag in self.object_flags.items()},
         )
 
 

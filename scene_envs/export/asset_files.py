@@ -11,7 +11,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from scene_envs.assets.base import Array, Asset, ConvexPart
+from scene_envs.arrays import Array
+from scene_envs.assets.base import Asset, ConvexPart
 from scene_envs.assets.shapes import convex_hull
 from scene_envs.export.placed import identifiers
 
@@ -62,8 +63,7 @@ class AssetFiles:
 
     def visual(self, asset: Asset) -> Path:
         """``visual.obj`` with normals, its colours in ``visual.png``; one material, ``visual.mtl``."""
-        path: Path = self.once(asset, "visual", lambda folder: _write_visual(visual_mesh(asset), folder))
-        return path
+        return self.once(asset, "visual", lambda folder: _write_visual(visual_mesh(asset), folder))
 
     def textured(self, asset: Asset) -> trimesh.Trimesh:
         """The mesh with its palette in memory, for formats that embed meshes; writes nothing."""
@@ -73,8 +73,7 @@ class AssetFiles:
 
     def parts(self, asset: Asset) -> list[Path]:
         """``part_00.obj`` …, the fine convex parts."""
-        paths: list[Path] = self.once(asset, "part", lambda folder: _write_parts(asset.fine, folder, "part"))
-        return paths
+        return self.once(asset, "part", lambda folder: _write_parts(asset.fine, folder, "part"))
 
     def inset_parts(self, asset: Asset, inset: float) -> list[Path]:
         """``inset_00.obj`` …, the fine parts with every face moved inward by ``inset`` m, for Bullet."""
@@ -86,8 +85,7 @@ class AssetFiles:
             hulls = [convex_hull(inset_hull(PartGeometry.of(part), inset)) for part in asset.fine]
             return _write_parts(hulls, folder, "inset")
 
-        paths: list[Path] = self.once(asset, "inset", write)
-        return paths
+        return self.once(asset, "inset", write)
 
 
 def visual_mesh(asset: Asset) -> trimesh.Trimesh:

@@ -21,16 +21,10 @@ class _Dumper(yaml.SafeDumper):
     """Block style outside, flow style for lists of numbers, doubles in full."""
 
 
-def _represent_angle_axis(dumper: yaml.SafeDumper, value: _AngleAxis) -> yaml.Node:
-    return dumper.represent_mapping("!AngleAxis", value, flow_style=True)
-
-
-def _represent_float(dumper: yaml.SafeDumper, value: float) -> yaml.Node:
-    return dumper.represent_scalar("tag:yaml.org,2002:float", number(value))
-
-
-_Dumper.add_representer(_AngleAxis, _represent_angle_axis)
-_Dumper.add_representer(float, _represent_float)
+_Dumper.add_representer(
+    _AngleAxis, lambda dumper, value: dumper.represent_mapping("!AngleAxis", value, flow_style=True)
+)
+_Dumper.add_representer(float, lambda dumper, value: dumper.represent_scalar("tag:yaml.org,2002:float", number(value)))
 
 
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:

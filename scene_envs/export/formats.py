@@ -55,8 +55,7 @@ class ExportFormat:
         if not isinstance(self.write, str):
             return self.write
         module, _, function = self.write.partition(":")
-        writer: SceneWriter = getattr(import_module(module), function)
-        return writer
+        return getattr(import_module(module), function)
 
 
 _HERE = "scene_envs.export"
@@ -93,12 +92,9 @@ def register_format(name: str, *, summary: str = "") -> Callable[[SceneWriter], 
     True
     """
     _FORMATS.check_name(name, "my_format")
-
-    def register(write: SceneWriter) -> SceneWriter:
-        _FORMATS[name] = ExportFormat(name, summary or (write.__doc__ or "").strip().split("\n")[0], write)
-        return write
-
-    return register
+    return _FORMATS.adding(
+        name, lambda write: ExportFormat(name, summary or (write.__doc__ or "").strip().split("\n")[0], write)
+    )
 
 
 def list_formats() -> list[str]:

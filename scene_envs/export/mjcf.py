@@ -9,8 +9,9 @@ import numpy as np
 
 from scene_envs.assets.base import Asset
 from scene_envs.export.asset_files import AssetFiles
-from scene_envs.export.placed import PlacedObject, PlacedScene, number, numbers, principal_inertia, quaternion
+from scene_envs.export.placed import PlacedObject, PlacedScene, number, numbers, quaternion
 from scene_envs.export.urdf import relative, write_xml
+from scene_envs.physics.rigid import principal_inertia
 from scene_envs.scene_types import Camera
 
 TIMESTEP = 0.002

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from scene_envs.assets.base import Array, Asset
+from scene_envs.arrays import Array
+from scene_envs.assets.base import Asset
 from scene_envs.errors import InvalidInputError
 from scene_envs.rotations import matrix_to_quaternion, project_to_so3
 from scene_envs.scene import SceneBatch
@@ -171,14 +172,6 @@ def angle_axis(rotation: Array) -> tuple[float, Array]:
     if length == 0.0:
         return 0.0, np.array([0.0, 0.0, 1.0])
     return float(np.degrees(2.0 * np.arctan2(length, w))), np.array(vector) / length
-
-
-def principal_inertia(inertia: Array) -> tuple[Array, Array]:
-    """Principal moments (3,) kg m^2, ascending, and the rotation (3, 3) from their axes to the asset's."""
-    moments, axes = np.linalg.eigh(np.asarray(inertia, dtype=np.float64))
-    if np.linalg.det(axes) < 0:
-        axes[:, 0] *= -1.0
-    return moments, axes
 
 
 def number(value: float) -> str:

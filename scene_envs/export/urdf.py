@@ -40,19 +40,17 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
 
 def asset_urdf(asset: Asset, files: AssetFiles) -> Path:
     """``<name>.urdf`` with exact parts, for everything but PyBullet. An asset without mass has none here either."""
-    path: Path = files.once(
+    return files.once(
         asset, "urdf", lambda folder: _write(asset, files, files.parts(asset), folder / f"{files.name(asset)}.urdf")
     )
-    return path
 
 
 def bullet_urdf(asset: Asset, files: AssetFiles) -> Path:
     """``<name>_bullet.urdf``, whose parts act at their true size in PyBullet, which adds a margin to them."""
     parts = files.inset_parts(asset, BULLET_MARGIN)
-    path: Path = files.once(
+    return files.once(
         asset, "bullet", lambda folder: _write(asset, files, parts, folder / f"{files.name(asset)}_bullet.urdf")
     )
-    return path
 
 
 def drake_contact(asset: Asset, friction: float) -> dict[str, float | None]:

@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from scene_envs.assets.base import Array, Asset
+from scene_envs.arrays import Array
+from scene_envs.assets.base import Asset
 from scene_envs.export.asset_files import AssetFiles, face_colors, visual_mesh
-from scene_envs.export.placed import PlacedScene, principal_inertia, quaternion
+from scene_envs.export.placed import PlacedScene, quaternion
 from scene_envs.export.urdf import relative
+from scene_envs.physics.rigid import principal_inertia
 
 
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
@@ -39,8 +41,7 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
 
 def asset_usd(asset: Asset, files: AssetFiles) -> Path:
     """``<name>.usda``: a coloured mesh, and convex colliders of purpose *guide*; the scene makes it a body."""
-    path: Path = files.once(asset, "usd", lambda folder: _write_asset(asset, files, folder))
-    return path
+    return files.once(asset, "usd", lambda folder: _write_asset(asset, files, folder))
 
 
 def _write_asset(asset: Asset, files: AssetFiles, folder: Path) -> Path:

@@ -55,10 +55,7 @@ class Gaussian:
         if along == 0.0 or across == 0.0:
             return None
         dx, dy = points[:, 0] - self.x, points[:, 1] - self.y
-        result: NDArray[np.float64] = -0.5 * (
-            ((cos * dx + sin * dy) / along) ** 2 + ((cos * dy - sin * dx) / across) ** 2
-        )
-        return result
+        return -0.5 * (((cos * dx + sin * dy) / along) ** 2 + ((cos * dy - sin * dx) / across) ** 2)
 
 
 @dataclass(frozen=True)

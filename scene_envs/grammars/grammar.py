@@ -132,9 +132,4 @@ GRAMMARS: Registry[Callable[[], Grammar]] = Registry(
 
 def register_grammar(name: str) -> Callable[[Callable[[], Grammar]], Callable[[], Grammar]]:
     """Decorator: make the function's grammar available as ``name``; the same name again replaces it."""
-
-    def register(make: Callable[[], Grammar]) -> Callable[[], Grammar]:
-        GRAMMARS[name] = make
-        return make
-
-    return register
+    return GRAMMARS.adding(name)

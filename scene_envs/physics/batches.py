@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from torch import Tensor
 
 from scene_envs.errors import InvalidInputError
 from scene_envs.physics.kernels import Chunk
-from scene_envs.physics.pool import PhysicsPool, run_in_process
+from scene_envs.physics.pool import PhysicsPool
 from scene_envs.rotations import geodesic_angle, project_to_so3
 from scene_envs.scene import SceneBatch
 
@@ -55,8 +54,7 @@ def run_kernel(
         rows = slice(start, start + size)
         some = None if limits is None else limits[rows]
         chunks.append(Chunk(batch.scene_type, translations[rows], rotations[rows], categories[rows], some))
-    run_chunks: Callable[..., Rows] = pool.run if pool else run_in_process
-    return run_chunks(kernel, chunks, options)
+    return (pool or PhysicsPool(workers=0)).run(kernel, chunks, options)
 
 
 def _check(batch: SceneBatch) -> None:

@@ -8,16 +8,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from scene_envs.errors import MissingDependencyError, PhysicsError
+from scene_envs.arrays import Array
+from scene_envs.errors import PhysicsError
 from scene_envs.physics.constants import FRICTION
 from scene_envs.physics.geometry import LevelGeometry, LibraryGeometry, inset_hull
-from scene_envs.silence import silence
+from scene_envs.physics.rigid import principal_inertia
+from scene_envs.silence import quiet_pybullet
 
-Array = NDArray[np.float64]
 BodyKey = tuple[int, str]
 """Asset category and level of detail ("fine" or "coarse") of a body."""
 
@@ -54,23 +53,23 @@ class BodyPool:
     """
 
     def __init__(self, library: LibraryGeometry) -> None:
-        self.bullet = _import_bullet()
+        self.bullet = quiet_pybullet(
+            "settling and equilibrium need pybullet, whose wheels exist for Python 3.10 and 3.11; "
+            "install it there with: pip install pybullet"
+        )
         self.client: int = self.bullet.connect(self.bullet.DIRECT)
         if self.client < 0:
             raise PhysicsError("PyBullet has no free client slot; close clients that are no longer used")
         self._library = library
         self._bodies: dict[BodyKey, list[int]] = {}
         self._parking: dict[int, tuple[float, float, float]] = {}
-        self._frames: dict[int, tuple[Array, Array]] = {}  # category -> principal axes, moments
+        self._frames: dict[int, tuple[Array, Array]] = {}  # category -> principal moments, axes
         self._wavefronts: dict[BodyKey, str] = {}
 
     def principal(self, category: int) -> tuple[Array, Array]:
-        """Principal axes (3, 3, columns) and moments (3,) kg m^2 of an asset's inertia."""
+        """Principal moments (3,) kg m^2 and axes (3, 3, columns) of an asset's inertia."""
         if category not in self._frames:
-            moments, axes = np.linalg.eigh(np.asarray(self._library.assets[category].asset.inertia))
-            if np.linalg.det(axes) < 0:
-                axes[:, 0] *= -1.0
-            self._frames[category] = axes, moments
+            self._frames[category] = principal_inertia(self._library.assets[category].asset.inertia)
         return self._frames[category]
 
     def take(self, needed: Mapping[BodyKey, int]) -> dict[BodyKey, list[int]]:
@@ -164,7 +163,7 @@ class BodyPool:
         category, level = key
         if key not in self._wavefronts:
             geometry: LevelGeometry = getattr(self._library.assets[category], level)
-            axes, center = self.principal(category)[0], self._library.center_of_mass[category]
+            axes, center = self.principal(category)[1], self._library.center_of_mass[category]
             self._wavefronts[key] = _wavefront(
                 [SCALE * (inset_hull(part, MARGIN) - center) @ axes for part in geometry.parts]
             )
@@ -179,7 +178,7 @@ class BodyPool:
         return shape
 
     def _inertia(self, category: int) -> list[float]:
-        return (SCALE**2 * self.principal(category)[1]).tolist()  # type: ignore[no-any-return]
+        return (SCALE**2 * self.principal(category)[0]).tolist()  # type: ignore[no-any-return]
 
     def _body(self, category: int, shape: int, visual: int, place: tuple[float, float, float]) -> int:
         static = bool(self._library.static[category])
@@ -202,18 +201,6 @@ class BodyPool:
             settings["activationState"] = self.bullet.ACTIVATION_STATE_SLEEP
         self.bullet.changeDynamics(body, -1, physicsClientId=self.client, **settings)
         return int(body)
-
-
-def _import_bullet() -> Any:
-    try:
-        with silence():
-            import pybullet
-    except ImportError as error:
-        raise MissingDependencyError(
-            "settling and equilibrium need pybullet, whose wheels exist for Python 3.10 and 3.11; "
-            "install it there with: pip install pybullet"
-        ) from error
-    return pybullet
 
 
 def _wavefront(hulls: list[Array]) -> str:

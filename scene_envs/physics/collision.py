@@ -6,17 +6,13 @@ from collections.abc import Iterator
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.geometry import LibraryGeometry
 from scene_envs.physics.narrowphase import PenetrationDepth
 from scene_envs.physics.pairs import Contacts, ObjectPairs
 from scene_envs.physics.placement import Objects, PlacedObjects, object_boxes, part_pairs, place
 from scene_envs.physics.separation import separations
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 TOUCHING = 2e-5
 """Overlap (m) below which the face-plane bound is taken as the depth, without looking for the exact one."""
@@ -181,9 +177,7 @@ def _rounds(target: Index, bound: Array, depth: Array, every: bool) -> Iterator[
         rows = rows[bound[rows] > depth[target[rows]]]
 
 
-def _boxes_near(
-    low: Array, high: Array, a: Index, b: Index, margin: float, fixed: NDArray[np.bool_] | None = None
-) -> NDArray[np.bool_]:
+def _boxes_near(low: Array, high: Array, a: Index, b: Index, margin: float, fixed: Mask | None = None) -> Mask:
     height = margin if fixed is None else np.where(fixed, NEAR_FIXED, margin)
     near = (low[a, 0] <= high[b, 0] + margin) & (low[b, 0] <= high[a, 0] + margin)
     near &= (low[a, 1] <= high[b, 1] + margin) & (low[b, 1] <= high[a, 1] + margin)

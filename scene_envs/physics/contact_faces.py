@@ -6,12 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from scene_envs.arrays import Array
 from scene_envs.physics.parts import PartGeometry
-
-Array = NDArray[np.float64]
 
 _FLAT = 1e-5
 """Corners this close (m) to the extreme height belong to the face."""

@@ -9,11 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from scene_envs.arrays import Array, Index
 
 _SAME_NORMAL = 1e-10
 """Faces whose unit normals differ by less than this are one face."""

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
+from scene_envs.arrays import Array, Index
 from scene_envs.assets.base import Asset, ConvexPart
 from scene_envs.physics.contact_faces import ContactFace, contact_face
-from scene_envs.physics.parts import SIZE_CLASSES, PartGeometry
-
-Array = NDArray[np.float64]
+from scene_envs.physics.parts import PartGeometry
 
 _CONTAINED = 1e-6
 """A fine corner this far (m) outside every coarse part still counts as inside."""
@@ -31,9 +30,9 @@ class LevelGeometry:
     """
 
     parts: tuple[PartGeometry, ...]
-    ids: NDArray[np.int64]
+    ids: Index
     vertices: Array
-    starts: NDArray[np.int64]
+    starts: Index
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,11 +91,11 @@ class LibraryGeometry:
         self.directions = np.array([sum(len(part.normals) for part in parts) for parts in fine], dtype=np.int64)
         self.size_class = np.array([part.size_class for part in self.parts], dtype=np.int64)
         self.row = np.zeros(len(self.parts), dtype=np.int64)
-        self.tables: list[PartTable | None] = []
-        for index in range(len(SIZE_CLASSES) + 1):
+        self.tables: dict[int, PartTable] = {}
+        for index in np.unique(self.size_class).tolist():
             members = np.flatnonzero(self.size_class == index)
             self.row[members] = np.arange(len(members))
-            self.tables.append(_table([self.parts[m] for m in members]) if len(members) else None)
+            self.tables[index] = _table([self.parts[m] for m in members])
 
     def _add(self, asset: Asset) -> AssetGeometry:
         fine = self._level(asset.fine)
@@ -147,7 +146,6 @@ def inset_hull(part: PartGeometry, distance: float) -> Array:
     A part too thin for the whole distance is inset by two fifths of its thickness.
     """
     from scipy.optimize import linprog
-    from scipy.spatial import HalfspaceIntersection
 
     count = len(part.normals)
     deepest = linprog(
@@ -166,12 +164,7 @@ def inset_hull(part: PartGeometry, distance: float) -> Array:
         return center + (part.vertices - center) * (1.0 - distance / radius)
 
 
-_LIBRARIES: dict[tuple[int, ...], LibraryGeometry] = {}
-
-
-def library_geometry(assets: Sequence[Asset]) -> LibraryGeometry:
+@cache
+def library_geometry(assets: tuple[Asset, ...]) -> LibraryGeometry:
     """The geometry of ``assets``, built on first use and shared by everything in this process."""
-    key = tuple(id(asset) for asset in assets)
-    if key not in _LIBRARIES:
-        _LIBRARIES[key] = LibraryGeometry(assets)  # holds the assets, so that their ids stay taken
-    return _LIBRARIES[key]
+    return LibraryGeometry(assets)

@@ -8,9 +8,9 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from scene_envs.arrays import Array, Index, Mask
 from scene_envs.assets.base import Asset, AssetLibrary, ConvexPart
 from scene_envs.assets.shapes import box
 from scene_envs.errors import InvalidInputError
@@ -20,10 +20,6 @@ from scene_envs.physics.geometry import library_geometry
 from scene_envs.physics.placement import Objects, flatten, object_boxes, part_pairs, place
 from scene_envs.physics.separation import separations
 from scene_envs.scene import SceneBatch
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 TOUCHING = 1e-4
 """Overlap (m) of the gripper with anything up to which it only touches."""
@@ -129,11 +125,6 @@ def reachable(batch: SceneBatch, approaches: Sequence[Sequence[float]], gripper:
     return ReachResult((found & valid[:, None]).to(device), valid.to(device))
 
 
-@lru_cache(maxsize=16)
-def _hand(library: AssetLibrary, gripper: Gripper) -> _Hand:
-    return _Hand(library, gripper)
-
-
 class _Hand:
     """A gripper among the assets of a library, of which it is the last but one; the space in it is the last."""
 
@@ -219,6 +210,9 @@ class _Hand:
         depth, _ = self.collider.depth(placed.parts, a, b)
         overlap[pair[depth > TOUCHING]] = True
         return overlap
+
+
+_hand = lru_cache(maxsize=16)(_Hand)
 
 
 def _frames(rotation: Array, back: Array) -> Array:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scene_envs.arrays import Array, Index
 from scene_envs.physics.budget import Budget, simulation_units
 from scene_envs.physics.motion import Physics, motion, physics_of
 from scene_envs.physics.pairs import ObjectPairs
@@ -18,9 +19,6 @@ from scene_envs.physics.projection import TOLERANCE, project_objects
 from scene_envs.physics.settling import settle_scene
 from scene_envs.physics.spreading import heaps
 from scene_envs.scene_types import SceneType
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _LOGGER = logging.getLogger(__name__)
 _FALLEN = 1.0
@@ -81,10 +79,6 @@ def _budgets(chunk: Chunk, objects: Objects, pairs: ObjectPairs) -> list[Budget]
     return [Budget(simulation_units(objects[rows], pairs.among(rows))) for rows in scenes]
 
 
-def _spent(budgets: list[Budget]) -> Array:
-    return np.array([budget.spent for budget in budgets])
-
-
 def feasibility_kernel(
     chunk: Chunk,
     *,
@@ -115,7 +109,7 @@ def feasibility_kernel(
         "displacement": _scatter(chunk, objects, displacement),
         "rotation": _scatter(chunk, objects, rotation),
         "valid": valid,
-        "spent": _spent(budgets),
+        "spent": np.array([budget.spent for budget in budgets]),
     }
 
 

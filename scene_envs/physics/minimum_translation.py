@@ -8,16 +8,13 @@ beside the other object, above it, or in its hollow.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scene_envs.arrays import Array, Index
 from scene_envs.physics.budget import Budget
 from scene_envs.physics.collision import Collider
 from scene_envs.physics.placement import Objects, object_boxes, part_pairs, place
 from scene_envs.physics.planes import CLEARANCE
 from scene_envs.physics.separation import grouped_gaps
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _AROUND = 0.06
 """Parts further away than this (m) are not looked at when a translation is measured."""

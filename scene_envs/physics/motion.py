@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.budget import Budget
 from scene_envs.physics.collision import Collider
 from scene_envs.physics.geometry import LibraryGeometry, library_geometry
@@ -18,10 +19,6 @@ from scene_envs.physics.rest import Rest, Statics
 from scene_envs.physics.support import Support, clusters, company
 from scene_envs.physics.world import SolverSettings, World
 from scene_envs.scene_types import SceneType
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -73,15 +70,12 @@ class Physics:
         return self._world
 
 
-_PHYSICS: dict[int, Physics] = {}
+_physics = cache(Physics)
 
 
 def physics_of(scene_type: SceneType) -> Physics:
     """The physics of a scene type's assets, shared within this process."""
-    library = library_geometry(scene_type.library.assets)
-    if id(library) not in _PHYSICS:
-        _PHYSICS[id(library)] = Physics(library)
-    return _PHYSICS[id(library)]
+    return _physics(library_geometry(scene_type.library.assets))
 
 
 @dataclass(frozen=True, eq=False)

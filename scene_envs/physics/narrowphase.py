@@ -18,14 +18,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.features import PartFeatures
 from scene_envs.physics.separation import PlacedParts
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 _BLOCK = 1 << 15
 """Elements of the arrays that hold face-corner or edge-edge combinations at a time (they stay in the cache)."""

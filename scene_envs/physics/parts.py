@@ -6,11 +6,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scene_envs.arrays import Array
 from scene_envs.assets.base import ConvexPart
-
-Array = NDArray[np.float64]
 
 SIZE_CLASSES = ((8, 6), (16, 16), (32, 24))
 """(corners, face directions) up to which parts share padded arrays; larger parts make a last class."""

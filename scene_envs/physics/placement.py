@@ -6,15 +6,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.geometry import LevelGeometry, LibraryGeometry
 from scene_envs.physics.rows import Rows
 from scene_envs.physics.separation import PlacedParts, rotate
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 Level = Literal["fine", "coarse"]
 
 

@@ -5,20 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.sparse import csr_array
 
+from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.budget import Budget
 from scene_envs.physics.collision import Collider, scene_pairs
 from scene_envs.physics.placement import Objects, object_boxes, part_pairs, place
 from scene_envs.physics.rows import Rows
 from scene_envs.physics.separation import grouped_gaps
 from scene_envs.physics.support import components
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 CLEARANCE = 2e-5
 """Gap (m) that planes ask for, so that rounding does not leave an overlap."""

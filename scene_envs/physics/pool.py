@@ -66,8 +66,7 @@ class _Worker:
 
     def receive(self) -> tuple[str, Any]:
         """The reply to the last message; raises EOFError or OSError when the process died."""
-        reply: tuple[str, Any] = self.inbox.recv()
-        return reply
+        return self.inbox.recv()
 
     @property
     def process_id(self) -> int:
@@ -281,11 +280,6 @@ def run_here(
             raise
         except Exception as error:
             _retry(task, tasks, f"failed ({type(error).__name__}: {error})")
-
-
-def run_in_process(kernel: str, chunks: Sequence[Chunk], options: Mapping[str, Any]) -> list[dict[str, Any] | None]:
-    """As :meth:`PhysicsPool.run`, without a pool."""
-    return PhysicsPool(workers=0).run(kernel, chunks, options)
 
 
 def _store(task: _Task, result: dict[str, Any], results: list[dict[str, Any] | None]) -> None:

@@ -16,8 +16,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.budget import Budget
 from scene_envs.physics.collision import Collider, corner_tests
 from scene_envs.physics.minimum_translation import Tried, minimum_translations
@@ -25,9 +25,6 @@ from scene_envs.physics.placement import Objects
 from scene_envs.physics.planes import Planes, near_pairs, nearest, separating_planes
 from scene_envs.physics.spreading import heaps, spread
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 TOLERANCE = 1e-4

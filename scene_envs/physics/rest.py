@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics import rigid
 from scene_envs.physics.collision import NEAR, scene_pairs
 from scene_envs.physics.constants import GRAVITY
@@ -21,10 +21,6 @@ from scene_envs.physics.pairs import Contacts, ObjectPairs
 from scene_envs.physics.parts import PartGeometry
 from scene_envs.physics.placement import Objects
 from scene_envs.physics.rows import Rows
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 _FLAT = 3e-4
 """Tilt (rad) up to which an object counts as upright."""

@@ -7,9 +7,8 @@ in a batch. scipy's ``Rotation`` picks its formula per batch and promises no suc
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from scene_envs.arrays import Array
 
 
 def apply(rotation: Array, vector: Array) -> Array:
@@ -58,3 +57,11 @@ def angle_between(a: Array, b: Array) -> Array:
     scalar = np.abs((a * b).sum(axis=1))
     vector = a[:, 3:] * b[:, :3] - b[:, 3:] * a[:, :3] - np.cross(a[:, :3], b[:, :3])
     return 2.0 * np.arctan2(np.linalg.norm(vector, axis=1), scalar)
+
+
+def principal_inertia(inertia: Array) -> tuple[Array, Array]:
+    """Principal moments (3,) kg m^2, ascending, and the rotation (3, 3) from their axes to the asset's."""
+    moments, axes = np.linalg.eigh(np.asarray(inertia, dtype=np.float64))
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1.0
+    return moments, axes

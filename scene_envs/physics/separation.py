@@ -11,13 +11,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scene_envs.arrays import Array, Index
 from scene_envs.physics.geometry import LibraryGeometry
+from scene_envs.physics.parts import SIZE_CLASSES
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-
+_CLASSES = len(SIZE_CLASSES) + 1
 _BLOCK = 1 << 16
 """Face-corner combinations looked at together: their arrays stay in the cache."""
 
@@ -60,9 +59,9 @@ def separations(library: LibraryGeometry, placed: PlacedParts, first: Index, sec
     gap = np.empty(len(first))
     direction = np.empty((len(first), 3))
     classes = library.size_class[placed.part]
-    groups = classes[first] * len(library.tables) + classes[second]
+    groups = classes[first] * _CLASSES + classes[second]
     for group in np.unique(groups):
-        class_a, class_b = divmod(int(group), len(library.tables))
+        class_a, class_b = divmod(int(group), _CLASSES)
         rows = np.flatnonzero(groups == group)
         step = max(1, _BLOCK // _combinations(library, class_a, class_b))
         for start in range(0, len(rows), step):
@@ -74,8 +73,6 @@ def separations(library: LibraryGeometry, placed: PlacedParts, first: Index, sec
 def _combinations(library: LibraryGeometry, class_a: int, class_b: int) -> int:
     """Faces of one part times corners of the other, both ways, for parts of two size classes."""
     a, b = library.tables[class_a], library.tables[class_b]
-    assert a is not None
-    assert b is not None
     return a.normals.shape[1] * b.vertices.shape[1] + b.normals.shape[1] * a.vertices.shape[1]
 
 
@@ -83,8 +80,6 @@ def _one_group(
     library: LibraryGeometry, placed: PlacedParts, first: Index, second: Index, class_a: int, class_b: int
 ) -> tuple[Array, Array]:
     table_a, table_b = library.tables[class_a], library.tables[class_b]
-    assert table_a is not None
-    assert table_b is not None
     row_a, row_b = library.row[placed.part[first]], library.row[placed.part[second]]
     rotation_a, rotation_b = placed.rotation[first], placed.rotation[second]
     shift = placed.translation[second] - placed.translation[first]  # (P, 3)
@@ -114,12 +109,10 @@ def grouped_gaps(
         rows (Q,) of the pairs, gaps (Q, K) m, and directions (Q, K, 3) in the world, from first to second.
     """
     classes = library.size_class[placed.part]
-    groups = classes[first] * len(library.tables) + classes[second]
+    groups = classes[first] * _CLASSES + classes[second]
     for group in np.unique(groups):
         rows = np.flatnonzero(groups == group)
-        table_a, table_b = (library.tables[index] for index in divmod(int(group), len(library.tables)))
-        assert table_a is not None
-        assert table_b is not None
+        table_a, table_b = (library.tables[index] for index in divmod(int(group), _CLASSES))
         a, b = first[rows], second[rows]
         row_a, row_b = library.row[placed.part[a]], library.row[placed.part[b]]
         turn_a, turn_b = placed.rotation[a], placed.rotation[b]

@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scene_envs.arrays import Array
 from scene_envs.physics.budget import Budget
 from scene_envs.physics.collision import ObjectPairs
 from scene_envs.physics.motion import Physics, advance
 from scene_envs.physics.placement import Objects
 from scene_envs.physics.rest import Rest
 from scene_envs.physics.support import company
-
-Array = NDArray[np.float64]
 
 _SEGMENT = 0.25
 """Seconds after which settling looks again at which shapes it needs, and whether anything still moves."""

@@ -9,17 +9,13 @@ bounded.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.collision import Collider, corner_tests, scene_pairs
 from scene_envs.physics.geometry import LibraryGeometry
 from scene_envs.physics.placement import Objects, object_boxes, place
 from scene_envs.physics.planes import CLEARANCE
 from scene_envs.physics.support import components
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 _HEAP = 3_000_000
 """Corner tests from which a group of objects whose boxes meet may be a heap,"""

@@ -5,18 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.contact_faces import ContactFace
 from scene_envs.physics.geometry import LibraryGeometry
 from scene_envs.physics.pairs import ObjectPairs
 from scene_envs.physics.placement import Objects
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 _REACH = 2e-3
 """Pairs further apart than this (m) do not carry each other."""

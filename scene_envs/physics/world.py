@@ -5,18 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics import rigid
 from scene_envs.physics.bodies import SCALE, BodyKey, BodyPool
 from scene_envs.physics.budget import Budget
 from scene_envs.physics.constants import GRAVITY
 from scene_envs.physics.geometry import LibraryGeometry
 from scene_envs.physics.placement import Objects
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 _LOOK = 12
 """Steps after which to see whether everything is at rest."""
@@ -81,7 +77,7 @@ class World:
         """
         bullet, client = self._pool.bullet, self._pool.client
         category, fixed, count = objects.category, objects.fixed, len(objects)
-        axes = np.array([self._pool.principal(c)[0] for c in category.tolist()])
+        axes = np.array([self._pool.principal(c)[1] for c in category.tolist()])
         center = self._library.center_of_mass[category]
         start_quaternion = rigid.quaternions(rigid.times(objects.rotation, axes))
         start_position = SCALE * (objects.translation + rigid.apply(objects.rotation, center))

@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scene_envs.arrays import Array, Index
 from scene_envs.scene_types import FixedObject, SceneType
 
-Array = NDArray[np.float64]
 _SIDES = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _TOP = np.array([0.0, 0.0, 1.0])
 _RAYS = 24
@@ -75,9 +74,7 @@ def frame_scene_type(scene_type: SceneType) -> Framing:
     return Framing(points, _direction(azimuth, elevation), _direction(azimuth - 85.0, 57.0), ground)
 
 
-def scene_type_of_one(
-    scene_type: SceneType, translations: Array, rotations: Array, categories: NDArray[np.int64]
-) -> SceneType:
+def scene_type_of_one(scene_type: SceneType, translations: Array, rotations: Array, categories: Index) -> SceneType:
     """Scene type by which one scene is framed: that of its only support, in types that hold tables and rooms.
 
     A union of scene types has no fixed objects and the workspace of the largest type, in which a table would be tiny. A
@@ -95,7 +92,7 @@ def scene_type_of_one(
     if scene_type.fixed or len(supports) != 1:
         return scene_type
 
-    def fixed(slots: NDArray[np.int64]) -> SceneType:
+    def fixed(slots: Index) -> SceneType:
         poses = ((translations[slot].tolist(), rotations[slot].ravel().tolist()) for slot in slots)
         objects = (FixedObject(str(names[slot]), *map(tuple, pose)) for slot, pose in zip(slots, poses, strict=True))
         return replace(scene_type, fixed=tuple(objects))

@@ -129,15 +129,10 @@ def _picture(
     shadow = soft_shadow(frame, light, normals, bias=1.3 * texel, lift=2.6 * texel)[..., None]
     reach = 0.04 * np.sqrt(framing.radius / _TABLE)
     shade = blur(contact_shade(frame, normals, radius=reach), 2 * scale + 1)[..., None]
-    towards = np.clip(2.0 * normals @ _camera_direction(frame, framing.to_light), 0.0, 1.0)[..., None]
+    towards = np.clip(2.0 * normals @ (frame.view[:3, :3] @ framing.to_light).astype(np.float32), 0.0, 1.0)[..., None]
     lit = color * (1.0 - _SHADOW * shadow * (0.4 + 0.6 * towards)) * (1.0 - np.minimum(1.25 * shade, 0.5))
     ramp = np.linspace(0.0, 1.0, scale * height, dtype=np.float32)[:, None, None]
     backdrop = _BACKDROP[0] * (1.0 - ramp) + _BACKDROP[1] * ramp
     image = np.where((frame.slots >= 0)[..., None], lit, backdrop)
     small = image.reshape(height, scale, width, scale, 3).mean(axis=(1, 3))
     return np.rint(np.clip(small, 0.0, 255.0)).astype(np.uint8)
-
-
-def _camera_direction(frame: Frame, direction: NDArray[np.float64]) -> NDArray[np.float32]:
-    """A world direction of unit length in the camera frame."""
-    return (frame.view[:3, :3] @ direction).astype(np.float32)

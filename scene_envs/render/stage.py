@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_envs.assets import Asset, get_library
-from scene_envs.errors import MissingDependencyError
 from scene_envs.scene_types import Camera
+from scene_envs.silence import quiet_pybullet
 
 _AWAY = (0.0, 0.0, -1000.0)
 _CELL, _CELLS = 8, 32
@@ -45,17 +45,10 @@ class Frame:
 
 def load_pybullet() -> ModuleType:
     """The PyBullet module; raises MissingDependencyError where it is not installed."""
-    from scene_envs.silence import silence
-
-    try:
-        with silence():
-            import pybullet
-    except ImportError as error:
-        raise MissingDependencyError(
-            "pictures need PyBullet, which is not installed; install it with `pip install pybullet` "
-            "(its wheels exist for Python 3.10 and 3.11)"
-        ) from error
-    return pybullet  # type: ignore[no-any-return]
+    return quiet_pybullet(
+        "pictures need PyBullet, which is not installed; install it with `pip install pybullet` "
+        "(its wheels exist for Python 3.10 and 3.11)"
+    )
 
 
 class Stage:
@@ -168,7 +161,7 @@ class Stage:
         cells = np.searchsorted(self._palette, _color_codes(asset) & self._mask)
         uv = np.stack([(cells % _CELLS + 0.5) / _CELLS, 1.0 - (cells // _CELLS + 0.5) / _CELLS], axis=1)
         gloss = 0.0 if asset.static else 0.35
-        shape: int = self._bullet.createVisualShape(
+        return self._bullet.createVisualShape(
             self._bullet.GEOM_MESH,
             vertices=asset.visual.vertices.tolist(),
             indices=asset.visual.faces.ravel().tolist(),
@@ -178,7 +171,6 @@ class Stage:
             specularColor=(gloss, gloss, gloss),
             physicsClientId=self._client,
         )
-        return shape
 
 
 @cache
@@ -213,5 +205,4 @@ def vertex_colors(asset: Asset) -> NDArray[np.uint8]:
 
 def _color_codes(asset: Asset) -> NDArray[np.int64]:
     rgb = vertex_colors(asset).astype(np.int64)
-    codes: NDArray[np.int64] = (rgb[:, 0] << 16) | (rgb[:, 1] << 8) | rgb[:, 2]
-    return codes
+    return (rgb[:, 0] << 16) | (rgb[:, 1] << 8) | rgb[:, 2]

@@ -5,10 +5,8 @@ from __future__ import annotations
 import base64
 import os
 from collections.abc import Sequence
-from functools import cache
-from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,15 +15,14 @@ from numpy.typing import NDArray
 from scene_envs.assets import Asset, ConvexPart
 from scene_envs.errors import InvalidInputError
 from scene_envs.files import write_text
+from scene_envs.pages import page_part, page_template
 from scene_envs.render.framing import frame_scene_type
 from scene_envs.render.stage import vertex_colors
 from scene_envs.rotations import matrix_to_quaternion
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
 
-if TYPE_CHECKING:
-    from jinja2 import Template
-
+_WEB = "scene_envs.render.web"
 _SCRIPTS = ("math.js", "decode.js", "shaders.js", "targets.js", "renderer.js", "controls.js", "app.js")
 _FOV = 28.0
 _STEPS = 65535
@@ -88,26 +85,12 @@ def _page(title: str, data: dict[str, Any]) -> str:
     from jinja2.utils import htmlsafe_json_dumps
     from markupsafe import Markup
 
-    return _template().render(
+    return page_template(_WEB, "viewer.html").render(
         title=title,
-        style=Markup(_web("viewer.css")),
-        scripts=Markup("\n".join(_web(name) for name in _SCRIPTS)),
+        style=Markup(page_part(_WEB, "viewer.css")),
+        scripts=Markup("\n".join(page_part(_WEB, name) for name in _SCRIPTS)),
         data=htmlsafe_json_dumps(data, separators=(",", ":"), allow_nan=False),
     )
-
-
-@cache
-def _template() -> Template:
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    loader = PackageLoader("scene_envs.render", "web")
-    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, keep_trailing_newline=True)
-    return environment.get_template("viewer.html")
-
-
-@cache
-def _web(name: str) -> str:
-    return resources.files("scene_envs.render.web").joinpath(name).read_text(encoding="utf-8")
 
 
 def _viewer_data(batch: SceneBatch, captions: Sequence[str]) -> dict[str, Any]:

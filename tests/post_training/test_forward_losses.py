@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
-
 import numpy as np
 import pytest
 import torch
@@ -179,30 +177,3 @@ def test_wrong_settings_and_shapes_are_named(prior: ScenePrior) -> None:
         AWMLoss(prior, prior, beta=1.0)
     with pytest.raises(InvalidInputError, match="'advantage' has 7 values per scene"):
         NFTLoss(prior, prior)(own_scenes(prior, advantage=torch.zeros(4, 7)))
-
-
-def test_bad_poses_beyond_the_limit_do_not_push(prior: ScenePrior) -> None:
-    torch.manual_seed(0)
-    other = deepcopy(prior)
-    with torch.no_grad():
-        for parameter in other.parameters():
-            parameter.add_(0.05 * torch.randn_like(parameter))
-    scenes = own_scenes(prior, advantage=torch.cat([torch.ones(2, 34), -torch.ones(2, 34)]))
-    noised = prior.noised(scenes["scene"], Generator().manual_seed(3))
-    poses = prior.pose_width
-    weight = noised.weight[..., :poses]
-    now, then = (
-        ((noised.target - denoiser.output(noised).continuous)[..., :poses].square() * weight).sum(dim=-1)
-        for denoiser in (prior, other)
-    )
-    bad = torch.tensor([False, False, True, True])[:, None] & (weight.sum(dim=-1) > 0)
-    expected = (bad & (now > 1.01 * then)).sum() / bad.sum()
-    loss = NFTLoss(prior, prior, base=other, push_limit=1.01, generator=Generator().manual_seed(3))
-    assert 0 < expected < 1
-    assert float(loss(scenes)["limited"]) == pytest.approx(float(expected))
-    assert float(NFTLoss(prior, prior, base=prior, push_limit=1.01)(scenes)["limited"]) == 0.0
-
-
-def test_a_limit_needs_the_base_prior(prior: ScenePrior) -> None:
-    with pytest.raises(InvalidInputError, match="give base="):
-        NFTLoss(prior, prior, push_limit=1.5)

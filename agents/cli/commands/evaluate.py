@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from agents.configuration.measure_names import choose_measures
 from agents.configuration.shared_keys import OutputKeys
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -103,7 +103,6 @@ def run(settings: EvaluateConfig, run: Run) -> None:
     from agents.evaluation.measures import EvaluationInputs, compute_measure
     from agents.evaluation.real_scenes import RealScenes
     from agents.priors.base import ScenePrior
-    from scene_envs.errors import MissingDependencyError
     from scene_envs.files import write_text
     from scene_envs.physics import PhysicsPool
 
@@ -156,8 +155,6 @@ def _read_figures(path: Path) -> tuple[dict[str, Any], dict[str, dict[str, float
     Raises:
         CorruptFileError: it is cut off, or was changed after it was written.
     """
-    from scene_envs.errors import CorruptFileError
-
     try:
         found = dict(json.loads(path.read_text(encoding="utf-8"))).get("evaluation")
         if found is None:
@@ -266,8 +263,6 @@ class _Results:
 
 def _identity(settings: EvaluateConfig, prior: ScenePrior) -> dict[str, Any]:
     """The keys that figures depend on, and a digest of what the prior is made of and of its weights."""
-    import hashlib
-
     digest = hashlib.sha256(json.dumps(prior.config_state(), sort_keys=True).encode())
     for name, tensor in sorted(prior.weights().items()):
         digest.update(name.encode())
@@ -290,7 +285,6 @@ def _sample(prior: ScenePrior, settings: EvaluateConfig, prompts: list[str] | No
 def _draw(samples: SceneBatch, count: int, run: Run) -> None:
     """``gallery.png``, where pictures can be drawn."""
     from agents.cli.commands.scenes import draw_scenes
-    from scene_envs.errors import MissingDependencyError
 
     try:
         draw_scenes(samples, count, run, "gallery.png")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.cli.commands.scenes import make_ready
+from scene_envs.errors import InvalidInputError
 from scene_envs.scene_sources import load_scenes
 
 if TYPE_CHECKING:
@@ -53,7 +54,6 @@ class ExportConfig:
 
 def check(settings: ExportConfig) -> None:
     """Refuse what cannot be, before scenes are read."""
-    from scene_envs.errors import InvalidInputError
     from scene_envs.export.formats import check_formats
 
     if bool(settings.scenes) == bool(settings.prior):

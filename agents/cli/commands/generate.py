@@ -51,17 +51,7 @@ def run(settings: GenerateConfig, run: Run) -> None:
     """Write the dataset into ``output``."""
     from scene_envs.datasets import generate
 
-    report = generate(
-        settings.scene,
-        settings.count,
-        settings.output,
-        seed=settings.seed,
-        workers=settings.workers,
-        verify=settings.verify,
-        shard_size=settings.shard_size,
-        progress=settings.progress,
-        backend=settings.backend,
-        address=settings.address,
-    )
+    keys = dict(vars(settings))
+    report = generate(keys.pop("scene"), **keys)
     run.write_metrics({**asdict(report), "output": str(report.output)})
     run.say(f"{report.scenes} scenes of {report.tried} tried, in {report.seconds:.0f} s: {report.output}")

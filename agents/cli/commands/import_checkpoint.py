@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from agents.configuration.fields import named
+from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
@@ -49,7 +50,6 @@ class ImportCheckpointConfig:
 def check(settings: ImportCheckpointConfig) -> None:
     """Refuse files that are not there."""
     from agents.cli.early_checks import check_files
-    from scene_envs.errors import InvalidInputError
 
     if not settings.checkpoint or not settings.metadata:
         raise InvalidInputError("name the two files: scene-envs import-checkpoint FILE metadata.json")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from agents.cli.commands.scenes import draw_scenes
+from scene_envs.errors import InvalidInputError
 from scene_envs.scene_sources import load_scenes
 
 if TYPE_CHECKING:
@@ -51,8 +52,6 @@ class InpaintingConfig:
 
 def check(settings: InpaintingConfig) -> None:
     """Refuse to work on nothing."""
-    from scene_envs.errors import InvalidInputError
-
     if not settings.scenes and not settings.prior:
         raise InvalidInputError("name a scene file, run or dataset, as in scenes=runs/mine, or a prior= to sample from")
 
@@ -60,7 +59,6 @@ def check(settings: InpaintingConfig) -> None:
 def load_prior_and_scenes(command: str, settings: InpaintingConfig) -> tuple[ScenePrior, SceneBatch]:
     """The prior and the scenes that a command works on."""
     from agents.priors.base import ScenePrior
-    from scene_envs.errors import InvalidInputError
 
     if not settings.scenes:
         fresh = ScenePrior.load(settings.prior).to(settings.device)

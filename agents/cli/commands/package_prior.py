@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
+from scene_envs.errors import InvalidInputError
+
 WRITES = False
 
 
@@ -40,7 +42,6 @@ class PackagePriorConfig:
 def check(settings: PackagePriorConfig) -> None:
     """Refuse what cannot be, before the prior is read."""
     from agents.configuration.checks import one_of
-    from scene_envs.errors import InvalidInputError
 
     if not settings.prior or not settings.output:
         raise InvalidInputError(
@@ -54,14 +55,6 @@ def run(settings: PackagePriorConfig) -> None:
     from agents.priors.card import package_prior
     from agents.priors.facts import PriorFacts
 
-    folder = package_prior(
-        settings.prior,
-        settings.output,
-        evaluation=settings.evaluation or None,
-        precision=settings.precision,
-        data=settings.data,
-        license=settings.license,
-        machine=settings.machine,
-        limits=settings.limits,
-    )
+    keys = {**vars(settings), "evaluation": settings.evaluation or None}
+    folder = package_prior(keys.pop("prior"), **keys)
     print("\n".join(PriorFacts.of(folder).lines()))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from agents.cli.commands.scenes import draw_scenes, make_ready
+from scene_envs.errors import InvalidInputError
 from scene_envs.scene_sources import load_scenes
 
 if TYPE_CHECKING:
@@ -34,8 +35,6 @@ class ProjectConfig:
 
 def check(settings: ProjectConfig) -> None:
     """Refuse to work on nothing."""
-    from scene_envs.errors import InvalidInputError
-
     if not settings.scenes:
         raise InvalidInputError("project: name a scene file, run or dataset, as in scenes=runs/mine")
 

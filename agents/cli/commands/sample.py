@@ -11,6 +11,7 @@ from agents.cli.commands.scenes import draw_scenes, make_ready, reward_figures
 from agents.configuration.checks import one_of
 from agents.configuration.fields import named
 from agents.configuration.shared_keys import OutputKeys, SamplingKeys
+from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
@@ -108,8 +109,6 @@ def run(settings: SampleConfig, run: Run) -> None:
 
 def _without_geometry(settings: SampleConfig, scene_type: SceneType, run: Run) -> SampleConfig:
     """The settings for assets without models: pictures and the default reward are left out, physics is refused."""
-    from scene_envs.errors import InvalidInputError
-
     if settings.project or settings.export is not None:
         raise InvalidInputError(
             f"project=true and export= need the geometry of the assets, and those of {scene_type.name!r} have none "

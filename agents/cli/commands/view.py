@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.configuration.fields import named
+from scene_envs.errors import InvalidInputError
 from scene_envs.scene_sources import find_scenes, is_dataset, load_scenes
 
 if TYPE_CHECKING:
@@ -50,8 +51,6 @@ class ViewConfig:
 
 def check(settings: ViewConfig) -> None:
     """Refuse to show nothing, or two things at once."""
-    from scene_envs.errors import InvalidInputError
-
     if settings.scenes and settings.prior:
         raise InvalidInputError("view: give either scenes= or prior=, not both")
     if settings.prior and settings.scene:
@@ -103,8 +102,6 @@ def _gather(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str]:
 
 def _read(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str]:
     """Scenes ``first`` to ``first + count`` of a scene file or a dataset, whose captions are its prompts."""
-    from scene_envs.errors import InvalidInputError
-
     path = find_scenes(Path(settings.scenes))
     chosen = slice(settings.first, settings.first + settings.count)
     if not is_dataset(path):

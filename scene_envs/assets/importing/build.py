@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scene_envs.assets.base import Array, Asset, ConvexPart
+from scene_envs.arrays import Array
+from scene_envs.assets.base import Asset, ConvexPart, bounds_of
 from scene_envs.assets.importing.entries import AssetEntry, Axis
 from scene_envs.assets.importing.hulls import enclosing_hull, thickness
 from scene_envs.assets.importing.inertials import weigh
@@ -183,15 +184,9 @@ def _collide(
     return parts, volume
 
 
-def _bounds(parts: Sequence[ConvexPart]) -> Array:
-    """(2, 3): lowest and highest corner of the parts, m."""
-    corners = np.stack([part.bounds for part in parts])
-    return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
-
-
 def _unlike(visual: trimesh.Trimesh, parts: Sequence[ConvexPart], size: float) -> list[str]:
     """A note when what is seen and what collides have different bounding boxes."""
-    apart = float(np.abs(np.asarray(visual.bounds) - _bounds(parts)).max())
+    apart = float(np.abs(np.asarray(visual.bounds) - bounds_of(parts)).max())
     if apart <= max(_UNLIKE, 0.05 * size):
         return []
     return [f"what is seen reaches up to {apart:.2g} m beyond what collides, or the other way round"]
@@ -201,7 +196,7 @@ def _shift(parts: Sequence[ConvexPart], entry: AssetEntry, visual: trimesh.Trime
     """(3,) m from the file's origin to the asset frame's; the visual counts too when there is one."""
     if entry.base == "origin":
         return np.zeros(3)
-    low, high = _bounds(parts)
+    low, high = bounds_of(parts)
     if visual is not None:
         low, high = np.minimum(low, visual.bounds[0]), np.maximum(high, visual.bounds[1])
     return 0.0 - np.array([0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]), low[2]])

@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from scene_envs.assets.base import Array, ConvexPart
+from scene_envs.arrays import Array
+from scene_envs.assets.base import ConvexPart
 from scene_envs.assets.importing.hulls import MOST_CORNERS, concavity, few_cornered_hull, has_volume
 from scene_envs.assets.importing.limits import seconds_left, too_slow
 from scene_envs.assets.importing.mesh_files import bare

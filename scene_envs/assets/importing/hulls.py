@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
-from scene_envs.assets.base import Array, ConvexPart
+from scene_envs.arrays import Array
+from scene_envs.assets.base import ConvexPart
 from scene_envs.assets.shapes import convex_hull
 
 MOST_CORNERS = 64

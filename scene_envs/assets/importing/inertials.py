@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scene_envs.assets.base import Array, ConvexPart
+from scene_envs.arrays import Array
+from scene_envs.assets.base import ConvexPart, bounds_of
 from scene_envs.assets.importing.model import Inertial
 from scene_envs.assets.shapes import MassProperties, mass_properties
 
@@ -94,8 +95,7 @@ def why_impossible(inertia: Array, center: Array, parts: Sequence[ConvexPart], c
     worst = ratio[np.abs(np.log(ratio)).argmax()]
     if not 1.0 / _FACTOR <= worst <= _FACTOR:
         return f"{shown} is {worst:.3g} times that of the shape"
-    low = np.min([part.bounds[0] for part in parts], axis=0)
-    high = np.max([part.bounds[1] for part in parts], axis=0)
+    low, high = bounds_of(parts)
     margin = 1e-3 * np.linalg.norm(high - low)
     if (center < low - margin).any() or (center > high + margin).any():
         return f"the centre of mass ({', '.join(f'{c:.3g}' for c in center)}) m lies outside the shape"

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scene_envs.assets.base import Array
+from scene_envs.arrays import Array
 
 Color = tuple[int, int, int]
 Kind = Literal["mesh", "box", "cylinder", "sphere", "capsule", "ellipsoid"]

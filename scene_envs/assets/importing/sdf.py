@@ -8,7 +8,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scene_envs.assets.base import Array
+from scene_envs.arrays import Array
 from scene_envs.assets.importing.model import Inertial, Model, Shape, from_roll_pitch_yaw, moved_inertial, pose_of
 from scene_envs.assets.importing.xml_files import color_of, find_mesh, numbers, positive, read_xml
 from scene_envs.errors import CorruptFileError, InvalidInputError

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from scene_envs.assets.base import Array, ConvexPart
+from scene_envs.arrays import Array
+from scene_envs.assets.base import ConvexPart
 from scene_envs.assets.importing.decomposition import Method, convex_parts
 from scene_envs.assets.importing.mesh_files import bare, painted, read_mesh
 from scene_envs.assets.importing.model import Color, Shape

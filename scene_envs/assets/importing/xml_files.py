@@ -10,7 +10,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from scene_envs.assets.base import Array
+from scene_envs.arrays import Array
 from scene_envs.assets.importing.limits import check_file
 from scene_envs.assets.importing.model import Color
 from scene_envs.errors import CorruptFileError, InvalidInputError

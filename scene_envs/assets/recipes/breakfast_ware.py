@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import trimesh
 
-from scene_envs.assets.base import Array
+from scene_envs.arrays import Array
 from scene_envs.assets.recipe import Model, asset_recipe
 from scene_envs.assets.recipes.painted import Cells, revolve
 from scene_envs.assets.shapes import hull_of, ring, rods, solid

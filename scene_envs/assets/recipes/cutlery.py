@@ -8,7 +8,8 @@ from itertools import pairwise
 import numpy as np
 import trimesh
 
-from scene_envs.assets.base import Array, ConvexPart
+from scene_envs.arrays import Array
+from scene_envs.assets.base import ConvexPart
 from scene_envs.assets.panels import loft
 from scene_envs.assets.recipe import Model, asset_recipe
 from scene_envs.assets.shapes import circle, convex_hull, hull_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from scene_envs.assets.base import Array
+from scene_envs.arrays import Array
 from scene_envs.assets.recipe import Model, asset_recipe
 from scene_envs.assets.recipes.painted import loft, sheet
 from scene_envs.assets.shapes import box, circle, convex_hull

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from scene_envs.assets.base import Array
+from scene_envs.arrays import Array
 from scene_envs.assets.shapes import Profile, circle
 from scene_envs.assets.surfaces import Color, arc, fan, join, quad_faces, surface
 

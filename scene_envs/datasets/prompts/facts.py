@@ -8,14 +8,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scene_envs.arrays import Array, Index, Mask
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 from scene_envs.supports import CONTACT, LARGEST_CONTACT, Contacts, Holding, Placed
-
-Array = NDArray[np.float64]
 
 SIDES = ("left", "right", "front", "back")
 """Directions of the viewer. Front is toward the viewer, or toward the lower edge of a view from above."""
@@ -82,11 +80,11 @@ class SceneFacts:
     """
 
     names: tuple[str, ...]
-    slots: NDArray[np.int64]
+    slots: Index
     positions: Array
     boxes: Array
-    fixed: NDArray[np.bool_]
-    tiers: NDArray[np.int64]
+    fixed: Mask
+    tiers: Index
     held: Holding
     tolerances: Tolerances = NOMINAL
 
@@ -101,11 +99,11 @@ class SceneFacts:
         return Counter(self.names)
 
     @cached_property
-    def _of_name(self) -> dict[str, NDArray[np.int64]]:
+    def _of_name(self) -> dict[str, Index]:
         names = np.array(self.names)
         return {name: np.flatnonzero(names == name) for name in self.objects}
 
-    def named(self, name: str) -> NDArray[np.int64]:
+    def named(self, name: str) -> Index:
         """Indices of the objects called ``name``."""
         return self._of_name.get(name, np.empty(0, dtype=np.int64))
 

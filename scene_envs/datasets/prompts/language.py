@@ -13,6 +13,7 @@ from scene_envs.datasets.prompts.claims import (
     Place,
     PlaceCount,
     Reference,
+    Side,
     SideClaim,
     SupportCount,
 )
@@ -26,7 +27,7 @@ NUMBERS = (
 # fmt: on
 """Numbers in words; larger ones are written in digits."""
 ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth")
-SIDE_PHRASES = {
+SIDE_PHRASES: dict[Side, str] = {
     "left": "to the left of",
     "right": "to the right of",
     "front": "in front of",

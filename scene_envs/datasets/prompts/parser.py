@@ -15,22 +15,15 @@ from scene_envs.datasets.prompts.claims import (
     PlaceCount,
     PromptFacts,
     Reference,
-    Side,
     SideClaim,
     SupportCount,
 )
 from scene_envs.datasets.prompts.facts import SIDES
-from scene_envs.datasets.prompts.language import NUMBERS, ORDINALS, Nouns, place_word
+from scene_envs.datasets.prompts.language import NUMBERS, ORDINALS, SIDE_PHRASES, Nouns, place_word
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene_types import SceneType, get_scene_type
 
-_SIDES: dict[str, Side] = {
-    "to the left of": "left",
-    "to the right of": "right",
-    "in front of": "front",
-    "behind": "back",
-    "next to": "next",
-}
+_SIDES = {phrase: side for side, phrase in SIDE_PHRASES.items()}
 _INSIDE = {"on top of": False, "in": True}
 _ENDS = ("top", "bottom")
 _COUNTS = {"a": 1, "an": 1, **{word: number for number, word in enumerate(NUMBERS)}}
@@ -62,9 +55,7 @@ class _Words:
         self.plural = {plural.lower(): name for name, plural in nouns.plural.items()}
 
 
-@lru_cache(maxsize=32)
-def _words(scene_type: SceneType) -> _Words:
-    return _Words(scene_type)
+_words = lru_cache(maxsize=32)(_Words)
 
 
 class _Reader:
