@@ -109,6 +109,7 @@ def run_together(prior: Any, keys: Sequence[dict[str, Any]]) -> list[dict[str, A
             **each,
             "curve": [env.problem.scale * value for value in plan.curve],
             "objective_found": plan.best_state.objective,
+            "maximum": env.problem.scale,
             "seconds_per_scene": seconds,
             "together": len(keys),
             "best": env.scene(plan.best_state),
@@ -150,8 +151,8 @@ def compare(options: argparse.Namespace) -> None:
         for at in options.at:
             values = [run["curve"][min(at, len(run["curve"])) - 1] for run in runs]
             cells.append(f"{statistics.median(values):g} ({min(values):g} to {max(values):g})")
-        ended = sorted(len(run["curve"]) for run in runs if len(run["curve"]) < run["scenes"])
-        cells.append(f"{', '.join(map(str, ended))}" if ended else "")
+        full = sorted(run["curve"].index(run["maximum"]) + 1 for run in runs if run.get("maximum") in run["curve"])
+        cells.append(", ".join(map(str, full)))
         seconds = statistics.median(run["seconds_per_scene"] for run in runs)
         table.add_row(planner, str(len(runs)), *cells, f"{seconds:.3f}")
     CONSOLE.print(table)

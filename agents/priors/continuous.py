@@ -214,6 +214,8 @@ class ContinuousPrior(ScenePrior):
                 if hook is not None and again == rounds - 1:
                     reverse = hook(step, x, reverse)
                 x = reverse.from_noise(draw_noise(x0, generators))
+        closed = self.closed_categories(batch, mask)[:, None].expand(*x.shape[:2], -1)
+        x = x.masked_fill(torch.nn.functional.pad(closed, (self.pose_width, 0)), torch.finfo(x.dtype).min)
         return torch.where(keep, x0, x)
 
     def noised_loss(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:

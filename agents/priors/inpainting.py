@@ -116,6 +116,20 @@ class Inpainting(ABC):
     def encode(self, batch: SceneBatch) -> Tensor:
         """Normalised x_0 (B, N, D) of scenes."""
 
+    def closed_categories(self, batch: SceneBatch, mask: Tensor) -> Tensor:
+        """(B, K) bool: categories that the slots under ``mask`` (B, N, 2) do not take.
+
+        These are the welded assets, in scenes that keep generated furniture and regenerate none. No mask generator
+        masks furniture, so every further inpainting of empty slots would add some.
+        """
+        furniture = batch.is_welded
+        furniture[:, : len(self.scene_type.fixed)] = False
+        changed = mask[..., 1]
+        keeps = (furniture & ~changed).any(dim=1) & ~(furniture & changed).any(dim=1)
+        welded = torch.zeros(self.scene_type.num_assets + 1, dtype=torch.bool, device=mask.device)
+        welded[list(self.scene_type.welded_categories)] = True
+        return keeps[:, None] & welded
+
     def observe(self, batch: SceneBatch, mask: Tensor) -> ObservedScenes:
         """Scenes that are regenerated where ``mask`` (B, N), or (B, N, 2) for pose and category, is True.
 
@@ -144,6 +158,9 @@ class Inpainting(ABC):
         guide: Guide | None = None,
     ) -> SceneBatch:
         """Regenerate what is masked, given the rest.
+
+        A room keeps its furniture: where generated welded objects are kept and none is masked, masked slots take no
+        welded asset.
 
         Args:
             batch: scenes to change.

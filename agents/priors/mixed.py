@@ -148,6 +148,7 @@ class MixedPrior(TrainableMixedPrior):
         guidance: float = 0.0,
         free: Text | None = None,
         eta: float = 1.0,
+        closed: Tensor | None = None,
     ) -> MixedStep:
         """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters.
 
@@ -162,6 +163,7 @@ class MixedPrior(TrainableMixedPrior):
             guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional, on poses and logits.
             free: what stands for no prompt, as :meth:`unconditional` gives it; encoded anew when None.
             eta: noise of the pose, 1 for the ancestral step and 0 for a certain one; categories are drawn all the same.
+            closed: (B, K) bool, further categories with probability 0 in slots that are not observed.
         """
         t, previous = int(table.timesteps[step]), int(table.previous[step])
         self.process.check_stride(t, previous)
@@ -180,7 +182,7 @@ class MixedPrior(TrainableMixedPrior):
         mean, std = self.process.posterior(x_t[..., :POSE_FEATURES], pose, t, previous, residual, eta)
         states = x_t[..., POSE_FEATURES:]
         state = state_of(states)
-        logits = logits.masked_fill(self.barred_categories(state), -torch.inf)
+        logits = logits.masked_fill(self.barred_categories(state, closed), -torch.inf)
         probs = self.categories.posterior(state, logits.softmax(dim=-1), t, previous)
         slots, fixed = x_t.shape[1], len(self.scene_type.fixed)
         random = torch.full((slots,), previous > 0, device=x_t.device)
@@ -223,13 +225,16 @@ class MixedPrior(TrainableMixedPrior):
         probs = self.categories.prior().to(noise).expand(*noise.shape[:2], -1)
         x = self.clamp(self.with_states(noise[..., :POSE_FEATURES], probs, noise))
         first, x = (0, x) if start is None else (start[0], start[1].to(x))
-        return self.run_chain(x, table, generators, observed, text, guidance, resample, hook=hook, first=first)
+        closed = self.closed_categories(batch, mask)
+        return self.run_chain(
+            x, table, generators, observed, text, guidance, resample, hook=hook, first=first, closed=closed
+        )
 
     @torch.no_grad()
     def run_chain(
         self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None,
         observed: Observed | None = None, text: Text | None = None, guidance: float = 0.0, resample: int = 1,
-        eta: float = 1.0, hook: Hook | None = None, first: int = 0,
+        eta: float = 1.0, hook: Hook | None = None, first: int = 0, closed: Tensor | None = None,
     ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D) from x_T, with observed entries kept.
 
@@ -238,7 +243,7 @@ class MixedPrior(TrainableMixedPrior):
             table: the chain.
             noises: one generator for all scenes, or one per scene; None for torch's own.
             observed: entries that carry no noise.
-            text, guidance, eta: as in :meth:`transition`.
+            text, guidance, eta, closed: as in :meth:`transition`.
             resample: how often each step is taken, going back in between.
             hook: called at the last taking of every step.
             first: step that the chain begins at.
@@ -253,7 +258,7 @@ class MixedPrior(TrainableMixedPrior):
                     x = self._renoise(x, after, level, draw_noise(x, noises))
                     x = x if observed is None else observed.write(x)
                 reverse: ReverseStep = self.transition(
-                    x, step, table, observed=observed, text=text, guidance=guidance, free=free, eta=eta
+                    x, step, table, observed=observed, text=text, guidance=guidance, free=free, eta=eta, closed=closed
                 )
                 if hook is not None and again == rounds - 1:
                     reverse = hook(step, x, reverse)

@@ -90,15 +90,17 @@ class MixedStates(PromptReader, ScenePrior):
         random = torch.ones(pose.shape[1], dtype=torch.bool, device=pose.device)
         return MixedStep(pose, torch.zeros_like(pose[0]), probs, random).from_noise(noise)
 
-    def barred_categories(self, state: Tensor) -> Tensor:
+    def barred_categories(self, state: Tensor, closed: Tensor | None = None) -> Tensor:
         """(B, N, K) bool: categories of x_0 with probability 0, given states (B, N) of x_t.
 
-        These are the categories of fixed objects, in all slots but theirs. A slot that holds one as an observed entry
-        keeps it where the chain only absorbs. With ``union="one_type"`` they are also the assets that no member has
+        These are the categories of fixed objects, in all slots but theirs, and ``closed`` (B, K). A slot that holds one
+        as an observed entry keeps it where the chain only absorbs. With ``union="one_type"`` they are also the assets that no member has
         beside what the scene holds already.
         """
         barred = torch.zeros(*state.shape, self.num_categories, dtype=torch.bool, device=state.device)
         barred[:, len(self.scene_type.fixed) :, list(self.scene_type.fixed_categories)] = True
+        if closed is not None:
+            barred |= closed[:, None]
         if self.categories.only_absorbs:
             held = F.one_hot(state, self.num_categories + 1)[..., :-1] > 0
             if self._separates_members:
