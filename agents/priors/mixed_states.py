@@ -94,8 +94,8 @@ class MixedStates(PromptReader, ScenePrior):
         """(B, N, K) bool: categories of x_0 with probability 0, given states (B, N) of x_t.
 
         These are the categories of fixed objects, in all slots but theirs, and ``closed`` (B, K). A slot that holds one
-        as an observed entry keeps it where the chain only absorbs. With ``union="one_type"`` they are also the assets that no member has
-        beside what the scene holds already.
+        as an observed entry keeps it where the chain only absorbs. With ``union="one_type"`` they are also the assets
+        that no member has beside what the scene holds already.
         """
         barred = torch.zeros(*state.shape, self.num_categories, dtype=torch.bool, device=state.device)
         barred[:, len(self.scene_type.fixed) :, list(self.scene_type.fixed_categories)] = True
