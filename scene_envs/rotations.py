@@ -25,7 +25,7 @@ def project_to_so3(matrices: Tensor) -> Tensor:
             [0., 1., 0.],
             [0., 0., 1.]])
     """
-    nearest: Tensor = roma.special_procrustes(matrices.double())
+    nearest: Tensor = roma.special_procrustes(matrices.double(), method="svd")
     return nearest.to(matrices.dtype)
 
 
