@@ -73,7 +73,8 @@ def draw(found: Sequence[Point], output: Path) -> None:
             axes.scatter(accuracies, rewards, color=colour, marker=shape, s=45, label=label, zorder=3)
             for point in own:
                 place = (100 * point.accuracy, point.reward)
-                axes.annotate(point.value, place, xytext=(5, 4), textcoords="offset points", fontsize=8, color=colour)
+                below = (5, -11) if setting == "kl" else (5, 4)
+                axes.annotate(point.value, place, xytext=below, textcoords="offset points", fontsize=8, color=colour)
     for point in found:
         if not point.algorithm:
             axes.scatter(
