@@ -77,8 +77,11 @@ class ForwardProcess(OwnSampleAlgorithm):
         return TensorDict({"advantage": poses, "category_advantage": categories}, [len(reward)])
 
     def _object_advantages(self, rollout: Rollout, reward: Tensor, valid: Tensor) -> Tensor:
-        """(B, N); slots that are empty have no advantage, nor have those whose siblings hold something else."""
-        valid = valid & ~rollout.batch.is_empty.to(valid.device)
+        """(B, N); empty and welded slots have no advantage, nor have those whose siblings hold something else.
+
+        Rewards judge free objects. A table has credit 0, and would be repelled like an object that is not feasible.
+        """
+        valid = valid & rollout.batch.is_free.to(valid.device)
         siblings = self.settings.siblings
         if siblings == 1:
             return compute_advantages(reward, valid, clip=math.inf, groups=rollout_groups(rollout))

@@ -221,7 +221,8 @@ def no_credit_per_object() -> InvalidInputError:
 def credited_reward(rollout: Rollout, credit: str) -> tuple[Tensor, Tensor]:
     """Rewards and their validity, (B,) for credit ``"scene"`` and (B, N) for ``"object"``; ``"auto"`` is one of them.
 
-    Welded slots have no credit, nor have the empty slots of a reward that is a mean over the objects.
+    Fixed slots have no credit. A reward that is a mean over the objects averages the free ones, so there generated
+    welded objects and empty slots have none either.
 
     Raises:
         InvalidInputError: credit per object is asked of a reward that has no ``per_object``.
@@ -231,9 +232,9 @@ def credited_reward(rollout: Rollout, credit: str) -> tuple[Tensor, Tensor]:
     if rollout.per_object is None:
         raise no_credit_per_object()
     free = torch.ones(rollout.per_object.shape, dtype=torch.bool, device=rollout.per_object.device)
-    free[:, : len(rollout.batch.scene_type.fixed)] = False  # welded slots are not drawn
+    free[:, : len(rollout.batch.scene_type.fixed)] = False  # they are not drawn
     if rollout.averages:
-        free &= ~rollout.batch.is_empty.to(free.device)
+        free &= rollout.batch.is_free.to(free.device)
     if rollout.observed is not None:
         free &= ~rollout.observed.all(dim=-1)  # nor is what is observed
     return rollout.per_object.float(), free & rollout.valid.unsqueeze(-1)

@@ -1,4 +1,4 @@
-"""Credit per object of empty slots, under a sum and under a mean."""
+"""Credit per object of empty and of welded slots."""
 
 from __future__ import annotations
 
@@ -51,3 +51,22 @@ def test_an_empty_slot_has_credit_under_a_sum_alone(tmp_path: Path, averages: bo
         assert float(advantage.sum()) == pytest.approx(0.0, abs=1e-4)
     good = ~empty & (credit > 0)
     assert bool((advantage[good] > 0).all())
+
+
+@pytest.mark.parametrize(("algorithm", "averages"), [("ddpo_sf", True), ("nft", True), ("nft", False)])
+def test_generated_furniture_is_not_treated_as_infeasible(tmp_path: Path, algorithm: str, averages: bool) -> None:
+    prior = tiny_prior("restaurant_low_clutter", process="mixed", seed=3)
+    config = small_config(tmp_path, reward=LeftHalf(averages), batch_size=12, algorithm={"name": algorithm})
+    learner = Learner(config, prior)
+    try:
+        rollout = learner.rollout(0)
+        advantage = learner.algorithm.advantage(rollout)
+    finally:
+        learner.close()
+    poses = advantage["advantage"] if algorithm == "nft" else advantage
+    furniture, free = rollout.batch.is_welded, rollout.batch.is_free
+    furniture[:, : len(rollout.batch.scene_type.fixed)] = False
+    assert furniture.any()
+    assert not poses[furniture].any()
+    assert bool((poses[free & (rollout.per_object > 0)] > 0).all())
+    assert bool((poses[free & (rollout.per_object == 0)] < 0).all())
