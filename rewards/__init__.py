@@ -15,6 +15,7 @@ from rewards.evaluation import evaluate_reward
 from rewards.feasible_objects import FeasibleObjects
 from rewards.feasible_share import FeasibleShare
 from rewards.isolation import IsolatedReward
+from rewards.learned import LearnedReward, learned_parts
 from rewards.local_files import allow_local_rewards
 from rewards.normalised import Normalised
 from rewards.object_count import ObjectCount
@@ -46,6 +47,7 @@ __all__ = [
     "FeasibleShare",
     "Gate",
     "IsolatedReward",
+    "LearnedReward",
     "Normalised",
     "ObjectCount",
     "Penetration",
@@ -66,6 +68,7 @@ __all__ = [
     "check_reward",
     "depends_on_batch",
     "evaluate_reward",
+    "learned_parts",
     "list_rewards",
     "make_reward",
     "register_reward",

@@ -201,7 +201,7 @@ def is_foreign(reward: Any) -> bool:
     if is_local(reward):
         return True
     module = registered_module(reward) or plugin_module(reward)
-    if module is None or module == "__main__" or module.split(".")[0] in ("rewards", "scene_envs"):
+    if module is None or module == "__main__" or module.split(".")[0] in ("rewards", "scene_envs", "agents"):
         return False
     return plugin_module(reward) is not None  # registered by a module that was imported here alone: only here
 

@@ -190,7 +190,7 @@ def is_own(reward: Any) -> bool:
     """
     code = reward.function if isinstance(reward, FunctionReward) else reward
     module = getattr(code, "__module__", None) or type(code).__module__
-    return _within(str(module), {"rewards"})
+    return _within(str(module), {"rewards", "agents"})
 
 
 # -- looking up --------------------------------------------------------------------------------------

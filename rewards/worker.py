@@ -19,11 +19,12 @@ import torch
 
 from rewards.base import RewardContext, averages_objects, declared_maximum, depends_on_batch
 from rewards.evaluation import describe_error, evaluate_reward
+from rewards.learned import learned_parts
 from rewards.local_files import allow_local_rewards
-from rewards.registry import RewardInfo, allow_reward_targets, resolve_reward, reward_info
+from rewards.registry import RewardInfo, allow_reward_targets, resolve_reward, reward_info, reward_name
 from rewards.reward_process import packed
 from rewards.seeding import other_draw, seeded_generators
-from scene_envs.errors import SceneEnvsError
+from scene_envs.errors import InvalidInputError, SceneEnvsError
 from scene_envs.physics import PhysicsPool
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type, register_scene_type
@@ -85,6 +86,11 @@ class _Answers:
             allow_local_rewards(file)
         with seeded_generators(seed):
             self.reward = resolve_reward(reward)
+        for part in learned_parts(self.reward):
+            raise InvalidInputError(
+                f"reward {reward_name(part)!r} learns in the process of a run, but {reward_name(self.reward)!r} has "
+                "parts of other packages and runs in a process of its own; combine it with this package's rewards alone"
+            )
         self.pool = PhysicsPool(workers=workers) if workers else None
         return depends_on_batch(self.reward), averages_objects(self.reward)
 

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
 
-from agents.evaluation.scene_tokens import (
-    NEIGHBOUR_FEATURES,
-    WAVE_FEATURES,
-    SceneTokens,
-    blurred,
-    scene_tokens,
-)
-from agents.evaluation.set_network import SetNetwork, SetNetworkConfig
+from agents.evaluation.scene_tokens import SceneTokens, blurred, scene_tokens
+from agents.evaluation.set_network import SetNetwork
 from agents.evaluation.two_sample_test import (
     FEWEST,
     Accuracy,
@@ -24,8 +18,9 @@ from agents.evaluation.two_sample_test import (
     check_classes,
     two_sample_accuracy,
 )
+from agents.evaluation.typical_places import TypicalPlaces
 from scene_envs.errors import InvalidInputError
-from scene_envs.scene import POSE_FEATURES, SceneBatch
+from scene_envs.scene import SceneBatch
 from scene_envs.scene_distance import check_same_assets
 
 RESOLUTION = (1e-3, 1e-2)
@@ -33,11 +28,6 @@ RESOLUTION = (1e-3, 1e-2)
 
 MOST_OBJECTS = 50_000
 """Objects to train on, both classes together: scenes of many objects need fewer scenes, and cost more each."""
-
-_PRIOR_COUNT = 4.0
-"""Weight of the variance over all groups in that of one group, in objects."""
-_CLIP = 8.0
-_LEAST_STD = 1e-4
 
 
 def classifier_accuracy(
@@ -85,15 +75,11 @@ def classifier_accuracy(
     width = real.scene_type.num_assets + 1
 
     def prepare(split: Split) -> tuple[nn.Module, Forward]:
-        typical = _Typical.of(tokens[split.train[split.train < len(real)]], width)
-        features, pair_features = 2 * POSE_FEATURES + WAVE_FEATURES, 2 * NEIGHBOUR_FEATURES
-        network = SetNetwork(SetNetworkConfig(features, width, outputs=1, pair_features=pair_features))
+        typical = TypicalPlaces.of(tokens[split.train[split.train < len(real)]], width)
+        network = SetNetwork(typical.network_config(outputs=1))
 
         def forward(module: nn.Module, rows: Tensor) -> Tensor:
-            part = tokens[rows]
-            own, pairs = typical.deviations(part)
-            own = torch.cat([own, part.waves], dim=-1)
-            logits: Tensor = module(own, part.categories, pairs, part.neighbours, part.present)
+            logits: Tensor = module(*typical.inputs(tokens[rows]))
             return logits[:, 0]
 
         return network, forward
@@ -107,56 +93,3 @@ def _affordable(config: ClassifierConfig, tokens: SceneTokens) -> ClassifierConf
     per_scene = float(tokens.present.sum()) / len(tokens)
     most = max(FEWEST, int(0.5 * MOST_OBJECTS / max(per_scene, 1.0)))
     return replace(config, most_train=min(config.most_train, most))
-
-
-@dataclass(frozen=True)
-class _Moments:
-    """Mean and standard deviation (G, F) of each of G groups."""
-
-    mean: Tensor
-    std: Tensor
-
-    @classmethod
-    def of(cls, values: Tensor, groups: Tensor, count: int) -> _Moments:
-        """From ``values`` (M, F) of ``groups`` (M,); rare groups lean on the variance within all of them."""
-        values = values.double()
-        size = torch.bincount(groups, minlength=count)[:, None].double()
-        mean = torch.zeros(count, values.shape[-1], dtype=torch.float64).index_add(0, groups, values)
-        mean = mean / size.clamp(min=1.0)
-        squares = torch.zeros_like(mean).index_add(0, groups, (values - mean[groups]) ** 2)
-        overall = squares.sum(dim=0) / size.sum().clamp(min=1.0)
-        variance = (squares + _PRIOR_COUNT * overall) / (size + _PRIOR_COUNT)
-        return cls(mean.float(), variance.sqrt().clamp(min=_LEAST_STD).float())
-
-    def deviations(self, values: Tensor, groups: Tensor) -> Tensor:
-        """(..., 2 F): values in standard deviations from the mean of their group, and log(1 + their squares)."""
-        scaled = (values - self.mean[groups]) / self.std[groups]
-        return torch.cat([scaled.clamp(-_CLIP, _CLIP), scaled.square().log1p()], dim=-1)
-
-
-@dataclass(frozen=True)
-class _Typical:
-    """Places of real objects: poses per asset, offsets to neighbours per pair of assets."""
-
-    poses: _Moments
-    offsets: _Moments
-    width: int
-
-    @classmethod
-    def of(cls, real: SceneTokens, width: int) -> _Typical:
-        """From real scenes of ``width`` categories, empty included."""
-        there = real.neighbours != width - 1
-        pairs = _pairs(real, width)[there]
-        poses = _Moments.of(real.poses[real.present], real.categories[real.present], width)
-        return cls(poses, _Moments.of(real.offsets[there], pairs, width * width), width)
-
-    def deviations(self, tokens: SceneTokens) -> tuple[Tensor, Tensor]:
-        """Deviations of the poses (B, N, 24) and of the offsets (B, N, K, 14)."""
-        there = (tokens.neighbours != self.width - 1)[..., None]
-        pairs = self.offsets.deviations(tokens.offsets, _pairs(tokens, self.width)) * there
-        return self.poses.deviations(tokens.poses, tokens.categories), pairs
-
-
-def _pairs(tokens: SceneTokens, width: int) -> Tensor:
-    """(B, N, K) index of the ordered pair of assets."""
-    return tokens.categories[..., None] * width + tokens.neighbours

@@ -79,17 +79,11 @@ class _InducedBlock(nn.Module):
         return self.spread(tokens, summary)
 
 
-class SetNetwork(nn.Module):
-    """Objects of a scene to ``outputs`` numbers; permutation-invariant, and blind to padding.
+class _ObjectEncoder(nn.Module):
+    """Objects of a scene to one token each, which has read the others; blind to padding.
 
     Set Transformer (Lee et al. 2019) with induced attention. Each token has already looked at its nearest neighbours
-    through a small MLP over pairs, which is where overlap and distance show. Pooled by attention, mean, maximum
-    and a scaled sum.
-
-    >>> network = SetNetwork(SetNetworkConfig(features=5, categories=4, outputs=2)).eval()
-    >>> objects = torch.randn(2, 6, 5), torch.randint(4, (2, 6)), torch.randn(2, 6, 3, 7), torch.randint(4, (2, 6, 3))
-    >>> network(*objects, torch.ones(2, 6, dtype=torch.bool)).shape
-    torch.Size([2, 2])
+    through a small MLP over pairs, which is where overlap and distance show.
     """
 
     def __init__(self, config: SetNetworkConfig) -> None:
@@ -103,6 +97,65 @@ class SetNetwork(nn.Module):
         self.pair_other = nn.Embedding(config.categories, hidden)
         self.enter = nn.Sequential(nn.Linear(3 * hidden, 2 * hidden), nn.GELU(), nn.Linear(2 * hidden, hidden))
         self.blocks = nn.ModuleList(_InducedBlock(config) for _ in range(config.blocks))
+
+    def _reset_embeddings(self) -> None:
+        for embedding in (self.category, self.pair_self, self.pair_other):
+            nn.init.normal_(embedding.weight, std=0.3)
+
+    def encode(
+        self, own: Tensor, categories: Tensor, offsets: Tensor, neighbours: Tensor, present: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Tokens (B, N, H), 0 for padding, and the mask (B, 1, 1, N) of attention to them; arguments as in forward."""
+        there = present[..., None].to(own.dtype)
+        pairs = self.pair(offsets) + self.pair_other(neighbours) + self.pair_self(categories)[:, :, None]
+        pairs = F.gelu(pairs)
+        around = torch.cat([pairs.mean(dim=2), pairs.amax(dim=2)], dim=-1)
+        tokens = self.enter(torch.cat([F.gelu(self.own(own) + self.category(categories)), around], dim=-1))
+        somewhere = present.any(dim=-1, keepdim=True)
+        mask = (present | ~somewhere)[:, None, None]  # a scene without objects attends to padding, which is zero
+        tokens = tokens * there
+        for block in self.blocks:
+            tokens = block(tokens, mask) * there
+        return tokens, mask
+
+
+class ObjectNetwork(_ObjectEncoder):
+    """Each object of a scene to one number, given its neighbours, and all objects where ``blocks`` is above 0.
+
+    ``outputs`` and ``dropout`` of the config are not read.
+
+    >>> network = ObjectNetwork(SetNetworkConfig(features=5, categories=4, outputs=1))
+    >>> objects = torch.randn(2, 6, 5), torch.randint(4, (2, 6)), torch.randn(2, 6, 3, 7), torch.randint(4, (2, 6, 3))
+    >>> network(*objects, torch.ones(2, 6, dtype=torch.bool)).shape
+    torch.Size([2, 6])
+    """
+
+    def __init__(self, config: SetNetworkConfig) -> None:
+        super().__init__(config)
+        self.leave = nn.Sequential(nn.LayerNorm(config.hidden), nn.Linear(config.hidden, 1))
+        self._reset_embeddings()
+
+    def forward(self, own: Tensor, categories: Tensor, offsets: Tensor, neighbours: Tensor, present: Tensor) -> Tensor:
+        """(B, N) logits; arguments as for :class:`SetNetwork`."""
+        tokens, _ = self.encode(own, categories, offsets, neighbours, present)
+        logits: Tensor = self.leave(tokens)
+        return logits[..., 0]
+
+
+class SetNetwork(_ObjectEncoder):
+    """Objects of a scene to ``outputs`` numbers; permutation-invariant, and blind to padding.
+
+    The tokens of the objects are pooled by attention, mean, maximum and a scaled sum.
+
+    >>> network = SetNetwork(SetNetworkConfig(features=5, categories=4, outputs=2)).eval()
+    >>> objects = torch.randn(2, 6, 5), torch.randint(4, (2, 6)), torch.randn(2, 6, 3, 7), torch.randint(4, (2, 6, 3))
+    >>> network(*objects, torch.ones(2, 6, dtype=torch.bool)).shape
+    torch.Size([2, 2])
+    """
+
+    def __init__(self, config: SetNetworkConfig) -> None:
+        super().__init__(config)
+        hidden = config.hidden
         self.seed = nn.Parameter(0.5 * torch.randn(1, 1, hidden))
         self.pool = _Attention(hidden, config.heads)
         self.norm = nn.LayerNorm(4 * hidden)
@@ -112,8 +165,7 @@ class SetNetwork(nn.Module):
             nn.GELU(),
             nn.Linear(2 * hidden, config.outputs),
         )
-        for embedding in (self.category, self.pair_self, self.pair_other):
-            nn.init.normal_(embedding.weight, std=0.3)
+        self._reset_embeddings()
 
     def forward(self, own: Tensor, categories: Tensor, offsets: Tensor, neighbours: Tensor, present: Tensor) -> Tensor:
         """Outputs per scene: logits, or features.
@@ -128,16 +180,9 @@ class SetNetwork(nn.Module):
         Returns:
             (B, ``outputs``).
         """
-        there = present[..., None].to(own.dtype)
-        pairs = self.pair(offsets) + self.pair_other(neighbours) + self.pair_self(categories)[:, :, None]
-        pairs = F.gelu(pairs)
-        around = torch.cat([pairs.mean(dim=2), pairs.amax(dim=2)], dim=-1)
-        tokens = self.enter(torch.cat([F.gelu(self.own(own) + self.category(categories)), around], dim=-1))
+        tokens, mask = self.encode(own, categories, offsets, neighbours, present)
         somewhere = present.any(dim=-1, keepdim=True)
-        mask = (present | ~somewhere)[:, None, None]  # a scene without objects attends to padding, which is zero
-        tokens = tokens * there
-        for block in self.blocks:
-            tokens = block(tokens, mask) * there
+        there = present[..., None].to(own.dtype)
         pooled = self.pool(self.seed.expand(tokens.shape[0], -1, -1), tokens, mask)[:, 0]
         total = tokens.sum(dim=1)
         count = there.sum(dim=1).clamp(min=1.0)

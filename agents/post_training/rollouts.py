@@ -34,6 +34,7 @@ STREAMS = (
     "base",
     "base_prompts",
     "base_samples",
+    "discriminator",
 )
 
 

@@ -192,6 +192,7 @@ class PostTrainer:
         self.scenes = bank if replay is None else bank.with_replay(replay, config.regularisation.replay_share)
         self.learner.deal_prompts(self.scenes)
         self.learner.deal_parts(batch[: len(self.scenes.train)], prompts)
+        self.learner.begin_rewards(batch[: len(self.scenes.train)], first=not reuse_scenes)
         if not reuse_scenes:
             check_it_can_learn(self.learner, batch, prompts)
         base = self.learner.regularisation.base
@@ -209,6 +210,7 @@ class PostTrainer:
             row |= self._learn(rollout)
         else:
             self._count_invalid()
+        self.learner.teach_rewards(rollout)
         self.iteration += 1
         return rollout, row
 

@@ -106,12 +106,16 @@ def _prompts() -> tuple[Row, ...]:
 
 
 def _realism() -> tuple[Row, ...]:
-    """An online discriminator as reward, alone and gated with feasibility."""
-    gated = "reward={name: gate, reward: realism, condition: feasible_share, threshold: 0.8, otherwise: -5.0}"
+    """A discriminator that learns online as reward, alone and gated with feasibility, and the likelihood as reward."""
+    gated = "reward={name: gate, reward: discriminator, condition: feasible_share, threshold: 0.7}"
     return tuple(
         Row(f"{prior}-{label}-0", prior, (f"algorithm={FORWARD}", reward, "seed=0"), 100)
         for prior in ("breakfast_table_high_clutter", "restaurant_low_clutter")
-        for label, reward in (("realism", "reward=realism"), ("gated", gated))
+        for label, reward in (
+            ("discriminator", "reward=discriminator"),
+            ("gated", gated),
+            ("realism", "reward=realism"),
+        )
     )
 
 
