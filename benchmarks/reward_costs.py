@@ -17,7 +17,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from rewards import RewardContext, evaluate_reward, list_rewards, resolve_reward
+from rewards import RewardContext, evaluate_reward, learned_parts, list_rewards, resolve_reward
 from rewards.verdicts import forget_verdicts
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch
@@ -45,6 +45,8 @@ def seconds(reward: Any, batch: SceneBatch) -> float:
     prompt = PROMPT if batch.scene_type.name == "dimsum_table" else SHELF_PROMPT
     context = RewardContext(prompts=(prompt,) * len(batch))
     resolved = resolve_reward(reward)
+    for part in learned_parts(resolved):
+        part.begin(batch, seed=0)
     evaluate_reward(resolved, batch, context, strict=True)
     forget_verdicts()
     start = time.process_time()

@@ -69,7 +69,7 @@ class Discriminator:
         """Mean over the free objects; ``per_object`` (B, N) is the probability of each. Term: ``free_objects``."""
         free = batch.is_free
         if self._model is None:
-            if not self._warned:
+            if not self._warned and bool(free.any()):
                 logger.warning(
                     "discriminator has not seen any samples, so every object scores 0.5; "
                     "only post-train trains it, with reward=discriminator"

@@ -56,6 +56,13 @@ def test_value_is_the_mean_of_its_credit(trained: Discriminator) -> None:
     torch.testing.assert_close(output.value, expected)
 
 
+def test_a_network_without_samples_is_reported(caplog: pytest.LogCaptureFixture) -> None:
+    reward = Discriminator()
+    scenes = get_grammar("dimsum_table").sample(np.random.default_rng(3), 2)
+    assert reward(scenes, RewardContext()).value.tolist() == [0.5, 0.5]
+    assert "only post-train trains it" in caplog.text
+
+
 def test_the_contract_holds_before_and_after_learning(trained: Discriminator) -> None:
     check_reward(trained)
     check_reward("discriminator")
