@@ -122,13 +122,22 @@ class Inpainting(ABC):
         These are the welded assets, in scenes that keep generated furniture and regenerate none. No mask generator
         masks furniture, so every further inpainting of empty slots would add some.
         """
-        furniture = batch.is_welded
-        furniture[:, : len(self.scene_type.fixed)] = False
         changed = mask[..., 1]
-        keeps = (furniture & ~changed).any(dim=1) & ~(furniture & changed).any(dim=1)
-        welded = torch.zeros(self.scene_type.num_assets + 1, dtype=torch.bool, device=mask.device)
+        masked = self.closed_by_furniture(batch.categories, changed).any(dim=1)
+        return self.closed_by_furniture(batch.categories, ~changed) & ~masked[:, None]
+
+    def closed_by_furniture(self, categories: Tensor, slots: Tensor) -> Tensor:
+        """(B, K) bool: the welded assets, in scenes with generated furniture in ``slots``.
+
+        Args:
+            categories: (B, N) int64 index of each slot's asset.
+            slots: (B, N) bool.
+        """
+        welded = torch.zeros(self.scene_type.num_assets + 1, dtype=torch.bool, device=categories.device)
         welded[list(self.scene_type.welded_categories)] = True
-        return keeps[:, None] & welded
+        indices = torch.tensor(self.scene_type.welded_categories, device=categories.device, dtype=torch.long)
+        furniture = torch.isin(categories, indices) & slots
+        return furniture[:, len(self.scene_type.fixed) :].any(dim=1, keepdim=True) & welded
 
     def observe(self, batch: SceneBatch, mask: Tensor) -> ObservedScenes:
         """Scenes that are regenerated where ``mask`` (B, N), or (B, N, 2) for pose and category, is True.

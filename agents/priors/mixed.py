@@ -204,9 +204,13 @@ class MixedPrior(TrainableMixedPrior):
         self, x_t: Tensor, step: int, table: StepTableLike, observed: Tensor, *,
         text: Text | None = None, guidance: float = 0.0,
     ) -> MixedStep:  # fmt: skip
-        """p(x_{t-1} | x_t) of scenes whose observed entries are certain; see :class:`Inpainting`."""
+        """p(x_{t-1} | x_t) of scenes whose observed entries are certain; see :class:`Inpainting`.
+
+        A room that keeps generated furniture gets no more of it.
+        """
         entries = Observed(x_t, observed[..., 0], observed[..., 1])
-        reverse = self.transition(x_t, step, table, observed=entries, text=text, guidance=guidance)
+        closed = self.closed_by_furniture(state_of(x_t[..., POSE_FEATURES:]), observed[..., 1])
+        reverse = self.transition(x_t, step, table, observed=entries, text=text, guidance=guidance, closed=closed)
         return reverse.observing(entries.pose, entries.category, x_t)
 
     def write_observed(self, x: Tensor, x0: Tensor, observed: Tensor, level: int, noise: Noise | None = None) -> Tensor:
