@@ -50,7 +50,8 @@ class Guard:
     The best checkpoint has the largest reward among the checks within all limits. If the guard samples, the reward of a
     check is that of the samples, which start from the same noise at every check; checks of the loss alone then keep
     nothing. Otherwise the reward of a check is the mean over all batches since the previous check, because single
-    batches are too noisy.
+    batches are too noisy. A reward that learns gives values of another network at each check; then the reward of a
+    check is the share of errors of the classifier that is trained on the spot.
 
     Args:
         heldout: (K, N, D) normalised real scenes that the regularisation never sees.
@@ -60,6 +61,7 @@ class Guard:
         samples: how to sample and measure; None measures the loss alone.
         limits: most by which figures of samples may exceed those of the base prior, by name.
         target: largest ratio of a checkpoint that is kept, if the run holds the ratio.
+        learns: the reward learns during the run.
 
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior()
@@ -78,10 +80,12 @@ class Guard:
         samples: SampleCheck | None = None,
         limits: Mapping[str, float] | None = None,
         target: float = math.inf,
+        learns: bool = False,
     ) -> None:
         self.heldout = heldout
         self.prompts = prompts
         self.limit, self.target = limit, target
+        self.learns = learns
         self.seed = seed
         self.samples = samples
         self.limits = dict(limits or {})
@@ -96,7 +100,10 @@ class Guard:
         """Measure the base prior."""
         self.base_loss, self.base_figures = self._measure(base, sample=True)
         if self.base_figures:
-            self.best_reward = _number(self.base_figures["sample_reward"])
+            self.best_reward = _number(self._sample_reward(self.base_figures))
+
+    def _sample_reward(self, figures: Mapping[str, float]) -> float:
+        return 1.0 - figures["classifier_accuracy"] if self.learns else figures["sample_reward"]
 
     def _measure(self, prior: ScenePrior, sample: bool) -> tuple[float, dict[str, float]]:
         """The loss, and figures of samples where the guard samples; all processes get those of the first."""
@@ -147,7 +154,7 @@ class Guard:
         ratio = loss / self.base_loss
         over = [] if ratio <= self.limit else ["loss"]
         if figures:
-            reward = figures["sample_reward"]
+            reward = self._sample_reward(figures)
             over += beyond(figures, self.base_figures, self.limits)
         counts = self.samples is None or sample
         kept = counts and not over and ratio <= self.target and reward > self.best_reward  # False for NaN

@@ -38,7 +38,8 @@ def make_guard(config: PostTrainConfig, learner: Learner, scenes: SceneBank) -> 
     limits = config.guard.limits(config.algorithm.sample_limits)
     held = config.regularisation.target
     target = held.value if held is not None and held.figure == "guard" else math.inf
-    return Guard(scenes.heldout, config.guard.limit, stream_seed(config.seed, "guard"), asked, check, limits, target)
+    seed, learns = stream_seed(config.seed, "guard"), bool(learner.learned)
+    return Guard(scenes.heldout, config.guard.limit, seed, asked, check, limits, target, learns)
 
 
 class GuardFiles:

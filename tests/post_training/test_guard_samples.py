@@ -10,6 +10,7 @@ import torch
 from agents.evaluation.metrics import count_wasserstein
 from agents.post_training import post_train
 from agents.post_training.config import GuardSettings
+from agents.post_training.guard import Guard
 from agents.post_training.guard_report import guard_sections, guard_verdict
 from agents.post_training.sample_check import beyond
 from agents.post_training.trainer import PostTrainer
@@ -136,3 +137,19 @@ def test_the_guard_samples_no_more_than_it_compares_with() -> None:
     assert GuardSettings(scenes=64, samples=19).sampled == 0
     with pytest.raises(InvalidInputError, match="samples=-1"):
         GuardSettings(samples=-1)
+
+
+def test_a_reward_that_learns_is_judged_by_the_classifier(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reward's own mean falls while the samples become harder to tell from real scenes: the last one is kept."""
+    figures = [
+        {"sample_reward": reward, "count_distance": 0.0, "category_kl": 0.0, "classifier_accuracy": accuracy}
+        for reward, accuracy in ((0.4, 0.9), (0.5, 0.92), (0.3, 0.8))
+    ]
+    kept = {}
+    for learns in (True, False):
+        guard = Guard(tiny_prior().sample_tensor(2, num_steps=2), limit=1.1, seed=0, learns=learns)
+        each = iter(figures)
+        monkeypatch.setattr(guard, "_measure", lambda prior, sample, each=each: (1.0, next(each)))
+        guard.start(tiny_prior())
+        kept[learns] = [guard.check(tiny_prior(), iteration, reward=0.0).kept for iteration in (1, 2)]
+    assert kept == {True: [False, True], False: [True, False]}
