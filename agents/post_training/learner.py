@@ -16,11 +16,12 @@ from agents.post_training.base import Algorithm
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.gradients import gradient_norm
 from agents.post_training.inpaint_deck import InpaintDeck, Parts, real_parts, sampled_parts
+from agents.post_training.learned_rewards import FIRST_SAMPLES, LearnedRewards
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.processes import WholeBatchReward
 from agents.post_training.prompts import PromptDeck, PromptSets
 from agents.post_training.regularisation import Regularisation
-from agents.post_training.rollouts import Rollout, collect, gathered, stream_seed
+from agents.post_training.rollouts import Rollout, collect, stream_seed
 from agents.post_training.run_files import CHECKPOINT_NAME
 from agents.post_training.scene_bank import SceneBank
 from agents.priors.adapters import attach_adapter
@@ -29,18 +30,13 @@ from agents.priors.prompt_validation import no_text
 from agents.utils.checkpoints import check_tensors
 from agents.utils.process_group import ProcessGroup
 from agents.utils.weight_average import AveragedWeights, WeightAverage
-from rewards import averages_objects, depends_on_batch, learned_parts
+from rewards import averages_objects, depends_on_batch
 from rewards.isolation import close_reward, run_reward
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.envs.masks import resolve_mask
 from scene_envs.envs.scoring import RewardScorer
 from scene_envs.errors import InvalidInputError, RewardError
 from scene_envs.scene import SceneBatch
-
-_FIRST_SAMPLES = 128
-"""Samples of the base prior that a reward which learns sees before the first iteration."""
-_FIRST_STEPS = 150
-"""Its optimiser steps on these."""
 
 
 class NonFiniteGradient(Exception):
@@ -86,7 +82,7 @@ class Learner:
             memory=config.reward_memory,
             workers=0 if config.workers == "ray" else config.workers,
         )
-        self.learned = learned_parts(self.reward)
+        self.learned = LearnedRewards(self.reward, config)
         shared = self.processes.size > 1 and depends_on_batch(self.reward)
         self.env = DenoisingTorchRLEnv(
             config.batch_size // self.processes.size,
@@ -191,34 +187,10 @@ class Learner:
             real: real scenes that training may see.
             first: let them learn from samples of the prior as it is; False for a run whose state is restored.
         """
-        if not self.learned:
-            return
-        seed = stream_seed(self.config.seed, "discriminator")
-        for part in self.learned:
-            part.begin(real, seed)
-        if not first:
-            return
-        prompts = None if self.deck is None else self.deck.deal(_FIRST_SAMPLES, Generator().manual_seed(seed))
-        samples = self.processes.from_first(
-            lambda: self.prior.sample(
-                _FIRST_SAMPLES,
-                prompt=prompts,
-                guidance=self.config.guidance if prompts else 0.0,
-                num_steps=self.config.num_steps,
-                slots=self.slots,
-                seed=seed,
-                batch_size=self.config.batch_size,
-            ).tensor.cpu()
-        )
-        for part in self.learned:
-            part.learn(SceneBatch(samples, real.scene_type), _FIRST_STEPS)
-
-    def teach_rewards(self, rollout: Rollout) -> None:
-        """Let the rewards that learn see the scenes of a batch, after these were scored."""
-        if self.learned:
-            scenes = gathered(rollout)[-1]
-            for part in self.learned:
-                part.learn(scenes)
+        self.learned.begin(real)
+        if self.learned and first:
+            prompts = None if self.deck is None else self.deck.deal(FIRST_SAMPLES, self._generator("discriminator", 0))
+            self.learned.learn_from_prior(self.prior, self.slots, prompts)
 
     def largest_reward(self) -> float | None:
         """The largest value that the reward declares for scenes of this run, None where it declares none."""
@@ -296,7 +268,7 @@ class Learner:
             "average_updates": 0 if self.average is None else self.average.updates,
             "algorithm": self.algorithm.state(),
             "regularisation": self.regularisation.state_dict(),
-            "learned_rewards": [part.state_dict() for part in self.learned],
+            "learned_rewards": self.learned.state(),
             "random": torch.get_rng_state(),
         }
 
@@ -314,8 +286,7 @@ class Learner:
             self.average.tensors, self.average.updates = state["average"], state["average_updates"]
         self.algorithm.restore(state["algorithm"])
         self.regularisation.load_state_dict(state.get("regularisation"))
-        for part, learned in zip(self.learned, state.get("learned_rewards", ()), strict=True):
-            part.load_state_dict(learned)
+        self.learned.restore(state.get("learned_rewards", ()))
         torch.set_rng_state(state["random"])
 
     def averaged(self) -> AveragedWeights[ScenePrior]:

@@ -210,7 +210,7 @@ class PostTrainer:
             row |= self._learn(rollout)
         else:
             self._count_invalid()
-        self.learner.teach_rewards(rollout)
+        self.learner.learned.learn(rollout)
         self.iteration += 1
         return rollout, row
 

@@ -10,7 +10,7 @@ import torch
 
 from agents import post_train
 from agents.evaluation.discriminator import Discriminator
-from agents.post_training import learner
+from agents.post_training import learned_rewards
 from agents.priors.testing import tiny_prior
 from rewards import allow_local_rewards, check_reward, learned_parts, resolve_reward
 from rewards.base import RewardContext
@@ -110,7 +110,7 @@ def test_the_parts_of_a_composite_that_learn_are_found() -> None:
 
 
 def test_a_resumed_run_equals_one_without_a_break(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(learner, "_FIRST_STEPS", 5)
+    monkeypatch.setattr(learned_rewards, "FIRST_STEPS", 5)
     reward = {"name": "clip", "reward": "discriminator", "high": 0.9}
     prior = tiny_prior(process="mixed")
     whole = post_train(small_config(tmp_path / "whole", reward=reward, iterations=4), prior=prior)

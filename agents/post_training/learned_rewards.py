@@ -1,0 +1,78 @@
+"""Rewards that learn during a run: their first lesson, those of every iteration, and their state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from agents.post_training.config import PostTrainConfig
+from agents.post_training.rollouts import Rollout, gathered, stream_seed
+from agents.priors.base import ScenePrior
+from agents.utils.process_group import ProcessGroup
+from rewards import learned_parts
+from scene_envs.scene import SceneBatch
+
+FIRST_SAMPLES = 128
+"""Samples of the base prior that a reward learns from before the first iteration."""
+FIRST_STEPS = 150
+"""Optimiser steps on these."""
+
+
+class LearnedRewards:
+    """The parts of a run's reward that learn; see :class:`rewards.LearnedReward`. All processes have the same.
+
+    Args:
+        reward: of the run, resolved.
+        config: of the run.
+    """
+
+    def __init__(self, reward: Any, config: PostTrainConfig) -> None:
+        self.parts = learned_parts(reward)
+        self._config = config
+        self._seed = stream_seed(config.seed, "discriminator")
+
+    def __bool__(self) -> bool:
+        return bool(self.parts)
+
+    def begin(self, real: SceneBatch) -> None:
+        """Give them the real scenes that training may see."""
+        for part in self.parts:
+            part.begin(real, self._seed)
+
+    def learn_from_prior(self, prior: ScenePrior, slots: int, prompts: Sequence[str] | None) -> None:
+        """Let them learn from samples of the base prior, before they score the first batch.
+
+        Args:
+            prior: the base prior.
+            slots: per sample.
+            prompts: one for each of the ``FIRST_SAMPLES``; None without prompts.
+        """
+        samples = ProcessGroup.current().from_first(
+            lambda: prior.sample(
+                FIRST_SAMPLES,
+                prompt=prompts,
+                guidance=self._config.guidance if prompts else 0.0,
+                num_steps=self._config.num_steps,
+                slots=slots,
+                seed=self._seed,
+                batch_size=self._config.batch_size,
+            ).tensor.cpu()
+        )
+        for part in self.parts:
+            part.learn(SceneBatch(samples, prior.scene_type), FIRST_STEPS)
+
+    def learn(self, rollout: Rollout) -> None:
+        """Let them learn from the scenes of a batch, which were scored before."""
+        if self.parts:
+            scenes = gathered(rollout)[-1]
+            for part in self.parts:
+                part.learn(scenes)
+
+    def state(self) -> list[dict[str, Any]]:
+        """For a checkpoint."""
+        return [part.state_dict() for part in self.parts]
+
+    def restore(self, states: Sequence[dict[str, Any]]) -> None:
+        """Inverse of :meth:`state`, after :meth:`begin`."""
+        for part, state in zip(self.parts, states, strict=True):
+            part.load_state_dict(state)
