@@ -49,8 +49,8 @@ class Discriminator:
     averages_objects: ClassVar[bool] = True
 
     def __init__(self, learning_rate: float = 1e-3, steps: int = 8, batch_size: int = 48, memory: int = 384) -> None:
-        if not learning_rate > 0:
-            raise InvalidInputError(f"discriminator: learning_rate={learning_rate} must be positive")
+        if isinstance(learning_rate, bool) or not isinstance(learning_rate, int | float) or not 0 < learning_rate < 1:
+            raise InvalidInputError(f"discriminator: learning_rate={learning_rate!r} must be a number between 0 and 1")
         for name, number in (("steps", steps), ("batch_size", batch_size), ("memory", memory)):
             if isinstance(number, bool) or not isinstance(number, int) or number < 1:
                 raise InvalidInputError(f"discriminator: {name}={number!r} must be a whole number of at least 1")
@@ -149,8 +149,8 @@ class _Model:
         loss = F.softplus(-real).mean() + F.softplus(fake).mean()  # -log of the probabilities of the right answers
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        self.optimizer.step()
+        if bool(torch.isfinite(nn.utils.clip_grad_norm_(self.network.parameters(), 1.0))):
+            self.optimizer.step()
 
     def _logits(self, scenes: Tensor, count: int, generator: Generator) -> Tensor:
         """Of the free objects of ``count`` scenes, drawn with replacement and blurred as for the classifier."""

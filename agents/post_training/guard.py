@@ -50,8 +50,8 @@ class Guard:
     The best checkpoint has the largest reward among the checks within all limits. If the guard samples, the reward of a
     check is that of the samples, which start from the same noise at every check; checks of the loss alone then keep
     nothing. Otherwise the reward of a check is the mean over all batches since the previous check, because single
-    batches are too noisy. A reward that learns gives values of another network at each check; then the reward of a
-    check is the share of errors of the classifier that is trained on the spot.
+    batches are too noisy. A reward that learns gives values of another network at each check; then the best checkpoint
+    is the one whose samples the classifier, trained at each check, tells from real scenes least often.
 
     Args:
         heldout: (K, N, D) normalised real scenes that the regularisation never sees.
@@ -93,17 +93,19 @@ class Guard:
         self.base_figures: dict[str, float] = {}
         self.last_samples: SceneBatch | None = None
         self.readings: list[GuardReading] = []
-        self.best_reward = float("-inf")
+        self.best_reward = self.best_score = float("-inf")
         self.best_iteration = 0
 
     def start(self, base: ScenePrior) -> None:
         """Measure the base prior."""
         self.base_loss, self.base_figures = self._measure(base, sample=True)
         if self.base_figures:
-            self.best_reward = _number(self._sample_reward(self.base_figures))
+            self.best_reward = _number(self.base_figures["sample_reward"])
+            self.best_score = self._score(self.best_reward, self.base_figures)
 
-    def _sample_reward(self, figures: Mapping[str, float]) -> float:
-        return 1.0 - figures["classifier_accuracy"] if self.learns else figures["sample_reward"]
+    def _score(self, reward: float, figures: Mapping[str, float]) -> float:
+        """By which checkpoints are compared; larger is better."""
+        return -figures["classifier_accuracy"] if self.learns and figures else reward
 
     def _measure(self, prior: ScenePrior, sample: bool) -> tuple[float, dict[str, float]]:
         """The loss, and figures of samples where the guard samples; all processes get those of the first."""
@@ -154,14 +156,15 @@ class Guard:
         ratio = loss / self.base_loss
         over = [] if ratio <= self.limit else ["loss"]
         if figures:
-            reward = self._sample_reward(figures)
+            reward = figures["sample_reward"]
             over += beyond(figures, self.base_figures, self.limits)
         counts = self.samples is None or sample
-        kept = counts and not over and ratio <= self.target and reward > self.best_reward  # False for NaN
+        score = self._score(reward, figures)
+        kept = counts and not over and ratio <= self.target and score > self.best_score  # False for NaN
         reading = GuardReading(iteration, loss, ratio, reward, realism or {}, kept, figures, tuple(over))
         self.readings.append(reading)
         if kept:
-            self.best_reward, self.best_iteration = reward, iteration
+            self.best_reward, self.best_score, self.best_iteration = reward, score, iteration
         return reading
 
     @property
@@ -200,6 +203,7 @@ class Guard:
             "base_samples": self.base_figures,
             "readings": [dict(vars(reading)) for reading in self.readings],
             "best_reward": self.best_reward,
+            "best_score": self.best_score,
             "best_iteration": self.best_iteration,
         }
 
@@ -208,6 +212,7 @@ class Guard:
         self.base_loss, self.base_figures = state["base_loss"], state["base_samples"]
         self.readings = [GuardReading(**reading) for reading in state["readings"]]
         self.best_reward, self.best_iteration = state["best_reward"], state["best_iteration"]
+        self.best_score = state.get("best_score", self.best_reward)
 
 
 def _number(value: float) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,8 +83,10 @@ def test_a_restored_state_goes_on_as_the_first_one() -> None:
     assert torch.equal(*scores)
 
 
-@pytest.mark.parametrize("settings", [{"steps": 0}, {"memory": 1.5}, {"batch_size": -1}, {"learning_rate": 0.0}])
-def test_wrong_settings_are_named(settings: dict[str, float]) -> None:
+@pytest.mark.parametrize(
+    "settings", [{"steps": 0}, {"memory": 1.5}, {"batch_size": -1}, {"learning_rate": 0.0}, {"learning_rate": "x"}]
+)
+def test_wrong_settings_are_named(settings: dict[str, Any]) -> None:
     with pytest.raises(InvalidInputError, match=next(iter(settings))):
         Discriminator(**settings)
 

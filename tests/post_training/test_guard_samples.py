@@ -58,7 +58,7 @@ def test_a_figure_beyond_its_limit_is_named_and_keeps_nothing(tmp_path: Path) ->
         for parameter in other.parameters():
             parameter.add_(0.3 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(0)))
     made.guard.base_figures["count_distance"] = -10.0  # whatever the samples are, they are further than that
-    made.guard.best_reward = float("-inf")
+    made.guard.best_reward = made.guard.best_score = float("-inf")
     reading = made.guard.check(other, 2, reward=1.0)
     assert "count_distance" in reading.beyond
     assert not reading.kept
