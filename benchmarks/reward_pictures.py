@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from agents.evaluation.discriminator import Discriminator
+from agents.post_training.discriminator import Discriminator
 from rewards import LearnedReward, RewardContext, RewardOutput, evaluate_reward, resolve_reward
 from scene_envs.grammars import get_grammar
 from scene_envs.render import gallery, render

@@ -1,7 +1,6 @@
 """Evaluation: measures of scenes against real scenes."""
 
 from agents.evaluation.classifier import classifier_accuracy
-from agents.evaluation.discriminator import Discriminator
 from agents.evaluation.frechet import frechet_scene_distance
 from agents.evaluation.inception import frechet_inception_distance
 from agents.evaluation.measure import evaluate, grammar_scenes, measure_samples
@@ -15,7 +14,6 @@ from agents.evaluation.two_sample_test import Accuracy, ClassifierConfig
 __all__ = [
     "Accuracy",
     "ClassifierConfig",
-    "Discriminator",
     "classifier_accuracy",
     "evaluate",
     "figure_table",

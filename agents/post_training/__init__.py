@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from agents.post_training.comparison_run import post_train_and_compare
     from agents.post_training.config import PostTrainConfig
     from agents.post_training.ddpo import DDPO
+    from agents.post_training.discriminator import Discriminator
     from agents.post_training.forward_losses import AWMLoss, NFTLoss, RewardWeightedLoss
     from agents.post_training.forward_process import ForwardProcess
     from agents.post_training.forward_process_loss import ForwardProcessLoss
@@ -33,6 +34,7 @@ __all__ = [
     "DDPOSFLoss",
     "DDPOSFSettings",
     "DenoisingPolicy",
+    "Discriminator",
     "ForwardProcess",
     "ForwardProcessLoss",
     "Guard",
