@@ -14,6 +14,7 @@ import pytest
 for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # parallel tests do not fight for cores
 os.environ.setdefault("MPLBACKEND", "Agg")
+os.environ.setdefault("RAY_worker_niceness", "0")  # at 15, Ray's default, its workers wait for the other tests
 _TESTS, _MEMORY = Path(__file__).parent / "tests", "/dev/shm"
 if "TMPDIR" not in os.environ and os.path.isdir(_MEMORY) and shutil.disk_usage(_MEMORY).free > 4 * 2**30:
     os.environ["TMPDIR"], tempfile.tempdir = _MEMORY, None  # files of tests wait for no disk
