@@ -39,7 +39,8 @@ class RewardOutput:
         per_object: (B, N) float credit per slot, or None.
         terms: named (B,) floats worth logging.
         valid: (B,) bool, or None when every row is valid. Invalid rows are left out of all statistics.
-        object_flags: named (B, N) bools, such as ``"feasible"``.
+        object_flags: named (B, N) bools, such as ``"feasible"``. ``"judged"`` are the slots that a mean over objects
+            gives credit to; without it, the free objects.
         problem: why the whole batch is invalid when the reward raised or broke its contract, else empty.
     """
 

@@ -8,7 +8,7 @@ terms follow as ``"<part>.<term>"``.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -25,7 +25,8 @@ from scene_envs.scene import SceneBatch
 class WeightedSum:
     """Sum of rewards, each times its weight.
 
-    ``per_object`` is the weighted sum of the parts' credits when all of them give one.
+    ``per_object`` is the weighted sum of the parts' credits when all of them give one. A slot is judged where every
+    part judges it.
 
     Args:
         rewards: the parts.
@@ -51,7 +52,11 @@ class WeightedSum:
         outputs = _score_parts(self.rewards, batch, context)
         credits = [output.per_object for output in outputs.values() if output.per_object is not None]
         per_object = self._add_up(credits) if len(credits) == len(outputs) else None
-        return _combine(self._add_up([output.value for output in outputs.values()]), outputs, per_object)
+        total = _combine(self._add_up([output.value for output in outputs.values()]), outputs, per_object)
+        if not any("judged" in output.object_flags for output in outputs.values()):
+            return total
+        judged = [output.object_flags.get("judged", batch.is_free) for output in outputs.values()]
+        return replace(total, object_flags={**total.object_flags, "judged": torch.stack(judged).all(dim=0)})
 
     def _add_up(self, tensors: Sequence[Tensor]) -> Tensor:
         return torch.stack([weight * tensor for weight, tensor in zip(self.weights, tensors, strict=True)]).sum(dim=0)

@@ -149,6 +149,12 @@ class SceneBatch(AssetFacts):
         return ~(self.is_empty | self.is_welded)
 
     @property
+    def is_furniture(self) -> Tensor:
+        """(B, N) bool: welded objects of kinds that are generated, such as the tables of a room."""
+        furniture = torch.tensor(self.scene_type.furniture_categories, device=self._tensor.device, dtype=torch.long)
+        return torch.isin(self.categories, furniture)
+
+    @property
     def counts(self) -> Tensor:
         """(B,) int64: objects per scene, welded ones included."""
         return (~self.is_empty).sum(dim=-1)

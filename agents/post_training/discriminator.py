@@ -34,6 +34,8 @@ class Discriminator:
     one logit per object). It reads an object's asset and pose and its four nearest neighbours, not the rest of the
     scene, so that an object is not blamed for others far away. ``post-train`` trains it from iteration to iteration.
     Without such a run it has learned nothing, and every object scores 0.5. A scene without free objects scores 0.
+    Generated welded objects, such as the tables of rooms, are judged as well. They get credit, but do not change the
+    value.
 
     Args:
         learning_rate: of AdamW.
@@ -66,8 +68,13 @@ class Discriminator:
         return 1.0
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
-        """Mean over the free objects; ``per_object`` (B, N) is the probability of each. Term: ``free_objects``."""
+        """Mean over the free objects. Term: ``free_objects``.
+
+        ``per_object`` (B, N) is the probability of each free or generated welded object; ``object_flags["judged"]``
+        marks these.
+        """
         free = batch.is_free
+        judged = free | batch.is_furniture
         if self._model is None:
             if not self._warned and bool(free.any()):
                 logger.warning(
@@ -78,10 +85,11 @@ class Discriminator:
             probability = torch.full(free.shape, 0.5, device=free.device)
         else:
             probability = self._model.probabilities(batch.to("cpu")).to(free.device)
-        probability = probability * free
         number = free.sum(dim=-1).float()
-        value = probability.sum(dim=-1) / number.clamp(min=1)
-        return RewardOutput(value, per_object=probability, terms={"free_objects": number})
+        value = (probability * free).sum(dim=-1) / number.clamp(min=1)
+        return RewardOutput(
+            value, per_object=probability * judged, terms={"free_objects": number}, object_flags={"judged": judged}
+        )
 
     def begin(self, real: SceneBatch, seed: int) -> None:
         """Start with an untrained network.
@@ -129,7 +137,7 @@ class _Model:
             torch.manual_seed(derived_seed(seed))
             self.network = ObjectNetwork(replace(self.typical.network_config(outputs=1), blocks=0, hidden=64))
         self.optimizer = torch.optim.AdamW(self.network.parameters(), learning_rate, weight_decay=1e-2)
-        self.welded = torch.tensor(real.scene_type.welded_categories, dtype=torch.long)
+        self.fixed = torch.tensor(real.scene_type.fixed_categories, dtype=torch.long)
 
     @torch.no_grad()
     def probabilities(self, batch: SceneBatch) -> Tensor:
@@ -153,13 +161,13 @@ class _Model:
             self.optimizer.step()
 
     def _logits(self, scenes: Tensor, count: int, generator: Generator) -> Tensor:
-        """Of the free objects of ``count`` scenes, drawn with replacement and blurred as for the classifier."""
+        """Of all but the fixed objects of ``count`` scenes, drawn with replacement and blurred as for the classifier."""
         rows = torch.randint(len(scenes), (count,), generator=generator)
         tokens: SceneTokens = scene_tokens(
             blurred(SceneBatch(scenes[rows], self.real.scene_type), *RESOLUTION, generator)
         )
-        free = tokens.present & ~torch.isin(tokens.categories, self.welded)
-        logits: Tensor = self.network(*self.typical.inputs(tokens))[free]
+        judged = tokens.present & ~torch.isin(tokens.categories, self.fixed)
+        logits: Tensor = self.network(*self.typical.inputs(tokens))[judged]
         return logits
 
     def state(self) -> dict[str, Any]:

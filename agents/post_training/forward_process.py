@@ -15,7 +15,7 @@ from agents.post_training.algorithms import AWMSettings, ForwardProcessSettings,
 from agents.post_training.expectation import Expectation
 from agents.post_training.forward_losses import AWMLoss, NFTLoss, RewardWeightedLoss
 from agents.post_training.forward_process_loss import ForwardProcessLoss
-from agents.post_training.gradients import BatchGradient, credited_reward
+from agents.post_training.gradients import BatchGradient, credited_reward, judged_slots
 from agents.post_training.own_samples import OwnSampleAlgorithm
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import Branching, Rollout, rollout_groups
@@ -77,11 +77,11 @@ class ForwardProcess(OwnSampleAlgorithm):
         return TensorDict({"advantage": poses, "category_advantage": categories}, [len(reward)])
 
     def _object_advantages(self, rollout: Rollout, reward: Tensor, valid: Tensor) -> Tensor:
-        """(B, N); empty and welded slots have no advantage, nor have those whose siblings hold something else.
+        """(B, N); slots that are not judged have no advantage, nor have those whose siblings hold something else.
 
-        Rewards judge free objects. A table has credit 0, and would be repelled like an object that is not feasible.
+        A table that is not judged has credit 0, and would be repelled like an object that is not feasible.
         """
-        valid = valid & rollout.batch.is_free.to(valid.device)
+        valid = valid & judged_slots(rollout).to(valid.device)
         siblings = self.settings.siblings
         if siblings == 1:
             return compute_advantages(reward, valid, clip=math.inf, groups=rollout_groups(rollout))

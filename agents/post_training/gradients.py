@@ -210,6 +210,11 @@ def gradient_norm(parameters: Iterable[nn.Parameter]) -> float:
     return float(torch.stack(norms).norm()) if norms else 0.0
 
 
+def judged_slots(rollout: Rollout) -> Tensor:
+    """(B, N) bool: slots that the reward judges."""
+    return rollout.batch.is_free if rollout.judged is None else rollout.judged
+
+
 def no_credit_per_object() -> InvalidInputError:
     """The error where credit per object is asked of a reward that gives none."""
     return InvalidInputError(
@@ -221,8 +226,8 @@ def no_credit_per_object() -> InvalidInputError:
 def credited_reward(rollout: Rollout, credit: str) -> tuple[Tensor, Tensor]:
     """Rewards and their validity, (B,) for credit ``"scene"`` and (B, N) for ``"object"``; ``"auto"`` is one of them.
 
-    Fixed slots have no credit. A reward that is a mean over the objects averages the free ones, so there generated
-    welded objects and empty slots have none either.
+    Fixed slots have no credit. With a reward that is a mean over the objects, the slots that it judges have credit
+    alone: the free objects, if it names no others.
 
     Raises:
         InvalidInputError: credit per object is asked of a reward that has no ``per_object``.
@@ -234,7 +239,7 @@ def credited_reward(rollout: Rollout, credit: str) -> tuple[Tensor, Tensor]:
     free = torch.ones(rollout.per_object.shape, dtype=torch.bool, device=rollout.per_object.device)
     free[:, : len(rollout.batch.scene_type.fixed)] = False  # they are not drawn
     if rollout.averages:
-        free &= rollout.batch.is_free.to(free.device)
+        free &= judged_slots(rollout).to(free.device)
     if rollout.observed is not None:
         free &= ~rollout.observed.all(dim=-1)  # nor is what is observed
     return rollout.per_object.float(), free & rollout.valid.unsqueeze(-1)

@@ -51,6 +51,7 @@ class Rollout:
         valid: (B,) bool.
         per_object: (B, N) credit per slot, or None.
         averages: the reward is a mean over the objects, so that an empty slot has no credit.
+        judged: (B, N) bool, slots that such a reward gives credit to; None for the free objects.
         terms: named (B,) parts of the reward.
         batch: the finished scenes.
         prompts: one per scene, or None without prompts.
@@ -71,6 +72,7 @@ class Rollout:
     prompts: tuple[str, ...] | None = None
     text: Text | None = None
     averages: bool = False
+    judged: Tensor | None = None
     observed: Tensor | None = None
     groups: Tensor | None = None
 
@@ -200,6 +202,7 @@ def collect(
         reward=result.reward,
         valid=result.valid,
         per_object=result.score.per_object,
+        judged=result.score.object_flags.get("judged"),
         terms=result.score.terms,
         batch=result.batch,
         prompts=result.prompts,

@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING
 from scene_envs.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from scene_envs.physics.api import equilibrium, feasibility, penetration, project, settle
+    from scene_envs.physics.api import (
+        equilibrium,
+        feasibility,
+        furniture_overlap,
+        penetration,
+        project,
+        settle,
+    )
     from scene_envs.physics.pool import PhysicsPool
     from scene_envs.physics.pools import make_pool
     from scene_envs.physics.ray_pool import RayPhysicsPool
@@ -37,6 +44,7 @@ __all__ = [
     "SettleResult",
     "equilibrium",
     "feasibility",
+    "furniture_overlap",
     "make_pool",
     "make_ready",
     "penetration",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from scene_envs.errors import InvalidInputError
 from scene_envs.physics.batches import poses_after, run_kernel, stack, valid_rows
@@ -85,6 +86,22 @@ def penetration(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> Penetr
         total_per_geometry=stack(rows, batch, "total_per_geometry", shape=()),
         valid=valid_rows(rows),
     )
+
+
+def furniture_overlap(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> Tensor:
+    """Deepest overlap of each generated welded object with any other welded one, (B, N) m; 0 in all other slots.
+
+    Rooms generate their tables and shelves, which are welded. :func:`feasibility` and :func:`penetration` do not judge
+    pairs of welded objects. No simulator is needed.
+
+    Raises InvalidInputError as :func:`feasibility` does.
+
+    >>> furniture_overlap(SceneBatch.empty("dimsum_table", 1)).any()
+    tensor(False)
+    """
+    if not bool(batch.is_furniture.any()):
+        return torch.zeros(batch.tensor.shape[:2])
+    return stack(run_kernel("furniture", batch, {}, pool), batch, "depth")
 
 
 def equilibrium(batch: SceneBatch, *, duration: float = 0.1, pool: PhysicsPool | None = None) -> EquilibriumResult:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -156,6 +156,18 @@ def penetration_kernel(chunk: Chunk) -> dict[str, Any]:
     }
 
 
+def furniture_kernel(chunk: Chunk) -> dict[str, Any]:
+    """See :func:`scene_envs.physics.furniture_overlap`."""
+    physics = physics_of(chunk.scene_type)
+    objects = _objects(physics, chunk)
+    categories = chunk.scene_type.welded_categories, chunk.scene_type.furniture_categories
+    is_welded, is_furniture = (np.isin(objects.category, np.array(some, dtype=np.int64)) for some in categories)
+    welded, furniture = objects[is_welded], is_furniture[is_welded]
+    pairs = physics.collider.pairs(replace(welded, fixed=~furniture))  # the collider skips pairs of fixed objects
+    depth = np.where(furniture, pairs.deepest(), 0.0)
+    return {"depth": _scatter(chunk, welded, depth), "valid": np.ones(len(chunk), dtype=bool)}
+
+
 def settle_kernel(chunk: Chunk, *, duration: float, iterations: int) -> dict[str, Any]:
     """See :func:`scene_envs.physics.settle`."""
     physics = physics_of(chunk.scene_type)
@@ -228,6 +240,7 @@ KERNELS: dict[str, Kernel] = {
     "feasibility": feasibility_kernel,
     "equilibrium": equilibrium_kernel,
     "penetration": penetration_kernel,
+    "furniture": furniture_kernel,
     "project": projection_kernel,
     "settle": settle_kernel,
     "units": units_kernel,

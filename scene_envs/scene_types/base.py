@@ -137,6 +137,11 @@ class SceneType:
         return tuple(self.assets.index(name) for name in self.welded)
 
     @property
+    def furniture_categories(self) -> tuple[int, ...]:
+        """Categories of welded assets that no fixed object is made of, and that are therefore generated."""
+        return tuple(sorted(set(self.welded_categories) - set(self.fixed_categories)))
+
+    @property
     def fixed_categories(self) -> tuple[int, ...]:
         """Categories of the welded assets of fixed objects, ascending.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,16 @@ from scipy.spatial.transform import Rotation
 
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.grammars import get_grammar
-from scene_envs.physics import PhysicsPool, equilibrium, feasibility, make_ready, penetration, project, settle
+from scene_envs.physics import (
+    PhysicsPool,
+    equilibrium,
+    feasibility,
+    furniture_overlap,
+    make_ready,
+    penetration,
+    project,
+    settle,
+)
 from scene_envs.physics.motion import Physics, physics_of
 from scene_envs.physics.placement import Objects
 from scene_envs.physics.rest import Rest
@@ -256,3 +266,33 @@ def test_an_object_at_rest_outside_the_workspace_is_not_feasible() -> None:
     assert result.displacement[0, 2].item() == pytest.approx(0.0, abs=1e-6)
     with PhysicsPool(workers=1) as pool:
         assert torch.equal(feasibility(batch, pool=pool).feasible, result.feasible)
+
+
+@pytest.mark.parametrize("overlap", [0.0005, 0.005, 0.05])
+def test_furniture_overlaps_furniture_by_the_depth_of_the_boxes(overlap: float) -> None:
+    """Boxes that are welded: two of them overlap each other, one stands on the fixed floor, one sinks into it."""
+    room = replace(TYPE, name="room_of_boxes", welded=("floor", "cube"))
+    room.__dict__["library"] = TYPE.library
+    boxes = scene(
+        ("cube", SIDE - overlap, 0.0, 0.0), ("cube", 0.0, 0.0, 0.0), ("cube", 0.0, 0.5, 0.0), ("post", 0, 0, 0)
+    )
+    batch = SceneBatch(torch.cat([boxes.tensor, SceneBatch.empty(TYPE, 1).tensor]), room)
+    assert batch.is_furniture.nonzero().tolist() == [[0, 1], [0, 2], [0, 3]]
+    depth = furniture_overlap(batch)
+    assert depth[0, :5].tolist() == pytest.approx([0.0, overlap, overlap, 0.0, 0.0], abs=1e-5)
+    assert not depth[1].any()
+    assert not furniture_overlap(boxes).any()  # where boxes are free, they are no furniture
+    sunk = batch.translations - torch.tensor([0.0, 0.0, overlap]) * batch.is_furniture[..., None]
+    assert furniture_overlap(batch.with_poses(sunk, batch.rotations))[0, 3].item() == pytest.approx(overlap, abs=1e-5)
+
+
+def test_furniture_of_real_rooms_is_apart_and_a_pool_measures_the_same() -> None:
+    rooms = get_grammar("restaurant_low_clutter").sample(np.random.default_rng(0), 6)
+    assert rooms.is_furniture.sum() > 12
+    assert not furniture_overlap(rooms).any()
+    first = rooms.translations[:, :1]
+    together = rooms.with_poses(torch.where(rooms.is_furniture[..., None], first, rooms.translations), rooms.rotations)
+    depth = furniture_overlap(together)
+    assert bool((depth > 0.01)[rooms.is_furniture].any(dim=0))
+    with PhysicsPool(workers=1) as pool:
+        assert torch.equal(furniture_overlap(together, pool=pool), depth)

@@ -64,9 +64,27 @@ def test_generated_furniture_is_not_treated_as_infeasible(tmp_path: Path, algori
     finally:
         learner.close()
     poses = advantage["advantage"] if algorithm == "nft" else advantage
-    furniture, free = rollout.batch.is_welded, rollout.batch.is_free
-    furniture[:, : len(rollout.batch.scene_type.fixed)] = False
+    furniture, free = rollout.batch.is_furniture, rollout.batch.is_free
     assert furniture.any()
     assert not poses[furniture].any()
     assert bool((poses[free & (rollout.per_object > 0)] > 0).all())
     assert bool((poses[free & (rollout.per_object == 0)] < 0).all())
+
+
+@pytest.mark.parametrize("algorithm", ["ddpo_sf", "nft"])
+def test_furniture_that_overlaps_furniture_is_blamed(tmp_path: Path, algorithm: str) -> None:
+    prior = tiny_prior("restaurant_low_clutter", process="mixed", seed=3)
+    config = small_config(tmp_path, reward="feasible_share", batch_size=12, algorithm={"name": algorithm})
+    learner = Learner(config, prior)
+    try:
+        rollout = learner.rollout(0)
+        advantage = learner.algorithm.advantage(rollout)
+    finally:
+        learner.close()
+    poses = advantage["advantage"] if algorithm == "nft" else advantage
+    furniture = rollout.batch.is_furniture
+    apart, blamed = furniture & (rollout.per_object > 0), furniture & (rollout.per_object == 0)
+    assert apart.any()
+    assert blamed.any()
+    assert bool((poses[apart] > 0).all())
+    assert bool((poses[blamed] < 0).all())

@@ -57,6 +57,22 @@ def test_value_is_the_mean_of_its_credit(trained: Discriminator) -> None:
     torch.testing.assert_close(output.value, expected)
 
 
+def test_furniture_of_rooms_is_judged_and_does_not_change_the_value() -> None:
+    grammar = get_grammar("restaurant_low_clutter")
+    real, samples = (grammar.sample(np.random.default_rng(seed), 24) for seed in (0, 1))
+    shift = torch.tensor([0.0, 0.0, 0.3]) * samples.is_furniture[..., None]
+    reward = Discriminator()
+    reward.begin(real, seed=0)
+    reward.learn(samples.with_poses(samples.translations + shift, samples.rotations), steps=60)
+    output = reward(samples, RewardContext())
+    moved = reward(samples.with_poses(samples.translations + shift, samples.rotations), RewardContext())
+    furniture = samples.is_furniture
+    assert float(moved.per_object[furniture].mean()) < 0.2 < 0.5 < float(output.per_object[furniture].mean())
+    assert torch.equal(output.object_flags["judged"], samples.is_free | furniture)
+    expected = (output.per_object * samples.is_free).sum(dim=1) / samples.is_free.sum(dim=1)
+    torch.testing.assert_close(output.value, expected)
+
+
 def test_a_network_without_samples_is_reported(caplog: pytest.LogCaptureFixture) -> None:
     reward = Discriminator()
     scenes = get_grammar("dimsum_table").sample(np.random.default_rng(3), 2)

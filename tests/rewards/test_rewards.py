@@ -1,5 +1,6 @@
 """Values of the built-in rewards on scenes where they are known."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -19,6 +20,7 @@ from rewards import (
 from rewards.base import averages_objects, declared_maximum
 from scene_envs import SceneBatch
 from scene_envs.errors import InvalidInputError
+from scene_envs.grammars import get_grammar
 
 
 def distances(batch, context):
@@ -130,6 +132,23 @@ def test_feasible_share_is_the_verdict_over_the_free_objects(table):
     assert output.terms["feasible_objects"].tolist() == [1.0]
     assert torch.equal(output.per_object, score(FeasibleObjects(), table).per_object)
     assert score(FeasibleShare(), SceneBatch.empty("dimsum_table", 2)).value.tolist() == [0.0, 0.0]
+
+
+def test_feasible_share_gives_furniture_credit_for_standing_apart(table):
+    assert torch.equal(score(FeasibleShare(), table).object_flags["judged"], table.is_free)
+    rooms = get_grammar("restaurant_low_clutter").sample(np.random.default_rng(0), 3)
+    apart = score(FeasibleShare(), rooms)
+    assert bool((apart.per_object[rooms.is_furniture] == 1).all())
+    assert torch.equal(apart.object_flags["judged"], rooms.is_free | rooms.is_furniture)
+    first, second = rooms.is_furniture[0].nonzero().flatten()[:2].tolist()
+    translations, rotations = rooms.translations.clone(), rooms.rotations.clone()
+    translations[0, second], rotations[0, second] = translations[0, first] + 0.05, rotations[0, first]
+    joined = score(FeasibleShare(), rooms.with_poses(translations, rotations))
+    assert joined.per_object[0, [first, second]].tolist() == [0.0, 0.0]
+    assert torch.equal(joined.per_object[1:], apart.per_object[1:])
+    assert joined.value.tolist() == (joined.terms["feasible_objects"] / joined.terms["free_objects"]).tolist()
+    summed = score(WeightedSum(["feasible_share", "object_count"]), rooms)
+    assert torch.equal(summed.object_flags["judged"], rooms.is_free)
 
 
 def test_what_stands_outside_the_workspace_counts_for_nothing(table):
