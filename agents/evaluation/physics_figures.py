@@ -32,7 +32,7 @@ def physics_figures(batch: SceneBatch, pool: PhysicsPool | None = None) -> dict[
         batch: the scenes.
         pool: worker processes; None computes in this process.
     """
-    return {**_overlap(batch, pool), **_feasibility(batch, pool)}
+    return {**_overlap(batch, pool), **_furniture(batch, pool), **_feasibility(batch, pool)}
 
 
 def ready_figures(batch: SceneBatch, pool: PhysicsPool | None = None) -> dict[str, float]:
@@ -111,6 +111,15 @@ def _overlap(batch: SceneBatch, pool: PhysicsPool | None) -> dict[str, float]:
         figures["deeper_than_1mm_fraction"] = float((result.depth[free] > COLLISION).double().mean())
         figures["deeper_than_1cm_fraction"] = float((result.depth[free] > DEEP).double().mean())
     return figures
+
+
+def _furniture(batch: SceneBatch, pool: PhysicsPool | None) -> dict[str, float]:
+    from scene_envs.physics import furniture_overlap
+
+    if not batch.scene_type.furniture_categories:
+        return {}
+    collides = furniture_overlap(batch, pool=pool) > COLLISION
+    return {"furniture_collision_rate": float(collides.any(dim=1).double().mean())}
 
 
 def _feasibility(batch: SceneBatch, pool: PhysicsPool | None) -> dict[str, float]:

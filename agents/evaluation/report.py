@@ -29,6 +29,7 @@ READING: dict[str, str] = {
     "median_total_penetration_cm": "per scene, summed over pairs of convex parts (the literature's); lower is better",
     "median_total_pair_penetration_cm": "per scene, the deepest overlap of each pair of objects; lower is better",
     "collision_rate": "scenes with two objects more than 1 mm in each other; lower is better",
+    "furniture_collision_rate": "rooms in which a table or shelf is more than 1 mm in another; lower is better",
     "overlapping_pairs": "penetrating pairs of objects per scene; lower is better",
     "overlap_median_mm": "depth over the penetrating pairs; lower is better",
     "overlap_p95_mm": "95 % quantile of the same",

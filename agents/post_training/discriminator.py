@@ -161,7 +161,7 @@ class _Model:
             self.optimizer.step()
 
     def _logits(self, scenes: Tensor, count: int, generator: Generator) -> Tensor:
-        """Of all but the fixed objects of ``count`` scenes, drawn with replacement and blurred as for the classifier."""
+        """Of all but the fixed objects of ``count`` scenes, drawn with replacement and blurred as for classifiers."""
         rows = torch.randint(len(scenes), (count,), generator=generator)
         tokens: SceneTokens = scene_tokens(
             blurred(SceneBatch(scenes[rows], self.real.scene_type), *RESOLUTION, generator)

@@ -88,6 +88,17 @@ def test_the_deep_ones_are_counted_apart(real: SceneBatch) -> None:
     assert "height_error_stack_mm" not in figures  # nothing is on a stack
 
 
+def test_rooms_whose_tables_overlap_are_counted(real: SceneBatch) -> None:
+    rooms = grammar_scenes("restaurant_low_clutter", 4, seed=1)
+    assert measure_samples(rooms, rooms, ready=False)["furniture_collision_rate"] == 0.0
+    first, second = rooms.is_furniture[2].nonzero().flatten()[:2].tolist()
+    translations, rotations = rooms.translations.clone(), rooms.rotations.clone()
+    translations[2, second], rotations[2, second] = translations[2, first] + 0.05, rotations[2, first]
+    joined = measure_samples(rooms.with_poses(translations, rotations), rooms, ready=False)
+    assert joined["furniture_collision_rate"] == 0.25
+    assert "furniture_collision_rate" not in measure_samples(real, real, ready=False)
+
+
 def test_ready_figures_are_those_after_projection_and_settling() -> None:
     reference = one_object("teapot", 0.0)
     figures = measure_samples(one_object("teapot", -4e-3), reference)
