@@ -14,6 +14,8 @@ from agents.networks.flux_modules import FluxModule, FluxSizes, ModuleConfig, Sc
 
 _DELTA = 0.02
 """Objects that may always still come, so that logarithms are finite."""
+_LEAST = 0.1
+"""Probability of the numbers from the visible one on, below which fewer objects of the kind are expected."""
 
 
 @dataclass(frozen=True)
@@ -130,10 +132,17 @@ class CountConditioning(FluxModule):
 def still_to_come(logits: Tensor, visible: Tensor) -> Tensor:
     """Expected number beyond the visible one, 0 at least: (..., M) logits of 0..M-1 and (...) visible to (...).
 
+    It is the mean over the numbers that the visible one allows. Where the text gives these less than ``_LEAST`` in all,
+    more objects are visible than it asks for, and the mean shrinks to 0 in proportion. Without this bound the mean
+    would be that of the remote tail, and all masked slots would become objects of a kind that is complete.
+
     >>> still_to_come(torch.tensor([[0.0, 0.0, 0.0, 0.0]]), torch.tensor([1.0]))  # 1, 2 or 3, as likely
     tensor([1.])
+    >>> two = torch.tensor([-9.0, -9.0, 9.0, *[-9.0] * 60])  # the text asks for two, and three are visible
+    >>> float(still_to_come(two, torch.tensor(3.0))) < 0.01
+    True
     """
     number = torch.arange(logits.shape[-1], device=logits.device, dtype=logits.dtype)
     beyond = number - visible[..., None]
     weight = logits.softmax(dim=-1) * (beyond >= 0)
-    return (weight * beyond).sum(dim=-1) / weight.sum(dim=-1).clamp(min=1e-9)
+    return (weight * beyond).sum(dim=-1) / weight.sum(dim=-1).clamp(min=_LEAST)

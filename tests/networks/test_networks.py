@@ -251,6 +251,19 @@ def test_known_numbers_become_shares_of_the_masked_slots() -> None:
     assert float(still_to_come(numbers, torch.tensor([[5.0, 0.0, 3.0]]))[0, 0]) == 0.0  # more than asked: none to come
 
 
+def test_more_objects_than_asked_for_do_not_bring_others() -> None:
+    """The text asks for two with a probability of 0.96; 3 to 42 have 0.001 each."""
+    probability = torch.tensor([0.0, 0.0, 0.96, *[0.001] * 40], dtype=torch.float64)
+    visible = torch.tensor([0.0, 2.0, 3.0, 12.0, 42.0], dtype=torch.float64)
+    found = still_to_come(probability.log().expand(5, -1), visible)
+    number = torch.arange(43.0, dtype=torch.float64)
+    beyond = torch.stack([(probability * (number - seen).clamp(min=0)).sum() for seen in visible])
+    # the mean of all numbers from the visible one on, unless these are improbable
+    torch.testing.assert_close(found, beyond / torch.tensor([1.0, 1.0, 0.1, 0.1, 0.1], dtype=torch.float64))
+    assert bool((found.diff()[2:] < 0).all())
+    assert float(found[-1]) == 0.0
+
+
 @pytest.mark.parametrize("name", BASELINES)
 def test_flags_and_time_are_read(name: str) -> None:
     network, arguments = make(name, "mixed"), inputs("mixed", 6)
