@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from agents.diffusion.unmasking import draw_unmasked, unmasking_log_prob
+from agents.diffusion.unmasking import draw_unmasked, systematic, unmasking_log_prob
 
 _TINY = 1e-30
 
@@ -127,6 +127,8 @@ class MixedStep(NamedTuple):
         masked: (B, N) bool, slots of which as many as expected are unmasked together
             (:mod:`agents.diffusion.unmasking`); None unmasks each by its own chance.
         denoised: (B, N, P + K) the denoiser's estimate of x_0, categories by arg-max, where it is known.
+        is_systematic: slots that are unmasked together draw their categories by systematic sampling, so that their
+            numbers are near the expected ones; :meth:`log_prob` does not know this, see :meth:`independent`.
 
     >>> probs = torch.tensor([[[0.25, 0.75, 0.0]]])
     >>> step = MixedStep(torch.zeros(1, 1, 1), torch.ones(1, 1), probs, torch.tensor([True]))
@@ -140,12 +142,13 @@ class MixedStep(NamedTuple):
     random: Tensor
     masked: Tensor | None = None
     denoised: Tensor | None = None
+    is_systematic: bool = False
 
     def take(self, rows: Tensor) -> MixedStep:
         """The step of scenes ``rows`` (K,), which may come more than once."""
         masked = None if self.masked is None else self.masked[rows]
         pose_std, random = _of_rows(self.pose_std, rows, 3), _of_rows(self.random, rows, 2)
-        return MixedStep(self.mean[rows], pose_std, self.probs[rows], random, masked)
+        return MixedStep(self.mean[rows], pose_std, self.probs[rows], random, masked, is_systematic=self.is_systematic)
 
     def observing(self, pose: Tensor, category: Tensor, x: Tensor) -> MixedStep:
         """The step in which some slots are certain to be as in ``x`` (B, N, P + K).
@@ -168,6 +171,10 @@ class MixedStep(NamedTuple):
     def shifted(self, shift: Tensor) -> MixedStep:
         """The step with the means of the first features moved by ``shift`` (B, N, F)."""
         return self._replace(mean=_shifted(self.mean, shift))
+
+    def independent(self) -> MixedStep:
+        """The step whose slots draw their categories independently, which :meth:`log_prob` assumes."""
+        return self._replace(is_systematic=False)
 
     @property
     def std(self) -> Tensor:
@@ -196,14 +203,14 @@ class MixedStep(NamedTuple):
         if self.masked is None:
             return _invert(cumulative, uniform)
         unmasked = draw_unmasked(self.masked, 1 - self.probs[..., -1], order)
-        chosen = _invert(cumulative[..., :-1], uniform)
+        chosen = _invert(cumulative[..., :-1], systematic(unmasked, uniform) if self.is_systematic else uniform)
         states = torch.where(unmasked, chosen, torch.full_like(chosen, mask))
         return torch.where(self.masked, states, self.probs.argmax(dim=-1))
 
     def log_prob(self, x: Tensor) -> Tensor:
         """(B, N) nats: the log-density of the pose plus the log-probability of the state.
 
-        Which slots are unmasked together has one log-probability per scene; the masked slots have equal shares of it.
+        With systematic sampling this is not the probability of all slots together, which has no simple form. Which slots are unmasked together has one log-probability per scene; the masked slots have equal shares of it.
         """
         pose = self.mean.shape[-1]
         continuous = gaussian_log_prob(x[..., :pose], self.mean, self.pose_std)
@@ -261,7 +268,7 @@ def concatenate_steps(parts: Sequence[ReverseStep]) -> ReverseStep:
         mean, probs = (torch.cat([getattr(part, name) for part in mixed]) for name in ("mean", "probs"))
         masked = None if first.masked is None else torch.cat([part.masked for part in mixed if part.masked is not None])
         pose_std, random = _joined([part.pose_std for part in mixed], 3), _joined([part.random for part in mixed], 2)
-        return MixedStep(mean, pose_std, probs, random, masked)
+        return MixedStep(mean, pose_std, probs, random, masked, is_systematic=first.is_systematic)
     raise TypeError(f"cannot concatenate steps of type {type(first).__name__}")
 
 

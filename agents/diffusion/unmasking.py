@@ -1,8 +1,9 @@
-"""Unmasking of absorbing chains: numbers of slots per step that differ from their expectation by less than one.
+"""Unmasking of absorbing chains: how many slots a step unmasks, and how their categories differ from each other.
 
 Slots that are unmasked in the same step do not know each other's categories, so scenes get too many objects of a kind.
-If each slot is unmasked independently, some steps unmask many slots. Here most steps of a small scene unmask one slot
-alone. Each slot keeps the chance that the chain gives it.
+Two remedies leave the distribution of each slot as it is. The number of slots that a step unmasks differs from its
+expectation by less than one (:func:`draw_unmasked`). The categories of these slots are drawn by systematic sampling
+(:func:`systematic`), so the number of each category differs little from its expectation as well.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-UNMASKINGS = ("even", "independent")
+UNMASKINGS = ("systematic", "even", "independent")
 """Ways to choose the masked slots that a step unmasks."""
 _TINY = 1e-30
 
@@ -36,6 +37,27 @@ def draw_unmasked(masked: Tensor, chance: Tensor, uniform: Tensor) -> Tensor:
     rounding = (1 - (1 - least) ** total).clamp(max=1 - 1e-12)
     number = (expected + rounding).floor()
     return masked & (order.argsort(dim=-1).argsort(dim=-1) < number.unsqueeze(-1))
+
+
+def systematic(unmasked: Tensor, uniform: Tensor) -> Tensor:
+    """(B, N) numbers on [0, 1) that are evenly spread over the ``unmasked`` slots of a scene, in random order.
+
+    Systematic sampling (Madow and Madow 1944): with k slots the numbers are (r + v) / k with the ranks r of ``uniform``
+    among these slots and one v for all, the fractional part of their sum. Ranks and v are independent, so each number
+    is uniform. Slots of equal probabilities p take a category p k times, rounded down or up.
+
+    Args:
+        unmasked: (B, N) bool.
+        uniform: (B, N) float64, independent and uniform on [0, 1); slots that are not unmasked keep theirs.
+
+    >>> unmasked = torch.tensor([[True, True, False, True, True]])
+    >>> systematic(unmasked, torch.tensor([[0.75, 0.25, 0.5, 0.5, 0.125]])).tolist()
+    [[0.90625, 0.40625, 0.5, 0.65625, 0.15625]]
+    """
+    number = unmasked.sum(dim=-1, keepdim=True).clamp(min=1)
+    ranks = torch.where(unmasked, uniform, torch.full_like(uniform, torch.inf)).argsort(dim=-1).argsort(dim=-1)
+    shared = torch.where(unmasked, uniform, torch.zeros_like(uniform)).sum(dim=-1, keepdim=True).frac()
+    return torch.where(unmasked, (ranks + shared) / number, uniform)
 
 
 def unmasking_log_prob(masked: Tensor, chance: Tensor, unmasked: Tensor) -> Tensor:

@@ -42,7 +42,9 @@ class OwnSampleAlgorithm(Algorithm[TensorDict]):
         self.prior: ScenePrior = policy.prior  # type: ignore[assignment]
         self.sampler = deepcopy(self.prior).eval().requires_grad_(False)
         self.draws = draws
-        self._sampling_policy = DenoisingPolicy(self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance)
+        self._sampling_policy = DenoisingPolicy(
+            self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance, independent=False
+        )  # it needs no log-probabilities
         self._average = WeightAverage(self.prior, sampler_decay)
 
     @property

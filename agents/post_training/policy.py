@@ -29,6 +29,8 @@ class DenoisingPolicy(TensorDictModuleBase):
         num_steps: steps of the chain, as in the environment.
         chunk: scenes denoised at once, in sampling and in log-probabilities alike; None takes all.
         guidance: w of classifier-free guidance; the guided chain is the policy then.
+        independent: slots draw their categories independently, so that log-probabilities are exact; False for the draws
+            of ``prior.sample``.
 
     >>> from agents.priors.testing import tiny_prior
     >>> from scene_envs.envs import DenoisingTorchRLEnv
@@ -41,13 +43,22 @@ class DenoisingPolicy(TensorDictModuleBase):
     in_keys = ["scene", "timestep"]  # noqa: RUF012  (torchrl reads lists)
     out_keys = ["action", "action_log_prob", "slot_log_prob"]  # noqa: RUF012
 
-    def __init__(self, prior: PriorLike, num_steps: int, *, chunk: int | None = None, guidance: float = 0.0) -> None:
+    def __init__(
+        self,
+        prior: PriorLike,
+        num_steps: int,
+        *,
+        chunk: int | None = None,
+        guidance: float = 0.0,
+        independent: bool = True,
+    ) -> None:
         super().__init__()
         if chunk is not None and chunk < 1:
             raise InvalidInputError(f"chunk={chunk}: at least one scene must be denoised at a time")
         self.prior = prior
         self.chunk = chunk
         self.guidance = guidance
+        self.independent = independent
         if prior.conditional:
             self.in_keys = [*self.in_keys, "prompt"]
         self.table: StepTableLike = prior.step_table(num_steps)
@@ -107,7 +118,7 @@ class DenoisingPolicy(TensorDictModuleBase):
         else:
             prior = cast(PromptedPriorLike, self.prior)
             reverse = prior.transition(x_t, step, self.table, text=text, guidance=self.guidance)
-        return reverse
+        return reverse.independent() if self.independent and isinstance(reverse, MixedStep) else reverse
 
     @torch.no_grad()
     def draw(

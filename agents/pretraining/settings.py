@@ -134,7 +134,7 @@ class ProcessSettings:
         kernels = ("mask_and_replace", "absorbing", "early_absorbing", "squared_absorbing", "uniform")
         one_of(self, "kernel", kernels, "categorical kernel")
         one_of(self, "empty_slots", ("attended", "dropped"), "treatment of empty slots")
-        one_of(self, "unmasking", ("even", "independent"))
+        one_of(self, "unmasking", ("systematic", "even", "independent"))
         positive(self, "noise_floor", "noise_ceiling")
         at_least(self, 0, "denoised_clip")
         if not self.noise_floor < self.noise_ceiling:

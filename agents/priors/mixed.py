@@ -97,7 +97,8 @@ class MixedPrior(TrainableMixedPrior):
         self.categories = CategoricalProcess(
             make_categorical_schedule(config.kernel, config.num_timesteps), config.network.categories
         )
-        self._together = config.unmasking == "even" and self.categories.only_absorbs
+        self._together = config.unmasking != "independent" and self.categories.only_absorbs
+        self._systematic = config.unmasking == "systematic"
         encoder = None if config.text is None else text_encoder(config.text)
         self.denoiser = MixedDenoiser(
             build_network(config.network), self.process, self.categories, encoder, config.empty_slots
@@ -198,7 +199,10 @@ class MixedPrior(TrainableMixedPrior):
         if self.categories.only_absorbs:
             category = torch.where(state < self.num_categories, state, category)
         estimate = torch.cat([pose, F.one_hot(category, self.num_categories).to(pose)], dim=-1).detach()
-        return MixedStep(clamped[..., :POSE_FEATURES], std * (~known).to(mean.dtype), probs, random, masked, estimate)
+        return MixedStep(
+            clamped[..., :POSE_FEATURES], std * (~known).to(mean.dtype), probs, random, masked, estimate,
+            self._systematic,
+        )  # fmt: skip
 
     def observed_transition(
         self, x_t: Tensor, step: int, table: StepTableLike, observed: Tensor, *,
