@@ -210,7 +210,8 @@ class MixedStep(NamedTuple):
     def log_prob(self, x: Tensor) -> Tensor:
         """(B, N) nats: the log-density of the pose plus the log-probability of the state.
 
-        With systematic sampling this is not the probability of all slots together, which has no simple form. Which slots are unmasked together has one log-probability per scene; the masked slots have equal shares of it.
+        Which slots are unmasked together has one log-probability per scene; the masked slots have equal shares of it.
+        With systematic sampling the sum over slots is not the log-probability of the step, which has no simple form.
         """
         pose = self.mean.shape[-1]
         continuous = gaussian_log_prob(x[..., :pose], self.mean, self.pose_std)

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Generator, Tensor
 
 from agents.diffusion import ReverseStep
-from agents.diffusion.reverse_steps import concatenate_steps
+from agents.diffusion.reverse_steps import MixedStep, concatenate_steps
 from agents.networks.text import Text
 from scene_envs.errors import InvalidInputError
 from scene_envs.protocols import InpaintingPriorLike, PriorLike, PromptedPriorLike, StepTableLike

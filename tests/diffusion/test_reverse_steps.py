@@ -6,10 +6,12 @@ from itertools import product
 
 import pytest
 import torch
+from scipy.stats import chisquare, kstest
 from torch.distributions import Categorical, Normal
 
 from agents.diffusion import GaussianStep, MixedStep
 from agents.diffusion.reverse_steps import concatenate_steps, one_hot_state, state_of
+from agents.diffusion.unmasking import systematic
 
 
 def _mixed(batch: int = 1, slots: int = 2) -> MixedStep:
@@ -64,9 +66,10 @@ def _masked(chance: float, batch: int = 1) -> MixedStep:
     return MixedStep(torch.zeros(batch, 5, 1), torch.zeros(5, 1), probs.expand(batch, -1, -1), random, masked)
 
 
+@pytest.mark.parametrize("is_systematic", [False, True])
 @pytest.mark.parametrize("chance", [0.1, 0.3, 0.5, 0.9])
-def test_slots_unmasked_together_are_as_many_as_expected(chance: float) -> None:
-    step = _masked(chance, 40_000)
+def test_slots_unmasked_together_are_as_many_as_expected(chance: float, is_systematic: bool) -> None:
+    step = _masked(chance, 40_000)._replace(is_systematic=is_systematic)
     state = state_of(step.from_noise(torch.randn(40_000, 5, 4, generator=torch.Generator().manual_seed(1)))[..., 1:])
     number = (state[:, [0, 1, 3, 4]] < 3).sum(dim=1)
     assert set(number.unique().tolist()) <= {int(4 * chance), int(4 * chance) + 1}
@@ -87,12 +90,52 @@ def test_the_probabilities_of_all_outcomes_of_unmasking_sum_to_one(chance: float
     assert float((of_number * torch.arange(5)).sum()) == pytest.approx(4 * chance, abs=1e-5)
 
 
+@pytest.mark.parametrize("slots", [1, 2, 7, 40])
+def test_systematic_numbers_are_uniform_and_a_step_apart(slots: int) -> None:
+    uniform = torch.rand(20_000, slots + 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    unmasked = torch.ones(20_000, slots + 2, dtype=torch.bool)
+    unmasked[:, [0, slots]] = False
+    spread = systematic(unmasked, uniform)
+    assert torch.equal(spread[~unmasked], uniform[~unmasked])
+    numbers = spread[unmasked].view(20_000, slots)
+    expected = torch.full((20_000, slots - 1), 1 / slots, dtype=torch.float64)
+    torch.testing.assert_close(numbers.sort(dim=1).values.diff(), expected)
+    for slot in range(slots):
+        assert kstest(numbers[:, slot], "uniform").pvalue > 1e-4
+    if slots > 1:  # two slots take every pair of different ranks equally often
+        ranks = (numbers[:, :2] * slots).long()
+        pairs = torch.bincount(ranks[:, 0] * slots + ranks[:, 1], minlength=slots**2).view(slots, slots)
+        assert not pairs.diagonal().any()
+        assert chisquare(pairs[~torch.eye(slots, dtype=torch.bool)]).pvalue > 1e-4
+
+
+def test_systematic_sampling_gives_each_category_its_expected_number() -> None:
+    """Thirty masked slots with probabilities 0.1, 0.25, 0.05 and 0.6: 3, 7 or 8, 1 or 2, and 18 slots."""
+    chosen = torch.tensor([0.1, 0.25, 0.05, 0.6])
+    probs = torch.cat([chosen, torch.zeros(1)]).expand(500, 30, 5)
+    masked, random = torch.ones(500, 30, dtype=torch.bool), torch.ones(30, dtype=torch.bool)
+    step = MixedStep(torch.zeros(500, 30, 1), torch.zeros(30, 1), probs, random, masked, is_systematic=True)
+    noise = torch.randn(500, 30, 5, generator=torch.Generator().manual_seed(0))
+    state = state_of(step.from_noise(noise)[..., 1:])
+    numbers = torch.stack([(state == value).sum(dim=1) for value in range(4)], dim=-1)
+    assert bool(((numbers - 30 * chosen).abs() < 1).all())
+    torch.testing.assert_close(numbers.float().mean(dim=0), 30 * chosen, atol=0.08, rtol=0)
+    alone = state_of(step.independent().from_noise(noise)[..., 1:])
+    assert float((alone == 3).sum(dim=1).float().std()) == pytest.approx((30 * 0.6 * 0.4) ** 0.5, rel=0.1)
+    assert torch.equal(step.take(torch.tensor([4, 4])).from_noise(noise[:2]), step.from_noise(noise)[:2])
+
+
 def test_steps_of_parts_are_the_step_of_the_whole() -> None:
     whole = _mixed(5)
     parts = [MixedStep(whole.mean[a:b], whole.pose_std, whole.probs[a:b], whole.random) for a, b in ((0, 2), (2, 5))]
     together = concatenate_steps(parts)
     noise = torch.randn(5, 2, 6)
     assert (together.from_noise(noise) == whole.from_noise(noise)).all()
+    masked = _masked(0.5, 4)._replace(is_systematic=True)
+    noise = torch.randn(4, 5, 4)
+    together = concatenate_steps([masked.take(torch.arange(2)), masked.take(torch.arange(2, 4))])
+    assert (together.from_noise(noise) == masked.from_noise(noise)).all()
+    noise = torch.randn(5, 2, 6)
     gaussian = GaussianStep(torch.randn(4, 2, 3), torch.rand(2, 3))
     halves = [GaussianStep(gaussian.mean[:2], gaussian.std), GaussianStep(gaussian.mean[2:], gaussian.std)]
     assert (concatenate_steps(halves).from_noise(noise[:4, :, :3]) == gaussian.from_noise(noise[:4, :, :3])).all()

@@ -13,6 +13,7 @@ from agents.diffusion import MixedStep
 from agents.diffusion.reverse_steps import state_of
 from agents.networks.mixed_denoiser import Observed
 from agents.post_training import DDPOSFLoss, DenoisingPolicy
+from agents.post_training.algorithms import DDPOSFSettings, NFTSettings, make_algorithm
 from agents.post_training.rollouts import collect
 from agents.priors.base import ScenePrior
 from agents.priors.mixed import MixedPrior
@@ -237,3 +238,39 @@ def test_the_probability_of_a_chain_of_states_is_that_of_bayes(prior: MixedPrior
     expected = torch.cat([keep * data + rest, torch.full((33, 1), mask)], dim=-1)
     torch.testing.assert_close(step.probs[0, 1:], expected, atol=1e-4, rtol=0)
     assert math.isclose(float(expected.detach().sum(dim=-1).mean()), 1.0, abs_tol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def systematic() -> MixedPrior:
+    """An absorbing chain whose slots draw their categories by systematic sampling."""
+    made = tiny_prior(process="mixed")
+    assert isinstance(made, MixedPrior)
+    config = replace(made.config, kernel="squared_absorbing", unmasking="systematic")
+    return MixedPrior(config, made.normalizer, made.preconditioning).eval()
+
+
+def test_systematic_sampling_follows_its_seed_and_keeps_what_is_observed(
+    systematic: MixedPrior, scenes: SceneBatch
+) -> None:
+    first, again = (systematic.sample(4, num_steps=5, seed=2) for _ in range(2))
+    assert torch.equal(first.tensor, again.tensor)
+    mask = scenes.is_free & (torch.arange(scenes.tensor.shape[1]) % 2 == 0)
+    alone = systematic.inpaint(scenes[2], mask[2:3], num_steps=5, seed=2)
+    together = systematic.inpaint(scenes, mask, num_steps=5, seed=0)
+    torch.testing.assert_close(together[2].tensor, alone.tensor)
+    assert torch.equal(together.tensor[~mask], scenes.tensor[~mask])
+
+
+def test_a_policy_draws_independently_where_log_probabilities_are_read(systematic: MixedPrior) -> None:
+    """Only then is the sum over slots the log-probability of the action; own samples are drawn as users get them."""
+    x, step = systematic.initial(3, 34, torch.Generator().manual_seed(0)), 3
+    table = systematic.step_table(8)
+    assert systematic.transition(x, step, table).is_systematic
+    exact, free = (DenoisingPolicy(systematic, 8, independent=flag, chunk=2) for flag in (True, False))
+    assert not exact.distribution(x, step).is_systematic
+    assert free.distribution(x, step).is_systematic
+    noise = torch.randn(x.shape, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(free.draw(x, step, noise=noise)[0], systematic.transition(x, step, table).from_noise(noise))
+    for settings, expected in ((DDPOSFSettings(), True), (NFTSettings(), False)):
+        algorithm = make_algorithm(settings, DenoisingPolicy(systematic, 8), torch.ones(8))
+        assert algorithm.sampling_policy.independent is expected
