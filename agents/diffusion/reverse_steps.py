@@ -127,8 +127,9 @@ class MixedStep(NamedTuple):
         masked: (B, N) bool, slots of which as many as expected are unmasked together
             (:mod:`agents.diffusion.unmasking`); None unmasks each by its own chance.
         denoised: (B, N, P + K) the denoiser's estimate of x_0, categories by arg-max, where it is known.
-        is_systematic: slots that are unmasked together draw their categories by systematic sampling, so that their
-            numbers are near the expected ones; :meth:`log_prob` does not know this, see :meth:`independent`.
+        groups: (B, K) int64, the group of each category: slots that are unmasked together draw groups by systematic
+            sampling, so that the number of each group is near the expected one, and then categories within the groups
+            independently. None draws categories independently, which is what :meth:`log_prob` describes.
 
     >>> probs = torch.tensor([[[0.25, 0.75, 0.0]]])
     >>> step = MixedStep(torch.zeros(1, 1, 1), torch.ones(1, 1), probs, torch.tensor([True]))
@@ -142,13 +143,14 @@ class MixedStep(NamedTuple):
     random: Tensor
     masked: Tensor | None = None
     denoised: Tensor | None = None
-    is_systematic: bool = False
+    groups: Tensor | None = None
 
     def take(self, rows: Tensor) -> MixedStep:
         """The step of scenes ``rows`` (K,), which may come more than once."""
         masked = None if self.masked is None else self.masked[rows]
         pose_std, random = _of_rows(self.pose_std, rows, 3), _of_rows(self.random, rows, 2)
-        return MixedStep(self.mean[rows], pose_std, self.probs[rows], random, masked, is_systematic=self.is_systematic)
+        groups = None if self.groups is None else self.groups[rows]
+        return MixedStep(self.mean[rows], pose_std, self.probs[rows], random, masked, groups=groups)
 
     def observing(self, pose: Tensor, category: Tensor, x: Tensor) -> MixedStep:
         """The step in which some slots are certain to be as in ``x`` (B, N, P + K).
@@ -173,8 +175,8 @@ class MixedStep(NamedTuple):
         return self._replace(mean=_shifted(self.mean, shift))
 
     def independent(self) -> MixedStep:
-        """The step whose slots draw their categories independently, which :meth:`log_prob` assumes."""
-        return self._replace(is_systematic=False)
+        """The step whose slots draw their categories independently, as :meth:`log_prob` assumes."""
+        return self._replace(groups=None)
 
     @property
     def std(self) -> Tensor:
@@ -189,21 +191,25 @@ class MixedStep(NamedTuple):
     def from_noise(self, noise: Tensor) -> Tensor:
         """Poses shifted and scaled; states by inverting their distribution function at Phi of one noise entry.
 
-        Phi of the next entry says which masked slots are unmasked, where they are unmasked together.
+        Phi of the next entry says which masked slots are unmasked, where they are unmasked together, and that of the
+        third one draws within the groups.
         """
         pose = self.mean.shape[-1]
-        uniform = torch.special.ndtr(noise[..., pose : pose + 2].double())
-        drawn = self._draw_states(uniform[..., 0], uniform[..., 1])
+        uniform = torch.special.ndtr(noise[..., pose : pose + 3].double())
+        drawn = self._draw_states(uniform[..., 0], uniform[..., 1], uniform[..., -1])
         state = torch.where(self.random, drawn, self.probs.argmax(dim=-1))
         return torch.cat([self.mean + self.pose_std * noise[..., :pose], one_hot_state(state, self.probs)], dim=-1)
 
-    def _draw_states(self, uniform: Tensor, order: Tensor) -> Tensor:
+    def _draw_states(self, uniform: Tensor, order: Tensor, inner: Tensor) -> Tensor:
         mask = self.probs.shape[-1] - 1
         cumulative = self.probs.double().cumsum(dim=-1)
         if self.masked is None:
             return _invert(cumulative, uniform)
         unmasked = draw_unmasked(self.masked, 1 - self.probs[..., -1], order)
-        chosen = _invert(cumulative[..., :-1], systematic(unmasked, uniform) if self.is_systematic else uniform)
+        if self.groups is None:
+            chosen = _invert(cumulative[..., :-1], uniform)
+        else:
+            chosen = _draw_grouped(self.probs[..., :-1].double(), self.groups, systematic(unmasked, uniform), inner)
         states = torch.where(unmasked, chosen, torch.full_like(chosen, mask))
         return torch.where(self.masked, states, self.probs.argmax(dim=-1))
 
@@ -211,7 +217,7 @@ class MixedStep(NamedTuple):
         """(B, N) nats: the log-density of the pose plus the log-probability of the state.
 
         Which slots are unmasked together has one log-probability per scene; the masked slots have equal shares of it.
-        With systematic sampling the sum over slots is not the log-probability of the step, which has no simple form.
+        With ``groups`` the sum over slots is not the log-probability of the step, which has no simple form.
         """
         pose = self.mean.shape[-1]
         continuous = gaussian_log_prob(x[..., :pose], self.mean, self.pose_std)
@@ -245,6 +251,16 @@ def _invert(cumulative: Tensor, uniform: Tensor) -> Tensor:
     return below.sum(dim=-1).clamp(max=cumulative.shape[-1] - 1)
 
 
+def _draw_grouped(probs: Tensor, groups: Tensor, uniform: Tensor, inner: Tensor) -> Tensor:
+    """(B, N) int64 categories of weights (B, N, K): a group of ``groups`` (B, K) by ``uniform``, then one in it."""
+    order = groups.argsort(dim=-1, stable=True)[:, None].expand_as(probs)
+    sorted_groups = groups[:, None].expand_as(probs).gather(2, order)
+    weights = probs.gather(2, order)
+    group = sorted_groups.gather(2, _invert(weights.cumsum(dim=-1), uniform).unsqueeze(-1))
+    within = _invert((weights * (sorted_groups == group)).cumsum(dim=-1), inner)
+    return order.gather(2, within.unsqueeze(-1)).squeeze(-1)
+
+
 def one_hot_state(state: Tensor, probs: Tensor) -> Tensor:
     """(..., K) one-hot rows of states (...) in 0..K, with all zeros for the mask token K; dtype of ``probs``."""
     return F.one_hot(state, probs.shape[-1])[..., :-1].to(probs.dtype)
@@ -269,7 +285,8 @@ def concatenate_steps(parts: Sequence[ReverseStep]) -> ReverseStep:
         mean, probs = (torch.cat([getattr(part, name) for part in mixed]) for name in ("mean", "probs"))
         masked = None if first.masked is None else torch.cat([part.masked for part in mixed if part.masked is not None])
         pose_std, random = _joined([part.pose_std for part in mixed], 3), _joined([part.random for part in mixed], 2)
-        return MixedStep(mean, pose_std, probs, random, masked, is_systematic=first.is_systematic)
+        groups = None if first.groups is None else torch.cat([part.groups for part in mixed if part.groups is not None])
+        return MixedStep(mean, pose_std, probs, random, masked, groups=groups)
     raise TypeError(f"cannot concatenate steps of type {type(first).__name__}")
 
 

@@ -14,6 +14,8 @@ from agents.networks.flux_modules import FluxModule, FluxSizes, ModuleConfig, Sc
 
 _DELTA = 0.02
 """Objects that may always still come, so that logarithms are finite."""
+_KNOWN = 0.8
+"""Probability of its likeliest number from which a text gives the number of a kind."""
 _LEAST = 0.1
 """Probability of the numbers from the visible one on, below which fewer objects of the kind are expected."""
 
@@ -121,6 +123,14 @@ class CountConditioning(FluxModule):
         inside = self.thing + self.asked_in(tokens) + self.seen_in(torch.cat([facts / 8.0, facts.log1p()], dim=-1))
         correction: Tensor = self.out(F.silu(self.inner(F.silu(inside))))
         return (self.trust * share + correction[..., 0])[:, self.kinds]
+
+    def groups_by_number(self, tokens: Tensor) -> Tensor:
+        """(B, K) int64: a group of its own for each kind whose number the text gives; all others are one group.
+
+        *Empty* has a group of its own where the text gives the number of all objects. ``tokens`` as in :meth:`forward`.
+        """
+        known = self.count_logits(tokens).softmax(dim=-1).amax(dim=-1) >= _KNOWN
+        return torch.where(known[:, self.kinds], self.kinds, self.things)
 
     def _numbers(self, counts: Tensor) -> Tensor:
         """(B, G + 1) objects of each kind, and in all, from (B, K) slots in each category, whose last is not read."""

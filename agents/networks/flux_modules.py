@@ -120,6 +120,13 @@ class FluxModule(nn.Module):
         """(B, 1 or N, K) joins the logits of the categories."""
         return None
 
+    def groups_by_number(self, tokens: Tensor) -> Tensor | None:
+        """(B, K) int64 groups of the categories, from the module's own text ``tokens`` (B, L, W).
+
+        The core asks for them outside of a pass, and takes the first that a module gives.
+        """
+        return None
+
     def pose_output(self, scene: Scene, features: Tensor) -> Tensor | None:
         """(B, N, 12) joins the pose output; ``features`` (B, N, E) are what the last layer of the core says."""
         return None

@@ -98,6 +98,11 @@ class MixedDenoiser(nn.Module):
         self.poses = poses
         self.categories = categories
 
+    def groups_by_number(self, text: Text) -> Tensor | None:
+        """(B, K) int64 groups of categories by the numbers that ``text`` gives; None for a network that reads none."""
+        grouped = getattr(self.network, "groups_by_number", None)
+        return None if grouped is None else grouped(text[0])
+
     def moments(self, states: Tensor, t: Tensor) -> Moments | None:
         """Mean and std (B, N, 12) of poses whose categories are in ``states`` (B, N) at ``t`` (B,).
 

@@ -125,6 +125,19 @@ class MixedFlux(nn.Module):
         logits = self._add(self.logits_out(features), lambda module: module.logits(scene))
         return self._add(self.pose_out(features), lambda module: module.pose_output(scene, features)), logits
 
+    def groups_by_number(self, text: Tensor) -> Tensor | None:
+        """(B, K) int64 groups of categories by the numbers that ``text`` (B, L, W) gives; None without such a module.
+
+        See :meth:`~agents.networks.count_conditioning.CountConditioning.groups_by_number`.
+        """
+        for module in self.config.modules:
+            count = module.text_tokens(self.config)
+            groups = getattr(self, module.name).groups_by_number(text[:, :count]) if count else None
+            if groups is not None:
+                return groups
+            text = text[:, count:]
+        return None
+
     # -- blocks -----------------------------------------------------------------------------------
 
     def _attend(

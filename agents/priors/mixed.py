@@ -195,14 +195,14 @@ class MixedPrior(TrainableMixedPrior):
             certain = F.one_hot(self._fixed[:fixed, POSE_FEATURES:].argmax(dim=-1), self.num_categories + 1).to(probs)
             probs = torch.cat([certain.expand(len(probs), -1, -1), probs[:, fixed:]], dim=1)
         masked = (state == self.num_categories) & random if self._together else None
+        groups = self.denoiser.groups_by_number(text) if self._systematic and text is not None else None
         category = logits.argmax(dim=-1)
         if self.categories.only_absorbs:
             category = torch.where(state < self.num_categories, state, category)
         estimate = torch.cat([pose, F.one_hot(category, self.num_categories).to(pose)], dim=-1).detach()
         return MixedStep(
-            clamped[..., :POSE_FEATURES], std * (~known).to(mean.dtype), probs, random, masked, estimate,
-            self._systematic,
-        )  # fmt: skip
+            clamped[..., :POSE_FEATURES], std * (~known).to(mean.dtype), probs, random, masked, estimate, groups
+        )
 
     def observed_transition(
         self, x_t: Tensor, step: int, table: StepTableLike, observed: Tensor, *,

@@ -66,10 +66,12 @@ def _masked(chance: float, batch: int = 1) -> MixedStep:
     return MixedStep(torch.zeros(batch, 5, 1), torch.zeros(5, 1), probs.expand(batch, -1, -1), random, masked)
 
 
-@pytest.mark.parametrize("is_systematic", [False, True])
+@pytest.mark.parametrize("grouped", [False, True])
 @pytest.mark.parametrize("chance", [0.1, 0.3, 0.5, 0.9])
-def test_slots_unmasked_together_are_as_many_as_expected(chance: float, is_systematic: bool) -> None:
-    step = _masked(chance, 40_000)._replace(is_systematic=is_systematic)
+def test_slots_unmasked_together_are_as_many_as_expected(chance: float, grouped: bool) -> None:
+    step = _masked(chance, 40_000)
+    if grouped:
+        step = step._replace(groups=torch.tensor([[2, 5, 2]]).expand(40_000, -1))
     state = state_of(step.from_noise(torch.randn(40_000, 5, 4, generator=torch.Generator().manual_seed(1)))[..., 1:])
     number = (state[:, [0, 1, 3, 4]] < 3).sum(dim=1)
     assert set(number.unique().tolist()) <= {int(4 * chance), int(4 * chance) + 1}
@@ -109,19 +111,23 @@ def test_systematic_numbers_are_uniform_and_a_step_apart(slots: int) -> None:
         assert chisquare(pairs[~torch.eye(slots, dtype=torch.bool)]).pvalue > 1e-4
 
 
-def test_systematic_sampling_gives_each_category_its_expected_number() -> None:
-    """Thirty masked slots with probabilities 0.1, 0.25, 0.05 and 0.6: 3, 7 or 8, 1 or 2, and 18 slots."""
-    chosen = torch.tensor([0.1, 0.25, 0.05, 0.6])
+def test_systematic_sampling_gives_each_group_its_expected_number() -> None:
+    """Thirty masked slots with probabilities 0.1, 0.25, 0.05 and 0.6; the second and the third are one group."""
+    chosen, groups = torch.tensor([0.1, 0.25, 0.05, 0.6]), torch.tensor([7, 1, 1, 0])
     probs = torch.cat([chosen, torch.zeros(1)]).expand(500, 30, 5)
     masked, random = torch.ones(500, 30, dtype=torch.bool), torch.ones(30, dtype=torch.bool)
-    step = MixedStep(torch.zeros(500, 30, 1), torch.zeros(30, 1), probs, random, masked, is_systematic=True)
+    alone = MixedStep(torch.zeros(500, 30, 1), torch.zeros(30, 1), probs, random, masked)
+    step = alone._replace(groups=groups.expand(500, -1))
     noise = torch.randn(500, 30, 5, generator=torch.Generator().manual_seed(0))
     state = state_of(step.from_noise(noise)[..., 1:])
     numbers = torch.stack([(state == value).sum(dim=1) for value in range(4)], dim=-1)
-    assert bool(((numbers - 30 * chosen).abs() < 1).all())
-    torch.testing.assert_close(numbers.float().mean(dim=0), 30 * chosen, atol=0.08, rtol=0)
-    alone = state_of(step.independent().from_noise(noise)[..., 1:])
-    assert float((alone == 3).sum(dim=1).float().std()) == pytest.approx((30 * 0.6 * 0.4) ** 0.5, rel=0.1)
+    assert numbers[:, 0].eq(3).all()
+    assert numbers[:, 1:3].sum(dim=1).eq(9).all()
+    assert numbers[:, 3].eq(18).all()
+    spread = (9 * (5 / 6) * (1 / 6)) ** 0.5  # within the group slots draw independently
+    assert float(numbers[:, 1].float().std()) == pytest.approx(spread, rel=0.1)
+    torch.testing.assert_close(numbers.float().mean(dim=0), 30 * chosen, atol=0.2, rtol=0)
+    assert torch.equal(step.independent().from_noise(noise), alone.from_noise(noise))
     assert torch.equal(step.take(torch.tensor([4, 4])).from_noise(noise[:2]), step.from_noise(noise)[:2])
 
 
@@ -131,7 +137,7 @@ def test_steps_of_parts_are_the_step_of_the_whole() -> None:
     together = concatenate_steps(parts)
     noise = torch.randn(5, 2, 6)
     assert (together.from_noise(noise) == whole.from_noise(noise)).all()
-    masked = _masked(0.5, 4)._replace(is_systematic=True)
+    masked = _masked(0.5, 4)._replace(groups=torch.arange(3).expand(4, -1))
     noise = torch.randn(4, 5, 4)
     together = concatenate_steps([masked.take(torch.arange(2)), masked.take(torch.arange(2, 4))])
     assert (together.from_noise(noise) == masked.from_noise(noise)).all()
