@@ -242,35 +242,57 @@ def test_the_probability_of_a_chain_of_states_is_that_of_bayes(prior: MixedPrior
 
 @pytest.fixture(scope="module")
 def systematic() -> MixedPrior:
-    """An absorbing chain whose slots draw their categories by systematic sampling."""
-    made = tiny_prior(process="mixed")
-    assert isinstance(made, MixedPrior)
-    config = replace(made.config, kernel="squared_absorbing", unmasking="systematic")
-    return MixedPrior(config, made.normalizer, made.preconditioning).eval()
+    """A shipped prior, whose slots draw the kinds that a prompt counts by systematic sampling."""
+    prior = ScenePrior.load("dimsum_table")
+    assert isinstance(prior, MixedPrior)
+    assert prior.config.unmasking == "systematic"
+    return prior
 
 
-def test_systematic_sampling_follows_its_seed_and_keeps_what_is_observed(
-    systematic: MixedPrior, scenes: SceneBatch
-) -> None:
-    first, again = (systematic.sample(4, num_steps=5, seed=2) for _ in range(2))
+def test_kinds_that_a_prompt_counts_are_groups_of_their_own(systematic: MixedPrior) -> None:
+    names = systematic.scene_type.assets
+    text = systematic.encode_prompts(["A scene with three teapots and two cups.", "A scene with 12 objects.", ""])
+    groups = systematic.denoiser.groups_by_number(text)[:, 1:]  # there is always one table
+    named, counted, nothing = groups.tolist()
+    teapot, cup, plate = (names.index(name) - 1 for name in ("teapot", "teacup", "dinner_plate"))
+    rest = named[plate]
+    assert named[teapot] != named[cup]
+    assert rest not in (named[teapot], named[cup])
+    assert named[-1] == rest  # the number of all objects is not given
+    assert set(counted[:-1]) == {rest}
+    assert counted[-1] != rest
+    assert set(nothing) == {rest}
+
+
+def test_systematic_sampling_follows_its_seed_and_changes_nothing_without_a_prompt(systematic: MixedPrior) -> None:
+    prompt = "A scene with three teapots and two cups."
+    first, again = (systematic.sample(4, prompt=prompt, num_steps=10, seed=2) for _ in range(2))
     assert torch.equal(first.tensor, again.tensor)
-    mask = scenes.is_free & (torch.arange(scenes.tensor.shape[1]) % 2 == 0)
-    alone = systematic.inpaint(scenes[2], mask[2:3], num_steps=5, seed=2)
-    together = systematic.inpaint(scenes, mask, num_steps=5, seed=0)
-    torch.testing.assert_close(together[2].tensor, alone.tensor)
-    assert torch.equal(together.tensor[~mask], scenes.tensor[~mask])
+    even = MixedPrior.load("dimsum_table")
+    even._systematic = False
+    assert torch.equal(even.sample(3, num_steps=5, seed=2).tensor, systematic.sample(3, num_steps=5, seed=2).tensor)
+    generators = [torch.Generator().manual_seed(seed) for seed in (5, 6, 7)]
+    mask = first.is_free[:3] & (torch.arange(first.tensor.shape[1]) % 2 == 0)
+    together = systematic.inpaint(first[:3], mask, prompt=prompt, num_steps=5, generators=generators)
+    alone = systematic.inpaint(
+        first[2], mask[2:], prompt=prompt, num_steps=5, generators=[torch.Generator().manual_seed(7)]
+    )
+    assert torch.equal(together[2].categories, alone.categories)
+    torch.testing.assert_close(together[2].tensor, alone.tensor, atol=1e-4, rtol=0)
+    assert torch.equal(together.tensor[~mask], first[:3].tensor[~mask])
 
 
 def test_a_policy_draws_independently_where_log_probabilities_are_read(systematic: MixedPrior) -> None:
     """Only then is the sum over slots the log-probability of the action; own samples are drawn as users get them."""
+    text = systematic.encode_prompts(["A scene with three teapots."] * 3)
     x, step = systematic.initial(3, 34, torch.Generator().manual_seed(0)), 3
-    table = systematic.step_table(8)
-    assert systematic.transition(x, step, table).is_systematic
+    transition = systematic.transition(x, step, systematic.step_table(8), text=text)
+    assert transition.groups is not None
     exact, free = (DenoisingPolicy(systematic, 8, independent=flag, chunk=2) for flag in (True, False))
-    assert not exact.distribution(x, step).is_systematic
-    assert free.distribution(x, step).is_systematic
+    assert exact.distribution(x, step, text).groups is None
     noise = torch.randn(x.shape, generator=torch.Generator().manual_seed(1))
-    assert torch.equal(free.draw(x, step, noise=noise)[0], systematic.transition(x, step, table).from_noise(noise))
+    drawn = free.draw(x, step, text=text, noise=noise)[0]
+    torch.testing.assert_close(drawn, transition.from_noise(noise), atol=1e-4, rtol=0)
     for settings, expected in ((DDPOSFSettings(), True), (NFTSettings(), False)):
         algorithm = make_algorithm(settings, DenoisingPolicy(systematic, 8), torch.ones(8))
         assert algorithm.sampling_policy.independent is expected
