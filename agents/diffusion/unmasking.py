@@ -2,8 +2,8 @@
 
 Slots that are unmasked in the same step do not know each other's categories, so scenes get too many objects of a kind.
 Two remedies leave the distribution of each slot as it is. The number of slots that a step unmasks differs from its
-expectation by less than one (:func:`draw_unmasked`). The categories of these slots are drawn by systematic sampling
-(:func:`systematic`), so the number of each category differs little from its expectation as well.
+expectation by less than one (:func:`draw_unmasked`). The kinds of objects whose number a prompt gives are drawn by
+systematic sampling (:func:`systematic`), so the number of each differs little from its expectation as well.
 """
 
 from __future__ import annotations

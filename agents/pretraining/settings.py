@@ -106,8 +106,8 @@ class ProcessSettings:
             paper; ``dropped`` leaves them out, which saves most of the work and needs a mixed prior with an absorbing
             kernel.
         unmasking: choice of the slots that a sampling step of an absorbing kernel unmasks. ``even`` unmasks the
-            expected number, rounded, so that a step decides few categories at once; ``systematic`` also draws their
-            categories so that the number of each is near the expected one; ``independent`` draws each slot on its own.
+            expected number, rounded, so that a step decides few categories at once; with ``systematic`` the slots also
+            share out the kinds of objects whose number a prompt gives; ``independent`` draws each slot on its own.
         denoised_clip: bound on denoised scenes during sampling, in normalised units; 0 for no bound.
     """
 

@@ -96,8 +96,8 @@ class MixedPriorConfig(PoseDiffusionConfig, DenoiserConfig):
         empty_slots: ``"dropped"`` leaves slots that are known to be empty out of the network, which saves most of the
             work at low noise and needs an absorbing kernel; ``"attended"`` is the paper's.
         unmasking: which masked slots a step of an absorbing kernel unmasks: ``"even"``, as near to the expected number
-            as can be; ``"systematic"``, which also draws their categories so that the number of each is near the
-            expected one; or ``"independent"``, each by its own chance. Other kernels take only ``"independent"``.
+            as can be; ``"systematic"``, the same, and kinds of objects whose number a prompt gives are near their
+            expected numbers, too; or ``"independent"``, each by its own chance. Other kernels always draw independently.
         union: what a scene of a union of scene types may hold: ``"one_type"``, the assets of one member, which is
             settled by the first objects of the scene, or ``"any"`` assets. Needs an absorbing kernel; other scene
             types have one member.

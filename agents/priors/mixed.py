@@ -98,7 +98,7 @@ class MixedPrior(TrainableMixedPrior):
             make_categorical_schedule(config.kernel, config.num_timesteps), config.network.categories
         )
         self._together = config.unmasking != "independent" and self.categories.only_absorbs
-        self._systematic = config.unmasking == "systematic"
+        self._systematic = config.unmasking == "systematic" and self._together
         encoder = None if config.text is None else text_encoder(config.text)
         self.denoiser = MixedDenoiser(
             build_network(config.network), self.process, self.categories, encoder, config.empty_slots
