@@ -16,7 +16,7 @@ _DELTA = 0.02
 """Objects that may always still come, so that logarithms are finite."""
 _KNOWN = 0.8
 """Probability of its likeliest number from which a text gives the number of a kind."""
-_LEAST = 0.1
+_LEAST = 0.01
 """Probability of the numbers from the visible one on, below which fewer objects of the kind are expected."""
 
 

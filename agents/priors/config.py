@@ -97,7 +97,7 @@ class MixedPriorConfig(PoseDiffusionConfig, DenoiserConfig):
             work at low noise and needs an absorbing kernel; ``"attended"`` is the paper's.
         unmasking: which masked slots a step of an absorbing kernel unmasks: ``"even"``, as near to the expected number
             as can be; ``"systematic"``, the same, and kinds of objects whose number a prompt gives are near their
-            expected numbers, too; or ``"independent"``, each by its own chance. Other kernels always draw independently.
+            expected numbers, too; or ``"independent"``, each by its own chance. Other kernels draw independently.
         union: what a scene of a union of scene types may hold: ``"one_type"``, the assets of one member, which is
             settled by the first objects of the scene, or ``"any"`` assets. Needs an absorbing kernel; other scene
             types have one member.
