@@ -16,8 +16,9 @@ _DELTA = 0.02
 """Objects that may always still come, so that logarithms are finite."""
 _KNOWN = 0.8
 """Probability of its likeliest number from which a text gives the number of a kind."""
-_LEAST = 0.01
-"""Probability of the numbers from the visible one on, below which fewer objects of the kind are expected."""
+_LEAST = 0.1
+"""Probability of the numbers from the visible one on, below which fewer objects of a known number are expected."""
+_TINY = 1e-9
 
 
 @dataclass(frozen=True)
@@ -142,9 +143,10 @@ class CountConditioning(FluxModule):
 def still_to_come(logits: Tensor, visible: Tensor) -> Tensor:
     """Expected number beyond the visible one, 0 at least: (..., M) logits of 0..M-1 and (...) visible to (...).
 
-    It is the mean over the numbers that the visible one allows. Where the text gives these less than ``_LEAST`` in all,
-    more objects are visible than it asks for, and the mean shrinks to 0 in proportion. Without this bound the mean
-    would be that of the remote tail, and all masked slots would become objects of a kind that is complete.
+    It is the mean over the numbers that the visible one allows. Where one number has a probability of at least
+    ``_KNOWN`` and all that are allowed have less than ``_LEAST``, more objects are visible than the text asks for, and
+    the mean shrinks to 0 in proportion. Without this bound the mean would be that of the remote tail, and all masked
+    slots would become objects of a kind that is complete.
 
     >>> still_to_come(torch.tensor([[0.0, 0.0, 0.0, 0.0]]), torch.tensor([1.0]))  # 1, 2 or 3, as likely
     tensor([1.])
@@ -154,5 +156,7 @@ def still_to_come(logits: Tensor, visible: Tensor) -> Tensor:
     """
     number = torch.arange(logits.shape[-1], device=logits.device, dtype=logits.dtype)
     beyond = number - visible[..., None]
-    weight = logits.softmax(dim=-1) * (beyond >= 0)
-    return (weight * beyond).sum(dim=-1) / weight.sum(dim=-1).clamp(min=_LEAST)
+    probability = logits.softmax(dim=-1)
+    weight = probability * (beyond >= 0)
+    least = torch.where(probability.amax(dim=-1) >= _KNOWN, _LEAST, _TINY)
+    return (weight * beyond).sum(dim=-1) / weight.sum(dim=-1).maximum(least)
