@@ -143,10 +143,10 @@ class CountConditioning(FluxModule):
 def still_to_come(logits: Tensor, visible: Tensor) -> Tensor:
     """Expected number beyond the visible one, 0 at least: (..., M) logits of 0..M-1 and (...) visible to (...).
 
-    It is the mean over the numbers that the visible one allows. Where one number has a probability of at least
+    It is the mean over the numbers that the visible one allows. Where one number above 0 has a probability of at least
     ``_KNOWN`` and all that are allowed have less than ``_LEAST``, more objects are visible than the text asks for, and
     the mean shrinks to 0 in proportion. Without this bound the mean would be that of the remote tail, and all masked
-    slots would become objects of a kind that is complete.
+    slots would become objects of a kind that is complete. Kinds that are seldom there at all are left as they are.
 
     >>> still_to_come(torch.tensor([[0.0, 0.0, 0.0, 0.0]]), torch.tensor([1.0]))  # 1, 2 or 3, as likely
     tensor([1.])
@@ -158,5 +158,5 @@ def still_to_come(logits: Tensor, visible: Tensor) -> Tensor:
     beyond = number - visible[..., None]
     probability = logits.softmax(dim=-1)
     weight = probability * (beyond >= 0)
-    least = torch.where(probability.amax(dim=-1) >= _KNOWN, _LEAST, _TINY)
+    least = torch.where(probability[..., 1:].amax(dim=-1) >= _KNOWN, _LEAST, _TINY)
     return (weight * beyond).sum(dim=-1) / weight.sum(dim=-1).maximum(least)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import pytest
+import torch
 
 from agents.post_training.learner import Learner
+from agents.post_training.rollouts import Rollout
 from agents.priors.testing import tiny_prior
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.scene import SceneBatch
@@ -53,17 +55,21 @@ def test_an_empty_slot_has_credit_under_a_sum_alone(tmp_path: Path, averages: bo
     assert bool((advantage[good] > 0).all())
 
 
-@pytest.mark.parametrize(("algorithm", "averages"), [("ddpo_sf", True), ("nft", True), ("nft", False)])
-def test_generated_furniture_is_not_treated_as_infeasible(tmp_path: Path, algorithm: str, averages: bool) -> None:
+def _credit_in_rooms(folder: Path, reward: Any, algorithm: str) -> tuple[Rollout, torch.Tensor]:
+    """Samples of an untrained prior of rooms, and the advantage of their poses (B, N)."""
     prior = tiny_prior("restaurant_low_clutter", process="mixed", seed=3)
-    config = small_config(tmp_path, reward=LeftHalf(averages), batch_size=12, algorithm={"name": algorithm})
-    learner = Learner(config, prior)
+    learner = Learner(small_config(folder, reward=reward, batch_size=12, algorithm={"name": algorithm}), prior)
     try:
         rollout = learner.rollout(0)
         advantage = learner.algorithm.advantage(rollout)
     finally:
         learner.close()
-    poses = advantage["advantage"] if algorithm == "nft" else advantage
+    return rollout, advantage["advantage"] if algorithm == "nft" else advantage
+
+
+@pytest.mark.parametrize(("algorithm", "averages"), [("ddpo_sf", True), ("nft", True), ("nft", False)])
+def test_generated_furniture_is_not_treated_as_infeasible(tmp_path: Path, algorithm: str, averages: bool) -> None:
+    rollout, poses = _credit_in_rooms(tmp_path, LeftHalf(averages), algorithm)
     furniture, free = rollout.batch.is_furniture, rollout.batch.is_free
     assert furniture.any()
     assert not poses[furniture].any()
@@ -73,15 +79,7 @@ def test_generated_furniture_is_not_treated_as_infeasible(tmp_path: Path, algori
 
 @pytest.mark.parametrize("algorithm", ["ddpo_sf", "nft"])
 def test_furniture_that_overlaps_furniture_is_blamed(tmp_path: Path, algorithm: str) -> None:
-    prior = tiny_prior("restaurant_low_clutter", process="mixed", seed=3)
-    config = small_config(tmp_path, reward="feasible_share", batch_size=12, algorithm={"name": algorithm})
-    learner = Learner(config, prior)
-    try:
-        rollout = learner.rollout(0)
-        advantage = learner.algorithm.advantage(rollout)
-    finally:
-        learner.close()
-    poses = advantage["advantage"] if algorithm == "nft" else advantage
+    rollout, poses = _credit_in_rooms(tmp_path, "feasible_share", algorithm)
     furniture = rollout.batch.is_furniture
     apart, blamed = furniture & (rollout.per_object > 0), furniture & (rollout.per_object == 0)
     assert apart.any()
