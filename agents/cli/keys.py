@@ -40,7 +40,8 @@ class KeyHelp:
 ADAPTER = KeyHelp(
     "adapter",
     "",
-    "low-rank updates of the prior: the folder of a run with adapter.rank or an adapter.safetensors; A+0.5*B adds two.",
+    "updates of the prior: the folder of a run from this prior, a prior that was trained from it, or an "
+    "adapter.safetensors; A+0.5*B adds two.",
 )
 """The key that every command with ``prior=`` has besides its own."""
 

@@ -1,4 +1,4 @@
-"""Adapters of priors: low-rank updates in a file of their own, which belong to the weights of one prior."""
+"""Adapters of priors: updates of the weights of one prior, low-rank ones in a file or those of a fine-tuned prior."""
 
 from __future__ import annotations
 
@@ -13,14 +13,17 @@ from typing import Any, Protocol, TypeVar
 
 from torch import Tensor
 
+from agents.configuration.prior_names import find_prior
 from agents.networks.low_rank import add_low_rank, low_rank_tensors, merge, set_low_rank
-from scene_envs.errors import CorruptFileError, InvalidInputError
+from agents.priors.storage import StoredPrior, read_stored
+from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError
 from scene_envs.files import write_json
+from scene_envs.scene_types import SceneType
 from scene_envs.tensor_files import read_tensors, tensors_digest, write_tensors
 
 ADAPTER_NAME = "adapter.safetensors"
 AdapterSpec = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
-"""A file, or the folder of a run; several joined by ``+``, or in a list; each may have a factor before ``*``."""
+"""A file, a run folder or a prior; several joined by ``+``, or in a list; each may have a factor before ``*``."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +48,14 @@ class Adaptable(Protocol):
 
     adapter: AdapterFacts | None
     denoiser: Any
+    scene_type: SceneType
+    process_name: str
 
     def weights(self) -> dict[str, Tensor]:
         """Trained tensors by name."""
+
+    def load_weights(self, tensors: dict[str, Tensor]) -> None:
+        """Inverse of :meth:`weights`."""
 
     def requires_grad_(self, requires_grad: bool = True) -> Any:
         """Switch the gradient of all weights on or off, as torch modules do."""
@@ -61,7 +69,7 @@ class AdapterTerm:
     """One adapter of a sum.
 
     Attributes:
-        path: its file, or a folder that holds it.
+        path: its file, a folder that holds it, or a prior with all its weights.
         factor: on its updates.
     """
 
@@ -126,17 +134,21 @@ def with_adapter_of(prior: Prior, directory: str | os.PathLike[str]) -> Prior:
 def merge_adapters(prior: Adaptable, name: str, terms: Sequence[AdapterTerm]) -> None:
     """Add the updates of adapters to the weights of a prior.
 
+    The update of a fine-tuned prior is its weights minus those of ``prior`` (task arithmetic, Ilharco et al. 2023).
+
     Args:
         prior: is changed.
         name: of the prior, for messages.
-        terms: adapters that were all trained on this prior.
+        terms: adapters, or fine-tuned priors, that were all trained on this prior.
 
     Raises:
         InvalidInputError: a file is missing, or an adapter is of another prior.
         CorruptFileError: a file is not an adapter.
     """
     digest = weights_digest(prior)
-    found = [(term, _read_facts(term), _read_tensors(term)) for term in terms]
+    whole = {term: stored for term in terms if (stored := _read_whole(term)) is not None}
+    differences = [_difference(prior, name, term, stored) for term, stored in whole.items()]
+    found = [(term, _read_facts(term), _read_tensors(term)) for term in terms if term not in whole]
     for term, facts, _ in found:
         if facts.digest != digest:
             same = "" if facts.prior != name else ", whose weights have changed since"
@@ -150,6 +162,40 @@ def merge_adapters(prior: Adaptable, name: str, terms: Sequence[AdapterTerm]) ->
             merge(prior.denoiser.network, tensors, term.factor * facts.scale)
         except (KeyError, RuntimeError) as error:
             raise CorruptFileError(f"the tensors of {str(term.file)!r} do not fit {name!r}: {error}") from error
+    if differences:
+        weights = prior.weights()
+        prior.load_weights({key: value + sum(each[key] for each in differences) for key, value in weights.items()})
+
+
+def _read_whole(term: AdapterTerm) -> StoredPrior | None:
+    """The fine-tuned prior that a term names; None where it has a file of low-rank updates, or is no prior."""
+    if term.file.exists():
+        return None
+    try:
+        find_prior(term.path)
+    except SceneEnvsError:
+        return None
+    return read_stored(term.path)
+
+
+def _difference(prior: Adaptable, name: str, term: AdapterTerm, stored: StoredPrior) -> dict[str, Tensor]:
+    """What a fine-tuned prior adds to the weights of its base prior, times the factor of the term."""
+    base = stored.card.get("post_training", {}).get("base", Path(name).name)
+    weights = prior.weights()
+    shapes, others = ({key: tensor.shape for key, tensor in each.items()} for each in (weights, stored.tensors))
+    same = (stored.process, stored.scene_type.name, others) == (prior.process_name, prior.scene_type.name, shapes)
+    if base != Path(name).name or not same:
+        origin = f"was trained from {base!r}" if base != Path(name).name else "has another network or scene type"
+        raise InvalidInputError(
+            f"adapter={str(term.path)!r}: this prior {origin}, so it cannot be added to {name!r}; give priors that "
+            f"were trained from {name!r}, or load its own base prior with prior="
+        )
+    changes = {key: stored.tensors[key].to(value) - value for key, value in weights.items()}
+    if not any(bool(change.any()) for change in changes.values()):
+        raise InvalidInputError(
+            f"adapter={str(term.path)!r}: this prior has the weights of {name!r}, so it adds nothing; leave it out"
+        )
+    return {key: term.factor * change for key, change in changes.items()}
 
 
 def weights_digest(prior: Adaptable) -> str:
@@ -164,7 +210,7 @@ def _read_facts(term: AdapterTerm) -> AdapterFacts:
     except (FileNotFoundError, NotADirectoryError):
         raise InvalidInputError(
             f"adapter={str(term.path)!r}: there is no {str(file)!r}; name an adapter.safetensors with its adapter.json "
-            "beside it, or the folder of a run with adapter.rank"
+            "beside it, the folder of a run, or a prior that was trained from this one"
         ) from None
     except (ValueError, TypeError, UnicodeDecodeError) as error:
         raise CorruptFileError(f"{str(file)!r} is not the description of an adapter: {error}") from error

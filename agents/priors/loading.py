@@ -68,8 +68,9 @@ class Loadable(ABC):
 
         Args:
             name: of the prior; ``NAME with ADAPTER`` names its adapters as well.
-            adapter: low-rank updates that are added to its weights: the file or the run folder of one, several joined
-                by ``+`` or in a list, each with a factor before ``*`` if need be.
+            adapter: updates that are added to its weights: a file of low-rank ones, a run folder, or a prior that was
+                trained from this one. Several are joined by ``+`` or in a list, each with a factor before ``*`` if need
+                be.
 
         Raises:
             UnknownNameError: no shipped prior has that name.

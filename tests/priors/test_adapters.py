@@ -98,6 +98,51 @@ def test_adapters_add_with_factors_and_any_spelling_of_a_sum(tmp_path: Path) -> 
         assert torch.allclose(prior.weights()[key], expected, atol=1e-6)  # type: ignore[attr-defined]
 
 
+def _fine_tuned(prior: ScenePrior, seed: int, base: str) -> ScenePrior:
+    """A copy with other weights, as of a run from the prior ``base`` that trained all of them."""
+    prior = deepcopy(prior)
+    generator = Generator().manual_seed(seed)
+    prior.load_weights(
+        {name: w + 0.05 * torch.randn(w.shape, generator=generator) for name, w in prior.weights().items()}
+    )
+    prior.card = {"post_training": {"base": base}}
+    return prior
+
+
+def test_fine_tuned_priors_and_adapters_add(base: ScenePrior, tmp_path: Path) -> None:
+    """base + 0.7 (a - base) - 0.2 (b - base) + the low-rank update, of every weight."""
+    folder = base.save(tmp_path / "base")
+    a, b = (_fine_tuned(base, seed, "base") for seed in (1, 2))
+    low_rank = _adapted(base, str(folder), 3)
+    save_adapter(low_rank, tmp_path / "c")
+    run = a.save(tmp_path / "run" / "prior").parent
+    merged = ScenePrior.load(folder, adapter=[f"0.7*{run}", f"-0.2*{b.save(tmp_path / 'b')}", tmp_path / "c"])
+    weights = [prior.weights() for prior in (base, a, b, low_rank)]
+    for name, found in merged.weights().items():
+        w0, w1, w2, w3 = (each[name] for each in weights)
+        torch.testing.assert_close(found, w0 + 0.7 * (w1 - w0) - 0.2 * (w2 - w0) + (w3 - w0), rtol=1e-4, atol=1e-6)
+
+
+def test_half_of_a_shipped_prior_is_the_mean_with_its_base() -> None:
+    merged, base, other = (
+        ScenePrior.load(name).weights()
+        for name in ("dimsum_table with 0.5*dimsum_table_feasible", "dimsum_table", "dimsum_table_feasible")
+    )
+    for name, found in merged.items():
+        torch.testing.assert_close(found, (base[name] + other[name]) / 2, rtol=1e-5, atol=1e-6)
+
+
+def test_priors_that_were_not_trained_from_this_one_are_refused(tmp_path: Path) -> None:
+    base = tiny_prior()
+    folder = base.save(tmp_path / "base")
+    elsewhere = _fine_tuned(base, 1, "pantry_shelf").save(tmp_path / "elsewhere")
+    with pytest.raises(InvalidInputError, match=r"trained from 'pantry_shelf'.*added to .*base"):
+        ScenePrior.load(folder, adapter=elsewhere)
+    for other in (tiny_prior("pantry_shelf"), tiny_prior(process="mixed")):
+        with pytest.raises(InvalidInputError, match="another network or scene type"):
+            ScenePrior.load(folder, adapter=other.save(tmp_path / "other"))
+
+
 @pytest.mark.parametrize(
     ("word", "spec"),
     [("adapter=a", "a"), ("adapter=a+0.5*b", "a+0.5*b"), ("adapter=[a,b]", "a+b"), ("adapter=a,b", "a+b")],
@@ -128,7 +173,7 @@ def test_bad_files_and_sums_are_refused(tmp_path: Path) -> None:
     base = tiny_prior()
     folder = base.save(tmp_path / "base")
     save_adapter(_adapted(base, str(folder), 0), tmp_path)
-    for spec, said in (("nowhere", "nowhere"), ("x*a", "FACTOR"), ("a+", "FACTOR"), (str(folder), "no .*adapter")):
+    for spec, said in (("nowhere", "nowhere"), ("x*a", "FACTOR"), ("a+", "FACTOR"), (str(folder), "adds nothing")):
         with pytest.raises(InvalidInputError, match=said):
             ScenePrior.load(folder, adapter=spec)
     (tmp_path / ADAPTER_NAME).write_bytes(b"not tensors")
