@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -50,6 +50,7 @@ class Adaptable(Protocol):
     denoiser: Any
     scene_type: SceneType
     process_name: str
+    card: dict[str, Any]
 
     def weights(self) -> dict[str, Tensor]:
         """Trained tensors by name."""
@@ -165,6 +166,8 @@ def merge_adapters(prior: Adaptable, name: str, terms: Sequence[AdapterTerm]) ->
     if differences:
         weights = prior.weights()
         prior.load_weights({key: value + sum(each[key] for each in differences) for key, value in weights.items()})
+        parts = [part for term, stored in whole.items() for part in _runs(stored.card, term)]
+        prior.card = {**prior.card, "post_training": {"base": Path(name).name, "sum": parts}}
 
 
 def _read_whole(term: AdapterTerm) -> StoredPrior | None:
@@ -190,12 +193,16 @@ def _difference(prior: Adaptable, name: str, term: AdapterTerm, stored: StoredPr
             f"adapter={str(term.path)!r}: this prior {origin}, so it cannot be added to {name!r}; give priors that "
             f"were trained from {name!r}, or load its own base prior with prior="
         )
-    changes = {key: stored.tensors[key].to(value) - value for key, value in weights.items()}
-    if not any(bool(change.any()) for change in changes.values()):
-        raise InvalidInputError(
-            f"adapter={str(term.path)!r}: this prior has the weights of {name!r}, so it adds nothing; leave it out"
-        )
-    return {key: term.factor * change for key, change in changes.items()}
+    return {key: term.factor * (stored.tensors[key].to(value) - value) for key, value in weights.items()}
+
+
+def _runs(card: Mapping[str, Any], term: AdapterTerm) -> list[dict[str, Any]]:
+    """The runs whose updates a fine-tuned prior has, each with its factor; those of a sum are the runs of its terms."""
+    run = card.get("post_training") or {"name": term.path.name}
+    if "sum" in run:
+        return [{**part, "factor": part["factor"] * term.factor} for part in run["sum"]]
+    kept = ("name", "algorithm", "reward", "iteration")
+    return [{"factor": term.factor, **{key: run[key] for key in kept if key in run}}]
 
 
 def weights_digest(prior: Adaptable) -> str:

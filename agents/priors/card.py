@@ -209,14 +209,24 @@ def _training(card: Mapping[str, Any]) -> str:
 
 def _post_training(card: Mapping[str, Any]) -> str:
     run = card.get("post_training") or {}
+    if "sum" in run:
+        terms = " + ".join(f"{part['factor']:g} x ({_iterations(part)})" for part in run["sum"])
+        return f"the weights of `{run['base']}` + {terms}; a bracket is the change of all weights by a run"
     if not run.get("iteration"):
         return ""
-    algorithm = f" of {run['algorithm'].upper().replace('_', '-')}" if "algorithm" in run else ""
     base = f" from `{run['base']}`" if "base" in run else ""
-    return (
-        f"{run['iteration']} iterations{algorithm} toward `{run['reward']}`{base}, held-out loss "
-        f"{run['guard_ratio']:.3f} times the base prior's"
-    )
+    return f"{_iterations(run)}{base}, held-out loss {run['guard_ratio']:.3f} times the base prior's"
+
+
+def _iterations(run: Mapping[str, Any]) -> str:
+    """What a run did, or the name of the prior that it made."""
+    if "reward" not in run:
+        return f"`{run.get('name', 'a run without a card')}`"
+    algorithm = f" of {run['algorithm'].upper().replace('_', '-')}" if "algorithm" in run else ""
+    reward = run["reward"]
+    if isinstance(reward, Mapping) and isinstance(reward.get("rewards"), list):
+        reward = f"{reward.get('name', 'composite')} of {', '.join(map(str, reward['rewards']))}"
+    return f"{run.get('iteration', 0)} iterations{algorithm} toward `{reward}`"
 
 
 def _training_of(source: Path) -> dict[str, Any]:

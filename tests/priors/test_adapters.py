@@ -17,6 +17,8 @@ from agents.networks.low_rank import low_rank_tensors, matrices
 from agents.networks.registry import build_network
 from agents.priors import ScenePrior, list_priors
 from agents.priors.adapters import ADAPTER_NAME, attach_adapter, save_adapter
+from agents.priors.card import card_page
+from agents.priors.facts import PriorFacts
 from agents.priors.testing import tiny_prior
 from scene_envs.envs.resolvers import resolve_prior
 from scene_envs.errors import CorruptFileError, InvalidInputError
@@ -123,6 +125,24 @@ def test_fine_tuned_priors_and_adapters_add(base: ScenePrior, tmp_path: Path) ->
         torch.testing.assert_close(found, w0 + 0.7 * (w1 - w0) - 0.2 * (w2 - w0) + (w3 - w0), rtol=1e-4, atol=1e-6)
 
 
+def test_the_card_of_a_sum_names_its_runs(tmp_path: Path) -> None:
+    """Of two runs and of a sum that is itself an update, whose factors multiply."""
+    base = tiny_prior()
+    folder = base.save(tmp_path / "base")
+    for seed, (name, algorithm) in enumerate((("a", "nft"), ("b", "awm"))):
+        run = _fine_tuned(base, seed, "base")
+        run.card["post_training"] |= {"algorithm": algorithm, "reward": "feasible_share", "iteration": 40 + seed}
+        run.save(tmp_path / name)
+    both = ScenePrior.load(folder, adapter=[f"0.5*{tmp_path / 'a'}", f"2*{tmp_path / 'b'}"])
+    both.save(tmp_path / "both")
+    half = ScenePrior.load(folder, adapter=f"0.5*{tmp_path / 'both'}")
+    page = card_page("half", half, PriorFacts.of(half.save(tmp_path / "half")))
+    assert (
+        "the weights of `base` + 0.25 x (40 iterations of NFT toward `feasible_share`) + 1 x (41 iterations of AWM"
+        in page
+    )
+
+
 def test_half_of_a_shipped_prior_is_the_mean_with_its_base() -> None:
     merged, base, other = (
         ScenePrior.load(name).weights()
@@ -173,7 +193,12 @@ def test_bad_files_and_sums_are_refused(tmp_path: Path) -> None:
     base = tiny_prior()
     folder = base.save(tmp_path / "base")
     save_adapter(_adapted(base, str(folder), 0), tmp_path)
-    for spec, said in (("nowhere", "nowhere"), ("x*a", "FACTOR"), ("a+", "FACTOR"), (str(folder), "adds nothing")):
+    for spec, said in (
+        ("nowhere", "nowhere"),
+        ("x*a", "FACTOR"),
+        ("a+", "FACTOR"),
+        (str(tmp_path / "runs"), "no .*adapter"),
+    ):
         with pytest.raises(InvalidInputError, match=said):
             ScenePrior.load(folder, adapter=spec)
     (tmp_path / ADAPTER_NAME).write_bytes(b"not tensors")
