@@ -147,9 +147,10 @@ def merge_adapters(prior: Adaptable, name: str, terms: Sequence[AdapterTerm]) ->
         CorruptFileError: a file is not an adapter.
     """
     digest = weights_digest(prior)
-    whole = {term: stored for term in terms if (stored := _read_whole(term)) is not None}
-    differences = [_difference(prior, name, term, stored) for term, stored in whole.items()]
-    found = [(term, _read_facts(term), _read_tensors(term)) for term in terms if term not in whole]
+    read = [(term, _read_whole(term)) for term in terms]
+    whole = [(term, stored) for term, stored in read if stored is not None]
+    differences = [_difference(prior, name, term, stored) for term, stored in whole]
+    found = [(term, _read_facts(term), _read_tensors(term)) for term, stored in read if stored is None]
     for term, facts, _ in found:
         if facts.digest != digest:
             same = "" if facts.prior != name else ", whose weights have changed since"
@@ -166,8 +167,9 @@ def merge_adapters(prior: Adaptable, name: str, terms: Sequence[AdapterTerm]) ->
     if differences:
         weights = prior.weights()
         prior.load_weights({key: value + sum(each[key] for each in differences) for key, value in weights.items()})
-        parts = [part for term, stored in whole.items() for part in _runs(stored.card, term)]
-        prior.card = {**prior.card, "post_training": {"base": Path(name).name, "sum": parts}}
+        parts = [part for term, stored in whole for part in _runs(stored.card, term)]
+        kept = {key: value for key, value in prior.card.items() if key not in ("measures", "limits")}
+        prior.card = {**kept, "post_training": {"base": Path(name).name, "sum": parts}}
 
 
 def _read_whole(term: AdapterTerm) -> StoredPrior | None:

@@ -112,13 +112,15 @@ def _fine_tuned(prior: ScenePrior, seed: int, base: str) -> ScenePrior:
 
 
 def test_fine_tuned_priors_and_adapters_add(base: ScenePrior, tmp_path: Path) -> None:
-    """base + 0.7 (a - base) - 0.2 (b - base) + the low-rank update, of every weight."""
+    """base + 0.7 (a - base) - 0.2 (b - base) + the low-rank update, of every weight; a term may come twice."""
     folder = base.save(tmp_path / "base")
     a, b = (_fine_tuned(base, seed, "base") for seed in (1, 2))
     low_rank = _adapted(base, str(folder), 3)
     save_adapter(low_rank, tmp_path / "c")
     run = a.save(tmp_path / "run" / "prior").parent
-    merged = ScenePrior.load(folder, adapter=[f"0.7*{run}", f"-0.2*{b.save(tmp_path / 'b')}", tmp_path / "c"])
+    merged = ScenePrior.load(
+        folder, adapter=[f"0.35*{run}", f"0.35*{run}", f"-0.2*{b.save(tmp_path / 'b')}", tmp_path / "c"]
+    )
     weights = [prior.weights() for prior in (base, a, b, low_rank)]
     for name, found in merged.weights().items():
         w0, w1, w2, w3 = (each[name] for each in weights)
