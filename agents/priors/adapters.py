@@ -185,12 +185,12 @@ def _read_whole(term: AdapterTerm) -> StoredPrior | None:
 
 def _difference(prior: Adaptable, name: str, term: AdapterTerm, stored: StoredPrior) -> dict[str, Tensor]:
     """What a fine-tuned prior adds to the weights of its base prior, times the factor of the term."""
-    base = stored.card.get("post_training", {}).get("base", Path(name).name)
-    weights = prior.weights()
+    weights, own = prior.weights(), Path(name).name
+    base = (stored.card.get("post_training") or {}).get("base", own)
     shapes, others = ({key: tensor.shape for key, tensor in each.items()} for each in (weights, stored.tensors))
     same = (stored.process, stored.scene_type.name, others) == (prior.process_name, prior.scene_type.name, shapes)
-    if base != Path(name).name or not same:
-        origin = f"was trained from {base!r}" if base != Path(name).name else "has another network or scene type"
+    if base != own or not same:
+        origin = f"was trained from {base!r}" if base != own else "has another network or scene type"
         raise InvalidInputError(
             f"adapter={str(term.path)!r}: this prior {origin}, so it cannot be added to {name!r}; give priors that "
             f"were trained from {name!r}, or load its own base prior with prior="
