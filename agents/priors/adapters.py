@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,10 +14,12 @@ from typing import Any, Protocol, TypeVar
 from torch import Tensor
 
 from agents.configuration.prior_names import find_prior
+from agents.diffusion import Preconditioning
 from agents.networks.low_rank import add_low_rank, low_rank_tensors, merge, set_low_rank
 from agents.priors.storage import StoredPrior, read_stored
 from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError
 from scene_envs.files import write_json
+from scene_envs.normalizer import Normalizer
 from scene_envs.scene_types import SceneType
 from scene_envs.tensor_files import read_tensors, tensors_digest, write_tensors
 
@@ -50,6 +52,8 @@ class Adaptable(Protocol):
     denoiser: Any
     scene_type: SceneType
     process_name: str
+    normalizer: Normalizer
+    preconditioning: Preconditioning
     card: dict[str, Any]
 
     def weights(self) -> dict[str, Tensor]:
@@ -148,18 +152,9 @@ def merge_adapters(prior: Adaptable, name: str, terms: Sequence[AdapterTerm]) ->
     """
     digest = weights_digest(prior)
     read = [(term, _read_whole(term)) for term in terms]
-    whole = [(term, stored) for term, stored in read if stored is not None]
-    differences = [_difference(prior, name, term, stored) for term, stored in whole]
-    found = [(term, _read_facts(term), _read_tensors(term)) for term, stored in read if stored is None]
-    for term, facts, _ in found:
-        if facts.digest != digest:
-            same = "" if facts.prior != name else ", whose weights have changed since"
-            raise InvalidInputError(
-                f"the adapter {str(term.path)!r} was trained on the prior {facts.prior!r} (weights {facts.digest[:8]})"
-                f"{same}, and not on {name!r} (weights {digest[:8]}); load it with prior={facts.prior}, or train one "
-                f"of {name!r}"
-            )
-    for term, facts, tensors in found:
+    differences = [_difference(prior, name, term, stored) for term, stored in read if stored is not None]
+    low_rank = [(term, _read_facts(term, name, digest), _read_tensors(term)) for term, stored in read if stored is None]
+    for term, facts, tensors in low_rank:
         try:
             merge(prior.denoiser.network, tensors, term.factor * facts.scale)
         except (KeyError, RuntimeError) as error:
@@ -167,9 +162,9 @@ def merge_adapters(prior: Adaptable, name: str, terms: Sequence[AdapterTerm]) ->
     if differences:
         weights = prior.weights()
         prior.load_weights({key: value + sum(each[key] for each in differences) for key, value in weights.items()})
-        parts = [part for term, stored in whole for part in _runs(stored.card, term)]
-        kept = {key: value for key, value in prior.card.items() if key not in ("measures", "limits")}
-        prior.card = {**kept, "post_training": {"base": Path(name).name, "sum": parts}}
+    parts = [part for term, stored in read for part in _runs(term, stored)]
+    kept = {key: value for key, value in prior.card.items() if key not in ("measures", "limits")}
+    prior.card = {**kept, "post_training": {"base": Path(name).name, "sum": parts}}
 
 
 def _read_whole(term: AdapterTerm) -> StoredPrior | None:
@@ -189,8 +184,15 @@ def _difference(prior: Adaptable, name: str, term: AdapterTerm, stored: StoredPr
     base = (stored.card.get("post_training") or {}).get("base", own)
     shapes, others = ({key: tensor.shape for key, tensor in each.items()} for each in (weights, stored.tensors))
     same = (stored.process, stored.scene_type.name, others) == (prior.process_name, prior.scene_type.name, shapes)
-    if base != own or not same:
-        origin = f"was trained from {base!r}" if base != own else "has another network or scene type"
+    units = [(each.normalizer.state(), each.preconditioning.state()) for each in (stored, prior)]
+    origin = ""
+    if base != own:
+        origin = f"was trained from {base!r}"
+    elif not same:
+        origin = "has another network or scene type"
+    elif units[0] != units[1]:
+        origin = "has another normaliser or preconditioning"
+    if origin:
         raise InvalidInputError(
             f"adapter={str(term.path)!r}: this prior {origin}, so it cannot be added to {name!r}; give priors that "
             f"were trained from {name!r}, or load its own base prior with prior="
@@ -198,9 +200,10 @@ def _difference(prior: Adaptable, name: str, term: AdapterTerm, stored: StoredPr
     return {key: term.factor * (stored.tensors[key].to(value) - value) for key, value in weights.items()}
 
 
-def _runs(card: Mapping[str, Any], term: AdapterTerm) -> list[dict[str, Any]]:
-    """The runs whose updates a fine-tuned prior has, each with its factor; those of a sum are the runs of its terms."""
-    run = card.get("post_training") or {"name": term.path.name}
+def _runs(term: AdapterTerm, stored: StoredPrior | None) -> list[dict[str, Any]]:
+    """The runs whose updates a term has, each with its factor; those of a sum are the runs of its terms."""
+    card = stored.card if stored is not None else {}
+    run = card.get("post_training") or {"name": (term.path if term.path.is_dir() else term.path.parent).name}
     if "sum" in run:
         return [{**part, "factor": part["factor"] * term.factor} for part in run["sum"]]
     kept = ("name", "algorithm", "reward", "iteration")
@@ -212,10 +215,11 @@ def weights_digest(prior: Adaptable) -> str:
     return tensors_digest({key: tensor.detach().cpu() for key, tensor in prior.weights().items()})
 
 
-def _read_facts(term: AdapterTerm) -> AdapterFacts:
+def _read_facts(term: AdapterTerm, name: str, digest: str) -> AdapterFacts:
+    """The facts of a low-rank adapter, which must be of the prior ``name`` with weights of this digest."""
     file = term.file.with_suffix(".json")
     try:
-        return AdapterFacts(**json.loads(file.read_text(encoding="utf-8")))
+        facts = AdapterFacts(**json.loads(file.read_text(encoding="utf-8")))
     except (FileNotFoundError, NotADirectoryError):
         raise InvalidInputError(
             f"adapter={str(term.path)!r}: there is no {str(file)!r}; name an adapter.safetensors with its adapter.json "
@@ -223,6 +227,14 @@ def _read_facts(term: AdapterTerm) -> AdapterFacts:
         ) from None
     except (ValueError, TypeError, UnicodeDecodeError) as error:
         raise CorruptFileError(f"{str(file)!r} is not the description of an adapter: {error}") from error
+    if facts.digest != digest:
+        same = "" if facts.prior != name else ", whose weights have changed since"
+        raise InvalidInputError(
+            f"the adapter {str(term.path)!r} was trained on the prior {facts.prior!r} (weights {facts.digest[:8]})"
+            f"{same}, and not on {name!r} (weights {digest[:8]}); load it with prior={facts.prior}, or train one "
+            f"of {name!r}"
+        )
+    return facts
 
 
 def _read_tensors(term: AdapterTerm) -> dict[str, Tensor]:

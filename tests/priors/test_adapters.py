@@ -145,6 +145,18 @@ def test_the_card_of_a_sum_names_its_runs(tmp_path: Path) -> None:
     )
 
 
+def test_the_card_of_a_sum_names_its_low_rank_updates(tmp_path: Path) -> None:
+    """Without the figures of the base prior, which are not those of the sum."""
+    base = tiny_prior()
+    base.card = {"iterations": 7, "measures": {"feasible_fraction": 0.8}, "limits": "none"}
+    folder = base.save(tmp_path / "base")
+    save_adapter(_adapted(base, str(folder), 0), tmp_path / "run")
+    for named in ("run", "run/adapter.safetensors"):
+        merged = ScenePrior.load(folder, adapter=f"0.5*{tmp_path / named}")
+        expected = {"base": "base", "sum": [{"factor": 0.5, "name": "run"}]}
+        assert merged.card == {"iterations": 7, "post_training": expected}
+
+
 def test_half_of_a_shipped_prior_is_the_mean_with_its_base() -> None:
     merged, base, other = (
         ScenePrior.load(name).weights()
@@ -163,6 +175,10 @@ def test_priors_that_were_not_trained_from_this_one_are_refused(tmp_path: Path) 
     for other in (tiny_prior("pantry_shelf"), tiny_prior(process="mixed")):
         with pytest.raises(InvalidInputError, match="another network or scene type"):
             ScenePrior.load(folder, adapter=other.save(tmp_path / "other"))
+    rescaled = _fine_tuned(base, 1, "base")
+    rescaled.preconditioning.std.mul_(2)
+    with pytest.raises(InvalidInputError, match="another normaliser or preconditioning"):
+        ScenePrior.load(folder, adapter=rescaled.save(tmp_path / "rescaled"))
 
 
 @pytest.mark.parametrize(
