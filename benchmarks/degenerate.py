@@ -2,11 +2,12 @@
 
     python benchmarks/degenerate.py [TYPE ...] [--count 2] [--seed 0] [--one-asset]
 
-Scenes are the heaps of ``projection.py --heaps``: all slots of a type taken, by random assets; further, four pairs of
-objects of which the upper one stands with a corner on a corner of the lower one, and a scene with a NaN. *search* is
-the evaluation of a root with the objective `feasible_objects`. Printed is the CPU time of one scene, the slowest of
-``--count``, as soon as a row is known, and at the end the largest of each function. A star: the scene was refused with
-an error of this package, or its row is invalid. An exclamation mark: what came back is not finite.
+The scenes are the heaps of ``projection.py --heaps``, in which random assets take all slots of a type. Two kinds are
+added: four pairs of objects, in each of which a corner of the upper object stands on a corner of the lower one, and a
+scene with a NaN. *search* is the evaluation of a root with the objective `feasible_objects`. Each row is printed as
+soon as it is known, with the CPU time of the slowest of ``--count`` scenes; at the end follows the largest time of each
+function. A star: the scene was refused with an error of this package, or its row is invalid. An exclamation mark: the
+result is not finite.
 """
 
 from __future__ import annotations
@@ -59,7 +60,10 @@ PHYSICS: dict[str, Function] = {
 
 
 def on_corners(name: str, rng: np.random.Generator) -> SceneBatch:
-    """Four pairs of objects over the workspace, turned at random; a highest corner meets a lowest one."""
+    """Four pairs of objects over the workspace, turned at random.
+
+    In each pair, the highest corner of one object meets the lowest corner of the other.
+    """
     batch = heap(name, "point", rng, one_asset=False)
     scene_type, slots = batch.scene_type, batch.is_free[0].nonzero()[:8, 0].tolist()
     low, high = (np.array(corner) for corner in scene_type.workspace)
@@ -91,7 +95,7 @@ def degenerate(name: str, kind: str, rng: np.random.Generator, *, one_asset: boo
 
 
 def seconds(function: Function, batch: SceneBatch) -> tuple[float, str]:
-    """CPU time of a call, and a mark for what came of it."""
+    """CPU time of a call, and a mark for its outcome."""
     start = time.process_time()
     try:
         result = function(batch)
@@ -106,7 +110,7 @@ def seconds(function: Function, batch: SceneBatch) -> tuple[float, str]:
 
 
 def scored(reward: Reward, batch: SceneBatch) -> RewardOutput:
-    """The output of a reward that has seen none of the scenes."""
+    """The output of a reward, computed without verdicts from earlier calls."""
     forget_verdicts()
     return evaluate_reward(reward, batch)
 

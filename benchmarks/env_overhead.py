@@ -3,10 +3,10 @@
     python benchmarks/env_overhead.py [--prior dimsum_table] [--batch 128] [--steps 10] [--rounds 3]
 
 Every adapter runs the same chain as the bare loop: the prior's posterior, one normal draw a step, and the decoding and
-counting of the finished scenes. Times are CPU seconds of one thread, which a busy machine disturbs little; the bare
+counting of the finished scenes. Times are CPU seconds of one thread, which a busy machine disturbs little. The bare
 loop is timed again in every round, and the table gives the median over rounds of adapter / bare. The single
-environment is compared with a bare loop of one scene. Freed memory is kept by the process: how often glibc gives it
-back to the kernel depends on what else is alive, and would swamp the differences that are looked for.
+environment is compared with a bare loop of one scene. The process keeps freed memory. Otherwise glibc gives it back to
+the kernel more or less often, depending on what else is allocated; this would hide the differences to be measured.
 """
 
 from __future__ import annotations

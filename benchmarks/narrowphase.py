@@ -149,8 +149,9 @@ def kinds(library: int, whole: int, maker: PairMaker) -> dict[str, Callable[[], 
     """Makers of one pair of each kind: the two parts and their poses.
 
     Args:
-        library: so many parts come from libraries; polytopes follow, each second one a scaled copy of the one before.
-        whole: so many parts have volume; slivers follow.
+        library: number of parts from libraries, which come first. Polytopes follow; every second one is a scaled copy
+            of the one before.
+        whole: number of parts with volume; slivers follow.
         maker: poses of all parts.
     """
     rng = maker.rng

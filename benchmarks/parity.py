@@ -71,7 +71,7 @@ NOISE = {"raw": (0.0, 0.0), "2 mm": (0.002, 0.0004), "10 mm": (0.010, 0.002)}
 """Standard deviations (m) sideways and in height."""
 CONTACT = {"hydroelastic": ContactModel.kHydroelasticWithFallback, "point": ContactModel.kPoint}
 DEEP, MOVED, TURNED, DURATION = 1e-3, 1e-3, 1e-2, 0.1
-"""The definition: m, m, rad, s."""
+"""Limits of the definition: depth (m), displacement (m) and rotation (rad), and the duration (s)."""
 _STEP = 1e-3
 _MODULUS, _STIFFNESS = 1e8, 1e8
 """Of patches (Pa) and of points (N/m); the solver limits both to what its step can resolve."""
@@ -101,7 +101,7 @@ class Verdicts:
 
     @classmethod
     def of(cls, result: FeasibilityResult) -> Verdicts:
-        """Those of ``feasibility``."""
+        """The verdicts of ``feasibility``."""
         depth, displacement, rotation = (
             values.double().numpy() for values in (result.depth, result.displacement, result.rotation)
         )

@@ -89,7 +89,7 @@ class Row:
 
 
 def score_function(prior: ScenePrior, steps: int, batch: int) -> tuple[Callable[[], None], list[Tensor]]:
-    """The gradient as trained, and the chain's states it reads."""
+    """A function that computes the gradient as in training, and the states of the chain that it reads."""
     policy = DenoisingPolicy(prior, steps)
     loss = DDPOSFLoss(policy, step_weights=gradient_weights(policy.stds(prior.config.slots), min_std=1e-6))
     x, states = prior.initial(batch, prior.config.slots, torch.Generator().manual_seed(0)), []
@@ -109,7 +109,7 @@ def score_function(prior: ScenePrior, steps: int, batch: int) -> tuple[Callable[
 
 
 def through_chain(prior: ScenePrior, steps: int, batch: int) -> Callable[[], None]:
-    """The same objective with states attached: one graph over all steps."""
+    """A function for the same objective whose graph goes through all steps, as the states are not detached."""
     policy = DenoisingPolicy(prior, steps)
     advantage = torch.linspace(-1, 1, batch)
 

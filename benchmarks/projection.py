@@ -111,7 +111,7 @@ def measure_heaps(name: str, count: int, seed: int, table: Table) -> None:
 
 
 def small_scenes(batch: SceneBatch, rng: np.random.Generator) -> SceneBatch:
-    """One scene of 2 to 8 free objects out of each: a random object, its nearest neighbours, and what is welded."""
+    """From each scene, one of 2 to 8 free objects: a random object, its nearest neighbours, and the welded objects."""
     categories = batch.categories.clone()
     for index in range(len(batch)):
         free = torch.nonzero(batch.is_free[index]).flatten()
@@ -161,7 +161,7 @@ class SmallProgram:
         depth, normal = self.physics.collider.depth(parts, self.a, self.b)
         gap = -depth
         jacobian = np.zeros((len(gap), len(self.free) + 1, 3))
-        for row in np.flatnonzero(gap > 0):  # at most the distance: nearest may be a corner and a corner
+        for row in np.flatnonzero(gap > 0):  # the gap is at most the distance: two corners may be nearest
             way = self._nearest(parts, self.a[row], self.b[row])
             distance = float(np.linalg.norm(way))
             if distance > gap[row] + 1e-6:
@@ -172,7 +172,7 @@ class SmallProgram:
         return gap - CLEARANCE, jacobian[:, :-1].reshape(len(gap), -1)
 
     def _nearest(self, parts: PlacedParts, a: int, b: int) -> Array:
-        """From the nearest point of one placed part to that of another that is apart from it (3,), m."""
+        """(3,) m: vector from the nearest point of one placed part to that of another, when the two are apart."""
         result = fcl.DistanceResult()
         shapes = [self._shape(int(parts.part[i]), side) for side, i in enumerate((a, b))]
         for shape, i in zip(shapes, (a, b), strict=True):
@@ -230,7 +230,7 @@ def objects_of(batch: SceneBatch) -> Objects:
 
 
 def compare(batch: SceneBatch, starts: int, rng: np.random.Generator) -> tuple[list[float], int, int]:
-    """Ratios of the way of projection to SLSQP's, how many scenes projection solved, and how many SLSQP alone."""
+    """Ratios of the distance moved by projection to that by SLSQP, and the numbers of scenes that each solved alone."""
     physics = physics_of(batch.scene_type)
     ratios, solved, alone = [], 0, 0
     for index in range(len(batch)):

@@ -38,7 +38,7 @@ from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import list_scene_types
 
 FORMATS = {"MuJoCo": "mjcf", "Drake": "drake"}
-"""What each simulator loads."""
+"""Export format that each simulator loads."""
 MOVED, DEEP = 1e-3, 1e-4
 """Distance and depth (m) beyond which an object is counted."""
 EARLY = 0.1
@@ -47,12 +47,12 @@ EARLY = 0.1
 
 @dataclass(frozen=True)
 class Figures:
-    """What was counted.
+    """Figures of ready objects in a simulator.
 
     Attributes:
-        scenes: how many.
-        free: free objects in them.
-        ready: of these, ready.
+        scenes: number of scenes.
+        free: number of free objects in them.
+        ready: number of ready objects among these.
         moved: (ready,) m, distance of each from where it was exported.
         depth: (ready,) m, deepest overlap of each.
     """
@@ -65,7 +65,7 @@ class Figures:
 
     @classmethod
     def total(cls, all_of: list[Figures]) -> Figures:
-        """Of several scene types together."""
+        """The figures of several scene types together."""
         return cls(
             sum(figures.scenes for figures in all_of),
             sum(figures.free for figures in all_of),
@@ -101,7 +101,7 @@ def without(batch: SceneBatch, dropped: torch.Tensor) -> SceneBatch:
 def measure(
     batch: SceneBatch, ready: torch.Tensor, free: int, options: argparse.Namespace, pool: PhysicsPool
 ) -> tuple[Figures, list[str]]:
-    """Simulate what is ready (B, N); figures, and a line for each object that moved."""
+    """Simulate the scenes; returns figures of the ``ready`` objects (B, N), and a line for each of them that moved."""
     overlaps = penetration(batch, pool=pool)
     simulate = SIMULATORS[options.simulator][1]
     moved, lines = torch.zeros(ready.shape, dtype=torch.float64), []

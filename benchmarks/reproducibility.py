@@ -4,7 +4,7 @@
 
 Scenes are the fullest of six draws of each grammar, a scene for each level of noise (m along every axis). `settle`,
 `project`, `feasibility` and `make_ready` take them as one batch; then one by one, in a random order of scenes and
-functions; then in two worker processes. Printed is how many comparisons were made, and how many differ in a bit.
+functions; then in two worker processes. The output is the number of comparisons, and how many differ in a bit.
 """
 
 from __future__ import annotations
@@ -35,25 +35,25 @@ def crowded(name: str, noise: Sequence[float] = NOISE, seed: int = 5) -> SceneBa
 
 
 def settled(batch: SceneBatch, pool: PhysicsPool | None = None) -> list[Tensor]:
-    """What `settle` gives after 0.25 s."""
+    """The result of `settle` after 0.25 s."""
     result = settle(batch, duration=0.25, pool=pool)
     return [result.batch.tensor, result.valid]
 
 
 def projected(batch: SceneBatch, pool: PhysicsPool | None = None) -> list[Tensor]:
-    """What `project` gives."""
+    """The result of `project`."""
     result = project(batch, pool=pool)
     return [result.batch.tensor, result.residual_depth, result.converged]
 
 
 def judged(batch: SceneBatch, pool: PhysicsPool | None = None) -> list[Tensor]:
-    """What `feasibility` gives."""
+    """The result of `feasibility`."""
     result = feasibility(batch, pool=pool)
     return [result.feasible, result.depth, result.displacement, result.rotation, result.valid]
 
 
 def made_ready(batch: SceneBatch, pool: PhysicsPool | None = None) -> list[Tensor]:
-    """What `make_ready` gives after one round of 0.25 s."""
+    """The result of `make_ready` after one round of 0.25 s."""
     result = make_ready(batch, duration=0.25, rounds=1, pool=pool)
     return [result.batch.tensor, result.ready, result.valid]
 

@@ -32,14 +32,14 @@ def credited(batch: SceneBatch, output: RewardOutput) -> Tensor:
 
 
 def without_credit(batch: SceneBatch, output: RewardOutput) -> Tensor:
-    """(B, N) free objects that have less than half of the credit of one at rest."""
+    """(B, N) free objects with a credit below 0.5, which is half of that of an object at rest."""
     assert output.per_object is not None
     return batch.is_free & (output.per_object < 0.5)
 
 
 @dataclass(frozen=True)
 class Picture:
-    """What is drawn for a reward.
+    """Settings of the picture of a reward.
 
     Attributes:
         reward: with its settings.
@@ -57,7 +57,7 @@ class Picture:
 
 
 def trained_discriminator() -> LearnedReward:
-    """Has learned to tell dim sum tables from those disturbed by 1 cm."""
+    """A discriminator that has learned to tell dim sum tables from tables disturbed by 1 cm."""
     grammar, reward = get_grammar("dimsum_table"), Discriminator()
     other = grammar.sample(np.random.default_rng(2), 128)
     noise = 0.01 * torch.randn(other.translations.shape, generator=torch.Generator().manual_seed(2))

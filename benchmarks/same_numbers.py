@@ -169,7 +169,7 @@ def search(name: str) -> Figures:
 
 
 def cases() -> dict[str, Callable[[], Figures]]:
-    """What is computed, by name."""
+    """The computations, by name."""
     result: dict[str, Callable[[], Figures]] = {}
     for name in list_priors():
         result[f"sample {name}"] = lambda name=name: sampling(name)  # type: ignore[misc]

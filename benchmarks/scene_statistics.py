@@ -119,7 +119,7 @@ def draw_histogram(total: Counts, support: str, path: Path) -> None:
 
 
 def draw_gallery(scene: str, count: int, seed: int, path: Path) -> None:
-    """Write a picture of ``count`` scenes to ``path``: of five times as many, evenly from empty to full."""
+    """Write a picture of ``count`` scenes to ``path``, chosen evenly from empty to full out of five times as many."""
     from scene_envs.render import gallery, render
 
     batch = get_grammar(scene).sample(np.random.default_rng(seed), 5 * count)

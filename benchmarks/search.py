@@ -61,7 +61,7 @@ def planner_of(text: str) -> dict[str, Any]:
 
 
 def word(text: str) -> Any:
-    """A name, or the mapping of JSON that ``text`` is."""
+    """``text`` as it is, or the mapping that it holds as JSON."""
     return json.loads(text) if text.startswith("{") else text
 
 
@@ -119,7 +119,7 @@ def run_together(prior: Any, keys: Sequence[dict[str, Any]]) -> list[dict[str, A
 
 
 def compare(options: argparse.Namespace) -> None:
-    """Run what is not recorded, and print the table."""
+    """Run the searches that are not recorded, and print the table."""
     prior, records = resolve_prior(options.prior), Path(options.records)
     known = [json.loads(line) for line in records.read_text().splitlines()] if records.exists() else []
     names = ("prior", "objective", "branching", "num_steps", "mask", "scenes", "slots", "scale", "prompt")

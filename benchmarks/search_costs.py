@@ -78,7 +78,7 @@ def crowding(options: argparse.Namespace) -> None:
 
 
 class Trivial:
-    """A tree without an end whose states cost nothing: a path, and a value that grows with it."""
+    """An endless tree that costs no time. A state is a path, and its value grows with the length of the path."""
 
     def clone_state(self) -> tuple[int, ...]:
         """The root."""
@@ -93,7 +93,7 @@ class Trivial:
         return [(*state, action) if len(state) < 100 else (*state[:-1], action) for state, action in pairs]
 
     def evaluate(self, state: tuple[int, ...]) -> float:
-        """Scrambled, and larger for longer paths."""
+        """A pseudo-random value, on average larger for longer paths."""
         return 0.5 * len(state) / 101 + (hash(state) % 997) / 2000
 
 
@@ -104,7 +104,7 @@ class Stopwatch:
         self.inner, self.seconds = inner, 0.0
 
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
-        """Call it."""
+        """Call the function and add its seconds."""
         begun = time.perf_counter()
         try:
             return self.inner(*arguments, **keywords)

@@ -3,11 +3,11 @@
     python -m benchmarks.search_feeds_training output=FOLDER [prior=dimsum_table] [count=144] [budget=8]
                                                [iterations=36] [seed=0] [samples=512]
 
-`count` samples of the prior are repaired by a search each: up to `budget` scenes, of which all but the first regenerate
-the infeasible objects of the best one so far. The winners are replayed in half of each batch of the pretraining loss of
-`iterations` iterations of NFT with `feasible_share`. The other run has as many iterations more as the search cost
-scenes. Prints a table of fresh samples of both priors, of the base prior, and of the winners. A second call goes on
-where the first ended.
+A search repairs each of `count` samples of the prior. It makes up to `budget` scenes; all but the first regenerate the
+infeasible objects of the best scene so far. NFT with `feasible_share` then runs for `iterations` iterations, and the
+winners of the search are replayed in half of each batch of its pretraining loss. The other run has no replay but more
+iterations; the additional ones cost as many NFE as the search. Prints a table of fresh samples of both priors, of the
+base prior, and of the winners. A second call goes on where the first ended.
 """
 
 from __future__ import annotations

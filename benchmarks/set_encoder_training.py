@@ -35,13 +35,13 @@ DAMAGES = 5
 
 _UNKNOWN_SHARE = 0.1
 _LEAST_VARIANCE = 0.05
-"""Variance of a direction of the features, over the largest, below which it is not blown up to one."""
+"""Share of the largest variance; directions of the features with a smaller variance are not scaled up to variance 1."""
 _TEMPERATURE = 0.2
 
 
 @dataclass(frozen=True)
 class SetEncoderTraining:
-    """How long and on what.
+    """Length, data and losses of a training.
 
     Attributes:
         scenes: grammar scenes per scene type.
@@ -69,9 +69,10 @@ def train_set_encoder(
 ) -> SetEncoder:
     """Train an encoder on grammar scenes; with the defaults, the shipped one.
 
-    Three tasks on one feature vector: how much a scene was damaged, and how (five numbers, squared error); how many
-    of each asset it holds (squared error of log counts); which other half of the objects comes from the same scene,
-    among the scenes of a batch (InfoNCE). A share of the assets is shown without its name.
+    One feature vector serves three tasks. The first is to predict how much a scene was damaged, and how (five numbers,
+    squared error). The second is to predict how many objects of each asset the scene holds (squared error of log
+    counts). The third is to find, for half of the objects of a scene, the other half among the scenes of a batch
+    (InfoNCE). A share of the assets is shown without names.
 
     Args:
         seed: of the grammars, the weights and the damage; the same seed gives the same weights on one machine with
@@ -184,8 +185,8 @@ def _train(encoder: SetEncoder, pools: Sequence[SceneBatch], config: SetEncoderT
 def whiten(encoder: SetEncoder, pools: Sequence[SceneBatch]) -> None:
     """Whiten the features over clean and damaged scenes, within each type.
 
-    Without it, all features that tell the same damage would count it again, and one kind of damage would rule the
-    distance.
+    Without whitening, several features that respond to the same damage would each count it, and one kind of damage
+    would dominate the distance.
 
     Args:
         encoder: its mean and whitening are set.

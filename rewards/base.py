@@ -39,8 +39,8 @@ class RewardOutput:
         per_object: (B, N) float credit per slot, or None.
         terms: named (B,) floats worth logging.
         valid: (B,) bool, or None when every row is valid. Invalid rows are left out of all statistics.
-        object_flags: named (B, N) bools, such as ``"feasible"``. ``"judged"`` are the slots that a mean over objects
-            gives credit to; without it, the free objects.
+        object_flags: named (B, N) bools, such as ``"feasible"``. ``"judged"`` marks the slots to which a mean over
+            objects gives credit; without this flag, they are the free objects.
         problem: why the whole batch is invalid when the reward raised or broke its contract, else empty.
     """
 
@@ -53,7 +53,7 @@ class RewardOutput:
 
     @property
     def is_valid(self) -> Tensor:
-        """(B,) bool, with None spelled out, and rows whose value is not finite excluded."""
+        """(B,) bool: ``valid``, or all rows where it is None, without rows whose value is not finite."""
         finite = torch.isfinite(self.value)
         return finite if self.valid is None else self.valid & finite
 
@@ -63,9 +63,9 @@ class Reward(Protocol):
     """Anything callable as ``(SceneBatch, RewardContext) -> RewardOutput``.
 
     A scene scores the same alone and in any batch, unless the reward says otherwise by an attribute
-    ``depends_on_batch`` that is True (see :func:`depends_on_batch`). It may declare the largest value it gives by an
-    attribute ``maximum`` (see :func:`declared_maximum`), which searches take for their scale. A mean over the objects
-    that gives credit per object says so by ``averages_objects = True`` (see :func:`averages_objects`).
+    ``depends_on_batch`` that is True (see :func:`depends_on_batch`). A reward may declare its largest value by an
+    attribute ``maximum`` (see :func:`declared_maximum`), which searches take for their scale. A reward that is a mean
+    over the objects and gives credit per object says so by ``averages_objects = True`` (see :func:`averages_objects`).
     """
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput: ...
@@ -83,8 +83,8 @@ def depends_on_batch(*rewards: object) -> bool:
 def averages_objects(*rewards: object) -> bool:
     """Whether each of ``rewards`` is a mean over the objects of a scene, not a sum.
 
-    In a sum an empty slot contributes the 0 that its credit says. In a mean it contributes nothing: neither its
-    presence nor its absence is worth 0, so an empty slot has no credit at all.
+    In a sum, an empty slot contributes its credit, which is 0. A mean is taken over the objects alone: an empty slot is
+    no part of it, so an empty slot has no credit at all, not even a credit of 0.
 
     >>> averages_objects(lambda batch: batch.counts)
     False
@@ -98,7 +98,7 @@ def declared_maximum(reward: object, slots: int, free_slots: int) -> float | Non
     Args:
         reward: its attribute ``maximum`` is a number, or a method that takes the two arguments below.
         slots: slots per scene.
-        free_slots: those that fixed objects do not take.
+        free_slots: slots that fixed objects do not take.
 
     >>> class Share:
     ...     maximum = 1.0

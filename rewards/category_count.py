@@ -35,7 +35,7 @@ class CategoryCount:
         object.__setattr__(self, "assets", names)
 
     def maximum(self, slots: int, free_slots: int) -> float:
-        """The largest value: every slot holds one."""
+        """The largest value: every slot holds an object that counts."""
         return slots
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:

@@ -135,7 +135,7 @@ class _Lines:
 def _chords(corners: Array, y: Array) -> tuple[Array, Array]:
     """Where lines at heights ``y`` (M,) enter and leave the convex outline of ``corners`` (3, V) from above, (M,) each.
 
-    A line that misses it enters at infinity and leaves at minus infinity.
+    A line that misses the outline enters at infinity and leaves at minus infinity.
     """
     from scipy.spatial import ConvexHull
 
@@ -150,7 +150,7 @@ def _chords(corners: Array, y: Array) -> tuple[Array, Array]:
 
 
 def _standing(facts: SceneFacts, support: int) -> list[Index]:
-    """Indices of what stands on each surface of a welded object: its tiers, or its top."""
+    """Indices of the objects that stand on each surface of a welded object: on its tiers, or on its top."""
     here, tiers = facts.held.place == support, int(facts.tiers[support])
     if tiers == 0:
         return [np.flatnonzero(here)]

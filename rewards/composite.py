@@ -119,12 +119,12 @@ class Gate:
 
     @property
     def depends_on_batch(self) -> bool:
-        """Whether ``reward`` or ``condition`` does."""
+        """Whether ``reward`` or ``condition`` depends on the batch."""
         return depends_on_batch(self.reward, self.condition)
 
     @property
     def averages_objects(self) -> bool:
-        """Whether ``reward`` does."""
+        """Whether ``reward`` is a mean over the objects."""
         return averages_objects(self.reward)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
@@ -165,12 +165,12 @@ class Clip:
 
     @property
     def depends_on_batch(self) -> bool:
-        """Whether ``reward`` does."""
+        """Whether ``reward`` depends on the batch."""
         return depends_on_batch(self.reward)
 
     @property
     def averages_objects(self) -> bool:
-        """Whether ``reward`` does."""
+        """Whether ``reward`` is a mean over the objects."""
         return averages_objects(self.reward)
 
     def maximum(self, slots: int, free_slots: int) -> float | None:

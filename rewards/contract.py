@@ -40,8 +40,8 @@ def check_reward(
         ``depends_on_batch = True``.
 
     Raises:
-        RewardError: one line per broken clause, each saying what was found and what would be right. The clauses after
-            one in which the reward took too long are not tried.
+        RewardError: one line per broken clause, each saying what was found and what would be right. After a clause in
+            which the reward took too long, no further clauses are tried.
 
     >>> check_reward("object_count")[0]
     'scores scenes that hold nothing but welded objects'
@@ -78,12 +78,12 @@ class _Subject:
 
     def score(self, batch: SceneBatch) -> RewardOutput:
         self._calls += 1
-        forget_verdicts()  # what is kept from an earlier call would prove nothing
+        forget_verdicts()  # verdicts kept from an earlier call would prove nothing
         context = self.given_context
         if context is None:
             counts = batch.counts.tolist()
             context = RewardContext(prompts=tuple(f"A scene with {n} object{'s' * (n != 1)}." for n in counts))
-        with other_draw(self._calls):  # a reward that draws shows it by another score
+        with other_draw(self._calls):  # a reward that draws random numbers then gives another score
             return evaluate_reward(self.reward, batch, context, strict=True)
 
     @property

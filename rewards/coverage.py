@@ -44,7 +44,7 @@ class Coverage:
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Count. ``per_object`` (B, N) shares each pair among the objects that make it.
 
-        Terms: ``batch_coverage``, the same for all scenes; ``pairs`` that the scene has.
+        Terms: ``batch_coverage``, the same for all scenes; ``pairs``, the number of pairs in the scene.
         """
         kind, device = batch.scene_type, batch.tensor.device
         low, high = (torch.tensor(corner, device=device) for corner in kind.workspace)

@@ -61,7 +61,7 @@ def evaluate_reward(
 
 
 def reward_scorer(reward: Any) -> SceneScorer:
-    """``reward``, resolved, as environments call it; what the entry point ``scene_envs.resolvers`` names.
+    """``reward`` as a function that environments call; the entry point ``scene_envs.resolvers`` names this maker.
 
     Args:
         reward: a name, mapping, function, class or reward; see :func:`rewards.resolve_reward`.

@@ -52,7 +52,7 @@ def as_output(result: Any) -> Any:
 
 
 def _accepts(function: Callable[..., Any], count: int, settings: Mapping[str, Any], name: str) -> bool:
-    """Whether ``function`` takes ``count`` positional arguments beside ``settings``; one fewer must do otherwise."""
+    """Whether ``function`` takes ``count`` positional arguments beside ``settings``; if not, it must take one fewer."""
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):

@@ -40,7 +40,7 @@ class IsolatedReward:
         workers: physics workers of a reward that asks for ``context.pool``; 0 computes in its process.
 
     Raises:
-        InvalidInputError: the reward or a limit is none.
+        InvalidInputError: ``reward`` is no valid reward, or a limit is no positive number.
         RewardError: the reward cannot be made, or not in time.
 
     >>> with IsolatedReward("object_count", timeout=60.0) as reward:
@@ -129,7 +129,7 @@ class SeededReward:
 
 
 def run_reward(reward: Any, *, seed: int = 0, timeout: float = 60.0, memory: float = 1.0, workers: int = 0) -> Any:
-    """A reward as runs use it: this package's own in this process, others in one that can be ended.
+    """A reward as runs use it: one of this package in this process, any other in a process that can be ended.
 
     Functions and objects, which exist in this process alone, stay in it.
 
@@ -154,10 +154,10 @@ def run_reward(reward: Any, *, seed: int = 0, timeout: float = 60.0, memory: flo
 def describe_rewards(
     names: Sequence[str], timeout: float = 60.0, memory: float = 1.0
 ) -> Iterator[tuple[str, RewardInfo | None, str]]:
-    """Each name with its listing, or with why the reward cannot be used.
+    """Each name with its listing, or with the reason why the reward cannot be used.
 
-    Those of installed packages are imported in another process, so that one which exits, crashes or hangs at its
-    import leaves the others to be listed.
+    Rewards of installed packages are imported in another process. If one of them exits, crashes or hangs at its import,
+    the others are still listed.
 
     Args:
         names: registered names.
@@ -203,7 +203,7 @@ def is_foreign(reward: Any) -> bool:
     module = registered_module(reward) or plugin_module(reward)
     if module is None or module == "__main__" or module.split(".")[0] in ("rewards", "scene_envs", "agents"):
         return False
-    return plugin_module(reward) is not None  # registered by a module that was imported here alone: only here
+    return plugin_module(reward) is not None  # if not: registered by a module imported in this process alone
 
 
 def check_limits(timeout: float, memory: float) -> None:

@@ -30,7 +30,7 @@ class LearnedReward(Protocol):
 
 
 def learned_parts(reward: Any) -> list[LearnedReward]:
-    """A reward, and the parts of a composite, that learn; in a fixed order.
+    """The rewards that learn, out of a reward and the parts of a composite; in a fixed order.
 
     >>> from rewards import resolve_reward
     >>> learned_parts(resolve_reward("object_count"))

@@ -50,13 +50,13 @@ class Normalised:
 
     @property
     def averages_objects(self) -> bool:
-        """Whether ``reward`` does."""
+        """Whether ``reward`` is a mean over the objects."""
         return averages_objects(self.reward)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
-        """Score and normalise. Terms: the value before, under the reward's name, and the reward's own terms.
+        """Score and normalise. Terms: the value of ``reward``, under its name, and the terms of ``reward``.
 
-        ``per_object`` is that of ``reward`` over the standard deviation: credit has no mean to be taken off.
+        ``per_object`` is that of ``reward`` over the standard deviation; the mean is not subtracted from credit.
         """
         output = evaluate_reward(self.reward, batch, context, strict=True)
         valid = output.value[output.is_valid].double()

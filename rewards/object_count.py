@@ -15,7 +15,7 @@ from scene_envs.scene import SceneBatch
 class ObjectCount:
     """Number of objects in a scene, welded ones included.
 
-    The value ignores where objects are; they may overlap. The objective of the paper's post-training experiment
+    The value ignores where objects are; they may overlap. This is the objective of the paper's post-training experiment
     (section 4.3).
 
     >>> output = ObjectCount()(SceneBatch.empty("dimsum_table", 2), RewardContext())

@@ -44,9 +44,9 @@ class Penetration:
 
         ``object_flags["overlapping"]`` (B, N) marks objects deeper than 0.1 mm in others.
 
-        ``per_object`` (B, N): with ``"total"`` a pair's depth is shared between its two objects, or falls to the free
-        one of a free and a welded object, so that credits add up to the value; with ``"deepest"`` it is minus the
-        deepest overlap of each free object.
+        ``per_object`` (B, N): with ``"total"``, a pair's depth is shared between its two objects; in a pair of a free
+        and a welded object, all of it falls to the free one. Credits then add up to the value. With ``"deepest"``, the
+        credit is minus the deepest overlap of each free object.
         """
         from scene_envs.physics import penetration
 

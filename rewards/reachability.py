@@ -58,7 +58,7 @@ class Reachability:
         return 1.0
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
-        """Try the gripper at each object. ``per_object`` (B, N) is 1 for what it reaches, as is the flag ``reachable``.
+        """Try the gripper at each object. ``per_object`` (B, N) and the flag ``reachable`` are 1 where it is reached.
 
         Terms: ``free_objects``, ``reachable_objects``, and ``from_<side>``, how many are reached from each side.
         """

@@ -30,7 +30,7 @@ class Realism:
 
     Attributes:
         prior: name or path of the prior; that of the scene type's name when null.
-        levels: timesteps at which the loss is taken, equally spaced quantiles of the chain of that many steps.
+        levels: number of timesteps at which the loss is taken: those of a chain of that many equally spaced steps.
         seed: of the noise.
     """
 

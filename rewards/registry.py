@@ -157,7 +157,7 @@ def reward_name(reward: Any) -> str:
 
 
 def reward_label(reward: Any) -> str:
-    """A reward's name in words, for headings: of a reward in a file, the name of the file and of the function.
+    """A reward's name in words, for headings; for a reward in a file, the names of the file and of the function.
 
     >>> reward_label("object_count"), reward_label("rewards/my_rewards.py:clutter")
     ('object count', 'my_rewards.py:clutter')
@@ -167,7 +167,7 @@ def reward_label(reward: Any) -> str:
 
 
 def allowed_targets() -> list[str]:
-    """The packages that ``_target_`` may name, those of installed plug-ins aside."""
+    """The packages that ``_target_`` may name, without those of installed plug-ins."""
     return list(_allowed_targets)
 
 
@@ -177,13 +177,13 @@ def registered_module(name: str) -> str | None:
 
 
 def plugin_module(name: str) -> str | None:
-    """The module of the installed plug-in that offers ``name``, which is not imported; None where there is none."""
+    """The module of the installed plug-in that offers ``name``, without an import; None where there is none."""
     point = _REWARDS.points().get(name)
     return None if point is None else point.module
 
 
 def is_own(reward: Any) -> bool:
-    """Whether the code of a reward object is of this package, that of its parts aside.
+    """Whether the code of a reward object belongs to this package; the code of its parts is not considered.
 
     >>> is_own(resolve_reward("object_count")), is_own(print)
     (True, False)

@@ -44,8 +44,9 @@ class Relation:
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Compare every scene with its prompt.
 
-        Terms: ``relations`` that are claimed; ``relations_hold``, the share of them that holds (1 of none).
-        ``per_object`` (B, N): the score of a relation, over their number, in equal shares to the objects it speaks of.
+        Terms: ``relations``, the number of claimed relations; ``relations_hold``, the share of them that holds (1 if
+        there are none). ``per_object`` (B, N): the score of each relation is divided by the number of relations and
+        shared equally among the objects that the relation is about.
 
         Raises:
             InvalidInputError: no prompt is given, not one per scene, or ``prompt`` cannot be read.

@@ -1,4 +1,4 @@
-"""Process of one reward, as the process that asks it sees it: start, messages, limits, end."""
+"""Process of one reward, seen from the parent process: start, messages, limits, end."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from scene_envs.worker_processes import module_command, module_environment
 _START_UP = 120.0
 """Seconds that an empty worker may take to start."""
 _GRACE = 2.0
-"""Seconds that a worker whose answers ended has to end by itself, so that its exit status is its own."""
+"""Seconds that a worker whose pipe was closed has to end by itself, so that its own exit status is known."""
 _MOST_TEXT = 2000
-"""Characters of an error that the process tells."""
+"""Most characters of an error message from the process."""
 _ERRORS: dict[str, type[SceneEnvsError]] = {
     kind.__name__: kind for kind in (InvalidInputError, UnknownNameError, RewardError)
 }
 
 
 class RewardProcess:
-    """A worker process, the two pipes to it, and the watch over its time.
+    """A worker process, the two pipes to it, and the timer that limits its answers.
 
     Args:
         name: of the reward, for messages.
@@ -55,7 +55,7 @@ class RewardProcess:
                 pass_fds=(child_reads, child_writes),
                 env=module_environment() | {"PYTHONHASHSEED": "0"},
                 stdin=subprocess.DEVNULL,
-                stdout=2,  # what a reward prints is no output of ours
+                stdout=2,  # what a reward prints goes to stderr
                 start_new_session=True,
             )
         finally:
@@ -79,7 +79,7 @@ class RewardProcess:
     def _receive(self, message: tuple[Any, ...] | None, timeout: float) -> Any:
         late = threading.Event()
 
-        def end() -> None:  # a process that hangs neither reads nor writes: only its end unblocks this one
+        def end() -> None:  # a process that hangs neither reads nor writes: only its end unblocks recv()
             late.set()
             _kill(self.process)
 
@@ -94,7 +94,7 @@ class RewardProcess:
                 raise ValueError(number)
         except (EOFError, OSError):
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self.process.wait(_GRACE)  # before the pipes close, at which the worker ends itself
+                self.process.wait(_GRACE)  # before stop() closes the pipes, which makes the worker end itself
             ended = self.process.returncode is not None
             self.stop()
             raise self._ended(late.is_set(), timeout) if ended else self._disturbed() from None
@@ -118,7 +118,7 @@ class RewardProcess:
         )
 
     def _ended(self, late: bool, timeout: float) -> RewardError:
-        """What the end of the process says of the reward."""
+        """The error that describes how the process ended."""
         status, reward = self.process.returncode, f"reward {self.name!r}"
         if late or status == -signal.SIGALRM:
             return RewardTimeoutError(f"{reward} took longer than reward_timeout={timeout:g} s; its process was ended")
@@ -133,7 +133,7 @@ def _end(process: subprocess.Popen[bytes], outbox: Connection, inbox: Connection
         with contextlib.suppress(OSError):
             pipe.close()
     with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(0.2)  # one that ended by itself is told from one that was ended
+        process.wait(0.2)  # a process that is ending by itself keeps its exit status
     _kill(process)
     process.wait()
 

@@ -20,8 +20,9 @@ _local = threading.local()
 def seeded_generators(seed: int, batch: SceneBatch | None = None) -> Iterator[None]:
     """Context in which the generators of torch (CPU), NumPy and Python start from a seed of their own.
 
-    The seed hangs on ``seed`` and on the scenes alone: the same scenes meet the same numbers in every call, in every
-    process, and after a run is resumed. The generators go on afterwards as if nothing had been drawn.
+    That seed depends only on ``seed``, the scenes and :func:`current_draw`. The same scenes get the same numbers in
+    every call, in every process, and after a run is resumed. Afterwards the generators go on as if nothing had been
+    drawn.
 
     Args:
         seed: of the run.
@@ -45,7 +46,7 @@ def seeded_generators(seed: int, batch: SceneBatch | None = None) -> Iterator[No
 
 @contextmanager
 def other_draw(number: int) -> Iterator[None]:
-    """Context in which rewards get other random numbers than usual, one stream for each ``number`` but 0."""
+    """Context in which rewards get other random numbers; each ``number`` has its own stream, and 0 is the usual one."""
     before = current_draw()
     _local.draw = number
     try:

@@ -58,7 +58,7 @@ class Stability:
             "max_displacement": 1e-3,
             "max_rotation": 1e-2,
             "duration": self.duration,
-        }  # those of feasible_objects, so that beside it nothing is simulated twice
+        }  # as in feasible_objects: scenes that both rewards score are simulated once
         result = verdicts(batch, limits, context.pool)
         moved, turned = result.displacement.to(device), result.rotation.to(device)
         simulated = batch.is_free & (result.depth.to(device) <= self.max_penetration)

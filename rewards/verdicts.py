@@ -23,10 +23,10 @@ _known: OrderedDict[bytes, _Verdict] = OrderedDict()
 
 
 def verdicts(batch: SceneBatch, limits: dict[str, float], pool: PhysicsPool | None) -> FeasibilityResult:
-    """:func:`scene_envs.physics.feasibility` of scenes, computed for those alone that were not judged lately.
+    """:func:`scene_envs.physics.feasibility` of scenes, computed only for scenes that were not judged recently.
 
-    Scenes are recognised by their content: type, poses, categories and order of slots. A verdict depends on its scene
-    alone, bit for bit, so that it may be kept. Those of invalid scenes are not: a worker may only have been slow.
+    Scenes are recognised by their content: type, poses, categories and order of slots. A verdict depends only on its
+    scene, bit for bit, so it may be kept. Verdicts of invalid scenes are not kept: a worker may only have been slow.
 
     Args:
         batch: B scenes of N slots.

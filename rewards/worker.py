@@ -30,7 +30,7 @@ from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type, register_scene_type
 
 _GRACE = 5
-"""Seconds after which a call that its parent did not end ends the process by itself."""
+"""Seconds after the time limit of a call at which the process ends itself, if its parent has not ended it."""
 
 
 def serve(inbox: Connection, outbox: Connection, timeout: float) -> None:
@@ -44,7 +44,7 @@ def serve(inbox: Connection, outbox: Connection, timeout: float) -> None:
             return
         except OSError:  # the reward closed the pipe
             os._exit(1)
-        signal.setitimer(signal.ITIMER_REAL, timeout + _GRACE)  # the default action ends even what holds the GIL
+        signal.setitimer(signal.ITIMER_REAL, timeout + _GRACE)  # the default action ends even code that holds the GIL
         try:
             reply: tuple[str, Any] = ("done", getattr(answer, kind)(*body))
         except MemoryError:
@@ -54,7 +54,7 @@ def serve(inbox: Connection, outbox: Connection, timeout: float) -> None:
             reply = ("failed", (type(error).__name__, f"{error}{hint}"))
         except BaseException as error:
             reply = ("failed", ("RewardError", f"the reward raised {describe_error(error)}"))
-        if os.getpid() != process:  # a copy that the reward forked and that came back here: one alone answers
+        if os.getpid() != process:  # a copy that the reward forked came back here: it must not answer
             os._exit(0)
         signal.setitimer(signal.ITIMER_REAL, 0)
         try:

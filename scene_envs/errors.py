@@ -15,14 +15,14 @@ class InvalidInputError(SceneEnvsError, ValueError):
 
 
 class UnknownNameError(SceneEnvsError, KeyError):
-    """A name was asked for that no registry knows."""
+    """No registry knows the name that was asked for."""
 
     def __str__(self) -> str:  # KeyError would print the repr of the message
         return str(self.args[0]) if self.args else ""
 
 
 class CorruptFileError(SceneEnvsError):
-    """A file exists but cannot be read as what it should be."""
+    """A file exists, but it is damaged or not in the format that it should have."""
 
 
 class MissingDependencyError(SceneEnvsError, ImportError):
@@ -52,7 +52,7 @@ class StorageError(SceneEnvsError, OSError):
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
     """Build the error for an unknown ``kind`` called ``name``, offering the nearest known name.
 
-    A dotted name is offered to who gives its last part.
+    When ``name`` is the last part of a known dotted name, that dotted name is offered.
 
     Args:
         kind: what was looked up, in words a user knows ("scene type", "reward", "prior").

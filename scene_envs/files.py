@@ -16,17 +16,17 @@ from typing import Any
 from scene_envs.errors import CorruptFileError, StorageError
 
 DIGEST = "sha256"
-"""Key of a JSON file under which the digest of the others stands."""
+"""Key of a JSON file that holds the digest of all other keys and their values."""
 _SEAL = "# scene-envs, sha256 of the lines below: "
 
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A file to write beside ``path``, which takes the name ``path`` when the block ends without an error.
+    """Context with a temporary file to write, which is renamed to ``path`` when the block ends without an error.
 
-    The folder is made if need be. What is written at first has a hidden name of its own,
-    ``.<name>.<process>.<random>.partial``; it is removed when the block fails, and what was at ``path`` before is
-    untouched.
+    The folder is made if need be. The temporary file lies beside ``path`` and has the hidden name
+    ``.<name>.<process>.<random>.partial``. When the block fails, the temporary file is removed, and a file that was at
+    ``path`` before stays unchanged.
 
     Raises:
         StorageError: the operating system refused to write or to rename; names the file and the remedy.
@@ -54,7 +54,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def sealed(text: str) -> str:
-    """YAML text under a first line, a comment, that holds the digest of the lines below it.
+    """YAML text after a first line that is a comment with the digest of the text.
 
     >>> sealed("seed: 0\\n").splitlines()[1:]
     ['seed: 0']
@@ -63,11 +63,13 @@ def sealed(text: str) -> str:
 
 
 def read_sealed(path: str | os.PathLike[str]) -> str:
-    """The text of a file that :func:`sealed` text was written to; one without a digest, of earlier versions, as it is.
+    """The text that was given to :func:`sealed` before it was written to the file at ``path``.
+
+    Files of earlier versions have no digest; their text is returned as it is.
 
     Raises:
-        CorruptFileError: it is not what was written, or no text.
-        OSError: it cannot be read.
+        CorruptFileError: the file was changed after it was written, or is not UTF-8 text.
+        OSError: the file cannot be read.
     """
     try:
         text = Path(path).read_text(encoding="utf-8")
@@ -80,7 +82,7 @@ def read_sealed(path: str | os.PathLike[str]) -> str:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a file; False also for names that the system cannot have."""
+    """Whether ``path`` is a file; False also for names that the operating system does not allow."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -88,7 +90,7 @@ def is_file(path: Path) -> bool:
 
 
 def exists(path: Path) -> bool:
-    """Whether there is anything; False also for names that the system cannot have."""
+    """Whether ``path`` exists; False also for names that the operating system does not allow."""
     try:
         return path.exists()
     except (OSError, ValueError):
@@ -119,16 +121,18 @@ def write_json(path: str | os.PathLike[str], content: Any, *, indent: int | None
 
 
 def with_digest(content: Mapping[str, Any]) -> dict[str, Any]:
-    """``content`` as JSON holds it, with the digest of all of it under ``sha256``, the last key."""
+    """``content`` as plain JSON values, with the digest of all of them under the last key, ``sha256``."""
     plain = {key: value for key, value in finite(content).items() if key != DIGEST}
     return {**plain, DIGEST: _digest_of(plain)}
 
 
 def without_digest(content: Mapping[str, Any], path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What :func:`with_digest` was given; content without a digest as it is, for such a file may be written by hand.
+    """``content`` without the digest of :func:`with_digest`, after a check against that digest.
+
+    Content without a digest is returned as it is, because such a file may be written by hand.
 
     Raises:
-        CorruptFileError: the content is not what was written; says how to accept an edit.
+        CorruptFileError: the content is not what was written; the message says how to accept an edit.
     """
     plain = {key: value for key, value in content.items() if key != DIGEST}
     if DIGEST in content and content[DIGEST] != _digest_of(plain):

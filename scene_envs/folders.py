@@ -18,7 +18,8 @@ from scene_envs.files import storage_error
 
 LOCK = ".writer.lock"
 _BEAT, _SILENCE = 15, 60
-"""Seconds between signs of life of a writer, and without one after which a writer on another computer has ended."""
+"""Seconds between two signs of life of a writer, and seconds without a sign of life after which a writer on another
+computer counts as ended."""
 _PARTIAL = re.compile(r"\..*?\.(?P<process>\d+)(\.\w+)?\.partial")
 _held: set[Path] = set()
 _guard = threading.Lock()
@@ -33,7 +34,7 @@ def claimed(folder: str | os.PathLike[str], owner: str) -> Iterator[Path]:
 
     Args:
         folder: where to write.
-        owner: what writes, for the message to others.
+        owner: name of the writer, for the message that other processes get.
 
     Raises:
         InvalidInputError: another process writes there (it is named), or ``folder`` is a file.
@@ -76,7 +77,7 @@ def claimed(folder: str | os.PathLike[str], owner: str) -> Iterator[Path]:
 
 
 def sweep(folder: Path) -> None:
-    """Remove what ended processes left half-written in ``folder`` and below."""
+    """Remove files that ended processes left half-written in ``folder`` and its subfolders."""
     for path in folder.rglob(".*.partial"):
         found = _PARTIAL.fullmatch(path.name)
         if found is None or int(found["process"]) == os.getpid() or not _is_alive(int(found["process"])):
@@ -85,7 +86,7 @@ def sweep(folder: Path) -> None:
 
 
 def _lock(path: Path, owner: str) -> int:
-    """The descriptor of the locked file; the system lets go of the lock when the process ends."""
+    """The descriptor of the locked file; the operating system releases the lock when the process ends."""
     import fcntl
 
     while True:
@@ -123,7 +124,10 @@ def _takeover(told: str, path: Path) -> str:
 
 
 def _owner_elsewhere(descriptor: int) -> str | None:
-    """Who on another computer gave a sign of life lately: a file system may share files and not their locks."""
+    """The owner of the lock if it is on another computer and gave a recent sign of life; else None.
+
+    A file system may share files between computers without their locks.
+    """
     told = os.pread(descriptor, 500, 0).decode(errors="replace").strip()
     found = re.search(r"process \d+ on (.+), since", told)
     recent = time.time() - os.fstat(descriptor).st_mtime < _SILENCE
@@ -132,7 +136,7 @@ def _owner_elsewhere(descriptor: int) -> str | None:
 
 @contextmanager
 def _heartbeat(descriptor: int) -> Iterator[None]:
-    """Context in which the lock's time of change is set to now every few seconds, for other computers to see."""
+    """Context that sets the lock file's modification time to now every few seconds, as a sign of life."""
     done = threading.Event()
 
     def beat() -> None:

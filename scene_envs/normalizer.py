@@ -98,7 +98,7 @@ class Normalizer:
         """Inverse of :meth:`state`.
 
         Raises:
-            InvalidInputError: an entry is missing, or the four are not finite numbers, one of each for a feature.
+            InvalidInputError: an entry is missing, or the four entries are not lists of finite numbers of one length.
         """
         try:
             params = state["params"]

@@ -19,7 +19,10 @@ def page_part(package: str, name: str) -> str:
 
 @cache
 def page_template(package: str, name: str, *, trim_blocks: bool = False) -> Template:
-    """The template in such a file. It escapes all text; the filter ``png`` gives the bytes of a path in base 64."""
+    """The template in a file beside the code of ``package``.
+
+    The template escapes all text. Its filter ``png`` gives the bytes of the file at a path in base 64.
+    """
     from jinja2 import Environment, StrictUndefined
 
     environment = Environment(

@@ -23,8 +23,8 @@ _LOGGER = logging.getLogger(__name__)
 def plugin_entry_points(group: str) -> dict[str, EntryPoint]:
     """The entry points of ``group`` by name, of all installed packages.
 
-    Those that the ``pyproject.toml`` of a checkout declares come first: an editable install keeps the metadata of the
-    day it was made, and a checkout on the path has none.
+    Entry points that the ``pyproject.toml`` of a checkout declares replace installed ones of the same name. An
+    editable install keeps the metadata of the day it was made, and a checkout on the path has no metadata.
     """
     installed = {point.name: point for point in entry_points(group=group)}
     declared = _checkout_entry_points(Path(__file__).parents[1] / "pyproject.toml").get(group, {})
@@ -45,9 +45,10 @@ def _checkout_entry_points(pyproject: Path) -> dict[str, dict[str, str]]:
 
 @cache
 def load_plugins(group: str) -> None:
-    """Import every module of ``group``, which registers what it brings; once per process, when a name is not found.
+    """Import every module of ``group``; each module registers its components when it is imported.
 
-    A plug-in that fails to import is reported in the log and does not keep others from working.
+    This happens once per process, when a name is not found. A plug-in that fails to import is reported in the log
+    and does not keep others from working.
     """
     for point in plugin_entry_points(group).values():
         try:
@@ -57,11 +58,11 @@ def load_plugins(group: str) -> None:
 
 
 def load_plugin(point: EntryPoint) -> Any:
-    """The object that an entry point names, whose module is imported.
+    """Import the module of an entry point and return the object that the entry point names.
 
-    ``sys.exit`` and ``os._exit`` at import end the import and not the process, and an import that takes longer than
-    ``SCENE_ENVS_PLUGIN_SECONDS`` (60 by default) is ended; that of compiled code which holds the interpreter is
-    not, nor one outside the main thread.
+    ``sys.exit`` and ``os._exit`` at import end the import and not the process. An import that takes longer than
+    ``SCENE_ENVS_PLUGIN_SECONDS`` (60 by default) is ended. An import outside the main thread is not ended, nor is
+    compiled code that holds the interpreter.
 
     Raises:
         PluginError: the import failed; says how.
@@ -123,14 +124,14 @@ def _exits_as_errors() -> Iterator[None]:
 
 @contextmanager
 def _ended_after(seconds: float) -> Iterator[None]:
-    """Context that is interrupted after ``seconds``, unless something else uses the alarm or this is no main thread."""
+    """Context that is interrupted after ``seconds``, unless the alarm is in use or this is not the main thread."""
     is_main = threading.current_thread() is threading.main_thread()
     if not is_main or not hasattr(signal, "setitimer") or signal.getitimer(signal.ITIMER_REAL)[0]:
         yield
         return
 
     def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt(_LATE)  # which code that catches every Exception lets through
+        raise KeyboardInterrupt(_LATE)  # not caught by code that catches every Exception
 
     before = signal.signal(signal.SIGALRM, interrupt)
     signal.setitimer(signal.ITIMER_REAL, seconds)

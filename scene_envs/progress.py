@@ -24,7 +24,7 @@ class Progress:
         always: numbers done at which a line is printed however little time has passed.
 
     Attributes:
-        seconds: since it was made.
+        seconds: since this object was made.
 
     >>> with Progress("Counting", 3, style="none") as progress:
     ...     progress.update(3, "all of them")
@@ -76,7 +76,7 @@ class Progress:
 
     @property
     def seconds(self) -> float:
-        """Seconds since it was made."""
+        """Seconds since this object was made."""
         return perf_counter() - self._started
 
     def update(self, done: int, text: str, line: str = "") -> None:

@@ -17,7 +17,7 @@ class RewardResult(Protocol):
 
     @property
     def value(self) -> Tensor:
-        """(B,) float32, larger is better; anything where not valid."""
+        """(B,) float32, larger is better; any value in rows that are not valid."""
 
     @property
     def is_valid(self) -> Tensor:
@@ -52,7 +52,7 @@ class StepTableLike(Protocol):
 
     @property
     def previous(self) -> Tensor:
-        """(S,) int64, where each step lands; the last is 0."""
+        """(S,) int64, the timestep after each step; the last is 0."""
 
     def __len__(self) -> int: ...
 
@@ -86,7 +86,7 @@ class PriorLike(Protocol):
     def transition(self, x_t: Tensor, step: int, table: StepTableLike) -> Any:
         """p(x_{t-1} | x_t) at ``table.timesteps[step]``, an object with ``from_noise(noise)``.
 
-        Known entries are certain; at the last step all are.
+        Known entries are certain; at the last step all entries are certain.
         """
 
     def inpaint(
@@ -104,7 +104,7 @@ class EncodedPriorLike(PriorLike, Protocol):
 
     @property
     def features(self) -> int:
-        """D, numbers per slot of what is denoised."""
+        """D, numbers per slot in the layout that is denoised."""
 
     def decode(self, x: Tensor) -> SceneBatch:
         """Scenes of x (B, N, D)."""
@@ -127,7 +127,7 @@ class LikelihoodPriorLike(PriorLike, Protocol):
 
 
 class ObservedScenesLike(Protocol):
-    """Scenes of which a part is observed: the rest is what a policy decides."""
+    """Scenes in which some entries are observed; a policy decides the others."""
 
     @property
     def entries(self) -> Tensor:
@@ -159,7 +159,7 @@ class InpaintingPriorLike(PriorLike, Protocol):
         text: Any = None,
         guidance: float = 0.0,
     ) -> Any:
-        """p(x_{t-1} | x_t), with the entries ``observed`` (B, N, 2) certain and no part of log p."""
+        """p(x_{t-1} | x_t), in which the entries ``observed`` (B, N, 2) are certain and do not count in log p."""
 
 
 class PromptedPriorLike(PriorLike, Protocol):
@@ -190,4 +190,4 @@ class PromptedPriorLike(PriorLike, Protocol):
         prompt: str | Sequence[str] | None = None,
         guidance: float = 0.0,
     ) -> SceneBatch:
-        """As for any prior, the whole scenes following ``prompt``."""
+        """As for any prior; the whole scenes follow ``prompt``."""

@@ -14,15 +14,15 @@ Component = TypeVar("Component")
 
 
 class Registry(dict[str, Component]):
-    """Components of one kind by name; a lookup of a name that is not there first loads the module that has it.
+    """Components of one kind by name; the lookup of a missing name first loads the module that registers it.
 
     Args:
         kind: what messages call a component, such as ``"planner"``.
         group: entry points of installed packages.
         components: those that are there from the start.
         modules: modules of this project by name of the component that each registers when it is imported.
-        read: from an entry point, which is called like its component, to the component; None where the entry points are
-            modules that register components when they are imported.
+        read: function from the entry point with the name of a component to that component; None where the entry points
+            are modules that register components when they are imported.
 
     Raises:
         UnknownNameError: at a lookup, when nothing has that name; the nearest known one is offered.
@@ -64,25 +64,28 @@ class Registry(dict[str, Component]):
         return self[name]
 
     def names(self) -> list[str]:
-        """All names, those of installed packages included, sorted. No module of this project is imported for it."""
+        """All names, those of installed packages included, sorted.
+
+        Modules of this project are imported only where installed packages have modules that register components.
+        """
         self._load_plugins()
         return sorted({*self, *self._modules, *(self.points() if self._read is not None else ())})
 
     def _load_plugins(self) -> None:
-        """Import the modules of installed packages after those of this project, whose components they may replace."""
+        """Import the modules of this project, then those of installed packages, which may replace its components."""
         if self._read is None and self.points():
             self._import(*self._modules.values())
             load_plugins(self.group)
 
     def _import(self, *modules: str) -> None:
-        """Import modules of this project, which replace no component that is there."""
+        """Import modules of this project; they do not replace components that are already registered."""
         registered = dict(self)
         for module in modules:
             import_module(module)
         self.update(registered)
 
     def adding(self, name: str, entry: Callable[[Any], Component] | None = None) -> Callable[[Any], Any]:
-        """A decorator that makes what it decorates, or ``entry`` of it, the component ``name``."""
+        """A decorator that registers its argument, or the result of ``entry`` for it, as the component ``name``."""
 
         def add(made: Any) -> Any:
             self[name] = made if entry is None else entry(made)

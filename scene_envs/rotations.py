@@ -52,8 +52,8 @@ def matrix_to_quaternion(matrices: Tensor) -> Tensor:
 def quaternion_to_matrix(quaternions: Tensor) -> Tensor:
     """Rotation matrices (..., 3, 3) of quaternions (w, x, y, z), normalised first.
 
-    Written out, since ``roma`` rounds otherwise in float32, and priors with quaternion codes give the same bits as when
-    they were trained.
+    The formula is written out, because ``roma`` rounds differently in float32. Priors with quaternion codes therefore
+    give the same bits as when they were trained.
     """
     w, x, y, z = (quaternions / quaternions.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [

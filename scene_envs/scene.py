@@ -72,7 +72,7 @@ class SceneBatch(AssetFacts):
     ) -> SceneBatch:
         """From a (B, N, D) tensor such as a sampler's output.
 
-        Rotations are projected to SO(3) by SVD and categories are the arg-max; empty slots become exact.
+        Rotations are projected to SO(3) by SVD and categories are the arg-max; empty slots get a pose of zeros.
 
         Args:
             tensor: (B, N, D) floats.

@@ -31,10 +31,10 @@ def cutoff(scene_type: SceneType) -> float:
 def scene_distances(batch: SceneBatch, other: SceneBatch) -> Tensor:
     """(B,) m: how far each scene is from its counterpart in ``other``, as sets of objects; orientations do not count.
 
-    The OSPA distance of order 1 (Schuhmacher, Vo and Vo, 2008): objects are matched one to one at the least total
-    cost, where a match costs the distance of the two positions, at most c, and c when the assets differ; each object
-    without match costs c. The total is divided by the number of objects of the larger scene. Fixed welded objects
-    are left out; c is :func:`cutoff`. The assignment is exact: what Sinkhorn iterations converge to when their
+    This is the OSPA distance of order 1 (Schuhmacher, Vo and Vo, 2008). Objects are matched one to one at the least
+    total cost. A match costs the distance of the two positions, at most c, or c when the assets differ. Each object
+    without a match costs c. The total is divided by the number of objects of the larger scene. Fixed welded objects
+    are left out; c is :func:`cutoff`. The assignment is exact: it is the limit of Sinkhorn iterations as their
     regularisation goes to zero.
 
     >>> from scene_envs.grammars import get_grammar

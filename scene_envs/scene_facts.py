@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from scene_envs.assets.base import AssetLibrary
 
 _CHUNK = 32
-"""Scenes whose supports are found together."""
+"""Number of scenes whose supports are found together."""
 
 
 class AssetFacts(ABC):
-    """The part of :class:`~scene_envs.scene.SceneBatch` that knows the assets themselves.
+    """The properties of :class:`~scene_envs.scene.SceneBatch` that depend on the assets themselves.
 
-    All tensors are on the device of the scenes, and 0 or False in empty slots unless they say otherwise. The asset
-    library is built on first use; a scene type without models raises UnknownNameError there.
+    All tensors are on the device of the scenes, and 0 or False in empty slots unless stated otherwise. The asset
+    library is built on first use, which raises UnknownNameError for a scene type without models.
     """
 
     scene_type: SceneType
@@ -97,8 +97,8 @@ class AssetFacts(ABC):
     def supports(self) -> Tensor:
         """(B, N) int64: slot of what each object stands on or lies in; -1 for nothing, fixed things and empty slots.
 
-        Surfaces touch up to 1 cm apart or into each other. These are the supports that prompts speak of
-        (:func:`scene_envs.datasets.scene_facts`).
+        Two surfaces touch when they are at most 1 cm apart or at most 1 cm into each other. These are the
+        supports that prompts describe (:func:`scene_envs.datasets.scene_facts`).
 
         >>> from scene_envs import SceneBatch
         >>> SceneBatch.empty("dimsum_table", 1, slots=2).supports

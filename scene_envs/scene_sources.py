@@ -17,10 +17,10 @@ _PRIORS = ("prior/config.json", "config.json")
 
 
 def find_scenes(path: Path, key: str = "scenes") -> Path:
-    """The file or folder that a key such as ``scenes=`` names: a run's folder stands for the scenes it holds.
+    """The file or folder of scenes that a key such as ``scenes=`` names; for a run's folder, the scene file in it.
 
     Raises:
-        InvalidInputError: there is nothing, or a prior and no scenes.
+        InvalidInputError: nothing is at ``path``, or the folder holds a prior and no scenes.
     """
     from scene_envs.files import exists
 
@@ -39,17 +39,19 @@ def find_scenes(path: Path, key: str = "scenes") -> Path:
 
 
 def is_dataset(path: Path) -> bool:
-    """Whether what :func:`find_scenes` gave is a dataset or one of its files, and neither scene file nor a folder of
-    scene files."""
+    """Whether a path from :func:`find_scenes` is a dataset or one of its files.
+
+    It is False for a scene file and for a folder of scene files.
+    """
     return not _scene_files(path) if path.is_dir() else path.suffix in (".parquet", ".arrow")
 
 
 def load_scenes(path: Path, count: int | None = None) -> SceneBatch:
-    """Scenes from a scene file, a folder of such files, the folder of a run that has one, a dataset or a file of one.
+    """Scenes from a scene file, a folder of them, a run's folder with a scene file, a dataset or a file of a dataset.
 
     Args:
         path: file or folder.
-        count: at most so many, the first ones; None for all. The files of a folder follow each other by name.
+        count: largest number of scenes, the first ones; None for all. Files are read in order of name.
 
     Raises:
         InvalidInputError: ``count`` below 1, nothing there, or files of several scene types.

@@ -1,4 +1,4 @@
-"""Silence of the greetings that libraries print when they are imported."""
+"""Suppression of the messages that libraries print when they are imported."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scene_envs.errors import MissingDependencyError
 
 @contextlib.contextmanager
 def silence() -> Iterator[None]:
-    """Keep the greeting that PyBullet prints on import out of the user's terminal."""
+    """Keep the message that PyBullet prints on import out of the user's terminal."""
     sys.stdout.flush()
     sys.stderr.flush()
     with open(os.devnull, "w") as sink:

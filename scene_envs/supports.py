@@ -16,11 +16,11 @@ CONTACT = 0.01
 LARGEST_CONTACT = 0.03
 """No tolerance of contacts may be larger than this (m)."""
 _FAR = 3.0
-"""What touches nothing is still on a table or tier within so many times the tolerance."""
+"""An object that touches nothing is still on a table or tier within this many times the tolerance."""
 _UPRIGHT = 0.85
 """Cosine of the tilt up to which a thing carries others."""
 _STEEPNESS = 20.0
-"""Foot points lie as far out as they can, where 1 m outward is worth 1/20 m upward."""
+"""Foot points lie low and far out: 1/20 m more height cancels 1 m more distance outward."""
 _DIRECTIONS = np.stack([np.cos(np.arange(8) * np.pi / 4.0), np.sin(np.arange(8) * np.pi / 4.0)], axis=1)  # (8, 2)
 
 
@@ -72,7 +72,10 @@ class Placed:
     def of_scenes(
         cls, scene_type: SceneType, categories: Index, translations: Array, rotations: Array
     ) -> tuple[LibraryShapes, Placed, Index]:
-        """The shapes of the assets, the objects of scenes (B, N), (B, N, 3), (B, N, 3, 3), and the slot of each."""
+        """The shapes of the assets, the objects of B scenes, and the slot of each object.
+
+        The arguments are categories (B, N), translations (B, N, 3) m and rotations (B, N, 3, 3).
+        """
         shapes = library_shapes(scene_type.library)
         scene, slot = np.nonzero(categories != scene_type.num_assets)
         placed = cls.of(
@@ -91,11 +94,11 @@ class Holding:
     """Supports of n objects; indices are into the same n.
 
     Attributes:
-        support: (n,) the thing it stands on or lies in; -1 for none.
-        contained: (n,) bool: it lies in it.
-        inside: (n,) the innermost container it lies in, directly or on top of what lies there; -1 for none.
+        support: (n,) the thing that each object stands on or lies in; -1 for none.
+        contained: (n,) bool: the object lies in its support.
+        inside: (n,) the innermost container with the object in it or on top of its contents; -1 for none.
         place: (n,) the first fixed thing down the chain of supports; -1 for none.
-        tier: (n,) tier of that thing from the top; -1 where it has none.
+        tier: (n,) tier of ``place``, counted from the top; -1 where ``place`` has none.
     """
 
     support: Index
@@ -113,7 +116,7 @@ class Holding:
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """M pairs of an object and what may hold it, with heights (m) from which any tolerance gives a :class:`Holding`."""
+    """M pairs of an object and a thing that may hold it, with heights (m); :meth:`holding` applies a tolerance."""
 
     shapes: LibraryShapes
     objects: Placed
@@ -162,7 +165,7 @@ class Contacts:
     def holding(self, tolerance: float = CONTACT) -> Holding:
         """Supports of objects, where surfaces up to ``tolerance`` (m) apart, or into each other, touch.
 
-        For what touches nothing, three times the tolerance decides on the place and tier alone.
+        For an object that touches nothing, three times the tolerance is used to find its place and tier alone.
         """
         support, contained, tier = self._lower(tolerance)
         far, _, far_tier = self._lower(_FAR * tolerance)
@@ -178,7 +181,7 @@ class Contacts:
         return Holding(support, contained, inside, place, np.where(place >= 0, tier[base], -1))
 
     def _lower(self, tolerance: float) -> tuple[Index, Mask, Index]:
-        """The highest thing below each object, whether it lies in that, and the tier; (n,) each."""
+        """The highest thing below each object, whether the object lies in that thing, and the tier; (n,) each."""
         size = self.shapes.bounds[self.objects.category[self.lower]]
         thickness = size[:, 1, 2] - size[:, 0, 2]
         into = np.minimum(tolerance, 0.5 * thickness)

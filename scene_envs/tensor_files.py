@@ -14,7 +14,7 @@ from scene_envs.errors import CorruptFileError
 from scene_envs.files import replacing
 
 DIGEST = "sha256"
-"""Key of the digest in a file's metadata; also the suffix of a file beside that holds the digest of all bytes."""
+"""Key of the digest in a file's metadata; also the suffix of a second file with the digest of all its bytes."""
 
 
 def write_tensors(
@@ -40,12 +40,12 @@ def write_tensors(
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
-    path.with_name(f"{path.name}.{DIGEST}").unlink(missing_ok=True)  # of what was there before
+    path.with_name(f"{path.name}.{DIGEST}").unlink(missing_ok=True)  # the digest of the file that was there before
     return path
 
 
 def read_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors and metadata of a file, on the CPU; one without a digest, as earlier versions wrote, is read as it is.
+    """Tensors and metadata of a file, on the CPU; a file of earlier versions, without a digest, is read as it is.
 
     Raises:
         FileNotFoundError: there is none.

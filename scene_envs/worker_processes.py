@@ -11,7 +11,7 @@ _START = (
     "import sys; sys.path[:] = filter(None, sys.path); del sys.argv[0]; import runpy; "
     "runpy.run_module(sys.argv[0], run_name='__main__', alter_sys=True)"
 )
-"""As ``python -m``, which would also import from the current folder, before all others."""
+"""Code that runs a module like ``python -m``, but without the current folder as the first place of imports."""
 
 
 def module_command(module: str, *words: str) -> list[str]:
@@ -30,7 +30,7 @@ def module_environment() -> dict[str, str]:
 
 @contextmanager
 def no_current_folder() -> Iterator[None]:
-    """Context in which interpreters that others start import nothing from the current folder (Python 3.11 or later)."""
+    """Context in which interpreters started by other code do not import from the current folder (Python >= 3.11)."""
     before = os.environ.get("PYTHONSAFEPATH")
     os.environ["PYTHONSAFEPATH"] = "1"
     try:

@@ -1,7 +1,8 @@
 """Checks of a command's values that need no torch: names, paths and numbers, refused within a second.
 
-The same key means the same in every command, so that most checks look at the key alone. What only one command knows
-stands in its config's ``__post_init__`` or, where the defaults would fail, in a function ``check`` of its module.
+A key has the same meaning in every command, so most checks look only at the key. Checks that belong to one command are
+in the ``__post_init__`` of its config. Where the defaults would fail such a check, it is in a function ``check`` of the
+command's module instead.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from scene_envs.plugins import plugin_entry_points
 from scene_envs.scene_sources import find_scenes
 
 COMPOSITES = ("clip", "gate", "normalised", "product", "weighted_sum")
-"""Rewards that need settings, so that no option of the group ``reward`` is called like them."""
+"""Rewards that need settings, so the group ``reward`` has no options with their names."""
 _LEAST = {
     "count": 1,
     "num_steps": 1,
@@ -45,7 +46,7 @@ _GRAMMAR = "grammar"
 
 
 def check_early(settings: Any, config_dir: str = "", module: ModuleType | None = None) -> None:
-    """Refuse names, paths and numbers that cannot be.
+    """Refuse unknown names, wrong paths and numbers out of range.
 
     Args:
         settings: the config of a command.
@@ -75,7 +76,7 @@ def check_early(settings: Any, config_dir: str = "", module: ModuleType | None =
     if (scenes := getattr(settings, "scenes", None)) and isinstance(scenes, str):
         find_scenes(Path(scenes))
     resumed = exists(Path(str(getattr(settings, "output", "") or "."), "checkpoint.pt"))
-    kept = ("regularisation.scenes",) if resumed else ()  # a run that goes on has them in its folder
+    kept = ("regularisation.scenes",) if resumed else ()  # a resumed run has them in its folder
     if not resumed and isinstance(replay := _dotted(settings, "regularisation.replay"), str):
         find_scenes(Path(replay), "regularisation.replay")
     for key in set(_DATASETS) - set(kept) - set(getattr(settings, "NO_PATHS", ())):
@@ -89,7 +90,7 @@ def known_rewards(config_dir: str = "") -> list[str]:
 
 
 def known_scenes(config_dir: str = "") -> list[str]:
-    """Names of scene types; none where an installed package may register more, whose names only its modules say."""
+    """Names of scene types; none where installed packages may register more, as only their modules know the names."""
     groups = ("scene_envs.scene_types", "scene_envs.grammars")
     return [] if any(map(plugin_entry_points, groups)) else sorted(group_options("scene", config_dir))
 
@@ -100,7 +101,7 @@ def known_masks(config_dir: str = "") -> list[str]:
 
 
 def check_files(*paths: str) -> None:
-    """Refuse paths where no file is."""
+    """Refuse paths at which there is no file."""
     for path in paths:
         if not is_file(Path(path)):
             raise InvalidInputError(f"{path[:200]!r} is no file; name one that is there")

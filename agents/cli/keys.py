@@ -27,7 +27,7 @@ class KeyHelp:
     """One key of a command.
 
     Attributes:
-        name: what stands before ``=``, a group's name and a dot before it where it is of one.
+        name: the text before ``=``; a key of a group begins with the name of the group and a dot.
         default: its default, as it would be typed.
         meaning: one sentence.
     """
@@ -60,13 +60,13 @@ class Sources:
 
 
 def keys_of(command: Any) -> type:
-    """The dataclass of a command's keys: what ``settings``, the argument of its ``run``, is annotated with."""
+    """The dataclass of a command's keys, which is the annotation of the argument ``settings`` of its ``run``."""
     annotation = command.run.__annotations__["settings"]
     return command.run.__globals__[annotation] if isinstance(annotation, str) else annotation
 
 
 def describe_fields(config: type | Any, prefix: str = "") -> list[KeyHelp]:
-    """The keys of a config, or of the default one of its class, part by part, those of groups last.
+    """The keys of a config (the default one, if its class is given), part by part; the keys of groups come last.
 
     Meanings stand under ``Attributes:`` in the docstrings.
     """
@@ -84,7 +84,7 @@ def _groups(made: Any) -> list[tuple[dataclasses.Field[Any], Any]]:
 
 
 def _plain_keys(made: Any, prefix: str = "", fields: Sequence[dataclasses.Field[Any]] | None = None) -> list[KeyHelp]:
-    """The fields that are no groups, of ``fields`` or of all."""
+    """The keys among ``fields``, by default among all fields, that are no groups."""
     fields = dataclasses.fields(made) if fields is None else fields
     meanings, values = attribute_meanings(type(made)), {field.name: getattr(made, field.name) for field in fields}
     return [
@@ -95,7 +95,7 @@ def _plain_keys(made: Any, prefix: str = "", fields: Sequence[dataclasses.Field[
 
 
 def _parts(made: Any) -> dict[type, list[KeyHelp]]:
-    """The keys of a command that are no groups, by the part of its config that declares them, in a listing's order."""
+    """The keys of a command that are no groups, by the class that declares them, in the order of a listing."""
     parts = {part: sorted(_plain_keys(made, fields=own), key=_place) for part, own in parts_of(type(made)).items()}
     return dict(sorted(((part, keys) for part, keys in parts.items() if keys), key=lambda item: _place(item[1][0])))
 
@@ -212,7 +212,7 @@ def compose(command: str, config: type, words: Sequence[str], sources: Sources =
 
 
 def _with_adapter(command: str, settings: Any, adapter: str) -> Any:
-    """Settings whose ``prior`` names its adapters as well, so that whatever loads a prior by name loads them."""
+    """Settings whose ``prior`` also names its adapters, so that code that loads the prior by name loads them too."""
     from agents.configuration.prior_names import adapted_name
 
     if not settings.prior:
@@ -243,7 +243,7 @@ def read_config(path: str) -> dict[str, Any]:
 def _component(
     command: str, field: dataclasses.Field[Any], value: str, config_dir: str, late: dict[str, Any]
 ) -> list[str]:
-    """The word that chooses a component; what is no name goes into ``late``."""
+    """The word that chooses a component; a value that is no name goes into ``late`` instead."""
     name = field.name
     if value in group_options(field.metadata["folder"], config_dir):
         return [f"{name}={value}"]

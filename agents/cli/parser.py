@@ -64,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def main_of(command: str, meaning: str, module: ModuleType, argv: Sequence[str] | None = None) -> int:
-    """Run a program that is one command of its own, and return its exit status.
+    """Run a program that consists of one command, and return its exit status.
 
     Args:
         command: its name in messages and in the name of its folder.
@@ -102,13 +102,14 @@ def _guarded(words: list[str], work: Callable[[list[str]], int]) -> int:
     except Exception as error:
         if show_traceback:
             traceback.print_exc()
-        if signals and not isinstance(error, StorageError | TrainingError):  # some code turns it into another error
+        # some code turns Terminated into another error
+        if signals and not isinstance(error, StorageError | TrainingError):
             return _ended(TERMINATED)
         return _complain(*_verdict(error))
 
 
 def _check_text(words: Sequence[str]) -> None:
-    """Refuse words that no file can keep as text, such as names of files in another encoding."""
+    """Refuse words that cannot be written to a file as text, such as names of files in another encoding."""
     for word in words:
         if not word.isprintable() and ("\0" in word or word.encode(errors="replace").decode() != word):
             raise InvalidInputError(f"{ascii(word)[:200]} is no text in UTF-8; give files and folders another name")
@@ -122,7 +123,8 @@ def _ended(status: int) -> int:
 def entry_point() -> None:
     """Run as a program, in which idle threads of OpenMP sleep after a short wait unless the environment says otherwise.
 
-    By default they wait busily. Where other work shares the cores, they take the time of the threads they wait for.
+    By default idle threads wait busily. Where other work shares the cores, they take processor time away from the
+    threads for which they wait.
     """
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", _SPINS)  # read when torch loads OpenMP
@@ -170,7 +172,7 @@ def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str
 
 
 def _check(settings: Any, allow_local: bool, only_show: bool, config_dir: str, module: ModuleType) -> None:
-    """Refuse what needs no more than a look; ask before a file of the user's is run."""
+    """Refuse wrong values that early checks can find; ask before one of the user's files is run."""
     if only_show:
         return
     check_early(settings, config_dir, module)
@@ -255,7 +257,7 @@ def _flag(words: list[str], *names: str) -> bool:
 
 
 def _named(words: Sequence[str], keys: Sequence[str]) -> list[str]:
-    """Words without ``=`` under the keys they stand for; those beyond the keys stay as they are."""
+    """The words; each one without ``=`` gets the next of ``keys`` in front, and stays as it is when none is left."""
     left = iter(keys)
     return [word if "=" in word else f"{key}={word}" if (key := next(left, "")) else word for word in words]
 

@@ -40,17 +40,17 @@ _PARTS = (
     "prior",
     "clutter",
 )
-"""What a command that was ended early leaves of its results, in a folder that has its log."""
+"""Partial results of a command that was ended early; they count in a folder that has the log of a command."""
 _RESUMES = {
     "generate": "metadata.json",
     "pretrain": "checkpoint.pt",
     "post-train": "checkpoint.pt",
     "search": "best.safetensors",
 }
-"""Commands that go on with what a run from Python left, and the file that says so."""
+"""Commands that can continue a run that was started in Python, and the file that shows that there is one."""
 _OWN_RULE = ("generate", "pretrain", "post-train", "search", "demo", "evaluate")
-"""Commands that compare their keys with what is there themselves, as do programs whose settings say
-``compares_keys``."""
+"""Commands that themselves compare their keys with those in the folder. Programs whose settings have ``compares_keys``
+do the same."""
 _MAY_DIFFER = (
     "output",
     "workers",
@@ -68,10 +68,10 @@ _MAY_DIFFER = (
 class Run:
     """Context in which a command works: its folder exists, and what the packages log goes to stderr and ``log.txt``.
 
-    One process writes into a folder at a time. One that holds results of another command, or of the same with other
-    keys, is refused. ``config.yaml`` is written when the command starts, unless an earlier run left results, and again
-    when it is done. Files that a failure left empty are removed.
-    Of the processes that ``torchrun`` starts, the first alone writes and speaks; the others log what fails.
+    One process writes into a folder at a time. A folder that holds results of another command, or of the same command
+    with other keys, is refused. ``config.yaml`` is written when the command starts, unless an earlier run left results,
+    and again when the command is done. Files that a failure left empty are removed.
+    Of the processes that ``torchrun`` starts, only the first writes files and messages; the others log what fails.
 
     Args:
         command: the command's name.

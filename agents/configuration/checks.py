@@ -11,7 +11,7 @@ from scene_envs.errors import InvalidInputError, unknown_name
 
 
 def at_least(settings: Any, low: float, *names: str) -> None:
-    """Refuse numbers below ``low``, and NaN; None stands for no number."""
+    """Refuse numbers below ``low``, and NaN; None is accepted."""
     for name in names:
         if getattr(settings, name) is not None and not getattr(settings, name) >= low:
             raise InvalidInputError(f"{name}={getattr(settings, name)} must be at least {low}")
@@ -39,7 +39,7 @@ def shares(settings: Any, *names: str) -> None:
 
 
 def one_of(settings: Any, name: str, known: Sequence[str], what: str = "") -> None:
-    """Refuse a word that is not known, as ``what``; the nearest known one is offered."""
+    """Refuse a word that is not in ``known``; the message calls it ``what`` and offers the nearest known word."""
     if getattr(settings, name) not in known:
         raise unknown_name(what or name, str(getattr(settings, name)), known)
 

@@ -114,16 +114,18 @@ def _by_hydra(command: str, primary: Mapping[str, Any], words: Sequence[str]) ->
 
 
 _GROUPS: dict[tuple[str, ...], dict[str, Any]] = {}
-"""Values of packaged groups, which Hydra takes a tenth of a second to compose, by what was chosen."""
+"""Composed values of packaged groups, by the groups chosen; Hydra takes a tenth of a second to compose them."""
 
 
 def _quickly(
     command: str, primary: Mapping[str, Any], groups: Sequence[str], values: Sequence[str]
 ) -> dict[str, Any] | None:
-    """The same, each choice of groups composed once: single values are set in a copy, as Hydra does in its last step.
+    """The composition of :func:`_by_hydra`, where each choice of groups is composed only once.
+
+    Single values are set in a copy, as Hydra does in its last step.
 
     Returns:
-        None where Hydra itself has to say what a value means, or what is wrong with it.
+        None where Hydra itself has to interpret a value, or to report what is wrong with it.
     """
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
@@ -148,7 +150,7 @@ def _quickly(
 
 
 def hidden(value: Any) -> Any:
-    """``value`` with ``${`` in its texts written so that OmegaConf sees no interpolation: text is text.
+    """``value`` with every ``${`` in its texts encoded, so that OmegaConf does not read it as an interpolation.
 
     >>> shown(hidden({"text": "${oc.env:HOME}"}))
     {'text': '${oc.env:HOME}'}

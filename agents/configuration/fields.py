@@ -59,7 +59,7 @@ def composed(kind: Kind) -> Kind:
     """A config dataclass that is made in Python as on the command line.
 
     A group may be given as its dataclass, as a mapping of those of its keys that differ, or as the name of an option
-    in ``configs``; ``recipe`` sets all that is not given beside it.
+    in ``configs``; ``recipe`` sets all values that are not given.
     """
     init = kind.__init__  # type: ignore[misc]
     signature = inspect.signature(init)
@@ -82,7 +82,7 @@ def composed(kind: Kind) -> Kind:
 
 
 def _place_short(kind: type, keywords: dict[str, Any]) -> None:
-    """Move keys that are written without their group, as ``kind.SHORT`` says, into it."""
+    """Move keys that are written without their group into the group that ``kind.SHORT`` gives."""
     short: Mapping[str, str] = getattr(kind, "SHORT", {})
     for key in short.keys() & keywords.keys():
         name, _, inner = short[key].partition(".")

@@ -19,7 +19,7 @@ _JOINT = " with "
 
 
 def adapted_name(prior: str, adapter: str) -> str:
-    """The name of a prior with adapters; those that it mentions already stay.
+    """The name of ``prior`` with a further adapter; adapters that ``prior`` already names stay.
 
     >>> adapted_name("dimsum_table", "runs/a")
     'dimsum_table with runs/a'

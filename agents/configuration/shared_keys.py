@@ -1,4 +1,4 @@
-"""Parts of the keys of commands, each shared by several; ``--help`` shows a paragraph for each."""
+"""Keys that several commands share, in parts; ``--help`` shows a paragraph for each part."""
 
 from __future__ import annotations
 

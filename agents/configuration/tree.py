@@ -17,10 +17,10 @@ _WANTED: dict[Any, str] = {int: "a whole number", float: "a number", bool: "true
 
 
 def build(kind: type[Config], tree: Mapping[str, Any], path: str = "", command: str = "") -> Config:
-    """An instance of the dataclass ``kind`` from a nested mapping; what it lacks keeps its default.
+    """An instance of the dataclass ``kind`` from a nested mapping; missing keys keep their defaults.
 
     Args:
-        kind: a dataclass, its groups dataclasses themselves.
+        kind: a dataclass, whose groups are dataclasses as well.
         tree: values by field name.
         path: where ``tree`` stands, for messages, such as ``"optimizer."``.
         command: whose keys these are, for messages.
@@ -37,7 +37,7 @@ def build(kind: type[Config], tree: Mapping[str, Any], path: str = "", command: 
 
 
 def field_values(kind: type, tree: Mapping[str, Any], path: str = "", command: str = "") -> dict[str, Any]:
-    """The values of ``tree`` as the fields of ``kind`` want them."""
+    """The values of ``tree``, converted to the types of the fields of ``kind``."""
     fields = {field.name: field for field in dataclasses.fields(kind)}
     hints = get_type_hints(kind)
     values = {}
@@ -51,7 +51,7 @@ def field_values(kind: type, tree: Mapping[str, Any], path: str = "", command: s
 
 
 def convert(field: dataclasses.Field[Any], hint: Any, value: Any, path: str, command: str = "") -> Any:
-    """``value`` as a field of type ``hint`` wants it."""
+    """``value``, converted for a field of type ``hint``."""
     if field.metadata.get("named"):
         if isinstance(value, int | float):
             raise InvalidInputError(f"{path}={typed(value)[:60]} is neither a name nor a mapping with a name")
@@ -144,7 +144,7 @@ def changed(config: Config, changes: Mapping[str, Any]) -> Config:
 
 
 def dotted_keys(config: Any) -> list[str]:
-    """All keys of a config, those of groups behind a dot."""
+    """All keys of a config; a key of a group stands behind the name of the group and a dot."""
     return list(dotted_values(config))
 
 
@@ -159,7 +159,7 @@ def dotted_values(config: Any) -> dict[str, Any]:
 
 
 def dotted(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested mappings as one, its keys behind dots.
+    """Nested mappings as one flat mapping with dotted keys.
 
     >>> dotted({"optimizer": {"lr": 0.1}, "seed": 0})
     {'optimizer.lr': 0.1, 'seed': 0}

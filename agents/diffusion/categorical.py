@@ -47,7 +47,7 @@ class CategoricalSchedule:
 
 
 def _absorbing(num_timesteps: int) -> tuple[Tensor, Tensor]:
-    """Masked at a constant rate of the original categories, all of them at T (Austin et al. 2021, app. A.2.2)."""
+    """Masks an equal share of original categories per timestep, all of them at T (Austin et al. 2021, app. A.2.2)."""
     mask = torch.linspace(0, 1, num_timesteps + 1, dtype=torch.float64)
     return 1.0 - mask, mask
 
@@ -69,7 +69,7 @@ def _mask_and_replace(num_timesteps: int) -> tuple[Tensor, Tensor]:
 
 
 def _early_absorbing(num_timesteps: int) -> tuple[Tensor, Tensor]:
-    """Absorbing from T/2 on: a chain has decided what there is before it decides where, from coarse to fine."""
+    """Absorbing from T/2 on: a reverse chain decides categories first, and then positions from coarse to fine."""
     u = torch.linspace(0, 1, num_timesteps + 1, dtype=torch.float64)
     mask = torch.maximum(1e-5 * u, (u - 0.5) / 0.5)
     return 1.0 - mask, mask
@@ -78,8 +78,8 @@ def _early_absorbing(num_timesteps: int) -> tuple[Tensor, Tensor]:
 def _squared_absorbing(num_timesteps: int) -> tuple[Tensor, Tensor]:
     """The kernel ``early_absorbing`` with a quadratic schedule: the last categories are decided one at a time.
 
-    Categories that are decided in the same step do not know of each other, so that counts come out inexactly. Few
-    should be left for the last such steps, as with the cosine of MaskGIT (Chang et al. 2022).
+    Categories that are decided in the same step do not depend on each other, so that counts come out inexactly. So only
+    few categories should be left for the last of these steps, as with the cosine of MaskGIT (Chang et al. 2022).
     """
     u = torch.linspace(0, 1, num_timesteps + 1, dtype=torch.float64)
     mask = torch.maximum(1e-5 * u, ((u - 0.5) / 0.5).clamp(min=0.0) ** 2)
@@ -124,7 +124,7 @@ class CategoricalProcess:
 
     @property
     def only_absorbs(self) -> bool:
-        """Whether a category is either what it was or masked: what is seen can be trusted."""
+        """Whether a category is either unchanged or masked, so that a visible category is the clean one."""
         return not bool(_replaced(self.schedule.keep, self.schedule.mask).any())
 
     # -- forward --------------------------------------------------------------------------------
@@ -172,8 +172,8 @@ class CategoricalProcess:
     def posterior(self, x_t: Tensor, x0_probs: Tensor, t: Tensor | int, previous: Tensor | int) -> Tensor:
         """p(x_s | x_t) = sum over x_0 of q(x_s | x_t, x_0) p(x_0 | x_t) for a stride t -> s (Austin et al., Eq. 4).
 
-        With w(x_0) = p(x_0) / q(x_t | x_0) it is q(x_t | x_s) times the mean of q(x_s | x_0) under w: linear in K.
-        An x_0 that cannot lead to x_t has no part in it.
+        With w(x_0) = p(x_0) / q(x_t | x_0), the posterior is q(x_t | x_s) times the sum of q(x_s | x_0) weighted by w.
+        The cost is linear in K. An x_0 that cannot lead to x_t has weight 0.
 
         Args:
             x_t: (B, ...) int64 states at t.
@@ -241,7 +241,7 @@ def sample_categorical(probs: Tensor, generator: torch.Generator | None = None) 
 
 
 def _replaced(keep: Tensor, mask: Tensor) -> Tensor:
-    """Probability of a uniformly drawn category; exactly 0 where rounding alone would leave some."""
+    """Probability of a uniformly drawn category; exactly 0 where only a rounding error is left."""
     rest = 1.0 - keep - mask
     return torch.where(rest > 1e-12, rest, torch.zeros_like(rest))
 

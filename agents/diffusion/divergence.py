@@ -11,7 +11,7 @@ _TINY = 1e-30
 
 
 def gaussian_kl(difference: Tensor, std: Tensor) -> Tensor:
-    """(B, N) nats between normals of equal ``std`` (N, D) whose means differ by (B, N, D); entries of std 0 count not.
+    """(B, N) nats between normals of equal ``std`` (N, D) whose means differ by (B, N, D), without entries of std 0.
 
     >>> gaussian_kl(torch.tensor([[[1.0, 9.0]]]), torch.tensor([[0.5, 0.0]]))
     tensor([[2.]])

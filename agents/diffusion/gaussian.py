@@ -16,14 +16,14 @@ Moments = tuple[Tensor, Tensor]
 PREDICTIONS = ("edm", "epsilon", "x0", "v")
 """Targets that a network may predict; see :meth:`GaussianProcess.x0_from_output`."""
 _FORMER = {"karras": "edm"}
-"""Predictions as earlier versions called them, and their names."""
+"""Former names of predictions, and the present ones."""
 
 
 def check_prediction(name: str) -> None:
     """Raise when ``name`` is not a prediction.
 
     Raises:
-        InvalidInputError: the prediction has another name now; says which.
+        InvalidInputError: the prediction has another name now; the message gives it.
         UnknownNameError: there is no such prediction.
 
     >>> check_prediction("edm")
@@ -77,14 +77,14 @@ class GaussianProcess:
         return alpha * x0 + sigma * noise
 
     def renoise(self, x_s: Tensor, s: int, t: int, noise: Tensor) -> Tensor:
-        """A sample of q(x_t | x_s), s < t: back up the chain."""
+        """A sample of q(x_t | x_s), s < t: adds noise to go back from s to t."""
         ratio = self.schedule.alpha_bar[t] / self.schedule.alpha_bar[s]
         return float(ratio.sqrt()) * x_s + float((1.0 - ratio).sqrt()) * noise
 
-    # -- what the network sees and says ---------------------------------------------------------
+    # -- input and output of the network --------------------------------------------------------
 
     def network_input(self, x_t: Tensor, t: Tensor) -> Tensor:
-        """x_t scaled to unit variance per feature (Karras et al. 2022, c_in); raw for other predictions."""
+        """x_t scaled to unit variance per feature for ``edm`` (Karras et al. 2022, c_in); x_t itself otherwise."""
         if self.prediction != "edm":
             return x_t
         alpha, sigma = self.rates(t, x_t)
@@ -97,8 +97,9 @@ class GaussianProcess:
         ``edm``: skip and output scaling of Karras et al. (2022), Table 1, in variance-preserving
         coordinates and with per-feature moments; ``epsilon``: predicted noise; ``v``: Salimans and Ho (2022).
 
-        ``moments``, here and in :meth:`target`, are mean and std that broadcast against ``x_t`` and scale the output;
-        None takes those of all data, by which the input is always scaled: positions must stay comparable.
+        ``moments``, here and in :meth:`target`, are mean and std that broadcast against ``x_t`` and scale the output.
+        None takes those of all data. The input is always scaled by those of all data, because positions must stay
+        comparable.
         """
         alpha, sigma = self.rates(t, x_t)
         if self.prediction == "edm":
@@ -149,9 +150,10 @@ class GaussianProcess:
             x0: (B, N, D) denoised scene.
             t: where the stride starts.
             previous: where it ends, s.
-            residual: (D,) or () expected squared error of ``x0``; None takes ``x0`` as exact (Ho et al.). Given, the
-                variance of ``eta`` 1 is the optimal one of Bao et al. (2022), Theorem 1; what the error adds is scaled
-                by the square of ``eta``, so that 0 is deterministic all the same.
+            residual: (D,) or () expected squared error of ``x0``; None takes ``x0`` as exact (Ho et al.). With
+                ``residual``, the variance at ``eta`` 1 is the optimal one of Bao et al. (2022), Theorem 1. The variance
+                that the error adds is scaled by the square of ``eta``, so that the chain at ``eta`` 0 stays
+                deterministic.
             eta: noise of the chain, 0..1.
 
         Returns:
@@ -173,9 +175,10 @@ class GaussianProcess:
         return x0_weight * x0 + xt_weight * x_t, variance.sqrt().float().to(x_t.device)
 
     def estimate(self, t: int, previous: int, residual: ResidualVariance | None = None) -> tuple[float, Tensor]:
-        """How far the mean of x_s moves with the denoised scene, s < t, and the latter's standard deviation (D,).
+        """Weight of the denoised scene in the mean of x_s, s < t, and standard deviation (D,) of its error.
 
-        The deviation is the root of ``residual``; None takes that of normal data of the moments of ``preconditioning``.
+        The deviation is the square root of ``residual``. None takes the deviation for normal data with the moments of
+        ``preconditioning``.
         """
         alpha, sigma = self.alpha[t], self.sigma[t]
         if residual is None:
@@ -193,7 +196,7 @@ class GaussianProcess:
 
 
 TIMESTEP_DISTRIBUTIONS = ("lognormal", "uniform", "both")
-"""How training timesteps are drawn: a normal logarithm of the noise-to-signal ratio, all alike, or half each."""
+"""Distributions of training timesteps: lognormal in the noise-to-signal ratio, uniform, or half of each."""
 
 
 def timestep_weights(distribution: str, schedule: NoiseSchedule, mean: float, std: float) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 from agents.diffusion.categorical import CategoricalProcess
 
 _MET = 20
-"""Slots from which the moments of a category are taken."""
+"""Least number of slots of a category from which its own moments are taken."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,9 @@ class CategoryMoments:
     def fit(cls, poses: Tensor, categories: Tensor, count: int, floor: float = 1e-3) -> CategoryMoments:
         """Moments of poses (M, D) whose categories are (M,) in 0..``count`` - 1.
 
-        A category met fewer than 20 times takes the moments of all objects: a spread guessed too small would blow up
-        the targets of what it leaves out. *Empty* stands still at the mean of all objects.
+        A category met fewer than 20 times takes the moments of all objects: a standard deviation estimated too small
+        would blow up the targets of poses far from the mean. *Empty* has the mean of all objects and the standard
+        deviation ``floor``.
         """
         poses = poses.double()
         object_poses = poses[categories != count - 1]
@@ -49,8 +50,8 @@ class CategoryMoments:
     def given_state(self, process: CategoricalProcess) -> tuple[Tensor, Tensor]:
         """E[x_0 | state at t] and its standard deviation, (T + 1, K + 1, D) each, K being the mask token.
 
-        A state may be wrong where the kernel replaces categories: the laws of total expectation and variance over
-        the clean category, whose posterior follows from ``share`` by Bayes' rule.
+        A state may be wrong where the kernel replaces categories. So the moments follow from the laws of total
+        expectation and variance over the clean category, whose posterior follows from ``share`` by Bayes' rule.
         """
         categories = torch.arange(process.categories)
         steps = process.schedule.num_timesteps + 1
@@ -100,7 +101,7 @@ class Preconditioning:
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> Preconditioning:
-        """Inverse of :meth:`state`; raises KeyError on a missing entry, ValueError where they cannot be moments."""
+        """Inverse of :meth:`state`; raises KeyError on a missing entry, ValueError where entries cannot be moments."""
         own = state.get("by_category")
         by_category = (
             None if own is None else CategoryMoments(*(torch.tensor(own[k]) for k in ("share", "mean", "std")))

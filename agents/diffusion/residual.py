@@ -13,7 +13,7 @@ class ResidualVariance:
     """Mean squared error of the denoised scene, E (x_0 - x_0_hat(x_t))^2, per noise level and feature.
 
     A chain that replaces x_0 by its estimate loses this much variance: with 25 strides of an exact
-    denoiser of Gaussian data a fifth of the standard deviation is missing. Adding it back is the optimal
+    denoiser of Gaussian data a fifth of the standard deviation is missing. Adding it back gives the optimal
     reverse variance of Bao et al. (Analytic-DPM, 2022), Theorem 1, here per feature.
 
     Attributes:

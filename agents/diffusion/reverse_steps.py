@@ -41,7 +41,7 @@ class ReverseStep(Protocol):
         ...
 
     def from_noise(self, noise: Tensor) -> Tensor:
-        """x_s (B, N, D) from standard normal noise (B, N, D): normal noise gives exactly this distribution."""
+        """x_s (B, N, D) from noise (B, N, D); standard normal noise gives exactly this distribution."""
 
     def log_prob(self, x: Tensor) -> Tensor:
         """(B, N) log-probability of ``x`` (B, N, D), summed over each slot's random variables, nats."""
@@ -124,12 +124,12 @@ class MixedStep(NamedTuple):
         pose_std: (N, P), or (B, N, P); 0 marks a certain entry.
         probs: (B, N, K + 1) of the state, the mask token last.
         random: (N,) bool, or (B, N), slots whose state is drawn; in the others the likeliest one is taken.
-        masked: (B, N) bool, slots of which as many as expected are unmasked together
-            (:mod:`agents.diffusion.unmasking`); None unmasks each by its own chance.
+        masked: (B, N) bool, masked slots that are unmasked together, so that their number is near the expected one
+            (:mod:`agents.diffusion.unmasking`); None unmasks each slot independently.
         denoised: (B, N, P + K) the denoiser's estimate of x_0, categories by arg-max, where it is known.
-        groups: (B, K) int64, the group of each category: slots that are unmasked together draw groups by systematic
-            sampling, so that the number of each group is near the expected one, and then categories within the groups
-            independently. None draws categories independently, which is what :meth:`log_prob` describes.
+        groups: (B, K) int64, the group of each category. Slots that are unmasked together draw groups by systematic
+            sampling, so that the number of each group is near the expected one. Then they draw categories within the
+            groups independently. None draws categories independently, which is what :meth:`log_prob` describes.
 
     >>> probs = torch.tensor([[[0.25, 0.75, 0.0]]])
     >>> step = MixedStep(torch.zeros(1, 1, 1), torch.ones(1, 1), probs, torch.tensor([True]))
@@ -156,8 +156,8 @@ class MixedStep(NamedTuple):
         """The step in which some slots are certain to be as in ``x`` (B, N, P + K).
 
         Args:
-            pose: (B, N) bool, where the pose is.
-            category: (B, N) bool, where the state is.
+            pose: (B, N) bool, where the pose is certain.
+            category: (B, N) bool, where the state is certain.
             x: scenes.
         """
         width = self.mean.shape[-1]
@@ -189,10 +189,10 @@ class MixedStep(NamedTuple):
         return _count(self.pose_std > 0, 3) + _count(self.random, 2)
 
     def from_noise(self, noise: Tensor) -> Tensor:
-        """Poses shifted and scaled; states by inverting their distribution function at Phi of one noise entry.
+        """Poses by shifting and scaling noise; states by inverting their distribution function at Phi of a noise entry.
 
-        Phi of the next entry says which masked slots are unmasked, where they are unmasked together, and that of the
-        third one draws within the groups.
+        Phi of the next entry decides which masked slots are unmasked, where slots are unmasked together. Phi of the
+        third entry draws categories within the groups.
         """
         pose = self.mean.shape[-1]
         uniform = torch.special.ndtr(noise[..., pose : pose + 3].double())
@@ -216,7 +216,7 @@ class MixedStep(NamedTuple):
     def log_prob(self, x: Tensor) -> Tensor:
         """(B, N) nats: the log-density of the pose plus the log-probability of the state.
 
-        Which slots are unmasked together has one log-probability per scene; the masked slots have equal shares of it.
+        The choice of the unmasked slots has one log-probability per scene; the masked slots have equal shares of it.
         With ``groups`` the sum over slots is not the log-probability of the step, which has no simple form.
         """
         pose = self.mean.shape[-1]
@@ -232,12 +232,12 @@ class MixedStep(NamedTuple):
 
 
 def _count(random: Tensor, dims: int) -> int | Tensor:
-    """Number of True entries, of each scene where ``random`` has as many dimensions as ``dims``."""
+    """Number of True entries; of each scene where ``random`` has ``dims`` dimensions."""
     return random.flatten(1).sum(dim=1) if random.ndim == dims else int(random.sum())
 
 
 def _of_rows(x: Tensor, rows: Tensor, dims: int) -> Tensor:
-    """``x[rows]`` where ``x`` differs among scenes, which it does if it has as many dimensions as ``dims``."""
+    """``x[rows]`` where ``x`` differs among scenes (it then has ``dims`` dimensions), else ``x``."""
     return x[rows] if x.ndim == dims else x
 
 
@@ -252,7 +252,10 @@ def _invert(cumulative: Tensor, uniform: Tensor) -> Tensor:
 
 
 def _draw_grouped(probs: Tensor, groups: Tensor, uniform: Tensor, inner: Tensor) -> Tensor:
-    """(B, N) int64 categories of weights (B, N, K): a group of ``groups`` (B, K) by ``uniform``, then one in it."""
+    """(B, N) int64 categories, drawn with the weights ``probs`` (B, N, K).
+
+    ``uniform`` draws one of the ``groups`` (B, K), then ``inner`` draws a category of this group.
+    """
     order = groups.argsort(dim=-1, stable=True)[:, None].expand_as(probs)
     sorted_groups = groups[:, None].expand_as(probs).gather(2, order)
     weights = probs.gather(2, order)
@@ -291,5 +294,5 @@ def concatenate_steps(parts: Sequence[ReverseStep]) -> ReverseStep:
 
 
 def _joined(parts: Sequence[Tensor], dims: int) -> Tensor:
-    """Parts that differ among scenes, one after another; the first of parts that are all equal."""
+    """Concatenated parts where they differ among scenes (they then have ``dims`` dimensions), else the first part."""
     return torch.cat(list(parts)) if parts[0].ndim == dims else parts[0]

@@ -42,8 +42,8 @@ class NoiseSchedule:
 def karras_alpha_bar(num_timesteps: int, sigma_min: float = 0.002, sigma_max: float = 80.0, rho: float = 7.0) -> Tensor:
     """(T + 1,) from noise levels spaced as in Karras et al. 2022, Eq. 5, from ``sigma_min`` at t = 1.
 
-    Its low end is 0.002 of the data's unit, five times finer than linear betas from 1e-4: what separates
-    an object that stands from one that floats is a millimetre.
+    The lowest noise level is 0.002 of the data's unit, five times finer than with linear betas from 1e-4. An object
+    that stands and one that floats differ by a millimetre.
     """
     u = torch.linspace(0, 1, num_timesteps, dtype=torch.float64)
     low, high = sigma_min ** (1 / rho), sigma_max ** (1 / rho)

@@ -43,7 +43,8 @@ class StepTable:
     def spaced(cls, num_timesteps: int, num_steps: int) -> StepTable:
         """``num_steps`` steps evenly spaced over 1..T, both ends included; any number from 1 to T.
 
-        One above the timesteps of diffusers' schedulers with ``timestep_spacing="linspace"``, which count from 0.
+        The timesteps are one above those of diffusers' schedulers with ``timestep_spacing="linspace"``, which count
+        from 0.
 
         Args:
             num_timesteps: T of the schedule.
@@ -64,10 +65,11 @@ class StepTable:
 
     @classmethod
     def gradual(cls, masked: Tensor, slots: int, num_steps: int) -> StepTable:
-        """``num_steps`` steps of which those beyond 25, at most half, come first and decide about one slot each.
+        """``num_steps`` steps, of which the first ones decide about one slot each.
 
-        Slots that are unmasked in one step do not know of each other's categories. What the first of them hold says
-        what kind of scene it will be, so they are decided one after the other. The other steps are evenly spaced.
+        Slots that are unmasked in one step do not know each other's categories. The categories of the first slots
+        determine the kind of scene, so these slots are decided one after the other. As many steps as ``num_steps``
+        exceeds 25, but at most half of all steps, decide about one slot each. The other steps are evenly spaced.
 
         Args:
             masked: (T + 1,) share of masked slots at each timestep, non-decreasing, as of an absorbing chain.
@@ -95,10 +97,10 @@ class StepTable:
 
         Args:
             timesteps: such as another library's, in 1..T.
-            num_timesteps: T, for a check against it; a process refuses later what is above its own.
+            num_timesteps: T, to check the timesteps against; a process later refuses timesteps above its own T.
 
         Raises:
-            InvalidInputError: they are not in decreasing order, or outside 1..T.
+            InvalidInputError: the timesteps are not in decreasing order, or outside 1..T.
         """
         t = torch.tensor(timesteps, dtype=torch.int64)
         if num_timesteps is not None and len(t) and not 1 <= int(t.min()) <= int(t.max()) <= num_timesteps:

@@ -1,4 +1,4 @@
-"""Unmasking of absorbing chains: how many slots a step unmasks, and how their categories differ from each other.
+"""Unmasking of absorbing chains: how many slots a step unmasks, and how their categories are drawn.
 
 Slots that are unmasked in the same step do not know each other's categories, so scenes get too many objects of a kind.
 Two remedies leave the distribution of each slot as it is. The number of slots that a step unmasks differs from its
@@ -20,7 +20,8 @@ def draw_unmasked(masked: Tensor, chance: Tensor, uniform: Tensor) -> Tensor:
     """(B, N) bool: of the ``masked`` slots of each scene, those that are unmasked now, drawn without replacement.
 
     Of M masked slots with chance p, M p rounded down or up are unmasked, up with the probability that makes M p the
-    mean. The ranks of independent numbers do not depend on their minimum, so one number per slot decides both.
+    mean. The ranks of independent numbers do not depend on their minimum. So one number per slot is enough: the
+    ranks choose the slots, and the minimum decides the rounding.
 
     Args:
         masked: (B, N) bool.
@@ -61,13 +62,13 @@ def systematic(unmasked: Tensor, uniform: Tensor) -> Tensor:
 
 
 def unmasking_log_prob(masked: Tensor, chance: Tensor, unmasked: Tensor) -> Tensor:
-    """(B, N) nats, whose sum over the slots of a scene is the log-probability that just ``unmasked`` are unmasked.
+    """(B, N) nats, whose sum over a scene's slots is the log-probability that exactly ``unmasked`` are unmasked.
 
     It depends on no parameter of a network; the masked slots of a scene have equal shares of it.
 
     Args:
-        masked, chance: as of :func:`draw_unmasked`.
-        unmasked: (B, N) bool, some of the masked.
+        masked, chance: as in :func:`draw_unmasked`.
+        unmasked: (B, N) bool, a subset of the masked slots.
 
     >>> masked, chance = torch.ones(1, 4, dtype=torch.bool), torch.full((1, 4), 0.5)
     >>> two = torch.tensor([[True, False, True, False]])

@@ -13,7 +13,7 @@ LOSS_WEIGHTINGS = ("none", "min_snr")
 """Weightings of the squared error by timestep; see :func:`loss_weights`."""
 
 MIN_SNR_GAMMA = 5.0
-"""Gamma of Hang et al. (2023), section 3.4: where the signal-to-noise ratio stops counting."""
+"""Gamma of Hang et al. (2023), section 3.4: the signal-to-noise ratio at which the weight is cut."""
 
 
 def check_weighting(kind: str, prediction: str) -> None:
@@ -39,8 +39,9 @@ def loss_weights(
     """(B,) float32 weights of the mean squares of the network's error at timesteps ``t``.
 
     ``"none"`` is 1 everywhere. ``"min_snr"`` (Hang et al. 2023, Eq. 8) gives the error of the clean scene the weight
-    min(SNR, gamma), SNR being alpha_t^2 / sigma_t^2. An error of the noise is SNR times that of the clean scene and one
-    of v is SNR + 1 times, so that their weights are min(SNR, gamma) / SNR and min(SNR, gamma) / (SNR + 1).
+    min(SNR, gamma), SNR being alpha_t^2 / sigma_t^2. The squared error of the noise is SNR times that of the
+    clean scene, and the squared error of v is SNR + 1 times that of the clean scene. So their weights are
+    min(SNR, gamma) / SNR and min(SNR, gamma) / (SNR + 1).
 
     Args:
         schedule: of the process.
@@ -66,7 +67,7 @@ def loss_weights(
 
 
 def timestep_distribution(timesteps: str | None, prediction: str) -> str:
-    """The distribution of training timesteps: the given one, or that which was published with ``prediction``.
+    """The distribution of training timesteps: the given one, or the one published with ``prediction``.
 
     >>> timestep_distribution(None, "epsilon"), timestep_distribution(None, "edm")
     ('uniform', 'lognormal')

@@ -24,10 +24,10 @@ from scene_envs.scene import SceneBatch
 from scene_envs.scene_distance import check_same_assets
 
 RESOLUTION = (1e-3, 1e-2)
-"""Standard deviation (m, rad) of the noise both classes get: what a feasible object may move."""
+"""Standard deviation (m, rad) of the noise that is added to both classes: the most that a feasible object may move."""
 
 MOST_OBJECTS = 50_000
-"""Objects to train on, both classes together: scenes of many objects need fewer scenes, and cost more each."""
+"""Most objects to train on, both classes together. Scenes of many objects cost more each, and fewer are needed."""
 
 
 def classifier_accuracy(
@@ -53,7 +53,7 @@ def classifier_accuracy(
         real: real scenes; the two batches should share none.
         fake: samples of the same scene type. The larger batch is subsampled to the size of the smaller one.
         seeds: repetitions with other splits and weights.
-        seed: the first of them.
+        seed: of the first repetition.
         resolution: standard deviation of the noise (m, rad); (0, 0) compares at full precision.
         config: sizes of the parts, and how the classifier is trained; it trains on at most 50,000 objects.
 
@@ -89,7 +89,7 @@ def classifier_accuracy(
 
 
 def _affordable(config: ClassifierConfig, tokens: SceneTokens) -> ClassifierConfig:
-    """The protocol with so few training scenes that they hold no more than ``MOST_OBJECTS``."""
+    """``config`` with ``most_train`` lowered so that the training scenes hold about ``MOST_OBJECTS`` at most."""
     per_scene = float(tokens.present.sum()) / len(tokens)
     most = max(FEWEST, int(0.5 * MOST_OBJECTS / max(per_scene, 1.0)))
     return replace(config, most_train=min(config.most_train, most))

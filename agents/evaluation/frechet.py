@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 def frechet_scene_distance(a: SceneBatch, b: SceneBatch, *, encoder: SetEncoder | None = None) -> float:
     """FSD: the squared Fréchet distance of Gaussian fits to the features of a frozen set encoder.
 
-    The formula is that of Heusel et al. (2017); the features are not Inception's, so the number compares with other
-    FSDs of the same encoder only. It is biased upwards by about 1 / scenes: compare sets of equal size, and print
-    the distance between two sets of real scenes of that size beside it.
+    The formula is that of Heusel et al. (2017). The features are not those of Inception, so the distance is comparable
+    only with other FSDs of the same encoder. It is biased upwards by about 1 / scenes: compare sets of equal size, and
+    print the distance between two sets of real scenes of that size beside it.
 
     Args:
         a: scenes.

@@ -19,7 +19,7 @@ from scene_envs.tensor_files import read_tensors
 
 _SIDE = 299
 _FID_CLASSES = 1008
-"""Classes of the network that FIDs are computed with (TensorFlow's of 2015); torchvision's own has 1000."""
+"""Classes of the TensorFlow network of 2015, with which FIDs are computed; torchvision's own network has 1000."""
 
 
 def frechet_inception_distance(
@@ -34,8 +34,8 @@ def frechet_inception_distance(
     """FID of semantic renders: the Fréchet distance of the pooled features of an Inception-v3.
 
     Nothing is downloaded. The weights are a state dict of torchvision's ``inception_v3`` (1000 classes) or of the
-    port of the 2015 TensorFlow network that the ``pytorch-fid`` project publishes (1008 classes), which is the one
-    published FIDs are computed with. A fit of 2048 features needs thousands of scenes; use equal numbers.
+    port of the 2015 TensorFlow network that the ``pytorch-fid`` project publishes (1008 classes). Published FIDs are
+    computed with the latter. A fit of 2048 features needs thousands of scenes; use equal numbers in ``a`` and ``b``.
 
     Args:
         a: scenes.
@@ -88,7 +88,7 @@ def load_inception(weights: str | os.PathLike[str]) -> nn.Module:
 
 
 class _Pooling(nn.Module):
-    """An Inception block whose pooling branch, the last one, reads another pooling of the input."""
+    """An Inception block with another pooling in its pooling branch, which is the last one."""
 
     def __init__(self, block: nn.Module, maximum: bool) -> None:
         super().__init__()
@@ -105,7 +105,7 @@ class _Pooling(nn.Module):
 
 
 def _pool_like_tensorflow(network: nn.Module) -> None:
-    """Averages that leave out the padding, and a maximum in the last block: how the 2015 network pools."""
+    """Pool as the 2015 network does: by averages that leave out the padding, and by a maximum in the last block."""
     for name in ("5b", "5c", "5d", "6b", "6c", "6d", "6e", "7b", "7c"):
         setattr(network, f"Mixed_{name}", _Pooling(getattr(network, f"Mixed_{name}"), maximum=name == "7c"))
 
@@ -118,7 +118,7 @@ def _read_state(path: Path) -> dict[str, Tensor]:
             state = torch.load(path, map_location="cpu", weights_only=True)
     except CorruptFileError:
         raise
-    except Exception as error:  # torch's own advice would be to run the code of the file
+    except Exception as error:  # torch's own message advises to run the code in the file
         raise CorruptFileError(f"{str(path)!r} cannot be read as a state dict ({type(error).__name__})") from error
     if not isinstance(state, dict) or "fc.weight" not in state:
         raise CorruptFileError(f"{str(path)!r} is no state dict of an Inception-v3: it lacks 'fc.weight'")

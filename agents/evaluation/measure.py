@@ -49,14 +49,14 @@ def measure_samples(
     """Measure scenes against reference scenes.
 
     Objects include welded ones, *free* objects do not. A figure without data (no stack in any scene, say) is left
-    out. Scenes whose physics failed leave the figures of that computation and are counted in
+    out. Scenes whose physics failed are left out of the figures of that computation; they are counted in
     ``invalid_fraction`` or ``ready_invalid_fraction``.
 
     Args:
         batch: the scenes to measure.
         reference: real scenes of the same type.
-        floor: other real scenes; each figure is measured on them too, under ``floor_<name>``: what a perfect sampler
-            would score.
+        floor: other real scenes; each figure is measured on them too and returned as ``floor_<name>``. A perfect
+            sampler would score these figures.
         pool: worker processes for physics; None computes in this process.
         ready: whether to project and settle as well, the slowest part.
 
@@ -124,7 +124,7 @@ def grammar_scenes(scene_type: str | SceneType, count: int, seed: int = 0) -> Sc
 
 
 def layout_figures(batch: SceneBatch, reference: SceneBatch) -> dict[str, float]:
-    """Counts, categories, heights, workspace and duplicates: what needs no simulator.
+    """Figures that need no simulator: counts, categories, heights, workspace and duplicates.
 
     Raises:
         InvalidInputError: the scenes are of another type than the reference.

@@ -28,11 +28,11 @@ class EvaluationInputs:
     Attributes:
         samples: raw samples of a prior.
         real: real scenes.
-        follow: scenes of the prior for prompts, one each; None for a prior that reads none.
+        follow: makes scenes with the prior, one for each prompt; None for a prior that reads no prompts.
         pool: physics workers; None computes in this process.
         seed: of classifiers and prompts.
         fid_weights: path of the weights of an Inception-v3; empty for none.
-        prompts: real scenes whose prompts are followed; None for all of them.
+        prompts: number of real scenes whose prompts the samples follow; None for all of them.
 
     >>> empty = SceneBatch.empty("dimsum_table", 2)
     >>> compute_measure("layout", EvaluationInputs(empty, RealScenes(empty, empty)))["floor_objects_mean"]
@@ -49,12 +49,12 @@ class EvaluationInputs:
 
 
 def compute_measure(name: str, inputs: EvaluationInputs) -> Figures:
-    """The figures of one group, each with its floor: the same of real scenes against other real scenes.
+    """The figures of one group, each with its floor: the same figure of real scenes against other real scenes.
 
     Raises:
         UnknownNameError: no such group.
-        InvalidInputError: the group needs what the inputs lacks.
-        MissingDependencyError: it needs a package that is not installed.
+        InvalidInputError: the inputs lack something that the group needs.
+        MissingDependencyError: the group needs a package that is not installed.
     """
     if name not in MEASURES:
         raise unknown_name("measure", name, MEASURE_NAMES)

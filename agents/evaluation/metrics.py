@@ -13,7 +13,7 @@ from scene_envs.scene import SceneBatch
 from scene_envs.scene_distance import check_same_assets
 
 KL_EPS = 1e-6
-"""Probability added to every category before renormalising, so that a category never sampled stays finite."""
+"""Probability added to every category before renormalising, so that a category never sampled gives no infinite KL."""
 
 _CHUNK = 128
 """Scenes whose pairs of objects are in memory together."""
@@ -58,17 +58,18 @@ def count_wasserstein(batch: SceneBatch, reference: SceneBatch) -> float:
 def height_errors(batch: SceneBatch, supports: Sequence[Support] | None = None) -> dict[str, Tensor]:
     """Distance in height between objects and the support nearest to each in height.
 
-    A support on another object is a candidate for what is within ``reach`` of it horizontally (and above it, where
-    its top is above its frame); a surface fixed in the world always is one. An object is counted under the kind of
-    the candidate that is nearest to its own z, so an error says how far it floats above (or is sunk into) what it
-    seems to rest on. What lies in a container, see :data:`~agents.evaluation.supports.CONTAINERS`, is left out.
+    A surface fixed in the world is always a candidate. A support on another object is a candidate for the objects
+    within ``reach`` of it horizontally; where the top of the supporting object is above its frame, they must also be
+    above that frame. An object is counted under the kind of the candidate that is nearest to its own z. The error is
+    how far the object floats above, or is sunk into, the support that it seems to rest on. Objects that lie in a
+    container, see :data:`~agents.evaluation.supports.CONTAINERS`, are left out.
 
     Args:
         batch: the scenes.
         supports: where objects may rest; None takes the ones of the scene type.
 
     Returns:
-        One (K,) float tensor of absolute errors in m per kind, K being the objects of that kind in the batch.
+        For each kind, a (K,) float tensor of absolute errors in m; K is the number of objects of that kind.
     """
     if supports is None:
         supports = SUPPORTS.get(batch.scene_type.name, ())
@@ -121,7 +122,9 @@ def _height_gap(batch: SceneBatch, support: Support) -> Tensor:
 
 
 def _near(batch: SceneBatch, names: Sequence[str], reach: float) -> Tensor:
-    """(B, N, N) bool: the second is another object, one of the assets ``names``, within ``reach`` horizontally."""
+    """(B, N, N) bool at [b, i, j]: j is another object than i, one of the assets ``names``, and within ``reach`` of i
+    horizontally.
+    """
     xy = batch.translations[..., :2].double()
     near = (xy.unsqueeze(2) - xy.unsqueeze(1)).norm(dim=-1) <= reach
     near.diagonal(dim1=1, dim2=2).fill_(False)

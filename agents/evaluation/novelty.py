@@ -34,12 +34,12 @@ _WAVES = 12
 
 @dataclass(frozen=True)
 class Neighbors:
-    """The nearest of some scenes, for each of B others.
+    """The nearest scene to each of B scenes, among some other scenes.
 
     Attributes:
-        distance: (B,) m, to the nearest; see :func:`scene_envs.scene_distance.scene_distances`.
-        index: (B,) int64, which it is.
-        copied: (B,) bool: one of the scenes has the same assets, each within 1 cm of its counterpart.
+        distance: (B,) m, to the nearest scene; see :func:`scene_envs.scene_distance.scene_distances`.
+        index: (B,) int64, index of the nearest scene.
+        copied: (B,) bool: one of the other scenes has the same assets, each within 1 cm of its counterpart.
 
     >>> from scene_envs.grammars import get_grammar
     >>> scenes = get_grammar("dimsum_table").sample(np.random.default_rng(0), 6)
@@ -57,9 +57,9 @@ def nearest_scenes(batch: SceneBatch, others: SceneBatch, *, candidates: int = C
     """The scene of ``others`` that is nearest to each scene of ``batch``, by its :func:`distance
     <scene_envs.scene_distance.scene_distances>`.
 
-    The distance is computed exactly for the ``candidates`` scenes that are nearest by features: sums over the objects
-    of an asset of bounded functions of the position with slope 1, whose differences never exceed the total cost
-    (Kantorovich duality).
+    The distance is computed exactly for the ``candidates`` scenes that are nearest by features. A feature is the sum of
+    a function of the position over all objects of one asset. The functions are bounded and have slope 1 at most, so
+    that a feature of two scenes never differs by more than the total cost of matching them (Kantorovich duality).
 
     Raises:
         InvalidInputError: no scenes, or scenes of other assets.
@@ -87,14 +87,14 @@ def novelty(samples: Neighbors, real: Neighbors) -> float:
 
     Args:
         samples: nearest training scenes of the samples.
-        real: nearest training scenes, the same ones, of real scenes that are not among them.
+        real: nearest training scenes of held-out real scenes, out of the same training scenes.
     """
     above, below = float(samples.distance.median()), float(real.distance.median())
     return above / below if below > 0 else (1.0 if above == 0 else math.inf)
 
 
 def duplicates(batch: SceneBatch) -> float:
-    """Share of the scenes that another of the batch repeats: the same assets, each within 1 cm of its counterpart.
+    """Share of the scenes that another scene of the batch repeats: same assets, each within 1 cm of its counterpart.
 
     >>> duplicates(SceneBatch.empty("dimsum_table", 4))
     1.0
@@ -127,7 +127,7 @@ def _is_copy(first: PlacedObjects, second: PlacedObjects) -> bool:
 
 
 def _close_pairs(positions: list[Array]) -> Index:
-    """(P, 2): scenes of the same assets whose centres are near enough for them to be copies."""
+    """(P, 2): pairs of scenes whose centres are near enough for them to be copies; all are of the same assets."""
     from scipy.spatial import KDTree
 
     if len(positions) < 2:
@@ -142,7 +142,7 @@ def _close_pairs(positions: list[Array]) -> Index:
 def _features(batch: SceneBatch, limit: float) -> Tensor:
     """(B, C * (1 + waves)) m: per asset, the sums over its objects of functions with slope <= 1 and range <= ``limit``.
 
-    They are the constant ``limit`` / 2, and waves of the position in random directions, the same for all scenes.
+    The functions are the constant ``limit`` / 2 and waves of the position in random directions, equal for all scenes.
     """
     generator = torch.Generator().manual_seed(0)
     direction = torch.nn.functional.normalize(torch.randn(3, _WAVES, generator=generator), dim=0)

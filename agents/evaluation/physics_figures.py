@@ -26,7 +26,7 @@ DEEP = 1e-2
 def physics_figures(batch: SceneBatch, pool: PhysicsPool | None = None) -> dict[str, float]:
     """Overlap, stability and feasibility of scenes as they are; the meaning of each name is on the docs' page.
 
-    Scenes whose physics failed leave the figures of that computation.
+    Scenes whose physics failed are left out of the figures of that computation.
 
     Args:
         batch: the scenes.
@@ -47,7 +47,7 @@ def ready_figures(batch: SceneBatch, pool: PhysicsPool | None = None) -> dict[st
 def penetration_totals(result: PenetrationResult) -> tuple[Tensor, Tensor]:
     """(V,), (V,) m: total penetration of each valid scene, over pairs of convex parts and over pairs of objects.
 
-    The first is the literature's: the sum over all colliding pairs of collision geometries. It grows with the number
+    The literature gives the first: the sum over all colliding pairs of collision geometries. It grows with the number
     of parts an asset is made of. The second counts each pair of objects once, with its deepest overlap. Pairs in
     contact (:data:`CONTACT`) are left out of both.
     """

@@ -20,18 +20,19 @@ _NAMES = {"count": "prompt_counts", "names": "prompt_names", "relations": "promp
 def prompt_following(batch: SceneBatch, prompts: Sequence[str]) -> dict[str, float]:
     """Share of scenes that hold their own prompt.
 
-    The paper's prompt-following accuracy: a prompt is followed when every claim in it is true of the scene; numbers
-    are exact for what is named. Relations have the tolerances of the checker, see the page on prompts.
+    This is the paper's prompt-following accuracy. A prompt is followed when every claim in it is true of the scene.
+    The numbers of the things that it names must be exact. Relations have the tolerances of the checker, see the page
+    on prompts.
 
     Args:
         batch: B scenes.
         prompts: B prompts that :func:`~scene_envs.datasets.parse_prompt` reads.
 
     Returns:
-        ``prompt_following``: share of all prompts followed; ``prompt_counts``, ``prompt_names`` and
-        ``prompt_relations``: the same among prompts of that kind, where there are any, and
-        ``prompt_counts_number`` and so on, how many there are; ``prompt_score``: mean partial credit in [0, 1], 1
-        only when every prompt is followed.
+        ``prompt_following``: share of all prompts followed. ``prompt_counts``, ``prompt_names`` and
+        ``prompt_relations``: the same among prompts of that kind, where there are any. ``prompt_counts_number`` and
+        so on: the number of prompts of that kind. ``prompt_score``: mean partial credit in [0, 1], 1 only when every
+        prompt is followed.
 
     Raises:
         InvalidInputError: another number of prompts than scenes, no prompt, or one that cannot be read.
@@ -75,7 +76,7 @@ def prompt_chance(batch: SceneBatch, prompts: Sequence[str], seed: int = 0) -> d
         raise InvalidInputError(f"chance needs at least 2 scenes to exchange prompts, got {len(batch)}")
     order = np.random.default_rng(seed).permutation(len(prompts))
     others = np.empty_like(order)
-    others[order] = np.roll(order, 1)  # one cycle: nobody keeps the own prompt
+    others[order] = np.roll(order, 1)  # one cycle: no scene keeps its own prompt
     figures = prompt_following(batch, [prompts[i] for i in others])
     return {CHANCE_PREFIX + name: value for name, value in figures.items() if not name.endswith("_number")}
 
@@ -83,7 +84,7 @@ def prompt_chance(batch: SceneBatch, prompts: Sequence[str], seed: int = 0) -> d
 def own_prompts(batch: SceneBatch, seed: int = 0) -> list[str]:
     """One prompt per scene that is true of it; counts, names and relations take turns.
 
-    A scene without relations to speak of gets a prompt on its number of objects.
+    A scene that has no relations to describe gets a prompt on its number of objects.
 
     >>> own_prompts(SceneBatch.empty("dimsum_table", 1))
     ['A scene with 1 object.']

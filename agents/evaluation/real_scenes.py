@@ -42,7 +42,7 @@ class RealScenes:
         cls, scene_type: SceneType, count: int, *, data: str = "", heldout: str = "", training: int = 20_000,
         seed: int = 0,
     ) -> RealScenes:  # fmt: skip
-        """Held-out scenes, ``count`` in either set where there are as many, and training scenes.
+        """Held-out scenes, at most ``count`` in each of the two sets, and training scenes.
 
         Args:
             scene_type: of the samples.
@@ -56,7 +56,7 @@ class RealScenes:
 
         Raises:
             InvalidInputError: no folder, scenes of another type, fewer than four held-out scenes, numbers below 1.
-            CorruptFileError: a file cannot be read, lacks a column, or holds what is no scene.
+            CorruptFileError: a file cannot be read, lacks a column, or holds something that is no scene.
         """
         if count < 2 or training < 1:
             raise InvalidInputError(

@@ -10,7 +10,7 @@ from agents.evaluation.prompt_following import CHANCE_PREFIX
 
 _HEADS = ("figure", "samples", "real", "how to read")
 _NOT_SHOWN = frozenset({"category_kl"})
-"""Shown under another name: in units of 1e-4."""
+"""Figures that the table leaves out, as they are shown under another name, in units of 1e-4."""
 
 READING: dict[str, str] = {
     "num_steps": "denoiser evaluations per sample",
@@ -76,14 +76,14 @@ def figure_table(figures: Mapping[str, float]) -> str:
         if name.startswith(FLOOR_PREFIX) or name in _NOT_SHOWN:
             continue
         cells = (name, _number(value), _number(figures.get(FLOOR_PREFIX + name)), how_to_read(name))
-        if name.startswith(CHANCE_PREFIX):  # of real scenes, so that it stands in their column
+        if name.startswith(CHANCE_PREFIX):  # a figure of real scenes, shown in their column
             cells = (name, "", _number(value), how_to_read(name))
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
 def how_to_read(name: str) -> str:
-    """A line on the figure ``name``; empty for one that is not ours.
+    """A line on how to read the figure ``name``; empty for an unknown figure.
 
     >>> how_to_read("height_error_stack_mm")
     'median distance in height to the support (stack); lower is better'

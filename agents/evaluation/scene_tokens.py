@@ -22,11 +22,12 @@ WAVE_FEATURES = 26
 
 _HORIZONTAL_WAVES = (16.0, 4.0, 1.0)
 _VERTICAL_WAVES = (2.56, 1.28, 0.64, 0.32, 0.16, 0.08, 0.04)
-"""Wavelengths (m) of the Fourier features of x and y, and of z: heights are few and exact, so finer."""
+"""Wavelengths (m) of the Fourier features of x and y, and of z; those of z are finer: heights are few and exact."""
 _NEAR = 0.005
-"""Gaps (m) are given as asinh(gap / 0.005): millimetres around contact, and still finite in a room."""
+"""Gaps (m) are given as asinh(gap / 0.005), which resolves millimetres around contact and stays small in a room."""
 _TIE_BREAK = (7.1e-5, 5.3e-5, 3.1e-5)
-"""Added per metre of offset: objects that touch are exactly equally near, and the order of slots must not decide."""
+"""Added to the distance per metre of offset. Objects that touch are exactly equally near; the order of slots must not
+decide between them."""
 _FAR = 1e6
 _CHUNK = 256
 
@@ -64,12 +65,12 @@ class SceneTokens:
 
 
 def scene_tokens(batch: SceneBatch, neighbours: int = NEIGHBOURS) -> SceneTokens:
-    """Describe every object of every scene; invariant to the order of the slots but for the order of the rows.
+    """Describe every object of every scene; the order of the slots affects only the order of the rows.
 
     The neighbours of an object are those whose world-aligned bounding boxes come nearest to its own, or overlap it
-    most; among equals, those whose centres are nearest. For each: the offset of its frame, asinh(offset / 0.1 m); the
-    gap between the two boxes along x, y and z (negative where they overlap) and between the circles around the two
-    outlines seen from above, asinh(gap / 5 mm).
+    most; among equals, those whose centres are nearest. Each neighbour has these numbers: the offset of its frame, as
+    asinh(offset / 0.1 m); the gap between the two boxes along x, y and z (negative where they overlap), and the gap
+    between the circles around the two outlines seen from above, as asinh(gap / 5 mm).
 
     Args:
         batch: B scenes.

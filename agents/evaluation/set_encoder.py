@@ -31,9 +31,9 @@ _CHUNK = 256
 class SetEncoder(nn.Module):
     """Scenes of any type to 64 features; invariant to the order of slots and to empty slots.
 
-    Categories are read by asset name, so that scenes of a union of types and of its members are alike. An asset
-    outside the vocabulary becomes the *unknown* one, which the encoder knows by its bounding box: distances between
-    scenes of users' own assets see sizes, poses and gaps, and not names.
+    Categories are read by asset name, so that a scene has the same features in a union of types as in its own type. An
+    asset outside the vocabulary becomes the *unknown* asset, of which the encoder reads the bounding box but no name.
+    Distances between scenes of users' own assets depend on sizes, poses and gaps, and not on names.
 
     Args:
         vocabulary: asset names known by name.

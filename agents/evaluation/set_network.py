@@ -74,16 +74,16 @@ class _InducedBlock(nn.Module):
         self.spread = _Attention(config.hidden, config.heads)
 
     def forward(self, tokens: Tensor, mask: Tensor) -> Tensor:
-        """Tokens (B, N, H) to the same."""
+        """Tokens (B, N, H) to tokens of the same shape."""
         summary = self.gather(self.points.expand(tokens.shape[0], -1, -1), tokens, mask)
         return self.spread(tokens, summary)
 
 
 class _ObjectEncoder(nn.Module):
-    """Objects of a scene to one token each, which has read the others; blind to padding.
+    """Encoder of the objects of a scene: one token each, which depends on the other objects and not on padding.
 
-    Set Transformer (Lee et al. 2019) with induced attention. Each token has already looked at its nearest neighbours
-    through a small MLP over pairs, which is where overlap and distance show.
+    A Set Transformer (Lee et al. 2019) with induced attention. Before the attention, a small MLP over pairs reads the
+    nearest neighbours of each object; overlaps and distances enter there.
     """
 
     def __init__(self, config: SetNetworkConfig) -> None:
@@ -120,7 +120,7 @@ class _ObjectEncoder(nn.Module):
 
 
 class ObjectNetwork(_ObjectEncoder):
-    """Each object of a scene to one number, given its neighbours, and all objects where ``blocks`` is above 0.
+    """One number for each object of a scene, from its neighbours, and from all objects where ``blocks`` is above 0.
 
     ``outputs`` and ``dropout`` of the config are not read.
 
@@ -143,7 +143,7 @@ class ObjectNetwork(_ObjectEncoder):
 
 
 class SetNetwork(_ObjectEncoder):
-    """Objects of a scene to ``outputs`` numbers; permutation-invariant, and blind to padding.
+    """``outputs`` numbers from the objects of a scene; permutation-invariant, and independent of padding.
 
     The tokens of the objects are pooled by attention, mean, maximum and a scaled sum.
 

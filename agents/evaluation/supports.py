@@ -15,8 +15,9 @@ class Support:
         on: names of the supporting assets; None when the surface is fixed in the world.
         riders: names of the assets that can rest there; None means all free ones.
         reach: largest horizontal distance (m) between the frames of rider and supporting object.
-        catch: a rider in reach whose z is at most so far (m) off belongs here, whatever surface is nearer: for
-            supports that are thinner than the errors to be told apart, such as a plate on a table.
+        catch: a rider within reach whose z is at most this far (m) off is assigned to this support, even if another
+            surface is nearer. For supports that are thinner than the errors to be told apart, such as a plate on a
+            table.
 
     >>> [support.kind for support in SUPPORTS["dimsum_table"]]
     ['table', 'stack']
@@ -32,7 +33,7 @@ class Support:
 
 @dataclass(frozen=True)
 class Container:
-    """Hollow things in which objects lie as they fell, so that no height is right: they are left out.
+    """Hollow assets, in which objects lie as they fell; as no height is right for these objects, they are left out.
 
     Attributes:
         names: the hollow assets.
@@ -64,7 +65,7 @@ _SHELF_LOADS = (
     "shared_plate", "soda_can", "speaker", "stacking_ring", "tea_bottle", "toy_train",
 )  # fmt: skip
 _PLATE, _CATCH = 0.006, 0.03
-"""Height of the inside of plates and breakfast bowls, and how far off (m) what lies there is still told."""
+"""Height (m) of the inside of plates and breakfast bowls, and ``catch`` (m) of the objects that lie there."""
 
 _TABLE = Support("table", 0.0)
 _FOOD = (

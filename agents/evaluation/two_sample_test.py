@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from scene_envs.errors import InvalidInputError
 
 FEWEST = 20
-"""Scenes of each class below which no classifier is trained."""
+"""Fewest scenes of each class with which a classifier is trained."""
 
 _SURE = 5e-3
 """Validation loss (nats) below which training stops: the classes are told apart."""
@@ -98,7 +98,7 @@ Forward = Callable[[nn.Module, Tensor], Tensor]
 """From a network and rows (R,) to logits (R,)."""
 
 Prepare = Callable[[Split], tuple[nn.Module, Forward]]
-"""From a split to an untrained network and how it reads rows; whatever it fits, it fits on the training part."""
+"""From a split to an untrained network and the function that reads rows; all fitting is on the training part."""
 
 
 def check_classes(real: int, fake: int, seeds: int) -> None:
@@ -116,15 +116,15 @@ def two_sample_accuracy(
 ) -> Accuracy:
     """Train and test one classifier per seed.
 
-    Rows 0 … real - 1 are real scenes, the following ``fake`` rows are samples; of the larger class as many as the
-    smaller one has are drawn.
+    Rows 0 … real - 1 are real scenes, the following ``fake`` rows are samples. The larger class is subsampled to the
+    size of the smaller one.
 
     Args:
         real: number of real scenes.
         fake: number of samples.
         prepare: makes the classifier of a split.
         seeds: number of repetitions, each with a split, weights and order of its own.
-        seed: the first of them.
+        seed: of the first repetition.
         config: the protocol.
     """
     check_classes(real, fake, seeds)

@@ -12,7 +12,7 @@ from agents.evaluation.set_network import SetNetworkConfig
 from scene_envs.scene import POSE_FEATURES
 
 _PRIOR_COUNT = 4.0
-"""Weight of the variance over all groups in that of one group, in objects."""
+"""Weight, in objects, of the variance over all groups in the variance of one group."""
 _CLIP = 8.0
 _LEAST_STD = 1e-4
 
@@ -26,7 +26,7 @@ class Moments:
 
     @classmethod
     def of(cls, values: Tensor, groups: Tensor, count: int) -> Moments:
-        """From ``values`` (M, F) of ``groups`` (M,); rare groups lean on the variance within all of them."""
+        """From ``values`` (M, F) of ``groups`` (M,); the variance of rare groups shrinks to that within all groups."""
         values = values.double()
         size = torch.bincount(groups, minlength=count)[:, None].double()
         mean = torch.zeros(count, values.shape[-1], dtype=torch.float64).index_add(0, groups, values)

@@ -48,7 +48,7 @@ class BaselineConfig:
 
     @property
     def time_input(self) -> str:
-        """The number that is embedded as time, as of :class:`~agents.networks.MixedFluxConfig`."""
+        """The number that is embedded as time; see :class:`~agents.networks.MixedFluxConfig`."""
         return "log_noise" if self.frequencies else "timestep"
 
 
@@ -94,7 +94,7 @@ class Attention(nn.Module):
 
 
 def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
-    """Two layers."""
+    """Two linear layers with a GELU between them."""
     return nn.Sequential(nn.Linear(inputs, hidden), nn.GELU(), nn.Linear(hidden, outputs))
 
 
@@ -107,7 +107,7 @@ def head(hidden: int, outputs: int) -> nn.Sequential:
 
 
 class _Baseline(nn.Module):
-    """Time and text around a trunk."""
+    """A trunk with inputs for time and text."""
 
     def __init__(self, config: BaselineConfig, trunk: nn.Module) -> None:
         super().__init__()
@@ -135,7 +135,10 @@ class _Baseline(nn.Module):
         return self.trunk(tokens, condition, self.text_in(text), mask)
 
     def _with_octaves(self, features: Tensor, position: Tensor | None, noise_level: Tensor | None) -> Tensor:
-        """Features (B, N, D) and, where asked for, those of the translations, with which ``position`` begins."""
+        """Features (B, N, D), with Fourier features of the translations appended where the network has any.
+
+        The translations are the first three features of ``position``.
+        """
         if not len(self.octaves):
             return features
         if position is None or noise_level is None:

@@ -1,7 +1,8 @@
 """BERT as a text encoder of a mixed prior: frozen, read from disk, and not part of the prior's file.
 
-The paper conditions its Flux model on BERT-base (Devlin et al. 2019; Pfaff et al., CoRL 2025); here on the last hidden
-states of its tokens. The package ``transformers`` is imported when a prompt is first read, never before.
+The paper conditions its Flux model on BERT-base (Devlin et al. 2019; Pfaff et al., CoRL 2025). Here a prior is
+conditioned on the last hidden states of BERT's tokens. The package ``transformers`` is imported when a prompt is first
+read, never before.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from scene_envs.errors import InvalidInputError
 Row = tuple[int, ...]
 """The tokens of one prompt, without padding."""
 CACHED_PROMPTS = 4096
-"""Prompts that are remembered, the latest ones."""
+"""Number of latest prompts whose hidden states are cached."""
 _TOGETHER = 64
 """Prompts encoded together on an accelerator; on CPU each is encoded alone, so that no result depends on others."""
 
@@ -76,13 +77,13 @@ class BertTextConfig:
 class BertEncoder(nn.Module):
     """Prompts to the last hidden states (B, L, W) of a frozen BERT.
 
-    Its only own tensor is ``nothing`` (2, W), what BERT makes of ``""``: a prior's file holds that and not BERT, so
-    that the prior can be sampled without prompts where BERT is not at hand. Copies of a prior share one BERT. What it
-    made of the latest prompts is remembered.
+    Its only own tensor is ``nothing`` (2, W), the hidden states of the empty prompt ``""``. A prior's file holds this
+    tensor and not BERT, so that the prior can be sampled without prompts where BERT is not at hand. Copies of a prior
+    share one BERT. The hidden states of the latest prompts are cached.
 
     Args:
         config: which BERT.
-        cached: how many prompts are remembered.
+        cached: number of prompts whose hidden states are cached.
     """
 
     nothing: Tensor
@@ -96,11 +97,11 @@ class BertEncoder(nn.Module):
 
     @property
     def token_space(self) -> tuple[int, int]:
-        """How many tokens a prompt has at most, and how many different ones there are."""
+        """Largest number of tokens in a prompt, and number of different tokens."""
         return self.config.max_tokens, self.config.size
 
     def tokenize(self, prompts: Sequence[str]) -> tuple[Tensor, list[str]]:
-        """Token indices (B, L) int64, padded with 0 at the end, and the words that BERT has no pieces for.
+        """Token indices (B, L) int64, padded with 0 at the end, and the words for which BERT has no word pieces.
 
         Raises:
             MissingDependencyError: ``transformers`` is not installed.
@@ -131,7 +132,7 @@ class BertEncoder(nn.Module):
         return self.encode(indices)
 
     def encode(self, indices: Tensor) -> tuple[Tensor, Tensor]:
-        """The same from token indices (B, L) int64 as :meth:`tokenize` gives them."""
+        """Tokens and mask as of :meth:`forward`, from token indices (B, L) int64 as :meth:`tokenize` gives them."""
         rows = [tuple(index for index in row if index != PADDING) for row in indices.tolist()]
         states = self._remembered(list(dict.fromkeys(rows)))
         padded = nn.utils.rnn.pad_sequence([states[row] for row in rows], batch_first=True)
@@ -139,7 +140,7 @@ class BertEncoder(nn.Module):
         return padded, torch.arange(padded.shape[1], device=padded.device) < lengths[:, None]
 
     def _remembered(self, rows: list[Row]) -> dict[Row, Tensor]:
-        """The hidden states (L, W) of each prompt; those that are not remembered are computed, and remembered."""
+        """The hidden states (L, W) of each prompt; those that are not cached are computed, and cached."""
         found = {row: self._states[row] for row in rows if row in self._states}
         if self.config.nothing in rows:
             self._know_nothing()
@@ -184,6 +185,6 @@ class BertEncoder(nn.Module):
         super()._save_to_state_dict(destination, prefix, keep_vars)
 
     def _apply(self, fn: Any, recurse: bool = True) -> BertEncoder:
-        self._states.clear()  # they belong to the device that is left
+        self._states.clear()  # the cached states are on the former device
         super()._apply(fn, recurse)
         return self

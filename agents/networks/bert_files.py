@@ -1,4 +1,4 @@
-"""BERT models on disk: found in a folder or in the local cache of the Hugging Face hub, read once, told apart."""
+"""BERT models from a folder or the local cache of the Hugging Face hub, loaded once and identified by a digest."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from scene_envs.errors import InvalidInputError, MissingDependencyError
 _LOGGER = logging.getLogger(__name__)
 
 BASE = "google-bert/bert-base-uncased"
-"""BERT-base as the Hugging Face hub calls it."""
+"""Name of BERT-base on the Hugging Face hub."""
 FOLDER_VARIABLE = "SCENE_ENVS_BERT"
 """Environment variable that names the folder of the BERT model, for priors trained with it elsewhere."""
 _HUB_NAME = re.compile(r"[\w.-]+(/[\w.-]+)?")
@@ -44,7 +44,7 @@ class Bert:
 
 @lru_cache(maxsize=4)
 def load_bert(model: str, device: str = "cpu") -> Bert:
-    """The frozen model at ``model``, once per process and device; only local files are read.
+    """The frozen model at ``model``, loaded once per process and device; only local files are read.
 
     Args:
         model: folder, or name on the hub of a model in the local cache.
@@ -79,7 +79,7 @@ def load_bert(model: str, device: str = "cpu") -> Bert:
 
 @contextmanager
 def _quiet(kinds: Any) -> Iterator[None]:
-    """Without the library's reports and progress bars; what is wrong is said by :func:`load_bert`."""
+    """Silence the library's reports and progress bars; :func:`load_bert` reports errors itself."""
     library, verbosity = kinds.utils.logging, kinds.utils.logging.get_verbosity()
     bars = library.is_progress_bar_enabled()
     library.set_verbosity_error()

@@ -1,10 +1,10 @@
-"""Pairwise contacts: distances at which two objects touch, and displacements along the gaps that are left.
+"""Pairwise contacts: distances at which two objects touch, and displacements along the gaps between them.
 
-Objects exclude each other and stand on each other to within a fraction of a millimetre, and how far apart their centres
-then are is a matter of both categories and of the direction, hardly of anything else. A transformer that sees positions
-has to find that by itself, for every pair of categories. Here a small network on pairs of slots learns that distance,
-and what the rest sees is the gap that it leaves, in units of the noise, which is the only scale on which a denoiser can
-move anything.
+Objects do not overlap, and stand on each other, to within a fraction of a millimetre. The distance between the centres
+of two touching objects depends on both categories and on the direction, and on hardly anything else. A transformer that
+reads positions has to learn this distance by itself, for every pair of categories. Here a small network on pairs of
+slots learns the distance. The gap is the actual distance minus the learned one, in units of the noise, because a
+denoiser can move objects only on the scale of the noise. Messages and displacements are computed from the gaps.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from torch.nn import functional as F
 from agents.networks.flux_modules import FluxModule, FluxSizes, ModuleConfig, Scene
 
 CHANNELS = 4
-"""Displacements that are offered for every slot."""
-_GAPS = 8  # sideways, in height, along the three axes of either object
+"""Number of displacements of every slot."""
+_GAPS = 8  # of a pair: horizontal, in height, along the three axes of i, along those of j
 _DIRECTIONS = 6
-_BASIS = 3  # of each gap
+_BASIS = 3  # functions of each gap that a layer reads
 _REACH = 4.0
 _GAP_OF = (0, 0, 1, 2, 3, 4, 5, 5, 5, 6, 6, 6, 7, 7, 7)
-"""Which gap each of the ways is along: x, y, z of the world, the axes of i, and those of j in the world."""
+"""The gap of each component of ``ways``: x, y, z of the world, the axes of i, and x, y, z of each axis of j."""
 _TYPICAL = 0.1  # metres between the centres of objects that touch
 _LEAST_NOISE = 2e-4  # metres
 
@@ -45,24 +45,27 @@ class ContactsConfig(ModuleConfig):
 
 
 class Contacts(FluxModule):
-    """Messages between slots about the gaps between them, and displacements along those.
+    """Messages between slots about the gaps between them, and displacements along these gaps.
 
-    Permutation-equivariant. For slots i and j a network on features of the pair, the direction to each other as each
-    sees it, and both categories gives the distances at which they would touch: sideways, in height, and along the axes
-    of each. The gaps are what is left of the actual distances, over the noise on both along the gap: normalised units
-    differ by axis, and so does the noise. A second network weighs them. Of a displacement along a gap every axis takes
-    the share that its noise has in the gap, as the posterior mean under such noise does.
+    Permutation-equivariant. For slots i and j, a network predicts the distances at which the two objects touch:
+    horizontally, in height, and along the axes of each object. It reads the features of the pair, the horizontal
+    direction between the objects in the frame of each, and both categories. A gap is the actual distance minus the
+    predicted one, divided by the noise on both positions along the gap. This noise differs by axis, because normalised
+    units do. A second network computes the messages and the amplitudes of the displacements from the gaps. Each axis
+    takes the part of a displacement that corresponds to its share of the noise along the gap, as in the posterior mean
+    under such noise.
 
-    A slot whose category is masked gets no message: what stands in another would be taken for empty, which is so of
-    real scenes with noise on them, but of samples takes objects away that only stand a little wrong.
+    A slot whose category is masked gets no message. Otherwise the network would take a masked slot that overlaps
+    another object for empty. This is right in real scenes with noise on them. In samples, however, it removes objects
+    that are only slightly misplaced.
 
     Args:
         categories: K = C + 1; the mask token is one more.
         features: numbers per pair of slots, from :class:`~agents.networks.relations.Relations`.
         hidden: width of the messages.
-        embedding: width of what the gates of the displacements are made of.
+        embedding: width of the features from which the gates of the displacements are computed.
         width: of the networks on pairs.
-        kind: width of what stands for a category.
+        kind: width of the embedding of a category.
 
     >>> contacts = Contacts(categories=3, features=40, hidden=16, embedding=16)
     >>> metres, rotation = torch.randn(2, 5, 3), torch.eye(3).expand(2, 5, 3, 3)
@@ -93,7 +96,7 @@ class Contacts(FluxModule):
         if scene.metres is None or scene.metres_noise is None or scene.rotation is None or scene.pairs is None:
             return None
         metres, rotation = scene.metres, scene.rotation.to(scene.metres)
-        with torch.autocast(metres.device.type, enabled=False):  # half of a percent of a metre is too much
+        with torch.autocast(metres.device.type, enabled=False):  # an error of half a percent of a metre is too large
             messages, moves = self(metres, rotation, scene.states, scene.metres_noise, scene.pairs, scene.slot_mask)
         scene.kept[ContactsConfig.name] = moves
         return messages
@@ -115,11 +118,12 @@ class Contacts(FluxModule):
 
         Args:
             metres: (B, N, 3) noisy positions.
-            rotation: (B, N, 3, 3) rotation matrices; they must be no noisier than that, or the axes are no directions.
+            rotation: (B, N, 3, 3) rotation matrices, such as the nearest to noisy matrices; their columns must be unit
+                vectors.
             states: (B, N) int64 categories, mask tokens among them.
             noise: (B, N, 3) standard deviation of the noise on positions along x, y, z, metres.
             features: (B, N, N, F) of pairs of slots.
-            slot_mask: (B, N) bool, False for filling that nothing may see; None where there is none.
+            slot_mask: (B, N) bool, False for padding slots, which nothing may see; None where there are none.
         """
         offset = metres.unsqueeze(2) - metres.unsqueeze(1)  # (B, N, N, 3) from j to i
         variance = noise.square().unsqueeze(2) + noise.square().unsqueeze(1) + _LEAST_NOISE**2
@@ -153,10 +157,10 @@ class Contacts(FluxModule):
         return self.out(weighed[..., :-1].sum(dim=2)) * known, moves
 
     def _displacements(self, weighed: Tensor, ways: Tensor, bounded: Tensor, rotation: Tensor) -> Tensor:
-        """(B, N, CHANNELS, 3): along every gap an amplitude, and another times the gap, summed over the others.
+        """Displacements (B, N, CHANNELS, 3): per gap one amplitude plus another times the gap, summed over other slots.
 
-        Amplitudes are linear in ``weighed`` (B, N, N, W + 1), so the sum is taken first: what a pair takes is not
-        CHANNELS times as much.
+        Amplitudes are linear in ``weighed`` (B, N, N, W + 1), so the sum over other slots is taken first. Then the cost
+        per pair does not grow with CHANNELS.
         """
         ways = torch.cat([ways, ways * bounded[..., _GAP_OF]], dim=-1)
         gathered = weighed.mT @ ways  # (B, N, W + 1, 2 * 15)
@@ -168,17 +172,21 @@ class Contacts(FluxModule):
 
 
 def gated_displacement(displacements: Tensor, gates: Tensor) -> Tensor:
-    """Contribution (B, N, 3) of displacements (B, N, :data:`CHANNELS`, 3) to the output of translations.
+    """Contribution (B, N, 3) of displacements (B, N, :data:`CHANNELS`, 3) to the translation output.
 
     Args:
-        displacements: as :class:`Contacts` make them.
-        gates: (B, N, CHANNELS * 3), one for each.
+        displacements: as :class:`Contacts` returns them.
+        gates: (B, N, CHANNELS * 3), one for each entry of the displacements.
     """
     return (displacements * gates.unflatten(-1, (CHANNELS, 3))).sum(dim=-2)
 
 
 def _as_seen(aside: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
-    """Level directions (B, N, N, 2) from j to i in the frames of i and of j, with their squares, (B, N, N, 6) each."""
+    """Horizontal directions in the frames of i and of j, with their squares, (B, N, N, 6) each.
+
+    The first is from j to i in the frame of i, the second from i to j in the frame of j; ``aside`` (B, N, N, 2) is from
+    j to i in the world.
+    """
     first = aside @ rotation[..., :2, :]
     second = -torch.einsum("bijw,bjwk->bijk", aside, rotation[..., :2, :])
     return torch.cat([first, first.square()], dim=-1), torch.cat([second, second.square()], dim=-1)

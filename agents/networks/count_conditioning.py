@@ -13,11 +13,11 @@ from agents.networks.count_embedding import count_states
 from agents.networks.flux_modules import FluxModule, FluxSizes, ModuleConfig, Scene
 
 _DELTA = 0.02
-"""Objects that may always still come, so that logarithms are finite."""
+"""Number of objects that is added before a logarithm is taken, so that it is finite."""
 _KNOWN = 0.8
-"""Probability of its likeliest number from which a text gives the number of a kind."""
+"""A text gives the number of a kind if the likeliest number has at least this probability."""
 _LEAST = 0.1
-"""Probability of the numbers from the visible one on, below which fewer objects of a known number are expected."""
+"""Probability of the visible number and all larger ones; below it, fewer objects of a known number are expected."""
 _TINY = 1e-9
 
 
@@ -64,12 +64,12 @@ class CountConditioning(FluxModule):
 
     Args:
         kinds: (C,) the kind 0..G-1 of each category but *empty*: prompts call several assets by one name.
-        text_width: W, of what the text encoder says of each kind, and last of all objects.
+        text_width: W, width of the text tokens: one for each kind, and a last one for all objects.
         hidden: width inside.
-        most: largest number that is told apart; larger ones count as it.
+        most: largest number that is told apart; larger numbers count as this one.
 
     Attributes:
-        things: G + 1, kinds and all objects.
+        things: G + 1, the number of kinds, plus one for all objects.
 
     >>> count_conditioning = CountConditioning(kinds=(0, 1, 1, 2), text_width=16, hidden=32, most=5)
     >>> count_conditioning(torch.randint(6, (2, 5)), torch.randn(2, 4, 16)).shape
@@ -112,7 +112,7 @@ class CountConditioning(FluxModule):
         Args:
             states: (B, N) int64 in 0..K, K being the mask token.
             tokens: (B, G + 1, W) leading tokens of the text encoder, one for each kind and the last for all objects.
-            slot_mask: (B, N) bool, False for filling; None where there is none.
+            slot_mask: (B, N) bool, False for padding slots; None where there are none.
         """
         counts = count_states(states, self.categories, slot_mask).to(tokens.dtype)
         visible, masked = self._numbers(counts), counts[:, -1:]  # (B, G + 1), (B, 1)
@@ -134,19 +134,20 @@ class CountConditioning(FluxModule):
         return torch.where(known[:, self.kinds], self.kinds, self.things)
 
     def _numbers(self, counts: Tensor) -> Tensor:
-        """(B, G + 1) objects of each kind, and in all, from (B, K) slots in each category, whose last is not read."""
+        """(B, G + 1) objects of each kind, and in all, from (B, K) slots in each category; the last is not read."""
         objects = counts[:, :-1]
         kinds = objects.new_zeros(len(counts), self.things - 1).index_add_(1, self.kinds[:-1], objects)
         return torch.cat([kinds, objects.sum(dim=1, keepdim=True)], dim=1)
 
 
 def still_to_come(logits: Tensor, visible: Tensor) -> Tensor:
-    """Expected number beyond the visible one, 0 at least: (..., M) logits of 0..M-1 and (...) visible to (...).
+    """Expected number of objects still missing, at least 0: (..., M) logits of 0..M-1 and (...) visible to (...).
 
-    It is the mean over the numbers that the visible one allows. Where one number above 0 has a probability of at least
-    ``_KNOWN`` and all that are allowed have less than ``_LEAST``, more objects are visible than the text asks for, and
-    the mean shrinks to 0 in proportion. Without this bound the mean would be that of the remote tail, and all masked
-    slots would become objects of a kind that is complete. Kinds that are seldom there at all are left as they are.
+    It is the mean of the numbers that are not below the visible one, minus the visible one. In one case it shrinks to 0
+    in proportion: one number above 0 has a probability of at least ``_KNOWN``, and the numbers that are not below the
+    visible one have less than ``_LEAST`` together. Then more objects are visible than the text asks for. Without this
+    bound the mean would be that of the remote tail, and all masked slots would become objects of a kind that is
+    complete. Kinds that are seldom present at all are not bounded in this way.
 
     >>> still_to_come(torch.tensor([[0.0, 0.0, 0.0, 0.0]]), torch.tensor([1.0]))  # 1, 2 or 3, as likely
     tensor([1.])

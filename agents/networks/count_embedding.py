@@ -1,6 +1,6 @@
 """Count embedding: numbers of visible slots of each category and of masked slots, added to the embedded time.
 
-Attention takes averages, and a prompt asks for numbers.
+Attention computes averages, but a prompt asks for numbers of objects.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ class CountEmbeddingConfig(ModuleConfig):
 
 
 def count_states(states: Tensor, categories: int, slot_mask: Tensor | None = None) -> Tensor:
-    """(B, K) slots in each category but *empty*, and in its place how many are masked.
+    """(B, K) numbers of slots in each category; in the place of *empty*, the number of masked slots.
 
     Empty slots are not counted, so that leaving them out of the network's batch changes nothing.
 
     Args:
         states: (B, N) int64 in 0..K, K being the mask token and K - 1 *empty*.
         categories: K.
-        slot_mask: (B, N) bool, False for filling; None where there is none.
+        slot_mask: (B, N) bool, False for padding slots; None where there are none.
 
     >>> count_states(torch.tensor([[0, 0, 1, 2, 3, 3]]), 3).tolist()
     [[2.0, 1.0, 2.0]]
@@ -46,7 +46,7 @@ def count_states(states: Tensor, categories: int, slot_mask: Tensor | None = Non
 
 
 class CountEmbedding(FluxModule):
-    """Counts of visible slots and the mean text token, to one vector (B, H) that joins the condition.
+    """Counts of visible slots and the mean text token, to one vector (B, H) that is added to the condition.
 
     Args:
         categories: K = C + 1.

@@ -1,4 +1,4 @@
-"""The denoiser of a continuous prior: its network inside its process."""
+"""The denoiser of a continuous prior: a network together with its diffusion process."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def autocast(like: Tensor, precision: torch.dtype) -> torch.autocast:
 
 
 class Denoiser(nn.Module):
-    """A network inside its process: x_t (B, N, D) and t (B,) to the denoised scene x_0 (B, N, D).
+    """A network together with its process: x_t (B, N, D) and t (B,) to the denoised scene x_0 (B, N, D).
 
     Attributes:
         precision: number format of the network alone (``torch.bfloat16`` for autocast); the chain is always float32.

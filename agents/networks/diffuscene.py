@@ -1,10 +1,11 @@
 """DiffuScene's denoiser: a U-Net of 1-D convolutions along the slots of a scene (Tang et al. 2024, "DiffuScene:
 Denoising Diffusion Models for Generative Indoor Scene Synthesis", section on the denoising network).
 
-The attributes of an object are encoded to channels, and decoded, by MLPs that all objects share. Between the two stand
-residual blocks of convolutions, to which the time embedding is added, attention among slots and, with text, from slots
-to words; convolutions of stride 2 lead down and skip connections lead across, as in the U-Net of Ho et al. 2020.
-Convolutions see who stands beside whom, so the network depends on the order of slots, unlike scenes.
+The attributes of an object are encoded to channels, and decoded, by MLPs that all objects share. Between encoder and
+decoder there are residual blocks of convolutions, to which the time embedding is added. Each level has attention among
+slots and, with text, from slots to words. As in the U-Net of Ho et al. 2020, convolutions of stride 2 halve the
+resolution on the way down, and skip connections lead from each level on the way down to that on the way up.
+Convolutions mix neighbouring slots, so the network depends on the order of slots, although scenes have no order.
 """
 
 from __future__ import annotations
@@ -101,7 +102,7 @@ class _Attend(nn.Module):
 
 
 class _Level(nn.Module):
-    """The residual blocks and the attention of one resolution, on one way."""
+    """The residual blocks and the attention of one resolution, on the way down or on the way up."""
 
     def __init__(self, config: _Size, channels: int) -> None:
         super().__init__()
@@ -116,7 +117,7 @@ class _Level(nn.Module):
 
 
 class _UNet(nn.Module):
-    """The trunk. Any number of slots: an odd one is halved upwards, and doubled with what is too much cut off."""
+    """The trunk, for any number of slots: halving rounds up, and doubling cuts off surplus slots."""
 
     def __init__(self, config: _Size) -> None:
         super().__init__()
@@ -159,7 +160,7 @@ class DiffuScene(ContinuousBaseline):
 
 
 class MixedDiffuScene(MixedBaseline):
-    """Poses (B, N, 12) and states (B, N) to a pose output (B, N, 12) and logits (B, N, K); depends on their order.
+    """Poses (B, N, 12) and states (B, N) to a pose output (B, N, 12) and logits (B, N, K); depends on slot order.
 
     >>> network = MixedDiffuScene(MixedDiffuSceneConfig(categories=8, hidden=16, heads=2, text_width=16))
     >>> pose, states = torch.randn(2, 5, 12), torch.randint(9, (2, 5))

@@ -52,8 +52,8 @@ class FluxDenoiser(nn.Module):
     """Scenes (B, N, D) at a noise level (B,) to a prediction (B, N, D); permutation-equivariant in N.
 
     Translations enter twice: linearly, and as Fourier features damped by the noise level (the expected
-    feature under the noise, as in mip-NeRF's integrated encoding), so that attention can compare distances
-    to a millimetre where the noise leaves them readable.
+    feature under the noise, as in mip-NeRF's integrated encoding). So attention can compare distances
+    to a millimetre where the noise is small enough.
 
     >>> denoiser = FluxDenoiser(FluxConfig(features=20, hidden=32, depth=2, heads=2))
     >>> x = torch.randn(2, 34, 20)

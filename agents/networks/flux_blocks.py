@@ -1,4 +1,4 @@
-"""The blocks of Flux-style transformers: of one stream, and of two that attend to each other (Esser et al. 2024)."""
+"""The blocks of Flux-style transformers: single-stream, and double-stream with joint attention (Esser et al. 2024)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class SingleStreamBlock(nn.Module):
         hidden: width of the tokens.
         heads: attention heads.
         mlp_ratio: width of the MLP over ``hidden``.
-        relations: numbers per pair of slots that attention gathers; 0 for none.
+        relations: features per pair of slots that attention sums with its weights; 0 for none.
     """
 
     MATRICES: ClassVar[Sequence[str]] = ("linear1", "linear2")
@@ -47,8 +47,8 @@ class SingleStreamBlock(nn.Module):
         Args:
             tokens: (B, T, H).
             condition: (B, H).
-            mask: (B, 1 or heads, 1 or T, T), True where to attend, or what is added to the attention logits.
-            relations: (B, N, N, F) features of pairs of the last N tokens; needs a mask that is added.
+            mask: (B, 1 or heads, 1 or T, T), bool, True where to attend, or float, added to the attention logits.
+            relations: (B, N, N, F) features of pairs of the last N tokens; needs a float mask.
         """
         shift, scale, gate = self.modulation(F.silu(condition)).unsqueeze(1).chunk(3, dim=-1)
         x = (1 + scale) * F.layer_norm(tokens, (self.hidden,), eps=1e-6) + shift
@@ -62,8 +62,8 @@ class DoubleStreamBlock(nn.Module):
     """Joint attention of two streams with their own projections, norms and MLPs, gated by the condition.
 
     Args:
-        hidden, heads, mlp_ratio, relations: as of :class:`~agents.networks.flux.SingleStreamBlock`.
-        text_ends: whether text is read here for the last time, so that it need not be changed.
+        hidden, heads, mlp_ratio, relations: as in :class:`SingleStreamBlock`.
+        text_ends: whether no later block reads the text, so that this block need not update it.
     """
 
     def __init__(self, hidden: int, heads: int, mlp_ratio: float, relations: int = 0, text_ends: bool = False) -> None:
@@ -75,7 +75,7 @@ class DoubleStreamBlock(nn.Module):
     def forward(
         self, scene: Tensor, text: Tensor, condition: Tensor, mask: Tensor | None, relations: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Slots (B, N, H) and text (B, L, H) to the same; ``mask`` and ``relations`` as of single-stream blocks."""
+        """Slots (B, N, H) and text (B, L, H) to the same; ``mask`` and ``relations`` as in single-stream blocks."""
         scene, text = scene + self.scene.modality, text + self.text.modality
         rates = [stream.rates(condition) for stream in (self.text, self.scene)]
         parts = [s.heads_of(x, r) for s, x, r in zip((self.text, self.scene), (text, scene), rates, strict=True)]
@@ -109,7 +109,7 @@ class _Stream(nn.Module):
         nn.init.zeros_(self.modulation.bias)
 
     def rates(self, condition: Tensor) -> tuple[Tensor, ...]:
-        """Shift, scale and gate of the attention, then of the MLP, (B, 1, H) each; only two where text ends."""
+        """Shift, scale and gate of the attention, then of the MLP, (B, 1, H) each; the first two where text ends."""
         return self.modulation(F.silu(condition)).unsqueeze(1).chunk(6 if self.finishes else 2, dim=-1)  # type: ignore[no-any-return]
 
     def heads_of(self, x: Tensor, rates: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, Tensor]:
@@ -119,7 +119,7 @@ class _Stream(nn.Module):
         return self.query_norm(query), self.key_norm(key), value
 
     def finish(self, x: Tensor, attended: Tensor, rates: tuple[Tensor, ...]) -> Tensor:
-        """The two gated residuals."""
+        """The tokens after the gated residuals of attention and MLP."""
         x = x + rates[2] * self.out(attended)
         inner = (1 + rates[4]) * F.layer_norm(x, (self.hidden,), eps=1e-6) + rates[3]
         return x + rates[5] * self.mlp(inner)

@@ -10,7 +10,7 @@ from typing import ClassVar, Literal, Protocol
 from torch import Tensor, nn
 
 Place = Literal["slots", "condition", "attention", "output"]
-"""The part of the core after which the weights of a module are drawn, so that a seed keeps its meaning."""
+"""The part of the core after which the weights of a module are drawn, so that a seed keeps giving the same weights."""
 
 
 class FluxSizes(Protocol):
@@ -46,7 +46,7 @@ class FluxSizes(Protocol):
 
     @property
     def pair_width(self) -> int:
-        """Number of features of a pair of slots, of all modules that offer some."""
+        """Number of features of a pair of slots, summed over all modules."""
 
 
 @dataclass
@@ -55,20 +55,21 @@ class Scene:
 
     Attributes:
         states: (B, N) int64 categories in 0..K, K being the mask token.
-        observed: (B, N) int64, 1 where the pose is observed, plus 2 where the category is; None for nowhere.
-        slot_mask: (B, N) bool, False for filling; None where there is none.
+        observed: (B, N) int64, 1 where the pose is observed, plus 2 where the category is; None if nothing is
+            observed.
+        slot_mask: (B, N) bool, False for padding slots; None where there are none.
         summary: (B, W) mean of the text tokens; None without text.
-        own_text: leading text tokens (B, T, W) that modules took, by their names.
+        own_text: leading text tokens (B, T, W) that only one module reads, by the name of the module.
         position: (B, N, 12) noisy poses in signal units, or translations alone (B, N, 3); None where no module reads
             geometry.
         noise_level: (B, N) noise-to-signal ratio of ``position``.
         metres: (B, N, 3) translations.
-        metres_noise: (B, N, 3) standard deviation of the noise on them.
+        metres_noise: (B, N, 3) standard deviation of the noise on ``metres``.
         noisy_rotation: (B, N, 3, 3) matrices with their noise, where a module reads rotations.
-        rotation: (B, N, 3, 3) the rotations nearest to them.
+        rotation: (B, N, 3, 3) the rotations nearest to ``noisy_rotation``.
         rotation_noise: (B, N) standard deviation of the noise on the entries of a rotation.
-        pairs: (B, N, N, F) features of pairs of slots, of all modules that offer some; None before and without them.
-        kept: what a module computed in one hook for a later one of its own, by its name.
+        pairs: (B, N, N, F) features of pairs of slots, of all modules together; None before any are computed.
+        kept: tensors that a module stores in one hook for a later hook of its own, by the name of the module.
     """
 
     states: Tensor
@@ -90,45 +91,46 @@ class Scene:
 class FluxModule(nn.Module):
     """A part of the network beside its core. Every hook may be left out; None adds nothing.
 
-    The core calls the hooks in the order in which they stand here, each for all modules in the order of the
-    configuration, and adds what they return. All must be permutation-equivariant in the slots.
+    The core calls the hooks in the order in which they are defined here. It calls each hook for all modules, in the
+    order of the configuration, and adds what they return. All must be permutation-equivariant in the slots.
     """
 
     def condition(self, scene: Scene) -> Tensor | None:
-        """(B, H) joins the embedded time, which modulates every block."""
+        """(B, H) that is added to the embedded time, which modulates every block."""
         return None
 
     def pose_features(self, scene: Scene) -> Tensor | None:
-        """(B, N, ``pose_width``) is read beside each pose."""
+        """(B, N, ``pose_width``) that is concatenated to the poses."""
         return None
 
     def slot_features(self, scene: Scene) -> Tensor | None:
-        """(B, N, E) joins the embedded slots."""
+        """(B, N, E) that is added to the embedded slots."""
         return None
 
     def relations(self, scene: Scene) -> tuple[Tensor, Tensor] | None:
-        """Biases (blocks, B, heads, N, N) of the attention between slots, and features of pairs (B, N, N, F) that
-        attention gathers and later hooks find in ``scene.pairs``; F is ``pair_width``.
+        """Biases (blocks, B, heads, N, N) of the attention between slots, and features of pairs (B, N, N, F).
+
+        F is ``pair_width``. Attention sums the features with its weights, and later hooks find them in ``scene.pairs``.
         """
         return None
 
     def messages(self, scene: Scene) -> Tensor | None:
-        """(B, N, H) joins the tokens of the slots before the first block."""
+        """(B, N, H) that is added to the tokens of the slots before the first block."""
         return None
 
     def logits(self, scene: Scene) -> Tensor | None:
-        """(B, 1 or N, K) joins the logits of the categories."""
+        """(B, 1 or N, K) that is added to the logits of the categories."""
         return None
 
     def groups_by_number(self, tokens: Tensor) -> Tensor | None:
         """(B, K) int64 groups of the categories, from the module's own text ``tokens`` (B, L, W).
 
-        The core asks for them outside of a pass, and takes the first that a module gives.
+        The core calls this outside of a forward pass, and takes the groups of the first module that returns some.
         """
         return None
 
     def pose_output(self, scene: Scene, features: Tensor) -> Tensor | None:
-        """(B, N, 12) joins the pose output; ``features`` (B, N, E) are what the last layer of the core says."""
+        """(B, N, 12) that is added to the pose output; ``features`` (B, N, E) leave the core's last layer."""
         return None
 
 
@@ -159,11 +161,11 @@ class ModuleConfig(ABC):
 
     @property
     def pair_width(self) -> int:
-        """Features of a pair of slots that the module offers."""
+        """Number of features of a pair of slots that the module computes."""
         return 0
 
     def text_tokens(self, core: FluxSizes) -> int:
-        """Leading text tokens that are for this module alone."""
+        """Number of leading text tokens that are for this module alone."""
         return 0
 
     @abstractmethod

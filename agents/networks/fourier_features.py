@@ -34,7 +34,7 @@ class FourierFeaturesConfig(ModuleConfig):
 
 
 class FourierFeatures(FluxModule):
-    """Sines and cosines (B, N, 6 F) of translations, each as faint as the noise makes its mean.
+    """Sines and cosines (B, N, 6 F) of translations, each damped to its mean under the noise.
 
     Under Gaussian noise of standard deviation s, E sin(w x) is sin(w x) exp(-w^2 s^2 / 2).
     """
@@ -52,7 +52,10 @@ class FourierFeatures(FluxModule):
 
 
 def fourier_features(position: Tensor, noise_level: Tensor, octaves: Tensor) -> Tensor:
-    """(B, N, 6 F) features of translations, with which ``position`` (B, N, D) begins, under noise (B, N)."""
+    """(B, N, 6 F) features of translations under noise (B, N).
+
+    The translations are the first three features of ``position`` (B, N, D).
+    """
     angle = position[..., :3, None] * octaves  # (B, N, 3, F)
     damping = torch.exp(-0.5 * (octaves * noise_level[..., None]) ** 2).unsqueeze(-2)  # (B, N, 1, F)
     return torch.cat([(angle.sin() * damping).flatten(-2), (angle.cos() * damping).flatten(-2)], dim=-1)

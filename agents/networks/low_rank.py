@@ -86,7 +86,7 @@ def set_low_rank(network: nn.Module, tensors: Mapping[str, Tensor]) -> None:
 
 
 def merged_weights(network: nn.Module) -> dict[str, Tensor]:
-    """Weights of a network by name, with the updates in them, as of a network without updates."""
+    """Weights of a network with the updates added to them, by their names in a network without updates."""
     weights = dict(network.state_dict())
     for name, layer in matrices(network):
         if parametrize.is_parametrized(layer, "weight"):

@@ -3,8 +3,8 @@ Scene Synthesis", section on the denoising network).
 
 Each object is a token, made of the embedding of its category and an MLP of its pose. Every block has self-attention
 among objects, cross-attention to the condition and a feed-forward layer, each behind a layer norm whose scale and shift
-are functions of time. Categories and poses leave through heads of their own. The paper's condition is a floor plan;
-here it is text, as in the comparison of Pfaff et al. (CoRL 2025). There is no positional encoding.
+are functions of time. Separate heads predict categories and poses. The paper's condition is a floor plan; here it is
+text, as in the comparison of Pfaff et al. (CoRL 2025). There is no positional encoding.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The denoiser of a mixed prior: its network inside its two processes."""
+"""The denoiser of a mixed prior: a network together with its two diffusion processes."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Observed:
         return Observed(self.x[rows], self.pose[rows], self.category[rows])
 
     def flags(self) -> Tensor:
-        """(B, N) int64 as the network reads them."""
+        """(B, N) int64 as the network reads them: 1 where the pose is observed, plus 2 where the category is."""
         return self.pose.long() + 2 * self.category.long()
 
     def entries(self, pose_width: int = POSE_FEATURES) -> Tensor:
@@ -99,12 +99,12 @@ class MixedDenoiser(nn.Module):
         self.categories = categories
 
     def groups_by_number(self, text: Text) -> Tensor | None:
-        """(B, K) int64 groups of categories by the numbers that ``text`` gives; None for a network that reads none."""
+        """(B, K) int64 groups of categories by the numbers that ``text`` gives; None if the network has none."""
         grouped = getattr(self.network, "groups_by_number", None)
         return None if grouped is None else grouped(text[0])
 
     def moments(self, states: Tensor, t: Tensor) -> Moments | None:
-        """Mean and std (B, N, 12) of poses whose categories are in ``states`` (B, N) at ``t`` (B,).
+        """Mean and std (B, N, 12) of clean poses, given their categories in ``states`` (B, N) at ``t`` (B,).
 
         None where the preconditioning does not tell categories apart.
         """
@@ -168,7 +168,7 @@ class MixedDenoiser(nn.Module):
 
         def run(rows: Tensor, index: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
             words = None if text is None else (text[0][rows], text[1][rows])
-            attended = mask | ~mask.any(dim=1, keepdim=True)  # a scene of filling alone attends to it, for no use
+            attended = mask | ~mask.any(dim=1, keepdim=True)  # a scene of padding alone attends to it, unused
             return self._run([take_slots(x, rows, index) for x in inputs], time[rows], words, attended)
 
         return run_packed(present, run, (POSE_FEATURES, self.categories.categories))

@@ -1,8 +1,9 @@
 """The Flux-style transformer of the paper on mixed scenes: poses and categories in, pose output and logits out.
 
-Text tokens, when there are any, meet the slots in double-stream blocks, which have weights of their own for each
-stream, and join them in single-stream blocks (Flux; Esser et al. 2024; Pfaff et al., CoRL 2025, appendix). What is not
-in the paper is a module (:mod:`agents.networks.flux_modules`), and the configuration lists it.
+Text tokens, when there are any, and slots attend to each other: first in double-stream blocks, which have weights of
+their own for each stream, then as one stream in single-stream blocks (Flux; Esser et al. 2024; Pfaff et al., CoRL 2025,
+appendix). Each part that is not in the paper is a module (:mod:`agents.networks.flux_modules`) that the configuration
+lists.
 """
 
 from __future__ import annotations
@@ -96,14 +97,15 @@ class MixedFlux(nn.Module):
         Args:
             pose: (B, N, 12) noisy poses, as the process scales them.
             states: (B, N) int64 in 0..K, K being the mask token.
-            time: (B,) what is embedded, times ``time_scale``: a timestep or a log noise level.
-            text: (B, L, W) text tokens; None for no text. The first are those that modules take for themselves.
+            time: (B,) a timestep or a log noise level; it is multiplied by ``time_scale`` and embedded.
+            text: (B, L, W) text tokens; None for no text. The first tokens are read by single modules only.
             text_mask: (B, L) bool, True for real tokens.
             position: (B, N, 12) poses in signal units, for modules that read geometry; translations alone, (B, N, 3),
-                will do where none reads rotations.
+                are enough where no module reads rotations.
             noise_level: (B, N) noise-to-signal ratio of ``position``.
-            observed: (B, N) int64, 1 where the pose is observed, plus 2 where the category is; None for nowhere.
-            slot_mask: (B, N) bool, False for filling that nothing may attend to; None where there is none.
+            observed: (B, N) int64, 1 where the pose is observed, plus 2 where the category is; None if nothing is
+                observed.
+            slot_mask: (B, N) bool, False for padding slots, to which nothing may attend; None where there are none.
 
         Returns:
             pose output (B, N, 12) and logits (B, N, K) of the clean category.
@@ -171,7 +173,7 @@ class MixedFlux(nn.Module):
     # -- modules ----------------------------------------------------------------------------------
 
     def _build_modules(self, place: Place) -> None:
-        """Draw the weights of the modules that have their place here."""
+        """Add the modules of this ``place``, with fresh weights."""
         for module in self.config.modules:
             if module.place == place:
                 self.add_module(module.name, module.build(self.config))
@@ -180,14 +182,17 @@ class MixedFlux(nn.Module):
         return (getattr(self, module.name) for module in self.config.modules)
 
     def _add(self, value: Tensor, hook: Callable[[FluxModule], Tensor | None]) -> Tensor:
-        """``value``, to which is added what a hook of every module says."""
+        """``value`` plus what a hook of every module returns."""
         for module in self._added():
             part = hook(module)
             value = value if part is None else value + part
         return value
 
     def _take_text(self, scene: Scene, text: Tensor | None, mask: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
-        """Give modules their leading tokens and the mean of the others, which are returned with their mask."""
+        """The tokens that are not for single modules, with their mask.
+
+        Puts the leading tokens of modules, and the mean of the other tokens, into ``scene``.
+        """
         if text is None:
             return None, mask
         for module in self.config.modules:
@@ -199,10 +204,10 @@ class MixedFlux(nn.Module):
         return text, mask
 
     def _read_geometry(self, scene: Scene, position: Tensor | None, noise_level: Tensor | None) -> None:
-        """Put poses in metres and rotations, and the noise on them, where modules read them.
+        """Put translations in metres, rotations, and the noise on them into ``scene``, where modules read them.
 
         Raises:
-            InvalidInputError: a module reads geometry, and there is none.
+            InvalidInputError: a module reads geometry, and none is given.
         """
         readers = [module.name for module in self.config.modules if module.reads_geometry]
         if not readers:
@@ -219,7 +224,7 @@ class MixedFlux(nn.Module):
             scene.rotation_noise = noise_level * self.rotations[0].max().to(noise_level)
 
     def _relate(self, scene: Scene) -> Iterator[Tensor | None]:
-        """Biases (B, heads, N, N) of block after block; puts features of pairs into ``scene``."""
+        """Iterator over the biases (B, heads, N, N) of the blocks; puts features of pairs into ``scene``."""
         parts = [part for module in self._added() if (part := module.relations(scene)) is not None]
         if not parts:
             return itertools.repeat(None)
@@ -237,7 +242,7 @@ def _rename_weights(_: nn.Module, state: dict[str, Any], prefix: str, *__: Any) 
 
 
 def _mean_token(text: Tensor, mask: Tensor | None) -> Tensor:
-    """(B, W) mean of the real ones of tokens (B, L, W)."""
+    """(B, W) mean of the tokens (B, L, W) that are not padding."""
     if mask is None:
         return text.mean(dim=1)
     real = mask[..., None].to(text)
@@ -245,7 +250,7 @@ def _mean_token(text: Tensor, mask: Tensor | None) -> Tensor:
 
 
 def _where_to_attend(text_mask: Tensor | None, slot_mask: Tensor | None, count: int, slots: Tensor) -> Tensor | None:
-    """(B, 1, 1, L + N) bool of ``count`` = L text tokens before N slots; None where nothing is masked."""
+    """(B, 1, 1, L + N) bool over ``count`` = L text tokens, then N slots; None where nothing is masked."""
     if text_mask is None and slot_mask is None:
         return None
     everywhere = torch.ones(len(slots), count + slots.shape[1], dtype=torch.bool, device=slots.device)

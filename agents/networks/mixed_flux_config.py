@@ -18,7 +18,7 @@ from agents.networks.rotation_features import RotationFeaturesConfig
 from scene_envs.errors import InvalidInputError, unknown_name
 
 TEXT_REACHES = ("all", "double")
-"""Blocks in which slots meet text."""
+"""Blocks in which slots and text attend to each other."""
 TIME_INPUTS = ("timestep", "log_noise")
 """Numbers that may be embedded as time: t - 1, or 250 times the logarithm of the noise-to-signal ratio."""
 MODULES: dict[str, type[ModuleConfig]] = {
@@ -140,7 +140,7 @@ def module_states(config: MixedFluxConfig) -> list[dict[str, Any]]:
 
 
 def make_module(entry: ModuleConfig | Mapping[str, Any]) -> ModuleConfig:
-    """A module's configuration, itself or from ``{"name": …, **fields}``."""
+    """A module's configuration: ``entry`` itself, or made from ``{"name": …, **fields}``."""
     if isinstance(entry, ModuleConfig):
         return entry
     options = {key: value for key, value in entry.items() if key != "name"}

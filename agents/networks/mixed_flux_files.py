@@ -1,4 +1,4 @@
-"""Files of earlier versions: their fields of a mixed Flux network, and names of its weights, as they are now."""
+"""Present fields of a mixed Flux network, and names of its weights, from those in files of earlier versions."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ FLAT_FIELDS = (
     *("frequencies", "flags", "attention", "relation_blur", "pooled_text", "count_embedding", "tally"),
     *("count_conditioning", "requests", "kinds", "rotation_features", "contacts"),
 )
-"""Fields that configured what are modules now."""
+"""Fields of earlier versions; they configured parts that are modules now."""
 
 _MODULES = {"given_flags": "observed_flags"}
-"""Modules that have another name now."""
+"""Former names of modules, and the present ones."""
 
 _PREFIXES = {
     "given_in.": "observed_flags.embedding.",
@@ -38,7 +38,7 @@ def current_name(name: str) -> str:
 
 
 def current_fields(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a configuration with ``modules``, from those of a file that may list none.
+    """Fields of a configuration with ``modules``, from the fields of a file that may lack ``modules``.
 
     >>> current_fields({"categories": 8, "frequencies": 0, "flags": 1})
     {'categories': 8, 'modules': [{'name': 'observed_flags'}], 'time_input': 'timestep'}

@@ -21,7 +21,7 @@ class ObservedFlagsConfig(ModuleConfig):
 
 
 class ObservedFlags(FluxModule):
-    """An embedding (B, N, E) of neither, pose, category or both being observed, which starts at zero."""
+    """An embedding (B, N, E) of what is observed (neither, pose, category or both); it starts at zero."""
 
     def __init__(self, width: int) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Packing of scenes: slots that are known to be empty leave the batch of a network."""
+"""Packing of scenes: slots that are known to be empty are left out of a network's batch."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ _CHUNKS = 4
 
 
 def pack(active: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Scenes in parts of similar size, and which slots of them to keep.
+    """Parts of a batch: scenes with similar numbers of active slots, and which of their slots to keep.
 
     Args:
         active: (B, N) bool, slots that take part.
 
     Yields:
         rows (b,) int64 of the part, index (b, M) int64 of its slots with the active ones first, and mask (b, M) bool
-        that is False on filling. Every scene is in one part; M is the largest count in the part, at least 1.
+        that is False on padding. Every scene is in one part. M is the largest number of active slots of a scene in the
+        part, at least 1.
     """
     counts = active.sum(dim=1)
     chunks = _CHUNKS if active.device.type == "cpu" and len(active) >= 4 * _CHUNKS else 1

@@ -1,4 +1,4 @@
-"""Parameters of networks: how many there are, and sizes at which two networks have as many."""
+"""Parameter counts of networks, and sizes at which two networks have equally many parameters."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _RATIO_STEPS, _RATIO_STEP = 24, 1 / 64
 
 @lru_cache(maxsize=1024)
 def parameter_count(config: NetworkConfig) -> int:
-    """Parameters of a network; leaves the random state alone.
+    """Number of parameters of a network; leaves the random state unchanged.
 
     >>> from agents.networks.flux import FluxConfig
     >>> parameter_count(FluxConfig(features=20, hidden=96, depth=3, heads=4))
@@ -30,15 +30,15 @@ def parameter_count(config: NetworkConfig) -> int:
 def match_parameters(name: str, process: str, target: int, **sizes: Any) -> NetworkConfig:
     """The size at which a network has nearly ``target`` parameters, for comparisons at equal parameters.
 
-    The width ``hidden`` is chosen first. As it goes in multiples of ``heads``, the width inside the blocks (the MLPs of
-    the transformers, the residual blocks of ``diffuscene``) then makes up for the rest: the least change, of at most
-    3/8, that comes within 1 %, or else what comes nearest.
+    The width ``hidden`` is chosen first, as a multiple of ``heads``. Then the width inside the blocks (the MLPs of the
+    transformers, the residual blocks of ``diffuscene``) is changed by at most 3/8. The least change that brings the
+    count within 1 % of ``target`` is taken, or else the change that brings it nearest.
 
     Args:
         name: of a network.
         process: ``"continuous"`` or ``"mixed"``.
         target: parameters, as :func:`parameter_count` counts them.
-        sizes: the keys of :func:`network_config` but for ``hidden``.
+        sizes: the keys of :func:`network_config` except ``hidden``.
 
     Raises:
         InvalidInputError: the narrowest such network has more parameters than ``target``.
@@ -80,7 +80,7 @@ def match_parameters(name: str, process: str, target: int, **sizes: Any) -> Netw
         candidates += [(at_ratio(at_width(units), near), abs(near)) for near in (step, step + 1, 0)]
 
     def distance(candidate: tuple[NetworkConfig, int]) -> tuple[float, int]:
-        """How far the count is off, of which less than a hundredth counts less than how far the ratio is."""
+        """Sort key: relative error of the count, where errors below 1 % count as 1 %, then change of the ratio."""
         config, departure = candidate
         return max(abs(parameter_count(config) / target - 1.0), 0.01), departure
 
@@ -88,9 +88,9 @@ def match_parameters(name: str, process: str, target: int, **sizes: Any) -> Netw
 
 
 def _last(low: int, high: int, holds: Callable[[int], bool]) -> int:
-    """The largest number from ``low`` to ``high`` for which ``holds``, which must not hold again once it does not.
+    """The largest number from ``low`` to ``high`` for which ``holds`` is true; ``low`` when it is true for none.
 
-    ``low`` when it holds for none.
+    Once ``holds`` is false for a number, it must be false for all larger ones.
     """
     while low < high:
         middle = (low + high + 1) // 2

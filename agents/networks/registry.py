@@ -22,7 +22,7 @@ from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.plugins import load_plugins
 
 NETWORKS = ("flux", "midiffusion", "diffuscene")
-"""Ours, and the two that it is compared with."""
+"""The Flux-style network, and the two that it is compared with."""
 NETWORK_PROCESSES = ("continuous", "mixed")
 """Processes that a network may denoise: scenes as numbers, or poses with discrete categories."""
 ENTRY_POINT_GROUP = "scene_envs.networks"
@@ -39,9 +39,9 @@ class _Entry:
 
     Attributes:
         config: class of its configuration, a frozen dataclass.
-        network: from a configuration to a network with fresh weights.
-        ratio: the field besides ``hidden`` that equal counts of parameters adjust; None where there is none.
-        sizes: from the keys of :func:`network_config` to fields of the configuration.
+        network: builds a network with fresh weights from a configuration.
+        ratio: the field besides ``hidden`` that :func:`match_parameters` adjusts; None where there is none.
+        sizes: maps the keys of :func:`network_config` to fields of the configuration.
     """
 
     config: type[Any]
@@ -144,19 +144,19 @@ def network_config(
         process: ``"continuous"`` or ``"mixed"``.
         features: D, numbers per slot; read by continuous networks.
         categories: K = C + 1; read by mixed networks.
-        hidden: width; of ``diffuscene`` its channels, which make about twice as many parameters.
-        depth: blocks. Mixed ``flux`` has a third as many double-stream blocks besides when there is text, and
+        hidden: width. For ``diffuscene`` it is the number of channels, and gives about twice as many parameters.
+        depth: number of blocks. Mixed ``flux`` with text has a third as many double-stream blocks in addition.
             ``diffuscene`` has a third as many residual blocks per level.
         heads: attention heads.
         text_width: width of the text tokens; 0 for none. The continuous ``flux`` reads none.
-        frequencies: octaves of Fourier features, read by ``flux`` alone: the others are as published, unless their
-            configuration is made by hand.
+        frequencies: octaves of Fourier features, read by ``flux`` alone. The other networks have none, as
+            published, unless their configuration is made by hand.
         double_blocks: read by the mixed ``flux`` alone; None for a third of ``depth``.
         embedding: read by the mixed ``flux`` alone; None for ``hidden``.
         pose_head, time_scale, text_reach, unit, rotations: read by the mixed ``flux`` alone, see
             :class:`~agents.networks.MixedFluxConfig`.
-        modules: of the mixed ``flux``, but for the Fourier features, which stand before those that come later in
-            :data:`~agents.networks.mixed_flux_config.MODULES`; None for the flags of inpainting alone.
+        modules: modules of the mixed ``flux``, without the Fourier features, which ``frequencies`` adds. All are put
+            in the order of :data:`~agents.networks.mixed_flux_config.MODULES`. None for the flags of inpainting alone.
 
     Raises:
         UnknownNameError: no network or no process has that name.
@@ -187,7 +187,7 @@ def config_from_state(state: Mapping[str, Any], process: str) -> NetworkConfig:
 
     Raises:
         UnknownNameError: no network or no process has that name.
-        InvalidInputError: fields are missing or not known; names them.
+        InvalidInputError: fields are missing or not known; the message names them.
     """
     name = state.get("kind", "flux")
     kind = _entry(name, process).config
@@ -219,7 +219,7 @@ def _entry(name: str, process: str) -> _Entry:
 
 
 def ratio_name(name: str, process: str) -> str | None:
-    """The field besides ``hidden`` that equal counts of parameters adjust; None where there is none."""
+    """The field besides ``hidden`` that :func:`match_parameters` adjusts; None where there is none."""
     return _entry(name, process).ratio
 
 

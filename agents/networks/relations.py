@@ -1,9 +1,9 @@
-"""Relations of pairs: biases of attention by where other slots stand, and features that attention gathers.
+"""Relations between slots: features of pairs from relative positions, and attention biases from these features.
 
-A transformer that sees positions slot by slot has to find distances by itself. Here they are features of pairs. They
-bias the attention logits, and the attention weights that gather values gather them as well, so that a head learns at
-what offset its neighbours stand (as with the edges of graph transformers, Dwivedi and Bresson 2021, and in the
-structure module of AlphaFold, Jumper et al. 2021).
+A transformer that reads positions slot by slot has to learn distances by itself. Here distances are features of pairs
+of slots. They bias the attention logits. Attention also sums them with the weights with which it sums the values, so
+that a head learns the offsets of its neighbours (as with the edges of graph transformers, Dwivedi and Bresson 2021, and
+in the structure module of AlphaFold, Jumper et al. 2021).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _SCALES = 8
 FEATURES = 5 * _SCALES
 """Numbers per pair of slots."""
 BLURS = ("axis", "largest")
-"""Whose noise blurs the features of an axis."""
+"""The noise that blurs the features of an axis: that of the axis itself, or the largest of all axes."""
 
 
 @dataclass(frozen=True)
@@ -51,15 +51,15 @@ class RelationsConfig(ModuleConfig):
 
 
 def pair_features(metres: Tensor, noise: Tensor, scales: Tensor) -> Tensor:
-    """Features of every pair of slots, (B, N, N, :data:`FEATURES`), from slot i to j.
+    """Features of every pair of slots, (B, N, N, :data:`FEATURES`); entry (i, j) is of the offset from slot j to i.
 
-    Horizontal distance and difference in height as Gaussians at every scale, then the offset along z, x and y, which
-    saturates beyond each scale. All are blurred by the noise that is on the two positions: E exp(-d^2 / 2 l^2) under
-    Gaussian noise is a wider Gaussian.
+    They are Gaussians of the horizontal distance and of the difference in height at every scale, then the offsets along
+    z, x and y, which saturate beyond each scale. All are blurred by the noise on the two positions: E exp(-d^2 / 2 l^2)
+    under Gaussian noise is a wider Gaussian.
 
     Args:
         metres: (B, N, 3) positions.
-        noise: (B, N, 3) standard deviation of the noise on them along x, y, z, metres; (B, N, 1) along every axis.
+        noise: (B, N, 3) standard deviation of the noise on them along x, y, z, metres; (B, N, 1) if equal for all axes.
         scales: (8,) lengths, metres.
     """
     variance, wide = noise.square(), scales.square()
@@ -76,15 +76,15 @@ def pair_features(metres: Tensor, noise: Tensor, scales: Tensor) -> Tensor:
 class Relations(FluxModule):
     """Features of pairs of slots, and the biases that every attention block makes of them.
 
-    Permutation-equivariant. Positions come in normalised units; features are of metres.
+    Permutation-equivariant. Positions are read in normalised units; features are computed in metres.
 
     Args:
         blocks: attention blocks.
         heads: heads per block.
         unit: metres per normalised unit along x, y, z; 0 along an axis that never varies.
         width: hidden width.
-        blur: the noise that blurs features of an axis: of the ``"axis"`` itself, or of the one where it is
-            ``"largest"`` for all, which is too much for heights in rooms.
+        blur: the noise that blurs features of an axis: ``"axis"`` for the noise of the axis itself, ``"largest"`` for
+            the largest noise of all axes, which is too large for heights in rooms.
 
     >>> relations = Relations(blocks=2, heads=4, unit=(0.5, 0.5, 0.5))
     >>> bias, features = relations(torch.zeros(3, 5, 3), torch.ones(3, 5))
@@ -120,7 +120,7 @@ class Relations(FluxModule):
 
         Args:
             position: (B, N, 3), normalised.
-            noise_level: (B, N) noise on them, in the same units.
+            noise_level: (B, N) noise on the positions, in the same units.
         """
         unit = self.unit.to(position)
         blurred = unit if self.blur == "axis" else unit.max().reshape(1)
@@ -137,13 +137,13 @@ def joint_attention(
     relations: Tensor | None = None,
     gathered: nn.Linear | None = None,
 ) -> Tensor:
-    """Attention over T tokens, (B, T, H), to which what slots gather of their relations is added.
+    """Attention over T tokens, (B, T, H), plus a linear map of ``relations``, summed with the attention weights.
 
     Args:
         query, key, value: (B, heads, T, H / heads).
-        mask: as of :func:`torch.nn.functional.scaled_dot_product_attention`; with ``relations`` one that is added.
+        mask: as in :func:`torch.nn.functional.scaled_dot_product_attention`; with ``relations`` a float mask.
         relations: (B, N, N, F) features of pairs of the last N tokens, the slots; None for none.
-        gathered: from heads * F to H.
+        gathered: linear map from heads * F to H.
     """
     if relations is None or gathered is None or mask is None:
         return F.scaled_dot_product_attention(query, key, value, attn_mask=mask).transpose(1, 2).flatten(-2)

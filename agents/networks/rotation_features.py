@@ -1,8 +1,8 @@
-"""Rotation features: how far noisy matrices are off SO(3), and off upright, in units of the noise on them.
+"""Rotation features: differences of noisy matrices from SO(3) and from upright, in units of the noise on them.
 
-A denoiser of nine numbers has to find out that they are those of a rotation, and that most things stand upright. Both
-are differences as small as the noise, which a network that sees the numbers alone learns last: what lies flat in one
-place and leans in another then lies flat to ten degrees only.
+A denoiser of the nine entries of a matrix has to learn that they form a rotation, and that most objects stand upright.
+Both show in differences as small as the noise. A network that reads the entries alone learns such differences last. If
+objects of a category lie flat in one place and lean in another, its samples lie flat only to ten degrees.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class RotationFeatures(FluxModule):
 
 @torch.no_grad()
 def nearest_rotations(rotation: Tensor) -> Tensor:
-    """The rotations that are nearest to noisy matrices (B, N, 3, 3); the identity where there are no numbers."""
+    """The rotations that are nearest to noisy matrices (B, N, 3, 3); the identity where all entries are NaN."""
     with torch.autocast(rotation.device.type, enabled=False):
         wide = rotation if rotation.dtype == torch.float64 else rotation.float()
         return project_to_so3(wide.nan_to_num())
@@ -74,17 +74,17 @@ def nearest_rotations(rotation: Tensor) -> Tensor:
 
 @torch.no_grad()
 def rotation_features(rotation: Tensor, nearest: Tensor, noise: Tensor) -> Tensor:
-    """Differences of matrices to SO(3), and of the nearest rotations to upright, (B, N, :data:`ROTATION_FEATURES`).
+    """Differences of matrices from SO(3), and of the nearest rotations from upright, (B, N, :data:`ROTATION_FEATURES`).
 
     Args:
         rotation: (B, N, 3, 3) noisy rotation matrices.
-        nearest: (B, N, 3, 3) those of :func:`nearest_rotations`.
-        noise: (B, N) standard deviation of the noise on their entries.
+        nearest: (B, N, 3, 3) their nearest rotations, from :func:`nearest_rotations`.
+        noise: (B, N) standard deviation of the noise on the entries of ``rotation``.
 
     Returns:
-        The residual of the projection onto SO(3), row-major, over the noise: three of the nine numbers of the noise
-        are not in it. Then R_20, R_21, R_02 and R_12 of the projection, which are 0 where the z-axes of object and
-        world are parallel, over the noise and saturating. No gradient passes.
+        The residual of the projection onto SO(3), row-major, divided by the noise; three of the nine dimensions of the
+        noise are not in it. Then R_20, R_21, R_02 and R_12 of the projection, divided by the noise and saturating. They
+        are 0 where the z-axes of object and world are parallel. No gradient passes.
 
     >>> upright = torch.eye(3).expand(1, 2, 3, 3)
     >>> rotation_features(upright, nearest_rotations(upright), torch.full((1, 2), 0.1)).abs().max() < 1e-5
@@ -99,8 +99,9 @@ def rotation_features(rotation: Tensor, nearest: Tensor, noise: Tensor) -> Tenso
 def gated_rotation(features: Tensor, gates: Tensor) -> Tensor:
     """Contribution of features (B, N, F) to the nine outputs of a rotation, each with a gate (B, N, F) of its own.
 
-    Carried through the blocks they would be thirteen numbers of noise to keep for every object. So the network only has
-    to say which of them count, which is a matter of the category and of where the object lies.
+    If the features had to pass through the blocks, the blocks would have to carry thirteen noisy numbers for every
+    object. With gates, the network only has to predict which features count. This depends on the category and on where
+    the object lies.
     """
     off, tilt = (features * gates).split([9, 4], dim=-1)
     return off.index_add(-1, torch.tensor(_TILTS, device=off.device), tilt)

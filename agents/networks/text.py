@@ -39,9 +39,9 @@ def split_words(prompt: str) -> list[str]:
 
 
 def number_features(word: str) -> list[float]:
-    """Features of a number word: 1, n/16, log(1 + n), and sines and cosines of n; zeros where it is no number.
+    """Features of a number word: 1, n/16, log(1 + n), and sines and cosines of n; zeros for other words.
 
-    Embeddings alone would have to learn for each number by itself how many it is. Articles stand for 1.
+    Embeddings alone would have to learn the value of each number separately. Articles stand for 1.
 
     >>> number_features("three")[:3] == number_features("3")[:3] == [1.0, 3 / 16, math.log(4)]
     True
@@ -95,15 +95,15 @@ class TextConfig:
 
 
 def vocabulary(prompts: Iterable[str]) -> tuple[str, ...]:
-    """All words of ``prompts``, sorted, and the numbers up to 130 (counts are made of these)."""
+    """All words of ``prompts`` and the numbers 0 to 130, which are for counts, sorted."""
     words = {word for prompt in prompts for word in split_words(prompt)}
     return tuple(sorted(words | {str(number) for number in range(131)}))
 
 
 class TextEncoder(nn.Module):
-    """Prompts to tokens (B, L, W): learned embeddings and positions, a small transformer, and a few learned questions.
+    """Prompts to tokens (B, L, W): learned embeddings and positions, a small transformer, and a few learned queries.
 
-    The questions (``latents``) attend to the words, as in the Perceiver's first layer (Jaegle et al. 2021).
+    The queries (``latents``) attend to the words, as in the Perceiver's first layer (Jaegle et al. 2021).
 
     >>> encoder = TextEncoder(TextConfig(words=("cup", "two", "cups"), width=16, heads=2, latents=0))
     >>> tokens, mask = encoder(["two cups", ""])
@@ -142,7 +142,7 @@ class TextEncoder(nn.Module):
 
     @property
     def token_space(self) -> tuple[int, int]:
-        """How many tokens a prompt has at most, and how many different ones there are."""
+        """Largest number of tokens in a prompt, and number of different tokens."""
         return self.config.max_tokens, len(self.config.words) + _SPECIAL
 
     def tokenize(self, prompts: Sequence[str]) -> tuple[Tensor, list[str]]:
@@ -182,7 +182,7 @@ class TextEncoder(nn.Module):
         return self.encode(indices)
 
     def encode(self, indices: Tensor) -> tuple[Tensor, Tensor]:
-        """The same from token indices (B, L) int64 as :meth:`tokenize` gives them."""
+        """Tokens and mask as of :meth:`forward`, from token indices (B, L) int64 as :meth:`tokenize` gives them."""
         indices = indices.to(self.position.device)
         if self.condense is None or len(indices) < 4 * _CHUNKS or indices.device.type != "cpu":
             return self._encode(indices)

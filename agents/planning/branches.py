@@ -1,4 +1,4 @@
-"""Scenes that are denoised from a stop on the way, and kept at later stops."""
+"""Recorder of half-denoised scenes at chosen steps of the denoising, the stops."""
 
 from __future__ import annotations
 
@@ -11,12 +11,15 @@ from scene_envs.scene import SceneBatch
 
 
 class Branches:
-    """Denoises scenes from a stop on the way, and keeps each at the later stops with the value it promises there.
+    """Records scenes at the stops of their denoising, with the values of their expected final scenes.
+
+    A stop is a share of the denoising steps. The denoising begins at noise, or at a stop with given scenes. Only the
+    later stops are recorded.
 
     Args:
         stops: shares of the denoising steps, increasing, each in (0, 1).
-        begin: the stop that the scenes begin at; -1 for noise.
-        x: (B, N, D) the scenes there; None for noise.
+        begin: index of the stop at which the scenes begin; -1 for noise.
+        x: (B, N, D) the scenes at that stop; None for noise.
         values: Φ (B,) of scenes.
     """
 
@@ -28,7 +31,7 @@ class Branches:
         self.promises: list[Tensor] = []
 
     def first_step(self, steps: int) -> int:
-        """The step that the scenes begin at."""
+        """The step at which the scenes begin."""
         return 0 if self.first < 0 else self.at(steps)[self.first]
 
     def at(self, steps: int) -> list[int]:
@@ -40,17 +43,20 @@ class Branches:
         return None if self.x is None else (self.first_step(steps), self.x)
 
     def see(self, step: int, steps: int, x: Tensor) -> None:
-        """Keep the scenes x_t (B, N, D) at a later stop."""
+        """Record the scenes x_t (B, N, D) if ``step`` is a later stop."""
         if step in self.at(steps)[self.first + 1 :]:
             self.places.append(x.cpu())
 
     def __call__(self, step: int, steps: int, denoised: Callable[[], SceneBatch]) -> None:
-        """Score what the scenes promise at a later stop."""
+        """Record the values Φ of the expected final scenes if ``step`` is a later stop."""
         if step in self.at(steps)[self.first + 1 :]:
             self.promises.append(self.values(denoised()))
 
     def trace(self, row: int) -> Mapping[str, Tensor]:
-        """The stops of one scene: ``x`` (M, N, D), and ``promises`` (M,)."""
+        """The recorded stops of scene ``row``.
+
+        Its states are ``x`` (M, N, D), and the values Φ of its expected final scenes are ``promises`` (M,).
+        """
         if not self.places:
             return {}
         return {

@@ -66,7 +66,7 @@ class SearchConfig(BudgetKeys, SamplingKeys):
     RENAMED: ClassVar[Mapping[str, str]] = {
         key: f"planner.{key}, of planner=uct" for key in ("exploration", "parallel")
     }
-    """Keys of earlier versions, and their names."""
+    """Keys of earlier versions, and their present names."""
 
     branching: int = 4
     max_depth: int = 1000
@@ -90,7 +90,7 @@ class SearchConfig(BudgetKeys, SamplingKeys):
 
     @property
     def parts(self) -> list[range]:
-        """The searches that run at once, by their numbers."""
+        """Groups of searches that run at once, as ranges of their numbers."""
         count = self.count or 1
         starts = range(0, count, self.side_by_side)
         return [range(start, min(start + self.side_by_side, count)) for start in starts]

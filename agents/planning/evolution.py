@@ -1,4 +1,4 @@
-"""Evolution: a population of scenes, two of which are cut, spliced and inpainted together."""
+"""Evolution: a population of scenes, pairs of which are cut, spliced and inpainted."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class EvolutionPlanner(PlannerSettings):
                 if actions:
                     pairs.append((self._mated(ledger, index, members, rng), actions[0]))
                     members[index] = parent, actions[1:]
-            if not pairs:  # in the beginning, and where all actions are spent
+            if not pairs:  # at the beginning, and when no drawn parent has an action left
                 pairs = [(ledger.root, action) for action in fresh[: self.population]]
                 fresh = fresh[self.population :]
             if not pairs:
@@ -95,5 +95,5 @@ class EvolutionPlanner(PlannerSettings):
 
 
 def _better_of_two(members: Sequence[Member], rng: np.random.Generator) -> int:
-    """The better of two members at random, as its index; members stand in the order of their values."""
+    """Index of the better of two random members; ``members`` are sorted by value, the best first."""
     return int(rng.integers(len(members), size=2).min())

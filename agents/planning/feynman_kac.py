@@ -18,10 +18,10 @@ from scene_envs.scene import SceneBatch
 
 
 def systematic(weights: np.ndarray, uniform: float) -> np.ndarray:
-    """(K,) which particle goes on in each place: systematic resampling (Carpenter et al. 1999).
+    """(K,) index of the particle that each place continues with: systematic resampling (Carpenter et al. 1999).
 
-    Particle i with share w_i of the weights (K,) goes on in K w_i places on average over ``uniform`` in [0, 1), and
-    always in a whole number of places next to that. One that goes on keeps its own place.
+    Let w_i be the share of particle i in the sum of the weights (K,). Particle i gets K w_i places on average over
+    ``uniform`` in [0, 1), and always K w_i rounded down or up. A particle that gets any place keeps its own.
 
     >>> systematic(np.array([0.5, 0.0, 0.5, 0.0]), 0.5).tolist()
     [0, 0, 2, 2]
@@ -39,16 +39,17 @@ def systematic(weights: np.ndarray, uniform: float) -> np.ndarray:
 class Particles:
     """Groups of particles: the children of one parent that are denoised in one batch.
 
-    At ``resamplings`` steps a group is resampled by exp(strength * (value - value at the last resampling)), so that the
-    weight of a whole path is exp(strength * value) of its last one (Singhal et al. 2025, difference potential).
+    At ``resamplings`` steps, each group is resampled with the weights exp(strength * (value - value at the last
+    resampling)). The product of the weights of a path is then exp(strength * last value) (Singhal et al. 2025,
+    difference potential).
 
     Args:
         parents: (B,) parent of each particle, any hashable.
         rngs: a generator per parent.
         values: Φ (B,) of denoised scenes.
-        resamplings: how often.
-        begin: share of the steps that come before.
-        strength: of the weights.
+        resamplings: number of resamplings.
+        begin: share of the denoising steps before the first resampling.
+        strength: factor on the values in the weights.
     """
 
     def __init__(
@@ -66,7 +67,7 @@ class Particles:
         self.before = np.zeros(len(parents))
 
     def __call__(self, step: int, steps: int, denoised: Callable[[], SceneBatch]) -> Tensor | None:
-        """(B,) the particles that go on, or None at a step without resampling."""
+        """(B,) index of the particle that each place continues with; None at a step without resampling."""
         if step not in self.at(steps):
             return None
         now = self.values(denoised()).double().numpy()
@@ -126,7 +127,7 @@ class FeynmanKacPlanner(PlannerSettings):
     def _steer(self, pairs: Sequence[tuple[Any, int]], values: Callable[[SceneBatch], Tensor]) -> Particles:
         parents, rngs = [(state.seed, state.path) for state, _ in pairs], {}
         for (seed, path), (_, action) in zip(parents, pairs, strict=True):
-            if (seed, path) not in rngs:  # 0 and 1 are the noise and the mask of the child
+            if (seed, path) not in rngs:  # spawn keys 0 and 1 are for the noise and the mask of the child
                 source = np.random.SeedSequence(entropy=seed, spawn_key=(*path, action, 2))
                 rngs[seed, path] = np.random.default_rng(source)
         return Particles(parents, rngs, values, self.resamplings, self.begin, self.strength)

@@ -32,9 +32,9 @@ WEIGHTS = ("overlap",)
 class GradientPlanner(PlannerSettings):
     """Gradient guidance of every inpainting that another planner makes.
 
-    Scenes follow the prior times exp(strength * weight), to first order around the scene that the network expects. The
-    objective scores the finished scenes, and the other planner chooses the scene that is inpainted next. Guidance adds
-    one gradient of the weight to a step, and no evaluation of the denoiser.
+    Scenes are distributed as the prior times exp(strength * weight), to first order around the scene that the network
+    expects. The objective scores the finished scenes, and the other planner chooses the scene that is inpainted next.
+    Guidance adds one gradient of the weight to a step, and no evaluation of the denoiser.
 
     Attributes:
         planner: the other planner: its name, or a mapping of its ``name`` and keys. It must accept any number of

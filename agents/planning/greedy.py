@@ -32,7 +32,7 @@ class GreedyPlanner(PlannerSettings):
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the current state."""
         ledger, count = Ledger(problem, budget, progress), self.children or 1
-        # The states on the way, the latest last, each with the actions that it has left.
+        # The states that were current, the latest last, each with its remaining actions.
         trail: list[tuple[Candidate, Sequence[int]]] = [(ledger.root, ledger.actions(ledger.root))]
         while ledger.left and trail:
             state, actions = trail.pop()

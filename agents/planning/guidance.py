@@ -38,7 +38,7 @@ def overlap(batch: SceneBatch, translations: Tensor) -> Tensor:
 
 
 def _contained(across: Tensor, radius: Tensor) -> Tensor:
-    """(B, N, N) bool: pairs of which one circle holds the middle of the other: things on tables, food in bowls."""
+    """(B, N, N) bool: pairs in which one circle contains the centre of the other: objects on tables, food in bowls."""
     return across.detach() > torch.minimum(radius[:, :, None], radius[:, None])
 
 
@@ -57,8 +57,8 @@ class Guidance:
 
     Args:
         weight: the log-weight.
-        strength: factor of it.
-        begin: share of the denoising steps that stay as they are.
+        strength: factor on the log-weight.
+        begin: share of the denoising steps that come before guidance.
     """
 
     role = "guide"

@@ -1,4 +1,4 @@
-"""Journal of a search: every state that was made, on the disk, for a run that goes on after it was killed."""
+"""Journal of a search: a file of all states that were made, from which a killed run continues."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class Journal:
     A record that was being written when the process was killed is dropped.
 
     Args:
-        path: the file; made when it is not there.
-        settings: what the states depend on; plain values.
+        path: the file; made if it does not exist.
+        settings: the settings that the states depend on, by name.
 
     Raises:
         InvalidInputError: the file was made with other settings.
@@ -50,14 +50,14 @@ class Journal:
             self._begin(settings)
 
     def __len__(self) -> int:
-        """States that an earlier run left."""
+        """Number of states that an earlier run wrote."""
         return len(self._states)
 
     def take(self, pairs: Sequence[tuple[SearchState, int]]) -> list[SearchState]:
-        """The states of the first of ``pairs`` that an earlier run made.
+        """The states that an earlier run made for the first of ``pairs``, as many as the file still has.
 
         Raises:
-            InvalidInputError: it made others.
+            InvalidInputError: the earlier run made states of other pairs.
         """
         known = self._states[self._taken : self._taken + len(pairs)]
         for (parent, action), state in zip(pairs, known, strict=False):
@@ -102,7 +102,7 @@ class Journal:
                 records.append(record)
                 whole = file.tell()
             file.truncate(whole)  # a process was killed while writing the rest
-        if not records:  # at its very beginning
+        if not records:  # killed before the first record was complete
             self._begin(settings)
             return
         for name in sorted({*settings, *records[0]}):
@@ -114,7 +114,7 @@ class Journal:
         self._states = [_state(values) for states in records[1:] for values in states]
 
     def _records(self, file: BinaryIO) -> Iterator[Any]:
-        """The records that were written whole; the file is positioned behind the record that is yielded."""
+        """The complete records; the file is positioned behind the record that is yielded."""
         file.seek(len(_MAGIC))
         while len(head := file.read(_HEAD.size)) == _HEAD.size:
             length, checksum = _HEAD.unpack(head)
@@ -132,7 +132,7 @@ def _state(values: Mapping[str, Any]) -> SearchState:
 
 
 def _described(value: Any) -> str:
-    """A setting as text that the next process gives too; a prior by its weights, other objects by their class alone."""
+    """A setting as text, the same in every process: a prior by its weights, other objects by their class alone."""
     if isinstance(value, str | int | float | bool | None):
         return repr(value)
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""Ledger of a plan: what was expanded, what is left to spend, and the best state so far."""
+"""Ledger of a plan: its expansions, its remaining budget and its best state so far."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class SearchStoppedError(SceneEnvsError):
 class Searchable(Protocol):
     """Protocol of the trees that a planner searches, such as ``scene_envs.envs.SearchEnv``.
 
-    States are immutable. A state with an attribute ``valid`` that is False could not be scored: it is counted and
-    left out of the plan. Two states with equal attributes ``fingerprint`` hold the same scene. Where an attribute
-    ``root_counts`` of the tree is True, its root is a scene that may be the best.
+    States are immutable. A state whose attribute ``valid`` is False could not be scored: its expansion is counted, and
+    the state is left out of the plan. Two states with equal attributes ``fingerprint`` hold the same scene. If the
+    attribute ``root_counts`` of the tree is True, the root is a scene that may itself be the best.
     """
 
     def clone_state(self) -> Any:
@@ -70,9 +70,9 @@ class PlanResult:
 
     @property
     def curve(self) -> list[float]:
-        """Best objective after each expansion; failed ones leave it as it was.
+        """Best objective after each expansion; failed expansions do not change it.
 
-        A better state that cost no expansion counts with the last one.
+        A better state that cost no expansion is counted at the last expansion.
         """
         best, curve = self.start if math.isfinite(self.start) else -math.inf, []
         for value in self.values:
@@ -104,7 +104,7 @@ class Candidate:
 
     @property
     def fingerprint(self) -> Any:
-        """Equal for equal scenes; the path where the problem does not say."""
+        """A key that is equal for equal scenes; the path if the state has no fingerprint."""
         return getattr(self.state, "fingerprint", self.path)
 
 
@@ -124,15 +124,15 @@ def best_different(pool: Sequence[Member], count: int) -> list[Member]:
 
 
 class Ledger:
-    """Spends a budget of expansions on a problem and keeps account: the planners' common part.
+    """Common part of the planners: spends a budget of expansions on a problem and records the results.
 
-    Nothing is left when the budget is spent, when a state of value 1 (the largest value) was found, or when the problem
-    stops the search.
+    :attr:`left` is 0 when the budget is spent, when a state of value 1 (the largest value) was found, or when the
+    problem stops the search.
 
     Args:
-        problem: what is searched.
-        budget: expansions.
-        progress: told after every round.
+        problem: the problem that is searched.
+        budget: number of expansions.
+        progress: called after every round.
 
     Raises:
         InvalidInputError: the budget is below 1.
@@ -155,7 +155,7 @@ class Ledger:
         return 0 if self._stopped or self.best.value >= 1.0 else self.budget - len(self.values)
 
     def generator(self, seed: int) -> np.random.Generator:
-        """Random numbers of a planner's own choices, which depend on its seed and on that of the root."""
+        """Random generator for a planner's own choices, seeded by ``seed`` and by the seed of the root."""
         return np.random.default_rng([seed, getattr(self.root.state, "seed", 0)])
 
     def actions(self, candidate: Candidate) -> Sequence[int]:
@@ -163,7 +163,7 @@ class Ledger:
         return self.problem.legal_actions(candidate.state)
 
     def expand(self, pairs: Sequence[tuple[Candidate, int]]) -> list[Candidate]:
-        """The children of (candidate, action) pairs in one batch: of as many as are left, of none when stopped."""
+        """The children of the first :attr:`left` (candidate, action) pairs, made in one batch; empty if stopped."""
         pairs = pairs[: self.left]
         if not pairs:
             return []
@@ -184,12 +184,12 @@ class Ledger:
         return children
 
     def keep(self, candidate: Candidate) -> None:
-        """Make ``candidate`` the best so far where it is; for a state that cost no expansion."""
+        """Make ``candidate`` the best so far if it ranks higher; planners call it for states that cost no expansion."""
         if candidate.valid and (not self.best.valid or _rank(candidate) < _rank(self.best)):
             self.best = candidate
 
     def result(self, tree: Tree | None = None) -> PlanResult:
-        """The plan: the best state, the shallowest and then the first path among equals."""
+        """The plan: the best state; among equals, the one with the shortest path, then with the first path."""
         return PlanResult(self.best.state, self.best.value, self.best.path, self.values, tree, self.root.value)
 
 
@@ -197,7 +197,7 @@ class Steered:
     """A problem whose expansions are steered.
 
     Args:
-        problem: what is searched.
+        problem: the problem that is searched.
         planner: name of the planner that steers.
         steering: as ``expand_batch`` takes it; may change between expansions.
 

@@ -1,4 +1,4 @@
-"""MCTS as published: UCT with all children of a leaf at once, one or all of which are the rollout."""
+"""MCTS as published: UCT that makes all children of a leaf at once, and backs up the value of one or of all."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def _back_up(node: _Node | None, value: float) -> None:
 
 
 def _close(node: _Node) -> None:
-    """Leave out a leaf without children, and every node above it whose children are all closed."""
+    """Exclude a leaf without children from the search, and every node above it whose children are all closed."""
     current: _Node | None = node
     while current is not None and all(child.closed for child in current.children):
         current.closed = True
@@ -105,7 +105,7 @@ def _is_done(state: object) -> bool:
 
 
 def _cleaned(problem: Searchable, result: PlanResult) -> PlanResult:
-    """``result`` with the masked objects removed from its best state, unless that scores less."""
+    """``result`` with the masked objects removed from its best state, unless the state then scores less."""
     remove = getattr(problem, "without_masked", None)
     if remove is None or not result.best_path:
         return result

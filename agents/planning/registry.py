@@ -14,7 +14,7 @@ ENTRY_POINT_GROUP = "scene_envs.planners"
 
 
 PER_STATE = ("children", "parallel")
-"""Keys of planners that are null for as many as the environment has actions per state."""
+"""Keys of planners in which null means ``branching``, the children of a state that the user asks for."""
 
 
 @dataclass(frozen=True)
@@ -27,15 +27,15 @@ class PlannerSettings:
 
     name: str = ""
     widens: ClassVar[bool] = False
-    """Whether it chooses itself how many children a state gets. The environment of a search run then has as many
-    actions as the budget instead of ``branching``."""
+    """Whether the planner itself chooses the number of children of a state. In a search run, a state then has as many
+    actions as the budget, instead of ``branching``."""
     steers: ClassVar[bool] = False
-    """Whether it steers the denoising itself."""
+    """Whether the planner itself steers the denoising."""
 
     def make(self, branching: int) -> Any:
         """The planner: an object with ``plan(problem, budget, progress)``, as :class:`agents.planning.UCTPlanner`.
 
-        Settings that plan by themselves are their own planner, with ``branching`` in place of null for
+        Settings with a method ``plan`` are the planner themselves, with ``branching`` in place of null in the keys of
         :data:`PER_STATE`.
 
         Args:
@@ -55,7 +55,9 @@ Settings = TypeVar("Settings", bound=type[PlannerSettings])
 
 
 def register_planner(name: str) -> Callable[[Settings], Settings]:
-    """Make a planner available as ``planner=name``; decorates the dataclass of its keys, which makes it.
+    """Make a planner available as ``planner=name``; decorates the dataclass of the planner's keys.
+
+    The method ``make`` of the dataclass makes the planner.
 
     Raises:
         InvalidInputError: the name is not one word.

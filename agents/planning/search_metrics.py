@@ -1,4 +1,4 @@
-"""Figures of a search run: what ``metrics.json`` holds."""
+"""Figures of a search run, the content of ``metrics.json``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scene_envs.files import finite
 
 
 def loss_of(plan: PlanResult) -> float:
-    """Less for a better plan; the most where nothing could be scored."""
+    """Minus the best value of a plan; infinity if no scene could be scored."""
     return -plan.best_value if math.isfinite(plan.best_value) else math.inf
 
 
@@ -32,14 +32,14 @@ def search_metrics(
     """The figures of a run.
 
     Args:
-        objective: what was searched for.
+        objective: the objective of the search.
         scale: objective at Φ = 1.
         config: the settings.
         searches: all plans.
         best_of: the baseline; None without one.
-        firsts: by the seed of a search, the best of its first samples, or the scene it started from.
+        firsts: the best of the first samples of each search, or the scene it started from; by the seed of the search.
         seconds: of the search and of the baseline.
-        stopped: why it ended early; empty where it did not.
+        stopped: why the run ended early; empty if it did not.
         spent: scenes generated.
         from_scenes: whether the searches started from given scenes.
     """

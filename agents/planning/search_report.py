@@ -26,7 +26,7 @@ def draw_curve(
         curves: best Φ after each generated scene, by planner; values that are not finite are left out.
         path: where the picture goes.
         num_steps: denoiser evaluations per generated scene.
-        first: scenes that were fresh samples in the tree search; the end of them is marked. 0 marks nothing.
+        first: number of scenes that were fresh samples in the tree search; a line marks their end. 0 draws no line.
         scale: raw objective at Φ = 1.
         label: name of the objective.
     """
@@ -54,7 +54,7 @@ def draw_curve(
 
 
 def draw_scene(scene: SceneBatch, state: Any, path: Path, *, width: int = 640, height: int = 480) -> Path:
-    """One scene, with the objects that its state would regenerate next in red.
+    """Draw one scene; the objects that its state would regenerate next are red.
 
     Args:
         scene: a batch of one.

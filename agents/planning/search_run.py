@@ -33,7 +33,7 @@ _PLAIN = (bool, int, float, str, list, dict, type(None))
 """Types of values that YAML holds."""
 
 _LIMITS = ("budget", "max_nfe", "max_seconds", "baseline", "workers")
-"""Keys of which the states of a search do not depend: they may change when a run goes on."""
+"""Keys that do not affect the states of a search: they may change when a run is resumed."""
 
 Progress = Callable[[str, int, int, float], None]
 """Called after every round with the planner's name, the expansions so far, the budget and the best Φ so far."""
@@ -45,8 +45,9 @@ class SearchOutcome:
 
     Attributes:
         search: the plan of the best search.
-        searches: the plans of all ``count`` searches that found a scene, the best first, or in the order of the scenes
-            that they started from; without their trees where there were more than ``side_by_side``.
+        searches: the plans of all ``count`` searches that found a scene. The best is first; if the searches started
+            from scenes, the plans are in the order of these scenes. With more than ``side_by_side`` searches, the plans
+            have no trees.
         best_of: best of as many independent samples, the baseline at equal NFE; None without one.
         first: the best of the first ``branching`` samples of the best search, or the scene it started from; a batch of
             one.
@@ -156,7 +157,7 @@ def _search(
             break
     searched, best_of = time.perf_counter(), None
     if config.baseline and spent and stopped in ("", "time"):
-        # The same seeds by path: the first scenes are those of the first search, unless it steers the denoising.
+        # Children are seeded by their path: the first scenes are those of the first search, unless that is steered.
         wide = spent if config.masks is None else max(actions, -(-spent // len(config.masks)))
         _, _, (best_of,) = run.plan(BestOfPlanner(), wide, spent, range(1), "best of N", progress)
     seconds = {"search": searched - started, "best_of": time.perf_counter() - searched}
@@ -196,7 +197,7 @@ def _search(
 
 @dataclass(frozen=True)
 class _Run:
-    """Common part of the searches of one run."""
+    """Settings that all searches of one run share."""
 
     prior: Any
     objective: Any
@@ -215,7 +216,10 @@ class _Run:
         progress: Progress | None,
         max_seconds: float = math.inf,
     ) -> tuple[SearchEnv, Session, list[PlanResult]]:
-        """Plans of ``budget`` scenes each, one per search of ``part``, in an environment of ``actions`` per state."""
+        """The environment with ``actions`` actions per state, the session, and a plan per search of ``part``.
+
+        Each plan has a budget of ``budget`` scenes.
+        """
         config = self.config
         if config.masks is None:
             kind, masks = SearchEnv, {"mask": config.mask}
@@ -293,7 +297,7 @@ def _write(outcome: SearchOutcome, config: SearchConfig, best: SceneBatch, first
 
 
 def _write_tree(outcome: SearchOutcome, env: SearchEnv, session: Session, output: Path) -> None:
-    """``tree.json`` and ``tree.html``, from the journal: it has the states of every planner."""
+    """Write ``tree.json`` and ``tree.html`` from the journal, which has the states of any planner."""
     assert session.journal is not None
     roots = [lane.root for lane in session.lanes]
     made = sum(len(lane.values) for lane in session.lanes)

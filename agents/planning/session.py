@@ -17,12 +17,12 @@ from scene_envs.errors import InvalidInputError
 
 Pairs = Sequence[tuple[Any, int]]
 Asked = tuple[Pairs, Any]
-"""Pairs, and how they are steered; None for not at all."""
+"""Pairs, and their steering; None for no steering."""
 Ask = Callable[[Asked], Sequence[Any]]
 
 
 class Lane:
-    """One plan's view of a session: the environment with a root of its own, whose expansions are recorded.
+    """One plan's view of a session: the environment with the plan's own root, and a record of the plan's expansions.
 
     Args:
         problem: the environment.
@@ -74,7 +74,7 @@ class Lane:
         return getattr(self.problem, name)
 
     def result(self) -> PlanResult:
-        """The plan of a planner that did not return: the best state seen."""
+        """The result for a planner that did not return one: the best state seen."""
         value, state = self.best
         path = getattr(state, "path", ()) if self.values else ()
         return PlanResult(state, value if value > -math.inf else math.nan, path, self.values, start=self.start)
@@ -89,12 +89,12 @@ class Session:
 
     Args:
         problem: the environment.
-        max_seconds: time after which nothing more is expanded, but for the first round; None for no limit.
+        max_seconds: time after which nothing more is expanded, except the first round; None for no limit.
         journal: of the rounds; None keeps none.
 
     Attributes:
         stopped: ``"time"``, ``"interrupt"`` or ``"terminated"`` (SIGTERM); empty when the plans came to their end.
-        lanes: what was seen of every plan.
+        lanes: one :class:`Lane` per plan, which records its expansions.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class Session:
             planner: has ``plan(problem, budget, progress)``.
             roots: states that the plans start from.
             budget: expansions of each plan.
-            progress: told of the expansions of all plans together, and of the best value of the worst of them.
+            progress: called with the expansions of all plans together, and with the lowest of the plans' best values.
             root_counts: whether a root may be the best state of its plan.
         """
         lanes = self.lanes = [Lane(self.problem, root, budget, self._expand, root_counts) for root in roots]
@@ -138,7 +138,7 @@ class Session:
                 return [lanes[0].result()]
 
     def _run_together(self, planner: Any, lanes: list[Lane], told: Progress | None) -> list[PlanResult]:
-        """Plans in threads that wait for each other: one asks or ends before any other goes on, in their order."""
+        """Run the plans in threads, one at a time and in order: each runs until it asks for expansions or ends."""
         heard: queue.Queue[Asked | PlanResult | BaseException] = queue.Queue()
         answers: list[queue.Queue[Sequence[Any] | None]] = [queue.Queue() for _ in lanes]
 
@@ -163,7 +163,7 @@ class Session:
         waiting: dict[int, Asked] = {}
 
         def hear(index: int) -> None:
-            """Wait until the plan that goes on asks or ends."""
+            """Wait until the running plan asks for expansions or ends."""
             nonlocal failure
             what: Any = None
             while what is None:
@@ -236,7 +236,7 @@ def _reason(interrupt: KeyboardInterrupt) -> str:
 def _plan(planner: Any, lane: Lane, told: Progress | None) -> PlanResult:
     try:
         return planner.plan(lane, lane.budget, told)
-    except SearchStoppedError:  # a planner that leaves it to us to keep the best
+    except SearchStoppedError:  # the planner did not catch it
         return lane.result()
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from scene_envs.scene import SceneBatch
 
 _SMALLEST_SHARE = 0.25
-"""A cut leaves at least this share of the objects of both scenes on either side."""
+"""A cut leaves about this share, or more, of the objects of both scenes together on either side."""
 
 
 def spliced(
@@ -17,8 +17,9 @@ def spliced(
 ) -> Tensor:
     """One scene with the objects of ``first`` on one side of a vertical plane, and those of ``second`` on the other.
 
-    The plane has a random direction, and the place at which most objects are kept, a quarter of the objects of both at
-    least on either side. Where slots are missing, the objects nearest to the plane are left out.
+    The plane has a random direction. Its place is the one at which most objects are kept. About a quarter of the
+    objects of both scenes together, or more, are on either side. If there are too few slots, the objects nearest to the
+    plane are left out.
 
     Args:
         first: a batch of one; the scene has its fixed objects.

@@ -27,7 +27,7 @@ def ucb1(mean: float, visits: int, parent_visits: int, exploration: float) -> fl
 
 @dataclass(eq=False, slots=True)
 class Node:
-    """One state of the search and what was learnt below it.
+    """One state of the search, with the statistics of the search below it.
 
     Attributes:
         state: the problem's own immutable state.
@@ -78,19 +78,19 @@ class Node:
 
 
 _OWN = tuple(entry.name for entry in fields(Node) if entry.name not in ("parent", "children"))
-"""Fields of a node that name no other node."""
+"""Fields of a node that refer to no other node."""
 
 
 class Tree:
-    """A UCT tree over opaque states. The work of an expansion is that of comparing the children on its way.
+    """A UCT tree over opaque states. An expansion costs the comparison of the children of each node on its path.
 
     Args:
         root: state the search starts from.
         actions: legal actions of the root.
         exploration: weight of the UCB1 bound.
-        children: children that a node gets before its children are searched; None for all its actions.
+        children: number of children that a node gets before the search goes below them; None for all its actions.
         widening: progressive widening (Coulom 2007; Chaslot et al. 2008): a node of n visits may have n^widening
-            children where that is more than ``children``; 0 for never.
+            children where that is more than ``children``; 0 for no widening.
 
     >>> tree = Tree("root", [0, 1])
     >>> node, action = tree.select()
@@ -179,7 +179,7 @@ class Tree:
         return list(self.root.walk())
 
     def best(self) -> Node:
-        """The evaluated node with the highest value; the shallowest, then the first path, among equals."""
+        """The evaluated node with the highest value; among equals, the shallowest, then the one with the first path."""
         return self._best
 
     def _takes_another_child(self, node: Node) -> bool:
@@ -197,7 +197,7 @@ class Tree:
         weight = self.exploration * math.sqrt(math.log(tries))
         best, highest = None, -math.inf
         for child in node.children.values():
-            if child.tried >= len(child.actions) and not child.open_children:  # closed; the loop that costs most
+            if child.tried >= len(child.actions) and not child.open_children:  # closed; this loop costs most
                 continue
             visits = child.visits + child.pending
             bound = child.total / visits + weight / math.sqrt(visits) if visits else math.inf
@@ -212,7 +212,7 @@ def _rank(node: Node) -> tuple[float, int, tuple[int, ...]]:
 
 
 def _close(node: Node) -> None:
-    """Tell the parents of a node that its last action went and that nothing is open below it."""
+    """Subtract a node that has closed from the open children of its parent, and so on towards the root."""
     current: Node | None = node
     while current is not None and not current.is_open and current.parent is not None:
         current = current.parent
@@ -220,7 +220,7 @@ def _close(node: Node) -> None:
 
 
 def _open(node: Node) -> None:
-    """Count a new open child of ``node``, and ``node`` itself among its parent's where it was closed."""
+    """Add an open child to ``node``; if ``node`` was closed, add it to its parent, and so on towards the root."""
     current: Node | None = node
     while current is not None:
         was_open = current.is_open

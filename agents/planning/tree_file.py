@@ -29,9 +29,9 @@ class TreeNode:
         action: which child of its parent it is; None for a root.
         depth: inpaintings since the root.
         value: Φ in [0, 1]; None where the objective could not score it.
-        objective: the objective's own value; None as well.
+        objective: the objective's own value; None where it could not be scored.
         visits: scored scenes at and below this node.
-        nfe: denoiser evaluations of all searches of the run when it was there.
+        nfe: denoiser evaluations of all searches of the run up to this scene, its own included.
         mask: slots that its children regenerate.
     """
 
@@ -48,7 +48,7 @@ class TreeNode:
 
 @dataclass(frozen=True)
 class SearchRecord:
-    """Trees of a search run, of any planner: what ``tree.json`` holds.
+    """Trees of a search run with any planner, the content of ``tree.json``.
 
     Attributes:
         settings: ``planner``, ``objective``, ``objective_scale`` (objective at Φ = 1) and ``nfe_per_scene``.
@@ -77,7 +77,7 @@ class SearchRecord:
 
         Args:
             roots: a state per search, each with a seed of its own.
-            states: all that were made, in that order.
+            states: all states that were made, in the order they were made.
             best: path of the best state, by seed; the best search first.
             settings: as the attribute; ``nfe_per_scene`` is needed.
         """
@@ -85,7 +85,7 @@ class SearchRecord:
         ids: dict[tuple[int, tuple[int, ...]], int] = {}
         for state in (*roots, *states):
             path = state.path
-            while path and (state.seed, path[:-1]) not in ids:  # a planner that makes states without their parents
+            while path and (state.seed, path[:-1]) not in ids:  # the nearest ancestor in the record
                 path = path[:-1]
             rows.append(
                 {
@@ -126,7 +126,7 @@ class SearchRecord:
         return [self.nodes[node] for node in sorted(inside)]
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the record as JSON with a digest of its content, whole or not at all."""
+        """Write the record atomically, as JSON with a digest of its content."""
         content = finite({**vars(self), "nodes": [asdict(node) for node in self.nodes]})
         write_json(path, {"format": _FORMAT, "sha256": _digest(content), **content}, indent=None)
 
@@ -135,8 +135,8 @@ class SearchRecord:
         """The record that :meth:`save` wrote.
 
         Raises:
-            FileNotFoundError: there is none.
-            CorruptFileError: it is damaged, or no such file.
+            FileNotFoundError: the file does not exist.
+            CorruptFileError: the file is damaged, or is no search tree.
         """
         text = Path(path).read_bytes()
         try:

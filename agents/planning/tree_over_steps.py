@@ -1,4 +1,4 @@
-"""Diffusion tree sampling: a tree over the denoising steps of an inpainting, whose branches begin midway."""
+"""Diffusion tree sampling: a tree over the denoising steps of an inpainting, with branches at a few of the steps."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from scene_envs.scene import SceneBatch
 
 @dataclass(eq=False)
 class _Stop:
-    """A scene on its way; the root is noise."""
+    """A node of the tree: a half-denoised scene at a stop; the root is noise."""
 
     level: int
     x: Tensor | None = None
@@ -29,13 +29,16 @@ class _Stop:
     total: float = 0.0
 
     def back_up(self, value: float) -> None:
-        """Count a value here and at all stops before."""
+        """Add a value to this node and to all its ancestors."""
         node: _Stop | None = self
         while node is not None:
             node.visits, node.total, node = node.visits + 1, node.total + value, node.parent
 
     def select(self, last: int, exploration: float, widening: float) -> _Stop:
-        """The node from which the next scenes branch: found by UCB, with fewer branches than its visits allow."""
+        """The node from which the next scenes branch.
+
+        UCB descends to the first node that has fewer branches than its visits allow, or that is at the last stop.
+        """
         node = self
         while node.level < last and len(node.children) >= max(1.0, node.visits**widening):
             weight = exploration * math.sqrt(math.log(max(1, node.visits)))
@@ -79,7 +82,7 @@ class TreeOverStepsPlanner(PlannerSettings):
             raise InvalidInputError(f"planner {self.name}: stops={list(self.stops)} are no increasing shares, in 0..1")
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
-        """Spend up to ``budget`` expansions below the current state; one that begins midway counts as a whole one.
+        """Spend up to ``budget`` expansions below the current state; one that begins at a stop counts as a whole one.
 
         Raises:
             InvalidInputError: the expansions of ``problem`` cannot be steered.
@@ -107,7 +110,7 @@ class TreeOverStepsPlanner(PlannerSettings):
 
 
 def _grow(node: _Stop, child: Candidate) -> None:
-    """Add the stops of a finished scene below ``node``, and its value to all of them."""
+    """Add the stops of a finished scene below ``node``, and its value to these stops and all their ancestors."""
     trace = getattr(child.state, "trace", None) or {}
     for x, promise in zip(trace.get("x", ()), trace.get("promises", ()), strict=True):
         node.children.append(_Stop(node.level + 1, x, node))

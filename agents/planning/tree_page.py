@@ -17,9 +17,9 @@ from scene_envs.pages import page_part, page_template
 from scene_envs.scene import SceneBatch
 
 LONGEST_PATH = 60
-"""Scenes of the best path that are shown; a longer path has some of its steps left out."""
+"""Most scenes of the best path that are shown; some steps of a longer path are left out."""
 BEST_NODES = 24
-"""Other scenes that are shown, the best ones."""
+"""Most other scenes that are shown, the best ones."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def best_path(record: SearchRecord) -> list[int]:
 
 
 def _first(record: SearchRecord) -> int:
-    """1 where the root is an empty scene, which is not shown; 0 where the search started from it."""
+    """Index of the first shown scene of a path: 1 if the root is an empty scene, 0 if the search started from it."""
     return 0 if record.settings.get("from_scene") else 1
 
 
@@ -79,9 +79,9 @@ def write_tree_page(
     Args:
         path: the HTML file.
         record: all scenes.
-        scenes: batches of one, of the ids of :func:`shown_nodes`.
+        scenes: a batch of one for each id of :func:`shown_nodes`.
         metrics: what ``metrics.json`` holds.
-        returned: the scene that the search gave, where it is no node: a planner may mend the best one in the end.
+        returned: the scene that the search returned, if it is no node: a planner may change the best scene at the end.
     """
     from jinja2.utils import htmlsafe_json_dumps
     from markupsafe import Markup
@@ -138,7 +138,7 @@ def write_tree_page(
 
 
 def _cards(record: SearchRecord, shown: Sequence[int], way: Sequence[int]) -> list[Card]:
-    """The scenes that are shown and all their ancestors but an empty root, parents first.
+    """The cards of the shown scenes and of all their ancestors except an empty root, parents first.
 
     The best path is in the first row.
 

@@ -24,7 +24,7 @@ def compute_advantages(
 
     The std is the population's (divided by n) over the valid rows. The leave-one-out baseline of a row is
     the mean of the *other* valid rows (Kool et al. 2019), which keeps the gradient unbiased; ``"mean"`` is the
-    mean of all. With ``torch.distributed`` running, all workers' rows count.
+    mean of all. If ``torch.distributed`` runs, the rows of all workers count.
 
     Args:
         reward: (B,) or (B, K) floats; K columns (slots) share one baseline and one std.

@@ -37,7 +37,7 @@ class AlgorithmSettings:
     regularisation_weight: ClassVar[float] = 0.5
     """Coefficient of the pretraining loss unless ``regularisation.weight`` names another."""
     sample_limits: ClassVar[Mapping[str, float]] = {}
-    """Limits of the guard's figures of samples, unless ``guard`` names others; a reward may ask for other counts."""
+    """Limits of the guard's sample figures unless ``guard`` names others; a reward may ask for other object counts."""
 
     name: str = ""
     scenes_per_prompt: int = 8
@@ -247,7 +247,7 @@ class NeonSettings(AlgorithmSettings):
 class _Entry:
     settings: type[AlgorithmSettings]
     code: Any
-    """The class, or ``module:class`` until it is needed."""
+    """The class, or its ``module:class``, which is imported when it is needed."""
 
 
 _FORWARD = "agents.post_training.forward_process:ForwardProcess"
@@ -270,7 +270,7 @@ def register_algorithm(
 ) -> Callable[[Algorithm], Algorithm]:
     """Make an algorithm available as ``algorithm=name``; the same name again replaces it.
 
-    The decorated class is made as ``(settings, policy, stds)`` and extends :class:`agents.post_training.base.Algorithm`
+    The decorated class takes ``(settings, policy, stds)`` and extends :class:`agents.post_training.base.Algorithm`
     or one of its subclasses, such as :class:`agents.post_training.DDPO`.
 
     Args:

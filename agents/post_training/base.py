@@ -43,7 +43,7 @@ class Algorithm(ABC, Generic[Credit]):
 
     @property
     def average(self) -> WeightAverage | None:
-        """The weights that are evaluated and saved in place of those in training; None for the latter."""
+        """Averaged weights that are evaluated and saved; None evaluates and saves the weights in training."""
         return None
 
     @abstractmethod
@@ -54,15 +54,16 @@ class Algorithm(ABC, Generic[Credit]):
     def accumulate(self, rollout: Rollout, advantage: Credit, generator: Generator) -> BatchGradient:
         """Add the gradient of a batch to ``.grad``; everything random is drawn from ``generator`` (CPU).
 
-        On several processes each adds the part of its own scenes in the mean over all, and the loop sums the parts.
+        With several processes, each process adds the gradient of its own scenes, as a part of the mean over all scenes.
+        The training loop sums these parts.
         """
 
     def real_generator(self, own: Generator, real: Generator) -> Generator:
         """Source of the timesteps and noise of real scenes in an update (CPU).
 
         Args:
-            own: in the state of the generator that :meth:`accumulate` was given in this update.
-            real: independent of it; drew the real scenes.
+            own: generator in the same state as the one that :meth:`accumulate` got in this update.
+            real: generator that is independent of ``own``, and that drew the real scenes.
         """
         return real
 
@@ -76,7 +77,7 @@ class Algorithm(ABC, Generic[Credit]):
 
         Args:
             rate: ``optimizer.lr``, after its warm-up.
-            update: its number in the run.
+            update: number of the update in the run.
         """
         return rate
 
@@ -89,7 +90,7 @@ class Algorithm(ABC, Generic[Credit]):
         return
 
     def state(self) -> dict[str, Any]:
-        """State that a resumed run needs beside the weights in training."""
+        """State that a resumed run needs in addition to the weights in training."""
         return {}
 
     def restore(self, state: dict[str, Any]) -> None:

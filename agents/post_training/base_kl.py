@@ -29,15 +29,15 @@ def chain_kl(
     than scenes do.
 
     Args:
-        policy: in training.
-        base: what it is compared with.
+        policy: policy in training.
+        base: base prior, with which the policy is compared.
         rollout: B episodes of the policy.
         count: passes over the batch that the estimate may cost, at most one per step.
         generator: draws the scenes of each step.
     """
     first = DenoisingPolicy(base, len(policy), guidance=policy.guidance)
     batch = rollout.scenes.shape[1]
-    steps = torch.nonzero(policy.table.previous > 0).flatten().tolist()  # the last step is certain
+    steps = torch.nonzero(policy.table.previous > 0).flatten().tolist()  # the last step is deterministic
     drawn = max(1, min(batch, round(batch * count / len(steps))))
     for step in steps:
         for rows in torch.randperm(batch, generator=generator)[:drawn].split(policy.chunk or drawn):
@@ -47,7 +47,7 @@ def chain_kl(
                 then = first.distribution(x_t, step, text, observed)
             now = policy.distribution(x_t, step, text, observed)
             entries = now.entries
-            if isinstance(entries, Tensor):  # of each scene
+            if isinstance(entries, Tensor):  # one number per scene
                 yield (step_kl(now, then).sum(dim=1) / entries.clamp(min=1)).sum() / drawn
             else:
                 yield step_kl(now, then).sum() / (drawn * entries)
@@ -58,12 +58,12 @@ def forward_kl(
 ) -> Iterator[Tensor]:
     """Terms () whose sum estimates the same divergence from finished scenes, noised again, without their chains.
 
-    The scenes of a batch take timesteps that are spread evenly over the chain of all timesteps. Several processes
-    draw timesteps and noise for the scenes of all of them, and each takes its own.
+    The scenes of a batch take timesteps that are spread evenly over the chain of all timesteps. With several processes,
+    each process draws timesteps and noise for the scenes of all processes, and takes those of its own scenes.
 
     Args:
-        prior: in training.
-        base: what it is compared with.
+        prior: prior in training.
+        base: base prior, with which the prior is compared.
         rollout: B finished scenes of this process.
         generator: source of timesteps and noise (CPU).
         chunk: scenes per pass.
@@ -72,7 +72,7 @@ def forward_kl(
     count, everything, total = len(x0), gather_rows(x0), prior.config.num_timesteps
     order = torch.randperm(len(everything), generator=generator)
     even = (order + torch.rand((), generator=generator)) / len(everything)
-    timesteps = (2 + even * (total - 1)).long().clamp(max=total).to(x0.device)  # the last step, t = 1, is certain
+    timesteps = (2 + even * (total - 1)).long().clamp(max=total).to(x0.device)  # the last step, t = 1, is deterministic
     mask = None if rollout.observed is None else gather_rows(rollout.observed)
     observed = prior.observed_entries(everything, prior.observed_by_mask(everything, mask))
     noised = prior.noised(everything, generator, timesteps, observed)
@@ -86,9 +86,9 @@ def forward_kl(
 def noised_kl(prior: ScenePrior, base: ScenePrior, noised: NoisedScenes, text: Text | None = None) -> Tensor:
     """(B,) KL divergences of the reverse steps t -> t - 1 from noised scenes, nats per random variable.
 
-    For normals it is half the difference of the signal-to-noise ratios at t - 1 and t times the squared difference of
-    the denoised scenes: the weight that the pretraining loss has in the evidence lower bound (Kingma et al. 2021,
-    Eq. 13). Known and observed entries have no part in it.
+    For normal distributions, it is half the difference of the signal-to-noise ratios at t - 1 and t, times the squared
+    difference of the denoised scenes. The pretraining loss has this weight in the evidence lower bound (Kingma et al.
+    2021, Eq. 13). Known and observed entries do not contribute.
     """
     now = prior.output(noised, text)
     with torch.no_grad():

@@ -27,14 +27,14 @@ def kept_base_samples(
 ) -> PromptedScenes:
     """The base prior's samples of a run, kept in its folder; the first process draws them.
 
-    They have the prompts of real scenes, so that prompts do not tell the two apart.
+    The samples have the prompts of real scenes, so that prompts do not distinguish samples from real scenes.
 
     Args:
         directory: of the run.
         base: the base prior.
         bank: real scenes, which give the prompts and the number of slots.
         config: of the run.
-        reuse: take those that are there, as a resumed run does.
+        reuse: load the samples that are already in the folder, as a resumed run does.
         progress: how the sampling is shown, a style of :class:`~scene_envs.progress.Progress`.
     """
     path, processes, count = directory / BASE_SAMPLES_NAME, ProcessGroup.current(), config.regularisation.base_samples

@@ -28,7 +28,7 @@ _GALLERY, _COLUMNS, _TILE = 12, 3, (400, 300)
 
 @dataclass(frozen=True)
 class Measured:
-    """A prior's fresh samples and what physics says of them.
+    """Fresh samples of a prior and their measured figures.
 
     Attributes:
         figures: ``objects`` (mean count, welded included), ``objects_sem`` (its standard error), ``feasible_objects``
@@ -37,7 +37,7 @@ class Measured:
             ``reward`` (mean of the trained reward), ``reward_sem``, ``reward_invalid`` (scenes it could not score),
             ``prompt_match`` (with prompts: the reward of that name), ``prompt_match_sem``,
             ``invalid_scenes`` (physics failed: left out of feasible and ready figures), and the cheap realism figures.
-        raw: the samples as they came.
+        raw: the samples, unchanged.
         ready: the same, projected and settled.
         is_ready: (B, N) bool, simulation-ready objects of ``ready``.
     """
@@ -71,7 +71,7 @@ def measure_prior(
         prompts: one per scene, which the samples are then compared with; None for none.
         guidance: weight of classifier-free guidance.
         slots: per sample; None means as trained.
-        reward: that the run trains, as :func:`rewards.isolation.run_reward` gives it; None measures none.
+        reward: reward that the run trains with, as :func:`rewards.isolation.run_reward` gives it; None measures none.
     """
     from agents.post_training.guard import realism
     from scene_envs.physics import feasibility, make_ready
@@ -98,8 +98,7 @@ def measure_prior(
 def write_comparison(
     result: PostTrainResult, before: Measured, after: Measured, *, title: str, extra: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Write ``before.png``, ``after.png``, ``report.html`` and ``metrics.json`` beside the run's
-    ``curve.png``.
+    """Write ``before.png``, ``after.png``, ``report.html`` and ``metrics.json`` beside the run's ``curve.png``.
 
     Args:
         result: the run.
@@ -109,7 +108,7 @@ def write_comparison(
         extra: more entries for ``metrics.json``.
 
     Returns:
-        What ``metrics.json`` holds: the run's metrics, ``before``, ``after`` and ``change`` (relative).
+        Content of ``metrics.json``: the run's metrics, ``before``, ``after`` and ``change`` (relative).
     """
     directory, settings = result.directory, result.config.plain()
     names = [name for name in ("reward", "objects", "feasible_objects", "ready_objects") if name in before.figures]
@@ -131,19 +130,19 @@ def write_comparison(
 
 
 def draw_gallery(batch: SceneBatch, path: Path, is_ready: Tensor | None = None) -> Path:
-    """The first scenes of ``batch`` with their counts as a PNG; nothing is selected.
+    """Draw the first scenes of ``batch`` with their counts as a PNG; nothing is selected.
 
     Args:
         batch: the scenes.
         path: where the picture goes.
-        is_ready: (B, N) bool; given, captions count these objects and the free ones that are not are red.
+        is_ready: (B, N) bool; if given, captions count these objects, and the other free objects are red.
     """
     images, captions = _drawn(batch, is_ready, _GALLERY)
     return _save_gallery(images, captions, path)
 
 
 def draw_side_by_side(measured: Mapping[str, Measured], path: Path, *, ready: bool = False) -> Path:
-    """The first scenes of several priors as a PNG: a row per scene, a column per prior.
+    """Draw the first scenes of several priors as a PNG: a row per scene, a column per prior.
 
     Args:
         measured: samples of each prior from the same noise, by the name in the captions; three fit the page.

@@ -25,7 +25,7 @@ SAMPLE_SEED = 100_000
 """Added to the run's seed for the samples that are measured, so that training never saw their noise."""
 
 PHYSICS_TIMEOUT = 300.0
-"""Seconds for a chunk of scenes: on a busy machine a slow scene must not become an invalid one."""
+"""Seconds for a chunk of scenes; long, so that a slow scene on a busy machine does not become an invalid one."""
 
 
 def post_train_and_compare(
@@ -33,19 +33,20 @@ def post_train_and_compare(
 ) -> dict[str, Any]:
     """Post-train, measure the base and the post-trained prior on fresh samples, and write the report.
 
-    Both priors start from the same noise, every sample is measured, and physics says what is simulation-ready.
+    Both priors start from the same noise, and every sample is measured. Physics decides which objects are
+    simulation-ready.
 
     Args:
         config: the run; ``config.output`` gets ``report.html``, ``curve.png``, ``before.png``, ``after.png``,
-            ``metrics.json`` and the prior. An interrupted run found there goes on.
+            ``metrics.json`` and the prior. An interrupted run found there is resumed.
         scenes: fresh samples measured of each prior.
         num_steps: denoiser evaluations per measured sample.
-        prior: in place of the one that ``config.prior`` names.
+        prior: prior to start from, in place of the one that ``config.prior`` names.
 
     Returns:
         The numbers of ``metrics.json``: ``before`` and ``after`` (``reward``, ``objects``, ``feasible_objects`` raw,
-        ``ready_objects``, and ``prompt_match`` with prompts), ``change``, ``guard``, ``seconds`` of each part, and the
-        run's own; of several processes the first alone measures, the others return the run's own.
+        ``ready_objects``, and ``prompt_match`` with prompts), ``change``, ``guard``, ``stage_seconds``, and the run's
+        own metrics. With several processes, only the first one measures; the others return the run's own metrics.
     """
     from scene_envs.physics import make_pool
 
@@ -82,7 +83,7 @@ def post_train_and_compare(
 
 
 def _measured_prompts(config: PostTrainConfig, prior: ScenePrior, count: int) -> list[str] | None:
-    """A prompt for each measured sample, from where the run has its own; None for a run without prompts."""
+    """One prompt per measured sample, from the source of the run's prompts; None for a run without prompts."""
     if config.prompt is None:
         return None
     directory = config.directory

@@ -23,7 +23,7 @@ from scene_envs.errors import InvalidInputError
 RESUMABLE = ("recipe", "iterations", "output", "workers", "logger", "reward_timeout", "reward_memory")
 """Fields that may change between a run and its continuation."""
 _ADAPTER_RATE = 10.0
-"""Learning rate of low-rank updates over that of all weights."""
+"""Learning rate of low-rank updates, divided by that of all weights."""
 
 
 @dataclass
@@ -87,7 +87,7 @@ class GuardSettings:
 
     @property
     def sampled(self) -> int:
-        """Scenes that a check samples: no more than there are held-out real ones to compare with, and 0 for too few."""
+        """Number of scenes that a check samples, at most that of the held-out scenes; 0 below ``FEWEST_SAMPLES``."""
         count = min(self.samples, self.scenes)
         return count if count >= FEWEST_SAMPLES else 0
 
@@ -138,16 +138,16 @@ class BatchKeys:
 class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
     """One post-training run.
 
-    The gradient that AdamW sees is that of
+    With DDPO-SF, the gradient that AdamW sees is that of
 
         - step_scale * sum over gradient steps of mean over scenes of  A * log p(x_{t-1} | x_t)
         + regularisation.weight * pretraining loss on real scenes
         + regularisation.kl * KL divergence from the base prior
 
-    with ``step_scale = steps with weight > 0 / gradient_steps``, log p reduced over a scene's entries as
-    ``algorithm.log_prob_reduction`` says, and the pretraining loss a mean over scenes and entries. The weight is
-    meaningful only together with these reductions: with ``"sum"`` the same balance needs a weight larger by the number
-    of random entries of a scene.
+    where ``step_scale = steps with weight > 0 / gradient_steps``. ``algorithm.log_prob_reduction`` says how log p is
+    reduced over a scene's entries. The pretraining loss is a mean over scenes and entries. The weight is meaningful
+    only together with these reductions: with ``"sum"`` the same balance needs a weight larger by the number of random
+    entries of a scene.
 
     Keys that are not listed are those of :class:`~agents.configuration.SamplingKeys`,
     :class:`~agents.configuration.TrainingKeys` and :class:`~agents.configuration.RewardLimits`.
@@ -254,7 +254,7 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
 
 
 def check_prompt(prompt: Any, guidance: float) -> None:
-    """Refuse what is neither a prompt, a list of them, a source of prompts nor None, and guidance without one."""
+    """Refuse a prompt that is no text, list of texts, source of prompts or None; refuse guidance without a prompt."""
     texts = [prompt] if isinstance(prompt, str) else prompt
     good = prompt is None or (
         isinstance(texts, list | tuple) and texts and all(isinstance(t, str) and t for t in texts)

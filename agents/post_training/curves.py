@@ -19,7 +19,7 @@ def draw_curve(
     beyond: int | None = None,
     highest: float | None = None,
 ) -> Path:
-    """Reward and guard over iterations, as a PNG; the reward of the guard's samples is dots.
+    """Draw reward and guard over iterations as a PNG; diamonds are the rewards of the guard's samples.
 
     Args:
         history: rows with ``iteration``, ``reward``, ``reward_std`` and, at checks, ``guard_ratio``.
@@ -27,7 +27,7 @@ def draw_curve(
         reward_name: label of the upper axis.
         limit: of the guard's loss, drawn as a line.
         beyond: iteration from which the run is over-optimised; shaded from there.
-        highest: largest reward there is, which the band of the standard deviation does not exceed; None for no bound.
+        highest: largest possible reward, which bounds the band of the standard deviation; None for no bound.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -70,7 +70,7 @@ def draw_curve(
 
 
 def band(reward: np.ndarray, spread: np.ndarray, highest: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Reward minus and plus its standard deviation, the latter at most the largest reward there is.
+    """Reward minus and plus its standard deviation; the sum is at most ``highest``, the largest possible reward.
 
     >>> low, high = band(np.array([0.9, 0.5]), np.array([0.2, 0.3]), highest=1.0)
     >>> low.round(2).tolist(), high.round(2).tolist()

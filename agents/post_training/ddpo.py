@@ -21,12 +21,12 @@ class DDPO(Algorithm[Tensor]):
     """DDPO-SF, or DDPO-IS if given the settings of DDPO-IS (Black et al. 2024).
 
     Args:
-        settings: its keys.
-        policy: what is optimised.
+        settings: settings of the algorithm.
+        policy: policy that is optimised.
         stds: (S,) smallest sigma of every step, normalised units.
 
     Attributes:
-        loss: of a batch of transitions; its ``step_weights`` (S,) say which steps enter the gradient.
+        loss: loss of a batch of transitions; its ``step_weights`` (S,) say which steps enter the gradient.
     """
 
     loss: DDPOSFLoss
@@ -42,7 +42,7 @@ class DDPO(Algorithm[Tensor]):
         ).to(next(policy.parameters()).device)
 
     def advantage(self, rollout: Rollout) -> Tensor:
-        """(B,) or (B, N), as ``credit`` says; among the scenes of the same prompt, or of the same observed part."""
+        """Advantages (B,) or (B, N), as ``credit`` says, within the scenes of one prompt or of one observed part."""
         settings = self.settings
         reward, valid = credited_reward(rollout, settings.credit)
         groups = rollout_groups(rollout)

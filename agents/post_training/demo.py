@@ -33,17 +33,18 @@ def run_demo(
 ) -> dict[str, Any]:
     """Post-train a prior in two ways, measure all three priors on fresh samples, and write the report.
 
-    All priors start from the same noise, every sample is measured, and physics says what is simulation-ready.
+    All priors start from the same noise, and every sample is measured. Physics decides which objects are
+    simulation-ready.
 
     Args:
-        output: folder for ``report.html``, ``metrics.json``, the pictures and a run folder each, ``clutter`` and
-            ``feasible``, which ``prior=`` loads. An interrupted demonstration goes on there.
-        seed: of training; the measured samples have a seed of their own that follows from it.
+        output: folder for ``report.html``, ``metrics.json``, the pictures, and one folder per run, ``clutter`` and
+            ``feasible``, which ``prior=`` loads. An interrupted demonstration is resumed.
+        seed: seed of training, from which the seed of the measured samples is derived.
         workers: physics worker processes.
         scenes: fresh samples measured of each prior.
         num_steps: denoiser evaluations per measured sample.
         recipes: the runs by name, in place of ``configs/recipe/demo_clutter.yaml`` and ``demo_feasible.yaml``.
-        prior: in place of the recipes'.
+        prior: prior to start from, in place of the one that the recipes name.
 
     Returns:
         The numbers of ``metrics.json``: those of ``measure_prior`` for ``base`` and each run, ``runs`` (the metrics of
@@ -94,7 +95,7 @@ def _measure(
 def _page(
     directory: Path, base: ScenePrior, results: Mapping[str, PostTrainResult], measured: Mapping[str, Measured]
 ) -> Page:
-    """The report; writes its pictures beside it."""
+    """Content of the report; also writes its pictures to ``directory``."""
     runs = " and ".join(
         f"{_goal(result.config)} ({_algorithm(result.config)}, {len(result.history)} iterations)"
         for result in results.values()

@@ -17,19 +17,20 @@ from agents.priors.forward import NoisedScenes
 class DiscriminativeLoss:
     """Direct discriminative optimisation (Zheng et al. 2025, arXiv 2503.01103) of a diffusion prior.
 
-    The log-likelihood ratio of the prior and its base is the logit of a discriminator of real scenes and samples of the
-    base prior, which is trained with the logistic loss. The best discriminator has the ratio of the densities of real
-    scenes and base samples as its odds, so the best prior has the density of real scenes. The pretraining losses l of
-    one noised scene stand for -log p. With the gap d = l(base) - l(prior), the losses are
+    The log-likelihood ratio of the prior and its base is the logit of a discriminator, which tells real scenes from
+    samples of the base prior. It is trained with the logistic loss. The odds of the best discriminator are the density
+    of real scenes divided by that of base samples, so the best prior has the density of real scenes. The pretraining
+    loss l of a noised scene takes the place of -log p. With the gap d = l(base) - l(prior), the losses are
 
         (2 / s) softplus(-s d) of real scenes,    (2 / s) softplus(s d) of base samples
 
-    At the base prior their gradients are those of l and of -l. They vanish where s d is large, so that no sample repels
-    without bound. Where base samples are like real scenes, the two gradients cancel in the mean.
+    At the base prior, their gradients are those of l and of -l. The gradient of a real scene vanishes where s d is
+    large, and that of a base sample where -s d is large. So no sample repels without bound. Where base samples are like
+    real scenes, the two gradients cancel in the mean.
 
     Attributes:
-        prior: in training.
-        base: what it is compared with; its weights get no gradient.
+        prior: prior in training.
+        base: base prior, with which the prior is compared; its weights get no gradient.
         sharpness: s, per unit of the pretraining loss; near 0 nothing bounds the loss of base samples.
 
     >>> from agents.priors.testing import tiny_prior

@@ -141,10 +141,10 @@ class _Model:
 
     @torch.no_grad()
     def probabilities(self, batch: SceneBatch) -> Tensor:
-        """(B, N) probability that the object of each slot is of a real scene."""
+        """(B, N) probability that the object of each slot is one of a real scene."""
         tokens = scene_tokens(batch)
         found = self.network(*self.typical.inputs(tokens)).sigmoid()
-        order = batch.is_empty.to(torch.uint8).argsort(dim=1, stable=True)[:, : found.shape[1]]  # that of the tokens
+        order = batch.is_empty.to(torch.uint8).argsort(dim=1, stable=True)[:, : found.shape[1]]  # as in the tokens
         return torch.zeros(batch.tensor.shape[:2]).scatter(1, order, found)
 
     def step(self, count: int) -> None:
@@ -161,7 +161,7 @@ class _Model:
             self.optimizer.step()
 
     def _logits(self, scenes: Tensor, count: int, generator: Generator) -> Tensor:
-        """Of all but the fixed objects of ``count`` scenes, drawn with replacement and blurred as for classifiers."""
+        """Logits of non-fixed objects of ``count`` scenes, drawn with replacement and blurred as for classifiers."""
         rows = torch.randint(len(scenes), (count,), generator=generator)
         tokens: SceneTokens = scene_tokens(
             blurred(SceneBatch(scenes[rows], self.real.scene_type), *RESOLUTION, generator)

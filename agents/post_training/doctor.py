@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from agents.post_training.rollouts import Rollout
 
 LOUD, QUIET = 30.0, 1 / 30.0
-"""Ratios of the two gradient norms beyond which the louder one drowns the other."""
+"""Ratios of policy to regularisation gradient norm beyond which one of the two gradients dominates."""
 DOMINANT = 0.7
-"""Share of the squared policy gradient beyond which one step drowns the others."""
+"""Share of the squared policy gradient beyond which one step dominates the others."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,10 @@ class StepRow:
 
     Attributes:
         step: index in the step table.
-        timestep: where it starts.
+        timestep: timestep at which the step starts.
         std: its smallest sigma over random entries, normalised units.
-        weight: in the policy gradient; 0 leaves it out.
-        gradient_norm: of this step's policy gradient alone; 0 when left out.
+        weight: weight in the policy gradient; 0 leaves the step out.
+        gradient_norm: norm of this step's policy gradient alone; 0 when the step is left out.
     """
 
     step: int
@@ -62,7 +62,7 @@ class DoctorReport:
         pretraining_gradient_norm: of the regularisation, its coefficient included.
         sampling_seconds: one batch of scenes with its rewards.
         update_seconds: one update.
-        iterations: of the run, for the estimate of its length.
+        iterations: iterations of the run, for the estimate of its duration.
         advice: what to change, in words; empty when all is well.
     """
 
@@ -93,7 +93,7 @@ class DoctorReport:
         return self.policy_gradient_norm / self.pretraining_gradient_norm
 
     def metrics(self) -> dict[str, Any]:
-        """JSON-able."""
+        """All findings as JSON-able values."""
         return {**vars(self), "steps": [vars(row) for row in self.steps], "gradient_ratio": self.gradient_ratio}
 
     def __rich__(self) -> RenderableType:
@@ -106,7 +106,7 @@ def diagnose(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> Doc
 
     Args:
         config: the run that is planned.
-        prior: in place of the one that ``config.prior`` names.
+        prior: prior to start from, in place of the one that ``config.prior`` names.
     """
     with TemporaryDirectory() as scratch:
         real = config.regularisation

@@ -1,4 +1,4 @@
-"""Refusals of post-training runs that cannot learn, before anything is sampled."""
+"""Checks that refuse a post-training run that cannot learn, before anything is sampled."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ from scene_envs.scene import SceneBatch
 _PROBED = 2
 """Real scenes on which the reward and the mask of a run are tried."""
 _PROBED_WITH_PROMPTS = 8
-"""The same in a run under the prompts of its real scenes."""
+"""The same number in a run that uses the prompts of its real scenes."""
 
 
 def check_it_can_learn(learner: Learner, real: SceneBatch, prompts: PromptSets | None) -> None:
     """Score real scenes as the scenes of the run will be scored, and try the mask of ``inpaint.mask`` on them.
 
-    Real scenes are scored with their own prompts where the run takes these, and with prompts of the run otherwise. A
-    prompt of the run may be one that no real scene can be scored by; then the reward decides nothing here.
+    Real scenes are scored with their own prompts if the run uses the prompts of real scenes, and with the prompts of
+    the run otherwise. With prompts that are not their own, it may be that no real scene can be scored. A run with such
+    prompts is therefore not refused if no real scene is scored.
 
     Args:
-        learner: of the run, whose prompts and observed parts can be dealt.
+        learner: learner of the run, which can already deal prompts and observed parts.
         real: real scenes.
-        prompts: of each of them; None for a prior that reads none.
+        prompts: prompts of each real scene; None for a prior that reads no prompts.
 
     Raises:
         InvalidInputError: credit per object is asked of a reward that gives none, or the mask cannot be made, or leaves
@@ -62,7 +63,8 @@ def nothing_scored(config: PostTrainConfig, what: str) -> TrainingError:
 def _tried(learner: Learner, real: SceneBatch, prompts: PromptSets | None) -> tuple[SceneBatch, list[str] | None]:
     """The first real scenes and a prompt for each, None in a run without prompts.
 
-    Under their own prompts more scenes are tried, each with all of its prompts: rewards may read one kind alone.
+    If the run uses the prompts of real scenes, more scenes are tried, each with all of its prompts, because a reward
+    may read only one kind of prompt.
     """
     if learner.config.prompt == "data" and prompts is not None:
         pairs = [(row, text) for row in range(min(_PROBED_WITH_PROMPTS, len(real))) for text in prompts(row)]

@@ -1,4 +1,4 @@
-"""Copies of a denoiser that are trained beside it, such as the mean of own samples."""
+"""Copies of a denoiser that are trained beside it, such as one that learns the mean target of own samples."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class TrainedCopy(nn.Module):
     """Copy of a prior with an optimiser of its own, for the parameters that the prior trains.
 
     Args:
-        prior: it is left as it was.
+        prior: prior that is copied; it is not changed.
         learning_rate: of AdamW.
     """
 
@@ -70,7 +70,7 @@ class Expectation(TrainedCopy):
     def __init__(self, prior: ScenePrior, learning_rate: float = 3e-4) -> None:
         copy = deepcopy(prior).requires_grad_(True)
         for update in (module for module in copy.modules() if isinstance(module, LowRank)):
-            update.requires_grad_(False)  # the copy learns with all weights
+            update.requires_grad_(False)  # the copy trains all weights but these
         copy.freeze_text()
         super().__init__(copy, learning_rate)
 

@@ -19,13 +19,13 @@ class NFTLoss(ForwardProcessLoss):
         o_plus = (1 - beta) o_old + beta o,    o_minus = (1 + beta) o_old - beta o
 
     the loss is r |o_plus - target|^2 + (1 - r) |o_minus - target|^2. Its minimum over o at one x_t is
-    o_old + (2 E[r] - 1 + cov) / beta in the direction of the error of o_old: a step that is bounded by beta. The loss
-    of categories has the same form, with cross-entropies of l_plus and l_minus, which combine logits as o_plus and
-    o_minus combine outputs.
+    o_old + E[(2 r - 1) (target - o_old)] / beta. The step is thus at most the mean absolute error of o_old divided by
+    beta. The category loss has the same form, with cross-entropies of the logits l_plus and l_minus. These combine
+    logits in the way that o_plus and o_minus combine outputs.
 
     Args:
         prior, sampler, expectation, generator: as in :class:`ForwardProcessLoss`.
-        beta: strength; smaller ones step further from the sampling policy.
+        beta: strength; smaller values step further from the sampling policy.
         clip: c, the advantage at which a sample is fully good or bad.
 
     >>> from agents.priors.testing import tiny_prior
@@ -66,16 +66,16 @@ class NFTLoss(ForwardProcessLoss):
         return good * _cross_entropy(old + change, category) + (1 - good) * _cross_entropy(old - change, category)
 
     def optimality(self, advantage: Tensor) -> Tensor:
-        """r in [0, 1]."""
+        """The optimality r of an advantage, in [0, 1]."""
         return 0.5 + 0.5 * (advantage / self.clip).clamp(-1.0, 1.0)
 
 
 class AWMLoss(ForwardProcessLoss):
     """Advantage weighted matching (Xue et al. 2025, arXiv 2509.25050) with a pull to the sampling policy.
 
-    With a = clip(A / c, -1, 1) the loss of an entry is a |o - target|^2 + beta |o - o_old|^2, and that of a category
-    a times its cross-entropy plus beta KL(p_old || p). It is bounded below for beta > 1. Its gradient at o = o_old is
-    that of :class:`NFTLoss` divided by the latter's beta.
+    With a = clip(A / c, -1, 1), the loss of a continuous entry is a |o - target|^2 + beta |o - o_old|^2. This loss is
+    bounded below for beta > 1. The loss of a category is a times its cross-entropy plus beta KL(p_old || p). At
+    o = o_old the gradient is that of :class:`NFTLoss` divided by the beta of :class:`NFTLoss`.
 
     Args:
         prior, sampler, expectation, generator: as in :class:`ForwardProcessLoss`.
@@ -114,8 +114,8 @@ class AWMLoss(ForwardProcessLoss):
 class RewardWeightedLoss(ForwardProcessLoss):
     """Reward-weighted fine-tuning: the pretraining loss of own samples, weighted by exp(A / temperature).
 
-    The baseline of the other losses (Peters and Schaal 2007; Lee et al. 2023): good samples attract the output, and no
-    sample repels it. Weights are bounded by ``largest``.
+    This is a baseline to compare with the other losses (Peters and Schaal 2007; Lee et al. 2023). Good samples attract
+    the output, and no sample repels it. Weights are bounded by ``largest``.
 
     Args:
         prior, sampler, generator: as in :class:`ForwardProcessLoss`.

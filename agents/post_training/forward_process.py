@@ -31,9 +31,9 @@ class ForwardProcess(OwnSampleAlgorithm):
     and saved.
 
     Args:
-        settings: its keys.
-        policy: what is optimised.
-        stds: of the reverse steps; not used.
+        settings: settings of the algorithm.
+        policy: policy that is optimised.
+        stds: sigmas of the reverse steps; not used.
     """
 
     loss: ForwardProcessLoss
@@ -62,7 +62,7 @@ class ForwardProcess(OwnSampleAlgorithm):
         return Branching(settings.siblings, round(settings.shared_steps * len(self.policy)))
 
     def advantage(self, rollout: Rollout) -> TensorDict:
-        """``advantage`` (B, 1) or (B, N) for poses and ``category_advantage`` (B, 1); both as ``credit`` says."""
+        """``advantage`` (B, 1) or (B, N) for poses and ``category_advantage`` (B, 1), as the credit settings say."""
         settings = self.settings
         reward, valid = credited_reward(rollout, settings.credit)
         per_object = reward.ndim == 2
@@ -77,9 +77,10 @@ class ForwardProcess(OwnSampleAlgorithm):
         return TensorDict({"advantage": poses, "category_advantage": categories}, [len(reward)])
 
     def _object_advantages(self, rollout: Rollout, reward: Tensor, valid: Tensor) -> Tensor:
-        """(B, N); slots that are not judged have no advantage, nor have those whose siblings hold something else.
+        """(B, N) advantages; 0 for slots that are not judged, and for slots whose siblings hold different objects.
 
-        A table that is not judged has credit 0, and would be repelled like an object that is not feasible.
+        A table that is not judged has credit 0. With an advantage, it would be repelled like an object that is not
+        feasible.
         """
         valid = valid & judged_slots(rollout).to(valid.device)
         siblings = self.settings.siblings
@@ -90,7 +91,7 @@ class ForwardProcess(OwnSampleAlgorithm):
         return sibling_advantages(reward, valid & same.repeat_interleave(siblings, dim=0), siblings)
 
     def _scene_advantages(self, rollout: Rollout) -> Tensor:
-        """(B, 1), among siblings where there are any."""
+        """(B, 1) advantages; among siblings if there are any."""
         groups = rollout_groups(rollout)
         if self.settings.siblings > 1:
             first = ProcessGroup.current().rank * len(rollout.reward)
@@ -113,12 +114,12 @@ class ForwardProcess(OwnSampleAlgorithm):
         self._average.copy_to(self.sampler)
 
     def return_to(self, prior: ScenePrior) -> None:
-        """Sample with the same weights, and begin their average anew."""
+        """Sample with the weights of ``prior``, and begin their average anew."""
         self._average = WeightAverage(prior, self.settings.sampler_decay)
         self._average.copy_to(self.sampler)
 
     def state(self) -> dict[str, Any]:
-        """The sampling policy's weights."""
+        """The weights of the sampling policy, and the state of the expectation."""
         expectation = None if self.copy is None else self.copy.state()
         return {"sampler": self._average.tensors, "updates": self._average.updates, "expectation": expectation}
 

@@ -32,10 +32,11 @@ class ForwardProcessLoss(OwnSampleLoss):
     the slots whose category is masked at that timestep, times the prior's ``category_weight``.
 
     The error of a sample is its target minus the mean target of own samples at that noised scene. ``expectation``
-    learns this mean. Without it, o_old replaces the mean, and drifts away where all samples are bad.
+    learns this mean. Without it, o_old replaces the mean. Where all samples are bad, o_old then drifts away.
 
-    Poses take ``advantage``, categories ``category_advantage``; each is one number per scene or one per slot. The
-    network denoises every slot given the others, so an advantage per slot credits an object for its own pose alone.
+    ``advantage`` weights the losses of poses, ``category_advantage`` those of categories. Each is one number per scene
+    or one per slot. The network denoises every slot given the others, so an advantage per slot credits an object only
+    for its own pose.
 
     Accepted keys (``set_keys``), beside those of :class:`~agents.post_training.own_sample_loss.OwnSampleLoss`:
         advantage: (B,), (B, 1) or (B, N) float, for poses. Default ``"advantage"``.
@@ -43,13 +44,13 @@ class ForwardProcessLoss(OwnSampleLoss):
             ``"category_advantage"``.
 
     Args:
-        prior: what is trained.
-        sampler: what made the scenes, such as a slower copy of ``prior``; its weights get no gradient.
-        expectation: of the targets over own samples, trained by ``loss_expectation``; None takes o_old for it.
+        prior: prior that is trained.
+        sampler: prior that sampled the scenes, such as a slower copy of ``prior``; its weights get no gradient.
+        expectation: mean of the targets over own samples, trained by ``loss_expectation``; None takes o_old instead.
         generator: source of timesteps, noise and observed entries (CPU); None for torch's own.
 
-    Returns (``forward``): ``loss_objective`` (); ``loss_expectation`` (), its pretraining loss on the scenes, 0 without
-        one; and detached ``distance`` (), the root mean square of o - o_old.
+    Returns (``forward``): ``loss_objective`` (); ``loss_expectation`` (), the pretraining loss of ``expectation`` on
+        the scenes, or 0 without it; and detached ``distance`` (), the root mean square of o - o_old.
     """
 
     @dataclass
@@ -71,7 +72,7 @@ class ForwardProcessLoss(OwnSampleLoss):
     ) -> None:
         super().__init__(prior, generator=generator)
         self.expectation = expectation
-        self._sampler = (sampler,)  # in a tuple: no module of the loss, whose parameters are the prior's
+        self._sampler = (sampler,)  # in a tuple: its parameters are not parameters of the loss
 
     @property
     def sampler(self) -> ScenePrior:
@@ -90,7 +91,7 @@ class ForwardProcessLoss(OwnSampleLoss):
         Args:
             output: o of the denoiser in training.
             old: o_old of the sampling policy, a constant.
-            target: what a denoiser should have said of this noise.
+            target: training target of the denoiser's output for this noise.
             advantage: of each entry's slot.
         """
 

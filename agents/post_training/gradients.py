@@ -40,10 +40,10 @@ class BatchGradient:
 class GradientSum:
     """Sum of the gradients of parts of a batch, each of which is complete before it is added.
 
-    Two parts have the same sum, bit for bit, in one process as in two that have one each.
+    The sum of two parts is the same, bit for bit, in one process as in two processes with one part each.
 
     Args:
-        parameters: of which ``.grad`` is summed; what it holds already is the first part.
+        parameters: parameters whose ``.grad`` is summed; a gradient that is there already is the first part.
 
     >>> weight = nn.Parameter(torch.ones(1))
     >>> total = GradientSum([weight])
@@ -61,7 +61,7 @@ class GradientSum:
         self.add_part()
 
     def add_part(self) -> None:
-        """Take ``.grad`` away and add it."""
+        """Add ``.grad`` to the sum, and clear it."""
         for index, parameter in enumerate(self._parameters):
             before, gradient = self._total[index], parameter.grad
             self._total[index] = before if gradient is None else gradient if before is None else before.add_(gradient)
@@ -74,7 +74,7 @@ class GradientSum:
 
 
 def draw_steps(weights: Tensor, count: int, generator: Generator) -> tuple[list[int], float]:
-    """``count`` distinct steps of positive weight, and the factor that makes their sum stand for all of them."""
+    """``count`` distinct steps of positive weight, and the factor that scales their sum to all such steps."""
     eligible = torch.nonzero(weights > 0).flatten()
     chosen = eligible[torch.randperm(len(eligible), generator=generator)[:count]]
     return sorted(chosen.tolist()), len(eligible) / len(chosen)
@@ -85,8 +85,8 @@ def accumulate_policy_gradient(
 ) -> BatchGradient:
     """Add the policy gradient of a rollout to ``.grad``, one chunk of scenes and one step at a time.
 
-    No graph outlives its step, so memory does not depend on the number of steps. On several processes ``.grad`` holds
-    the part of this one's scenes in the mean over all.
+    The graph of a step is freed after the step, so memory does not depend on the number of steps. With several
+    processes, ``.grad`` gets the part of this process's scenes in the mean over all scenes.
 
     Args:
         loss: the objective; its policy's ``chunk`` bounds the scenes per pass.
@@ -103,7 +103,7 @@ def accumulate_policy_gradient(
     gradient = GradientSum(loss.policy.parameters())
     for start in range(0, batch, size):
         rows = slice(start, min(start + size, batch))
-        share = int(rollout.valid[rows].sum()) / valid_count  # a chunk's mean to the batch's mean
+        share = int(rollout.valid[rows].sum()) / valid_count  # turns a chunk's mean into its part of the batch's mean
         for step in steps if share else ():
             result = loss(rollout.transitions(step, advantage, rows))
             objective = result["loss_objective"] * (scale * share)
@@ -131,7 +131,7 @@ def add_regularisation_gradient(
 
     Args:
         prior: the prior in training.
-        x0: (B, N, D) normalised scenes, of all processes; each takes its share of them.
+        x0: (B, N, D) normalised scenes of all processes; each process takes its share of them.
         coefficient: of the loss, which is a mean over scenes and entries.
         generator: source of timesteps and noise (CPU).
         loss: (B,) losses of noised scenes; None for the pretraining loss.
@@ -139,7 +139,7 @@ def add_regularisation_gradient(
         prompts: of the scenes, ``""`` for none; None for a prior that reads none.
 
     Returns:
-        The mean loss of all, and the norm of ``coefficient`` times its gradient.
+        The mean loss of all scenes, and the norm of ``coefficient`` times its gradient.
     """
     if coefficient == 0:
         return 0.0, 0.0
@@ -172,7 +172,7 @@ def add_gradient(
 ) -> tuple[float, float]:
     """Add ``coefficient`` times the gradient of a sum to ``.grad``, one term () and its graph at a time.
 
-    With several processes the sum is the mean of theirs.
+    With several processes, the mean of their sums takes the place of the sum.
 
     Returns:
         The sum, and the norm of ``coefficient`` times its gradient.
@@ -224,10 +224,10 @@ def no_credit_per_object() -> InvalidInputError:
 
 
 def credited_reward(rollout: Rollout, credit: str) -> tuple[Tensor, Tensor]:
-    """Rewards and their validity, (B,) for credit ``"scene"`` and (B, N) for ``"object"``; ``"auto"`` is one of them.
+    """Rewards and their validity, (B,) for credit ``"scene"`` and (B, N) for ``"object"``; ``"auto"`` takes one.
 
-    Fixed slots have no credit. With a reward that is a mean over the objects, the slots that it judges have credit
-    alone: the free objects, if it names no others.
+    Fixed slots have no credit. If the reward is a mean over the objects, only the slots that it judges have credit. If
+    it does not name these slots, they are the free objects.
 
     Raises:
         InvalidInputError: credit per object is asked of a reward that has no ``per_object``.
@@ -237,9 +237,9 @@ def credited_reward(rollout: Rollout, credit: str) -> tuple[Tensor, Tensor]:
     if rollout.per_object is None:
         raise no_credit_per_object()
     free = torch.ones(rollout.per_object.shape, dtype=torch.bool, device=rollout.per_object.device)
-    free[:, : len(rollout.batch.scene_type.fixed)] = False  # they are not drawn
+    free[:, : len(rollout.batch.scene_type.fixed)] = False  # fixed slots are not drawn
     if rollout.averages:
         free &= judged_slots(rollout).to(free.device)
     if rollout.observed is not None:
-        free &= ~rollout.observed.all(dim=-1)  # nor is what is observed
+        free &= ~rollout.observed.all(dim=-1)  # observed slots are not drawn
     return rollout.per_object.float(), free & rollout.valid.unsqueeze(-1)

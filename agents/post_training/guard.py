@@ -24,10 +24,10 @@ class GuardReading:
     """One check.
 
     Attributes:
-        iteration: when.
+        iteration: iteration of the check.
         loss: pretraining loss on the held-out real scenes, noise and timesteps fixed.
-        ratio: over the base prior's.
-        reward: mean valid reward since the check before.
+        ratio: ``loss`` divided by that of the base prior.
+        reward: mean reward of the samples; without samples, mean valid reward since the check before.
         realism: figures of the last rollout's scenes, such as ``workspace_fraction``.
         kept: whether this became the best checkpoint.
         samples: figures of samples; empty at a check of the loss alone.
@@ -48,10 +48,11 @@ class Guard:
     """Monitors the held-out pretraining loss and samples, and keeps the best checkpoint within all limits.
 
     The best checkpoint has the largest reward among the checks within all limits. If the guard samples, the reward of a
-    check is that of the samples, which start from the same noise at every check; checks of the loss alone then keep
-    nothing. Otherwise the reward of a check is the mean over all batches since the previous check, because single
-    batches are too noisy. A reward that learns gives values of another network at each check; then the best checkpoint
-    is the one whose samples the classifier, trained at each check, tells from real scenes least often.
+    check is that of the samples, which start from the same noise at every check. Checks of the loss alone then keep no
+    checkpoint. Otherwise the reward of a check is the mean over all batches since the previous check, because single
+    batches are too noisy. If the reward learns, its network differs from check to check, so its values cannot be
+    compared. The best checkpoint is then the one at which the classifier, trained anew at each check, is least accurate
+    in telling samples from real scenes.
 
     Args:
         heldout: (K, N, D) normalised real scenes that the regularisation never sees.
@@ -59,9 +60,9 @@ class Guard:
         seed: seed of the fixed timesteps and noise.
         prompts: one prompt of each held-out scene; None measures without prompts.
         samples: how to sample and measure; None measures the loss alone.
-        limits: most by which figures of samples may exceed those of the base prior, by name.
+        limits: by name, the largest excess of a figure of samples over that of the base prior.
         target: largest ratio of a checkpoint that is kept, if the run holds the ratio.
-        learns: the reward learns during the run.
+        learns: whether the reward learns during the run.
 
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior()
@@ -104,11 +105,11 @@ class Guard:
             self.best_score = self._score(self.best_reward, self.base_figures)
 
     def _score(self, reward: float, figures: Mapping[str, float]) -> float:
-        """By which checkpoints are compared; larger is better."""
+        """Score by which checkpoints are compared; larger is better."""
         return -figures["classifier_accuracy"] if self.learns and figures else reward
 
     def _measure(self, prior: ScenePrior, sample: bool) -> tuple[float, dict[str, float]]:
-        """The loss, and figures of samples where the guard samples; all processes get those of the first."""
+        """The loss, and figures of samples if the guard samples; all processes get the values of the first process."""
         check = self.samples if sample else None
         batch = None if check is None else check.sample(prior)
         if batch is not None:
@@ -147,10 +148,10 @@ class Guard:
 
         Args:
             prior: with the weights that are evaluated and saved.
-            iteration: that is finished.
+            iteration: number of the finished iteration.
             reward: mean over the batches since the check before.
             realism: further figures, kept with the reading.
-            sample: whether to sample, where the guard does.
+            sample: whether this check samples; ignored if the guard never samples.
         """
         loss, figures = self._measure(prior, sample)
         ratio = loss / self.base_loss
@@ -179,11 +180,11 @@ class Guard:
 
     @property
     def over_limit_at(self) -> int | None:
-        """First iteration that found something beyond its limit, or None: from there the reward is over-optimised."""
+        """Iteration of the first check beyond a limit, from which the reward counts as over-optimised, or None."""
         return next((r.iteration for r in self.readings if r.beyond), None)
 
     def summary(self) -> dict[str, Any]:
-        """JSON-able: the ratio of what was kept, and where the limit was passed."""
+        """JSON-able summary: ratio of the kept checkpoint, first check beyond a limit, limits, and all checks."""
         return {
             "ratio": self.best_ratio,
             "last_ratio": self.ratio,
@@ -216,7 +217,7 @@ class Guard:
 
 
 def _number(value: float) -> float:
-    """-inf for NaN, than which every reward is larger."""
+    """``value``; NaN becomes -inf, so that every reward is larger."""
     return value if value == value else float("-inf")
 
 

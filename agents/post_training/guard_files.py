@@ -22,7 +22,7 @@ _PICTURED = 6
 
 
 def make_guard(config: PostTrainConfig, learner: Learner, scenes: SceneBank) -> Guard:
-    """The guard of a run, which samples where the configuration says so."""
+    """The guard of a run; it samples if the configuration says so."""
     asked, count, check = scenes.heldout_prompts(), config.guard.sampled, None
     if count:
         check = SampleCheck(
@@ -76,14 +76,14 @@ class GuardFiles:
                 writing("the adapter", lambda: save_adapter(prior, self.directory))
 
     def best(self, beside: ScenePrior | None = None) -> ScenePrior:
-        """The prior that was kept last; with the adapter of its own that ``beside`` has, if any."""
+        """The prior that was kept last; if ``beside`` has an adapter, a copy of ``beside`` with the kept adapter."""
         self._processes.wait()  # until it is written
         if beside is not None and beside.adapter is not None:
             return with_adapter_of(beside, self.directory)
         return ScenePrior.load(self.directory / "prior")
 
     def picture(self, guard: Guard, reading: GuardReading) -> None:
-        """Keep the samples of the best checkpoint, and of the first beyond a limit, for the report."""
+        """Keep the samples of the best checkpoint, and of the first check beyond a limit, for the report."""
         batch = guard.last_samples
         name = "guard_within" if reading.kept else "guard_beyond"
         first = reading.beyond and guard.over_limit_at == reading.iteration

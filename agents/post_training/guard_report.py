@@ -15,7 +15,7 @@ _LABELS = {
     "category_kl": "KL divergence of categories (nats)",
     "classifier_accuracy": "accuracy of a classifier, samples against real scenes",
 }
-"""Figures of a check, as the page calls them."""
+"""Labels of the figures of a check on the page."""
 
 
 def guard_verdict(guard: Mapping[str, Any]) -> str:
@@ -29,7 +29,7 @@ def guard_verdict(guard: Mapping[str, Any]) -> str:
 
 
 def guard_sections(guard: Mapping[str, Any], pictures: Mapping[str, Path]) -> list[Section]:
-    """The guard's samples: a table, and pictures of the best checkpoint and of the first beyond a limit."""
+    """The guard's samples: a table, and pictures for the best checkpoint and for the first check beyond a limit."""
     base = guard["base_samples"]
     if not base:
         return []

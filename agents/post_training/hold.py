@@ -12,16 +12,16 @@ BASE_VALUES = {"guard": 1.0, "kl": 0.0}
 LOWEST, HIGHEST = 0.01, 100.0
 """Bounds of the factor."""
 GAIN = 0.05
-"""Change of the factor's logarithm per iteration, for a figure whose excess is twice that of the target."""
+"""Change of the factor's logarithm per iteration if the figure's excess over its base value is twice the target's."""
 LOOK_AHEAD = 30.0
-"""Iterations ahead for which a measurement is extrapolated: weights act with a delay."""
+"""Iterations by which a measurement is extrapolated, because the weights act with a delay."""
 SMOOTHING = 10.0
 """Iterations over which the figure's change per iteration is averaged."""
 LARGEST_ERROR = 3.0
 FAR = 0.5
-"""Error of the last measurement from which a target counts as not held at the end."""
+"""A target counts as not held at the end if the error of the last measurement is larger than this."""
 PATIENCE = 3
-"""Measurements in a row above the target, with the factor at its bound, after which it counts as not held."""
+"""Measurements in a row above the target, with the factor at its upper bound, after which the target is not held."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Target:
     Attributes:
         figure: ``guard``, the held-out loss as a ratio to the base prior's, or ``kl``, the KL divergence from the base
             prior in nats per random variable.
-        value: above that of the base prior.
+        value: value to hold, above that of the base prior.
     """
 
     figure: str
@@ -39,11 +39,11 @@ class Target:
 
     @classmethod
     def parse(cls, text: str) -> Target:
-        """From ``FIGURE:VALUE``.
+        """The target that a text ``FIGURE:VALUE`` describes.
 
         Raises:
             UnknownNameError: no such figure.
-            InvalidInputError: the value is no number, or not above that of the base prior.
+            InvalidInputError: the value is not a number, or not above that of the base prior.
 
         >>> Target.parse("guard:1.05")
         Target(figure='guard', value=1.05)
@@ -66,7 +66,7 @@ class Target:
         return cls(figure, value)
 
     def error(self, measured: float) -> float:
-        """Distance beyond the target, divided by that of the target from the base value: -1 at the base value."""
+        """Measured value minus target, divided by target minus base value: 0 at the target, -1 at the base value."""
         base = BASE_VALUES[self.figure]
         error = (measured - base) / (self.value - base) - 1.0
         return max(-1.0, min(error, LARGEST_ERROR)) if error == error else LARGEST_ERROR
@@ -82,7 +82,7 @@ class HoldState:
         measured: the last value; None before the first.
         slope: its change per iteration, averaged.
         beyond: measurements in a row that were above the target while the factor was at its upper bound.
-        lost_at: iteration from which the target counts as not held; None where it does not.
+        lost_at: iteration from which the target counts as not held; None while it counts as held.
     """
 
     log_factor: float = 0.0
@@ -94,22 +94,22 @@ class HoldState:
 
     @property
     def factor(self) -> float:
-        """On the weights."""
+        """Factor on the weights."""
         return math.exp(self.log_factor)
 
 
 def adjust(state: HoldState, target: Target, measured: float, iteration: int) -> HoldState:
     """The state after a measurement: integral control of the factor's logarithm, within bounds.
 
-    The KL controller of Ziegler et al. (2019, Eq. 4) with a gain per iteration, so that checks may come at any
-    distance, on the figure as it will be in ``LOOK_AHEAD`` iterations if it changes as before. The error is bounded;
-    one that is not a number counts as the largest.
+    It is the KL controller of Ziegler et al. (2019, Eq. 4) with two changes. The gain is per iteration, so that checks
+    may come at any distance. The figure is extrapolated by ``LOOK_AHEAD`` iterations with its averaged change per
+    iteration. The error is bounded; an error that is not a number counts as the largest.
 
     Args:
-        state: before.
-        target: what is held.
+        state: state before the measurement.
+        target: target that is held.
         measured: the figure now.
-        iteration: that is finished.
+        iteration: number of the finished iteration.
 
     >>> state = adjust(HoldState(), Target("kl", 0.01), measured=0.02, iteration=1)
     >>> round(state.factor, 3)

@@ -14,7 +14,7 @@ _COLUMNS = {"guard": ("guard_ratio", "held-out loss over base"), "kl": ("kl", "K
 
 
 def hold_sections(hold: Mapping[str, Any] | None, history: Sequence[Mapping[str, float]], path: Path) -> list[Section]:
-    """A section on the target, whose picture goes to ``path``; none for a run without."""
+    """A section on the target, with its picture written to ``path``; no section for a run without a target."""
     if hold is None or hold["measured"] is None:
         return []
     caption = "The figure with its target, and the weights of the regularisation as a multiple of their first value."

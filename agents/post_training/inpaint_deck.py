@@ -19,7 +19,7 @@ from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
 _ROUNDS = 4
-"""Times that other scenes are drawn where a mask leaves nothing to regenerate."""
+"""Most draws of scenes for a batch; all but the first replace scenes whose mask leaves nothing to regenerate."""
 
 Source = Callable[[int, Sequence[str] | None, int], tuple[SceneBatch, Sequence[str] | None]]
 """``(count, prompts, seed) -> (scenes, prompts)``: scenes on the CPU, one per prompt if there are any."""
@@ -54,9 +54,9 @@ class InpaintDeck:
     replaced by another one.
 
     Args:
-        settings: which slots are regenerated.
-        source: of the scenes.
-        scorer: of the run's reward, whose verdict on the scenes masks may read.
+        settings: settings that say which slots are regenerated.
+        source: source of the scenes.
+        scorer: scorer of the run's reward; masks may read its scores of the scenes.
         share: episodes of a batch that share a part.
     """
 
@@ -66,7 +66,7 @@ class InpaintDeck:
         self._source, self._scorer = source, scorer
 
     def deal(self, count: int, prompts: Sequence[str] | None, seed: int) -> Parts:
-        """The parts of ``count`` episodes, whose ``prompts`` are equal within each group; all hangs on ``seed``.
+        """The parts of ``count`` episodes, whose ``prompts`` are equal within each group; ``seed`` decides all draws.
 
         Raises:
             InvalidInputError: the mask leaves nothing to regenerate in any scene.
@@ -93,10 +93,10 @@ class InpaintDeck:
         return Parts(scenes, torch.cat([part.mask for part in parts]), torch.arange(groups), texts).take(of_row)
 
     def check(self, scenes: SceneBatch, prompts: Sequence[str] | None) -> None:
-        """Try the mask on ``scenes``, made for ``prompts`` if any.
+        """Try the mask on ``scenes``, each with its prompt if there are ``prompts``.
 
         Raises:
-            InvalidInputError: the mask needs what it does not get, such as credit per object, or a prompt.
+            InvalidInputError: the mask needs something that is missing, such as credit per object, or a prompt.
         """
         score = self._scorer(scenes, prompts)
         for row in range(len(scenes)):
@@ -104,7 +104,7 @@ class InpaintDeck:
             self._mask(scenes[row], score.row(row), text, np.random.default_rng(row))
 
     def _candidates(self, prompts: Sequence[str] | None, groups: int, seed: int) -> list[tuple[int, Parts]]:
-        """Parts in which something is regenerated, with the number of their group."""
+        """Parts in which something is regenerated, each with the number of its group."""
         scenes, texts = self._source(groups, prompts, seed)
         score = self._scorer(scenes, texts)
         result = []
@@ -128,15 +128,15 @@ class InpaintDeck:
 
 
 def real_parts(scenes: SceneBatch, slots: int, prompts: PromptSets | None = None) -> Source:
-    """Real scenes, drawn without repetition while there are enough.
+    """A source of real scenes, drawn without repetition while there are enough.
 
     Args:
         scenes: all of them.
         slots: per scene; scenes with objects in further slots are left out.
-        prompts: of each scene by its index, one of which takes the place of the prompt that was dealt; None keeps that.
+        prompts: prompts of a scene by its index; one of them replaces the dealt prompt. None keeps the dealt prompt.
 
     Raises:
-        InvalidInputError: no scene has so few slots.
+        InvalidInputError: no scene fits into ``slots``.
     """
     fitting = torch.nonzero(scenes.is_empty[:, slots:].all(dim=1))[:, 0]
     if not len(fitting):
@@ -159,7 +159,7 @@ def real_parts(scenes: SceneBatch, slots: int, prompts: PromptSets | None = None
 
 
 def sampled_parts(prior: ScenePrior, num_steps: int, slots: int, guidance: float = 0.0) -> Source:
-    """Fresh samples of ``prior``, as it is when they are drawn."""
+    """A source of fresh samples of ``prior``, with the weights that it has when they are drawn."""
 
     def draw(count: int, episode_prompts: Sequence[str] | None, seed: int) -> tuple[SceneBatch, Sequence[str] | None]:
         weight = 0.0 if episode_prompts is None else guidance

@@ -1,4 +1,4 @@
-"""Rewards that learn during a run: their first lesson, those of every iteration, and their state."""
+"""Rewards that learn during a run: their training before the run and in every iteration, and their state."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from scene_envs.scene import SceneBatch
 FIRST_SAMPLES = 128
 """Samples of the base prior that a reward learns from before the first iteration."""
 FIRST_STEPS = 150
-"""Optimiser steps on these."""
+"""Optimiser steps on these samples."""
 
 
 class LearnedRewards:
-    """The parts of a run's reward that learn; see :class:`rewards.LearnedReward`. All processes have the same.
+    """The parts of a run's reward that learn; see :class:`rewards.LearnedReward`. All processes have the same models.
 
     Args:
-        reward: of the run, resolved.
+        reward: resolved reward of the run.
         config: of the run.
     """
 
@@ -35,12 +35,12 @@ class LearnedRewards:
         return bool(self.parts)
 
     def begin(self, real: SceneBatch) -> None:
-        """Give them the real scenes that training may see."""
+        """Give the parts the real scenes that training may see."""
         for part in self.parts:
             part.begin(real, self._seed)
 
     def learn_from_prior(self, prior: ScenePrior, slots: int, prompts: Sequence[str] | None) -> None:
-        """Let them learn from samples of the base prior, before they score the first batch.
+        """Train the parts on samples of the base prior, before they score the first batch.
 
         Args:
             prior: the base prior.
@@ -62,7 +62,7 @@ class LearnedRewards:
             part.learn(SceneBatch(samples, prior.scene_type), FIRST_STEPS)
 
     def learn(self, rollout: Rollout) -> None:
-        """Let them learn from the scenes of a batch, which were scored before."""
+        """Train the parts on the scenes of a batch, after these were scored."""
         if self.parts:
             scenes = gathered(rollout)[-1]
             for part in self.parts:

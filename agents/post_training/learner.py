@@ -59,7 +59,7 @@ class Learner:
         self.config = config
         self.prior = deepcopy(prior).to(config.device).eval()
         if config.inpaint.mask is not None:
-            resolve_mask(config.inpaint.mask)  # says now, not later, that there is no such mask
+            resolve_mask(config.inpaint.mask)  # raises now, not later, if there is no such mask
         if config.prompt is not None and not self.prior.conditional:
             raise no_text(self.prior.scene_type, str(config.prompt))
         self.prior.freeze_text()
@@ -116,7 +116,7 @@ class Learner:
         close_reward(self.reward)
 
     def deal_prompts(self, scenes: SceneBank) -> None:
-        """Make the deck from which the prompts of batches come; nothing without prompts."""
+        """Make the deck that deals the prompts of batches; does nothing in a run without prompts."""
         config = self.config
         if config.prompt is not None and scenes.prompts is not None:
             together = config.algorithm.scenes_per_prompt
@@ -125,11 +125,11 @@ class Learner:
             )
 
     def deal_parts(self, real: SceneBatch, prompts: PromptSets | None) -> None:
-        """Make the deck from which the observed parts of batches come; nothing where whole scenes are sampled.
+        """Make the deck that deals the observed parts of batches; does nothing in a run that samples whole scenes.
 
         Args:
             real: real scenes that training may see.
-            prompts: of each of them; None for a prior that reads none.
+            prompts: prompts of each real scene; None for a prior that reads no prompts.
         """
         config, settings = self.config, self.config.inpaint
         if settings.mask is None:
@@ -142,7 +142,7 @@ class Learner:
         self.inpaint_deck = InpaintDeck(settings, source, self.scorer, config.algorithm.scenes_per_prompt)
 
     def deal(self, iteration: int) -> tuple[Sequence[str] | None, Parts | None]:
-        """Prompts and observed parts of a batch, one for each of its trunks; None for what the run has none of.
+        """Prompts and observed parts of a batch, one per group of siblings; None where the run has none.
 
         Raises:
             InvalidInputError: the mask leaves nothing to regenerate in any scene.
@@ -181,11 +181,11 @@ class Learner:
         return replace(rollout, averages=averages_objects(self.reward))
 
     def begin_rewards(self, real: SceneBatch, *, first: bool) -> None:
-        """Give the rewards that learn their real scenes; nothing where none does.
+        """Give real scenes to the rewards that learn; does nothing if no reward learns.
 
         Args:
             real: real scenes that training may see.
-            first: let them learn from samples of the prior as it is; False for a run whose state is restored.
+            first: also train them on samples of the base prior; False for a run whose state is restored.
         """
         self.learned.begin(real)
         if self.learned and first:
@@ -200,13 +200,13 @@ class Learner:
             return None
 
     def accumulate(self, rollout: Rollout, advantage: Any, scenes: SceneBank, index: int) -> dict[str, float]:
-        """Put both gradients, summed over all processes, into ``.grad`` and measure them apart.
+        """Put the policy and regularisation gradients, summed over all processes, into ``.grad``; measure each one.
 
         Args:
             rollout: the batch.
             advantage: its advantages, as the algorithm makes them.
             scenes: real scenes for the regularisation.
-            index: number of the update in the run; steps and real scenes are drawn by it.
+            index: number of the update in the run, from which the draws of steps and real scenes follow.
         """
         config = self.config
         self.optimizer.zero_grad(set_to_none=True)
@@ -232,7 +232,7 @@ class Learner:
         """One optimiser step.
 
         Raises:
-            NonFiniteGradient: the gradient is not finite; nothing was changed.
+            NonFiniteGradient: the gradient is not finite; the weights in training are unchanged.
         """
         config = self.config.optimizer
         rate = self.algorithm.learning_rate(self.lr * min(1.0, (index + 1) / max(1, config.warmup)), index)

@@ -23,16 +23,16 @@ class DDPOSFLoss(PlainLoss):
 
         - mean over valid rows of  weight(t) * A * log p(x_{t-1} | x_t)
 
-    where x_t and x_{t-1} are constants: the gradient is the score function's, and one step's graph can be freed before
-    the next is built, so memory does not grow with the length of the chain. Known entries, the deterministic last step
-    and steps of weight 0 do not enter the loss.
+    where x_t and x_{t-1} are constants, so the gradient is that of the score function. The graph of one step can be
+    freed before the next is built, so memory does not grow with the length of the chain. Known entries, the
+    deterministic last step and steps of weight 0 do not enter the loss.
 
-    With ``clip_epsilon`` the surrogate is ``min(ratio * A, clip(ratio, 1 ± epsilon) * A)``, the ratio being that
-    of the *reduced* probabilities to the ones stored at sampling; before the first update the ratio is exactly 1.
+    With ``clip_epsilon``, ``min(ratio * A, clip(ratio, 1 ± epsilon) * A)`` replaces A * log p. The ratio is that of the
+    *reduced* probabilities to those stored at sampling; before the first update it is exactly 1.
 
-    The scale of the gradient, and so the meaning of any coefficient beside it, depends on the reduction of log p over
-    the entries of a scene: ``"sum"`` (the log-probability itself) or ``"mean"`` (divided by the number of
-    random entries, as in the published code). It is always the mean over rows, never over steps.
+    The reduction of log p over the entries of a scene is ``"sum"`` (the log-probability itself) or ``"mean"`` (divided
+    by the number of random entries, as in the published code). It decides the scale of the gradient, and so the
+    meaning of the coefficient of any other loss. Over rows the loss is always a mean, never over steps.
 
     Accepted keys (``set_keys``):
         scene: (B, N, D) float, x_t. Default ``"scene"``.
@@ -41,18 +41,18 @@ class DDPOSFLoss(PlainLoss):
         advantage: (B,) or (B, 1) float, or (B, N) for credit per slot. Default ``"advantage"``.
         sample_log_prob: (B, N) float, log-probability per slot at sampling; read when clipping, and optional
             without. Default ``"slot_log_prob"``.
-        valid: (B,) or (B, 1) bool, optional; False rows are left out of the mean. Default ``"valid"``. Where
-            ``("next", valid)`` is there, as in what a collector gives, the whole episode of a scene that the reward
-            could not score is left out: rows are transitions in order along the last dimension, as ``("next", "done")``
-            parts them.
+        valid: (B,) or (B, 1) bool, optional; False rows are left out of the mean. Default ``"valid"``. If
+            ``("next", valid)`` is present, as in the output of a collector, the whole episode of a scene that the
+            reward could not score is left out. Rows must then be transitions in order along the last dimension, and
+            ``("next", "done")`` marks where an episode ends.
         text, text_mask: (B, L, W) tokens and (B, L) their mask, optional, as the policy saw them. Default ``"text"``
             and ``"text_mask"``.
         prompt: (B, L) int64 token indices, optional, read where ``text`` is missing. Default ``"prompt"``.
-        observed: (B, N, 2) bool, optional, True where the pose, or the category, of a slot is observed: in an
-            inpainting only the other entries are actions. Default ``"observed"``.
+        observed: (B, N, 2) bool, optional, True where the pose, or the category, of a slot is observed. In
+            inpainting, only the other entries are actions. Default ``"observed"``.
 
     Args:
-        policy: what is optimised.
+        policy: policy that is optimised.
         step_weights: (S,) weight of every step; None means 1 wherever the step is random.
         reduction: ``"sum"`` or ``"mean"`` of log p over the random entries of a scene.
         clip_epsilon: half-width of the ratio's clip, or None for the plain score function.

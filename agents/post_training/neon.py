@@ -25,8 +25,8 @@ class SelfTrainingLoss(OwnSampleLoss):
     ``loss_objective`` is 0: the prior in training gets no gradient from its own samples.
 
     Args:
-        prior: what is trained elsewhere, on real scenes; it noises the scenes.
-        copy: the copy.
+        prior: prior that is trained elsewhere, on real scenes; this loss uses it to noise the scenes.
+        copy: copy that is trained on the scenes.
         generator: source of timesteps, noise and observed entries (CPU); None for torch's own.
 
     >>> from agents.priors.testing import tiny_prior
@@ -50,16 +50,17 @@ class SelfTrainingLoss(OwnSampleLoss):
 class Neon(OwnSampleAlgorithm):
     """Negative extrapolation from self-training (Alemohammad et al. 2025, arXiv 2510.03597), in rounds.
 
-    A round lasts ``settings.period`` iterations, in which the prior theta samples all scenes. Two copies of it are
-    trained with the pretraining loss from the same timesteps and noise: one on real scenes (theta_real, by the loop),
-    one on the samples (theta_own). The next round begins with theta + w (theta_real - theta_own). Changes
-    that training makes whatever the scenes are the same in both copies, so the difference does not contain them. In a
-    round the learning rate of both falls from ``optimizer.lr`` to 0.
+    A round lasts ``settings.period`` iterations, in which the prior theta samples all scenes. Two copies of theta are
+    trained with the pretraining loss, with the same timesteps and noise. The training loop trains one copy on real
+    scenes (theta_real); the other copy is trained on the samples (theta_own). The next round begins with
+    theta + w (theta_real - theta_own). Some changes by training do not depend on the scenes. They are the same in both
+    copies, so they cancel in the difference. Within a round, the learning rate of both copies falls from
+    ``optimizer.lr`` to 0.
 
     Args:
-        settings: its keys.
-        policy: what is trained on real scenes.
-        stds: of the reverse steps; not used.
+        settings: settings of the algorithm.
+        policy: policy of the prior that is trained on real scenes.
+        stds: sigmas of the reverse steps; not used.
     """
 
     copy: TrainedCopy
@@ -80,7 +81,7 @@ class Neon(OwnSampleAlgorithm):
         return TensorDict({}, [len(rollout.reward)])
 
     def learning_rate(self, rate: float, update: int) -> float:
-        """The learning rate of both copies."""
+        """The learning rate of both copies; sets that of the copy that is trained on samples."""
         place = self.iterations % self.period + update % self.updates / self.updates
         rate *= 1 - place / self.period
         for group in self.copy.optimizer.param_groups:
@@ -107,7 +108,7 @@ class Neon(OwnSampleAlgorithm):
         self._begin({name: p.detach().clone() for name, p in prior.named_parameters()})
 
     def state(self) -> dict[str, Any]:
-        """The weights that sample, those of the copy, and the place in the round."""
+        """The weights that sample, the state of the copy, and the number of finished iterations."""
         return {"sampler": self._average.tensors, "copy": self.copy.state(), "iterations": self.iterations}
 
     def restore(self, state: dict[str, Any]) -> None:

@@ -26,28 +26,28 @@ class PlainLoss(LossModule):
         return False
 
     def _forward_value_estimator_keys(self, **kwargs: object) -> None:
-        """There is no value estimator."""
+        """Does nothing: there is no value estimator."""
 
 
 class OwnSampleLoss(PlainLoss):
-    """A loss of finished scenes x_0, of which every scene is noised once per call.
+    """A loss of finished scenes x_0; each call noises every scene once.
 
-    A subclass defines the losses of noised scenes. Their mean is over the valid scenes.
+    A subclass defines the losses of noised scenes. :meth:`forward` returns their means over the valid scenes.
 
     Accepted keys (``set_keys``):
         scene: (B, N, D) float, finished scenes x_0 as the prior encodes them. Default ``"scene"``.
-        timestep: (B,) or (B, 1) int64, optional; drawn as in pretraining without. Default ``"timestep"``.
+        timestep: (B,) or (B, 1) int64, optional; without it, drawn as in pretraining. Default ``"timestep"``.
         valid: (B,) or (B, 1) bool, optional; False rows are left out of the mean. Default ``"valid"``.
         text, text_mask: (B, L, W) tokens and (B, L) their mask, optional. Default ``"text"`` and ``"text_mask"``.
-        observed: (B, N, 2) bool, optional, True where the pose, or the category, of a slot is observed: in an
-            inpainting the other entries alone have a loss. Default ``"observed"``.
+        observed: (B, N, 2) bool, optional, True where the pose, or the category, of a slot is observed. In inpainting,
+            only the other entries have a loss. Default ``"observed"``.
 
     Args:
         prior: noises the scenes.
         generator: source of timesteps, noise and observed entries (CPU); None for torch's own.
 
-    Returns (``forward``): ``loss_objective`` (), of the prior in training, and ``loss_expectation`` (), of a copy that
-        is trained beside it; each 0 where nothing of the kind is trained on the scenes.
+    Returns (``forward``): ``loss_objective`` (), the loss of the prior in training, and ``loss_expectation`` (), the
+        loss of a copy that is trained beside it. Each is 0 if the scenes do not train that model.
     """
 
     @dataclass
@@ -77,7 +77,7 @@ class OwnSampleLoss(PlainLoss):
 
     @abstractmethod
     def of_scenes(self, noised: NoisedScenes, text: Text | None, flat: TensorDictBase) -> Mapping[str, Tensor]:
-        """Values of ``out_keys``: (B,) for each scene, or () for what is not a mean over scenes."""
+        """Values of ``out_keys``: (B,) with one per scene, or () for a value that is not a mean over scenes."""
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """The loss of a batch of finished scenes."""

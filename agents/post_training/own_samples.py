@@ -22,16 +22,16 @@ from agents.utils.weight_average import WeightAverage
 
 
 class OwnSampleAlgorithm(Algorithm[TensorDict]):
-    """An algorithm whose sampling policy is another copy of the prior, with weights that are evaluated and saved.
+    """An algorithm that samples with a separate copy of the prior, whose weights are also evaluated and saved.
 
     Args:
-        policy: what is optimised.
-        draws: timesteps and noises of every scene per update.
-        sampler_decay: of the average of the weights in training that samples, per :meth:`WeightAverage.update`.
+        policy: policy that is optimised.
+        draws: number of timesteps and noises of every scene per update.
+        sampler_decay: decay, per :meth:`WeightAverage.update`, of the weight average that samples.
 
     Attributes:
         sampler: the prior that samples.
-        copy: a copy of the denoiser that is trained on the samples, by ``loss_expectation``; None for none.
+        copy: a copy of the denoiser that is trained on the samples, with ``loss_expectation``; None for none.
     """
 
     loss: OwnSampleLoss
@@ -59,16 +59,16 @@ class OwnSampleAlgorithm(Algorithm[TensorDict]):
 
     @abstractmethod
     def advantage(self, rollout: Rollout) -> TensorDict:
-        """The keys of the scenes that the loss reads beside the scenes themselves."""
+        """The tensors that the loss reads in addition to the scenes, by key."""
 
     def measure(self, result: TensorDict) -> dict[str, float]:
-        """Figures of a part of the batch, from its loss."""
+        """Figures of a part of the batch, from ``result``, the loss of this part."""
         return {}
 
     def accumulate(self, rollout: Rollout, advantage: TensorDict, generator: Generator) -> BatchGradient:
         """Add the gradient of a batch to ``.grad``: ``draws`` timesteps and noises of every scene.
 
-        On several processes ``.grad`` holds the part of this one's scenes in the mean over all.
+        With several processes, ``.grad`` gets the part of this process's scenes in the mean over all scenes.
         """
         x0 = self.prior.encode(rollout.batch.to(self.prior.device))
         fields: dict[str, Any] = {"scene": x0, "valid": rollout.valid, **advantage}

@@ -20,17 +20,17 @@ from scene_envs.scene import POSE_FEATURES
 class DenoisingPolicy(TensorDictModuleBase):
     """The reverse chain of a prior as a policy: action x_{t-1} ~ p(. | x_t), state (x_t, t, prompt).
 
-    Works as a torchrl policy (``env.rollout(n, policy)``): reads ``scene`` (B, N, D), ``timestep`` (B, 1) and, when the
-    prior reads prompts, ``prompt`` (B, L), writes ``action`` (B, N, D), ``slot_log_prob`` (B, N), which is summed over
-    the random entries of each slot, and ``action_log_prob`` (B,), summed over all.
+    Works as a torchrl policy (``env.rollout(n, policy)``). It reads ``scene`` (B, N, D), ``timestep`` (B, 1) and, if
+    the prior reads prompts, ``prompt`` (B, L). It writes ``action`` (B, N, D), ``slot_log_prob`` (B, N), which is
+    summed over the random entries of each slot, and ``action_log_prob`` (B,), which is summed over all.
 
     Args:
-        prior: what denoises; its parameters are the policy's.
+        prior: prior that denoises; its parameters are the policy's.
         num_steps: steps of the chain, as in the environment.
-        chunk: scenes denoised at once, in sampling and in log-probabilities alike; None takes all.
-        guidance: w of classifier-free guidance; the guided chain is the policy then.
-        independent: slots draw their categories independently, so that log-probabilities are exact; False for the draws
-            of ``prior.sample``.
+        chunk: scenes denoised at once, for sampling and for log-probabilities; None takes all.
+        guidance: weight w of classifier-free guidance; if it is not 0, the guided chain is the policy.
+        independent: whether slots draw their categories independently, so that log-probabilities are exact; False draws
+            as ``prior.sample`` does.
 
     >>> from agents.priors.testing import tiny_prior
     >>> from scene_envs.envs import DenoisingTorchRLEnv
@@ -91,7 +91,7 @@ class DenoisingPolicy(TensorDictModuleBase):
     ) -> ReverseStep:
         """p(x_{t-1} | x_t) of ``x_t`` (B, N, D) given ``text``; differentiable in the prior's parameters.
 
-        Entries that are ``observed`` (B, N, 2), the pose or the category of a slot, are certain: no actions.
+        Entries that are ``observed`` (B, N, 2), the pose or the category of a slot, are known and are no actions.
         """
         size = self.chunk or x_t.shape[0]
         return concatenate_steps(
@@ -132,7 +132,7 @@ class DenoisingPolicy(TensorDictModuleBase):
     ) -> tuple[Tensor, Tensor]:
         """An action (B, N, D) and its log-probability per slot (B, N), without gradients.
 
-        The action is made of standard normal ``noise`` (B, N, D), which is drawn from ``generator`` where it is None.
+        The action is made from standard normal ``noise`` (B, N, D). If ``noise`` is None, ``generator`` draws it.
         """
         reverse = self.distribution(x_t, step, text, observed)
         if noise is None:
@@ -145,7 +145,7 @@ class DenoisingPolicy(TensorDictModuleBase):
     ) -> Tensor:
         """(B, N) log-probability per slot of ``action``; states and actions are taken as constants.
 
-        Entries that are ``observed`` (B, N, 2) have no part in it.
+        Entries that are ``observed`` (B, N, 2) do not contribute to it.
         """
         return self.distribution(x_t.detach(), step, text, observed).log_prob(action.detach())
 
@@ -155,9 +155,9 @@ class DenoisingPolicy(TensorDictModuleBase):
 
     @torch.no_grad()
     def unobserved_entries(self, observed: Tensor) -> Tensor:
-        """(B,) random variables that a step draws for scenes whose entries ``observed`` (B, N, 2) are not drawn."""
+        """(B,) number of random variables that a step draws for scenes, without the entries ``observed`` (B, N, 2)."""
         first: Any = self._steps(observed.shape[1])[0]
-        poses = first.std > 0  # (N, D), of a mixed prior no categories
+        poses = first.std > 0  # (N, D); no categories for a mixed prior
         width = getattr(self.prior, "pose_width", POSE_FEATURES)
         count = (poses[:, :width] & ~observed[..., :1]).sum(dim=(1, 2))
         count = count + (poses[:, width:] & ~observed[..., 1:]).sum(dim=(1, 2))
@@ -201,8 +201,8 @@ def gradient_weights(
 ) -> Tensor:
     """(S,) weight of every step in the policy gradient; 0 leaves a step out.
 
-    A step whose sigma is below ``min_std`` is sampled with that sigma but has no part in the gradient: its
-    log-density is so steep that millimetres of noise drown the reward. (Flooring the sigma of the *sampler*
+    A step whose sigma is below ``min_std`` is sampled with that sigma but excluded from the gradient. Its log-density
+    is so steep that millimetres of noise outweigh the reward. (Raising the sigma of the *sampler* to ``min_std``
     instead would add that much noise to every finished scene.)
 
     Args:
@@ -210,7 +210,7 @@ def gradient_weights(
         min_std: smallest sigma of a step in the gradient.
         skip_first: fraction of the chain, from its noisy end, that stays out of the gradient.
         weighting: ``"uniform"``, ``"std"`` (proportional to sigma) or ``"variance"`` (to sigma squared);
-            weights of the steps taken have mean 1.
+            weights of the steps in the gradient have mean 1.
 
     >>> gradient_weights(torch.tensor([0.6, 0.2, 0.005, 0.0])).tolist()
     [1.0, 1.0, 0.0, 0.0]

@@ -35,8 +35,8 @@ class WholeBatchReward:
     """A reward that depends on the other scenes of a batch: each process scores the scenes of all processes.
 
     Args:
-        reward: what scores, resolved.
-        processes: each of which calls this at the same time, with equally many scenes.
+        reward: resolved reward.
+        processes: processes that all call this reward at the same time, each with the same number of scenes.
     """
 
     depends_on_batch = True

@@ -12,12 +12,12 @@ from scene_envs.progress import Progress
 def run_progress(title: str, total: int, style: str, done: int = 0) -> Iterator[Callable[[int, float, float], None]]:
     """Show the progress of a run; yields the function that advances it.
 
-    It is called with the iterations done, the mean reward of the last batch, and the held-out loss over the base
-    prior's. Lines come after the first iteration, every 5 s and at the end.
+    The function takes the number of iterations done, the mean reward of the last batch, and the held-out loss divided
+    by that of the base prior. Lines are printed after the first iteration, every 5 s and at the end.
 
     Args:
-        title: what runs.
-        total: iterations.
+        title: name of the run.
+        total: number of iterations.
         style: ``"bar"`` (lines when stderr is no terminal), ``"lines"`` or ``"none"``.
         done: iterations done before, by a resumed run.
     """

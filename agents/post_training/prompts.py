@@ -26,7 +26,7 @@ PromptSets = Callable[[int], Sequence[str]]
 
 
 class GrammarPrompts:
-    """Descriptions of scenes that have none, each written when it is first asked for.
+    """Descriptions of scenes without prompts; those of a scene are written when they are first asked for.
 
     Args:
         batch: the scenes.
@@ -50,9 +50,9 @@ class PromptDeck:
 
     Args:
         prompt: one text, a list, ``"data"`` (the prompts of real scenes) or ``"grammar"``.
-        share: scenes of a batch that share a prompt, so that they can be compared.
+        share: number of scenes of a batch that share a prompt, so that they can be compared.
         real: prompts of real scenes by index; for ``"data"``.
-        count: how many real scenes there are.
+        count: number of real scenes.
 
     >>> deck = PromptDeck(["A scene with two cups.", "A scene with a teapot."], share=2)
     >>> dealt = deck.deal(4, Generator().manual_seed(0))
@@ -69,13 +69,13 @@ class PromptDeck:
 
     @classmethod
     def of(cls, prior: ScenePrior, prompt: Any, share: int, slots: int, real: PromptSets, count: int) -> PromptDeck:
-        """The deck of a run; ``"grammar"`` is spelled out, and prompts that cannot be followed are refused."""
+        """The deck of a run; ``"grammar"`` is replaced by descriptions of grammar scenes that fit into ``slots``."""
         if prompt == "grammar":
             prompt = grammar_prompts(prior.scene_type, slots)
         return cls(prompt, share, real, count)
 
     def deal(self, count: int, generator: Generator) -> list[str]:
-        """``count`` prompts; neighbours share one, in groups of ``share`` or a few more."""
+        """``count`` prompts; neighbours share a prompt, in groups of ``share`` or a few more."""
         groups = max(1, count // self.share)
         different = [self._text(index, generator) for index in self._indices(groups, generator)]
         return [different[row * groups // count] for row in range(count)]
@@ -94,19 +94,19 @@ class PromptDeck:
 
 
 def prompts_beside(directory: Path, batch: SceneBatch, seed: int) -> PromptSets:
-    """The prompts of a run's real scenes: those of their dataset, kept in its folder, or descriptions of them."""
+    """The prompts of a run's real scenes: those kept in the run's folder, or else descriptions of the scenes."""
     path = directory / PROMPTS_NAME
     return load_prompts(path) if path.exists() else GrammarPrompts(batch, seed)
 
 
 def prompt_groups(prompts: Sequence[str]) -> Tensor:
-    """(B,) int64, equal for equal prompts on every worker."""
+    """(B,) int64 hashes of prompts; equal prompts have equal hashes on every worker."""
     hashes = {text: hashlib.blake2b(text.encode(), digest_size=8).digest() for text in dict.fromkeys(prompts)}
     return torch.tensor([int.from_bytes(hashes[text], "little", signed=True) for text in prompts])
 
 
 def save_prompts(path: Path, prompts: Sequence[Sequence[str]]) -> None:
-    """The prompts of a dataset's scenes, beside the scenes themselves."""
+    """Write the prompts of a dataset's scenes to ``path``, as JSON."""
     write_text(path, json.dumps([list(texts) for texts in prompts]) + "\n")
 
 

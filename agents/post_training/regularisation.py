@@ -28,8 +28,8 @@ class Regularisation:
     """Terms that keep a prior in training near the base prior, and their weights.
 
     Args:
-        settings: its keys.
-        prior: the base prior; it is copied where it is needed.
+        settings: settings of the regularisation.
+        prior: the base prior; it is copied if it is needed.
     """
 
     def __init__(self, settings: RegularisationSettings, prior: ScenePrior) -> None:
@@ -76,12 +76,12 @@ class Regularisation:
     ) -> dict[str, float]:
         """Add the gradient of the loss on real scenes, and on samples of the base prior; returns columns of the log.
 
-        Both take the same timesteps and noise.
+        Real scenes and samples get the same timesteps and noise.
 
         Args:
-            prior: in training.
+            prior: prior in training.
             real: real scenes of all processes.
-            base: as many samples of the base prior; None but for the discriminative loss.
+            base: as many samples of the base prior; None for any loss but the discriminative one.
             generator: source of timesteps and noise (CPU).
             chunk: scenes per pass.
         """
@@ -106,7 +106,7 @@ class Regularisation:
         }
 
     def observe(self, figure: str, value: float | None, iteration: int) -> None:
-        """Adjust the weights after a measurement; does nothing where another figure is held, or none."""
+        """Adjust the weights after a measurement of ``figure``; does nothing if the run does not hold this figure."""
         if self.target is None or self.target.figure != figure or value is None:
             return
         held = self.state.lost_at is None
@@ -115,7 +115,7 @@ class Regularisation:
             logger.warning("%s", self.verdict())
 
     def verdict(self) -> str:
-        """Whether the target was held, in one sentence; empty without a target."""
+        """One sentence that says whether the target was held; empty without a target."""
         state, settings = self.state, self.settings
         if self.target is None or state.measured is None:
             return ""
@@ -152,5 +152,5 @@ class Regularisation:
         return asdict(self.state)
 
     def load_state_dict(self, state: dict[str, Any] | None) -> None:
-        """Inverse of :meth:`state_dict`; None, of an earlier version's checkpoint, leaves all as it is."""
+        """Inverse of :meth:`state_dict`; None, for a checkpoint of an earlier version, gives the initial state."""
         self.state = HoldState(**(state or {}))

@@ -69,12 +69,12 @@ class RegularisationSettings:
 
     @property
     def pretraining_weight(self) -> float:
-        """``weight``; 0 for null, which a run's config has replaced by the algorithm's own."""
+        """``weight``, or 0 for null; the config of a run has replaced null by the default of the algorithm."""
         return self.weight or 0.0
 
     @property
     def kl_weight(self) -> float:
-        """``kl``, or what null stands for."""
+        """``kl``; null stands for 1 with ``hold=kl:VALUE``, and for 0 otherwise."""
         if self.kl is None:
             return float(self.target is not None and self.target.figure == "kl")
         return self.kl

@@ -17,7 +17,7 @@ class Picture:
 
     Attributes:
         path: PNG file; its bytes go into the page.
-        caption: one line below.
+        caption: one line below the image.
     """
 
     path: Path
@@ -29,9 +29,9 @@ class Tile:
     """A headline number.
 
     Attributes:
-        label: what it is.
-        value: as text.
-        note: what it is compared with.
+        label: name of the number.
+        value: the number as text.
+        note: what the number is compared with.
     """
 
     label: str
@@ -47,7 +47,7 @@ class Section:
         title: heading.
         text: one paragraph.
         pictures: images.
-        table: rows of cells; the first is the head.
+        table: rows of cells; the first row is the head.
     """
 
     title: str
@@ -64,8 +64,8 @@ class Page:
         title: heading of the page.
         lead: what was done, in a sentence or two.
         tiles: headline numbers.
-        sections: in order.
-        settings: shown folded at the end.
+        sections: sections of the page, in order.
+        settings: settings of the run, shown folded at the end.
     """
 
     title: str

@@ -50,14 +50,14 @@ class Rollout:
         reward: (B,); 0 where not valid.
         valid: (B,) bool.
         per_object: (B, N) credit per slot, or None.
-        averages: the reward is a mean over the objects, so that an empty slot has no credit.
+        averages: whether the reward is a mean over the objects, so that an empty slot has no credit.
         judged: (B, N) bool, slots that such a reward gives credit to; None for the free objects.
         terms: named (B,) parts of the reward.
         batch: the finished scenes.
         prompts: one per scene, or None without prompts.
         text: what the network attended to, tokens (B, L, W) and mask (B, L); None when the prior reads no prompts.
-        observed: (B, N, 2) bool, the poses and categories that were observed, of an inpainting; None of whole scenes.
-        groups: (B,) int64, equal for scenes with the same observed part, over all processes; None of whole scenes.
+        observed: (B, N, 2) bool, the poses and categories that were observed in inpainting; None for whole scenes.
+        groups: (B,) int64, equal for scenes with the same observed part, over all processes; None for whole scenes.
     """
 
     scenes: Tensor
@@ -95,7 +95,7 @@ class Rollout:
 
 
 def rollout_groups(rollout: Rollout) -> Tensor | None:
-    """(B,) int64 that tell apart what scenes are compared within: observed parts, or else prompts; None for neither."""
+    """(B,) int64 groups within which scenes are compared, per observed part or else per prompt; None for neither."""
     if rollout.groups is not None:
         return rollout.groups
     return None if rollout.prompts is None else prompt_groups(rollout.prompts).to(rollout.reward.device)
@@ -145,18 +145,18 @@ def collect(
 ) -> Rollout:
     """Run ``policy`` to the end of one episode in each of the environment's rows.
 
-    On several processes the rows of all are one batch, and those of the first come first: an episode starts from the
-    same x_T and meets the same noise, whichever process it is on.
+    With several processes, the rows of all processes form one batch, in the order of the processes. An episode starts
+    from the same x_T and gets the same noise, whichever process runs it.
 
     Args:
         env: the torchrl adapter, in ``next_sample`` mode.
         policy: draws x_{t-1}; must have the environment's number of steps.
-        seed: of the run; x_T and the chain's noise hang on it and on ``iteration`` alone.
+        seed: seed of the run; x_T and the chain's noise depend only on it and on ``iteration``.
         iteration: which batch of the run this is.
-        prompts: one per row, equal among siblings; None draws them as the environment was told. Text is encoded once,
-            at the start.
+        prompts: one per row, equal among siblings; None lets the environment draw them. Text is encoded once, at the
+            start.
         branching: which episodes share their first steps.
-        observed: one scene per row of which a part is observed, equal among siblings; None for whole scenes.
+        observed: one partly observed scene per row, equal among siblings; None for whole scenes.
         groups: (rows,) int64, equal for rows with the same observed part.
     """
     branching.groups(env.core.num_envs)
@@ -214,7 +214,7 @@ def collect(
 
 
 def _with_equal_parts(rollout: Rollout, processes: ProcessGroup) -> Rollout:
-    """The rollout with the credit and the terms that any process has; where a reward failed altogether, zeros."""
+    """The rollout with the credit and terms that any process has; zeros where the reward of this process gave none."""
     found = processes.gather((rollout.per_object is not None, list(rollout.terms)))
     per_object, reward = rollout.per_object, rollout.reward
     if per_object is None and any(has for has, _ in found):

@@ -27,13 +27,13 @@ def write_text(path: Path, text: str) -> None:
     """Replace ``path`` atomically.
 
     Raises:
-        TrainingError: the disk refused; what was there before is untouched.
+        TrainingError: the file could not be written; a file that was there before is unchanged.
     """
     writing(repr(str(path)), lambda: files.write_text(path, text))
 
 
 def writing(what: str, write: Callable[[], object]) -> None:
-    """Run ``write``; a disk that refuses ``what`` becomes a TrainingError."""
+    """Run ``write``; an OSError or RuntimeError of it becomes a TrainingError that names ``what``."""
     try:
         write()
     except (OSError, RuntimeError) as error:
@@ -41,7 +41,7 @@ def writing(what: str, write: Callable[[], object]) -> None:
 
 
 def write_config(directory: Path, config: PostTrainConfig) -> None:
-    """``config.yaml``, every field."""
+    """Write ``config.yaml`` with every field of ``config``."""
     write_text(directory / "config.yaml", files.sealed(config_text(config.plain())))
 
 
@@ -68,13 +68,13 @@ def run_metrics(
 
 
 def write_metrics(directory: Path, metrics: Mapping[str, Any]) -> None:
-    """``metrics.json``; numbers that JSON lacks become null."""
+    """Write ``metrics.json``; numbers that JSON lacks become null."""
     path = directory / METRICS_NAME
     writing(repr(str(path)), lambda: files.write_json(path, metrics))
 
 
 def write_log(directory: Path, history: Sequence[Mapping[str, float]]) -> None:
-    """``log.csv``, one row per iteration; the union of all columns."""
+    """Write ``log.csv``: one row per iteration, with the union of the columns of all rows."""
     columns = list(dict.fromkeys(name for row in history for name in row))
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, lineterminator="\n")
@@ -108,5 +108,5 @@ def load_resumable(directory: Path, config: PostTrainConfig) -> dict[str, Any] |
 
 
 def _flat(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Keys behind dots; a reward is one value, whether it is a name or a mapping."""
+    """The configuration with nested keys joined by dots; the reward stays one value, even if it is a mapping."""
     return {**dotted({key: value for key, value in config.items() if key != "reward"}), "reward": config.get("reward")}

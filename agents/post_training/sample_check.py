@@ -17,7 +17,7 @@ from scene_envs.scene import SceneBatch
 _AT_ONCE = 32
 """Scenes sampled together."""
 _CLASSIFIERS = 3
-"""Classifiers of which the accuracy is the mean."""
+"""Number of classifiers over which the accuracy is averaged."""
 
 
 @dataclass(frozen=True)
@@ -27,12 +27,12 @@ class SampleCheck:
     Attributes:
         real: real scenes that training never sees.
         scorer: of the run's reward.
-        count: samples.
+        count: number of samples.
         num_steps: denoising steps per sample.
         seed: of the noise.
         slots: per sample.
         prompts: one per sample; None without prompts.
-        guidance: of the prompts.
+        guidance: weight of classifier-free guidance.
 
     >>> from agents.priors.testing import tiny_prior
     >>> scorer = RewardScorer("object_count")
@@ -75,9 +75,11 @@ class SampleCheck:
         return batch.tensor.cpu()
 
     def figures(self, batch: SceneBatch) -> dict[str, float]:
-        """Mean reward, and in objects, nats and a share of scenes: counts, categories, accuracy of a classifier.
+        """Mean reward of ``batch``, and figures of its difference from the real scenes.
 
-        Those that have no meaning, such as the categories of empty scenes, are NaN.
+        The difference is measured by the distance of object counts (objects), by the KL divergence of categories
+        (nats), and by the accuracy of a classifier (share of scenes). A figure that has no meaning, such as the
+        categories of empty scenes, is NaN.
         """
         from agents.evaluation.classifier import classifier_accuracy
         from agents.evaluation.metrics import category_kl, count_wasserstein

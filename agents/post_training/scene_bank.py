@@ -28,18 +28,18 @@ _DRAWN = 64
 
 @dataclass(frozen=True)
 class PromptedScenes:
-    """Normalised scenes and a prompt of each.
+    """Normalised scenes and one prompt for each.
 
     Attributes:
         scenes: (M, N, D).
-        prompts: ``""`` for none; None for a prior that reads none.
+        prompts: one per scene, ``""`` for a scene without one; None for a prior that reads no prompts.
     """
 
     scenes: Tensor
     prompts: Sequence[str] | None
 
     def batch(self, count: int, generator: Generator) -> PromptedScenes:
-        """``count`` of them, drawn with replacement."""
+        """``count`` scenes and their prompts, drawn with replacement."""
         index = torch.randint(len(self.scenes), (count,), generator=generator)
         prompts = None if self.prompts is None else [self.prompts[i] for i in index.tolist()]
         return PromptedScenes(self.scenes[index], prompts)
@@ -47,14 +47,14 @@ class PromptedScenes:
 
 @dataclass(frozen=True)
 class SceneBank:
-    """Normalised real scenes, split once and for all.
+    """Normalised real scenes, in a fixed split into training scenes and held-out scenes.
 
     Attributes:
         train: (M, N, D) for the regularisation.
         heldout: (K, N, D) for the guard.
-        prompts: all prompts of scene i of both, the held-out ones being last; None when they are not asked for.
+        prompts: all prompts of a scene by its index, with held-out scenes after training scenes; None without prompts.
         replay: (R, N, D) further scenes for the regularisation; None for none.
-        replay_share: of a batch that they take.
+        replay_share: share of a batch that is taken from ``replay``.
         base: samples of the base prior; None for none.
     """
 
@@ -67,7 +67,7 @@ class SceneBank:
 
     @classmethod
     def split(cls, x0: Tensor, heldout: int, prompts: PromptSets | None = None) -> SceneBank:
-        """The last ``heldout`` scenes of ``x0`` (M, N, D) are held out."""
+        """A bank of ``x0`` (M, N, D), of which the last ``heldout`` scenes are held out."""
         if not 0 < heldout < len(x0):
             raise InvalidInputError(f"{len(x0)} real scenes cannot spare {heldout} for the guard; give more scenes")
         return cls(x0[:-heldout], x0[-heldout:], prompts)
@@ -77,7 +77,7 @@ class SceneBank:
         return replace(self, replay=scenes.to(self.train.device), replay_share=share)
 
     def batch(self, count: int, generator: Generator) -> PromptedScenes:
-        """``count`` training scenes, drawn with replacement, and one of each one's prompts.
+        """``count`` training scenes, drawn with replacement, each with one of its prompts.
 
         As in pretraining, the prompt is withheld (``""``) from one scene in ten. Replayed scenes come last and have no
         prompt.
@@ -98,7 +98,7 @@ class SceneBank:
         return PromptedScenes(x0, texts)
 
     def heldout_prompts(self) -> list[str] | None:
-        """One prompt of each held-out scene, of all kinds in turn; None when they are not asked for."""
+        """One prompt of each held-out scene; kinds of prompts alternate from scene to scene; None without prompts."""
         if self.prompts is None:
             return None
         first = len(self.train)
@@ -120,8 +120,8 @@ def kept_scenes(
     Args:
         directory: of the run.
         prior, seed, slots: as for :func:`real_scenes`.
-        settings: where they come from, and how many.
-        reuse: take those that are there, as a resumed run does.
+        settings: source and number of the scenes.
+        reuse: load the scenes that are already in the folder, as a resumed run does.
         progress: how the drawing is shown, a style of :class:`~scene_envs.progress.Progress`.
     """
     path, texts, processes = directory / SCENES_NAME, directory / PROMPTS_NAME, ProcessGroup.current()
@@ -129,7 +129,7 @@ def kept_scenes(
         count = settings.bank_size
         batch, found = real_scenes(prior, settings.scenes, count, seed=seed, slots=slots, progress=progress)
         writing(f"the real scenes {str(path)!r}", lambda: batch.save(path))
-        texts.unlink(missing_ok=True)  # of other scenes, by a run that never reached a checkpoint
+        texts.unlink(missing_ok=True)  # prompts of other scenes, left by a run without a checkpoint
         if found is not None and prior.conditional:
             writing(f"their prompts {str(texts)!r}", lambda: save_prompts(texts, found))
     processes.wait()
@@ -144,12 +144,12 @@ def kept_replay(
     Args:
         directory: of the run.
         prior: whose scene type the scenes must have.
-        settings: that name them.
-        slots: of the real scenes, which these are filled up to.
-        reuse: take those that are there, as a resumed run does.
+        settings: settings that name the scenes.
+        slots: slots of the real scenes; the replayed scenes get empty slots up to this number.
+        reuse: load the scenes that are already in the folder, as a resumed run does.
 
     Raises:
-        InvalidInputError: nothing is there, no scene, another scene type, or more objects than slots.
+        InvalidInputError: the source does not exist, holds no scene, has another scene type, or has more slots.
     """
     path, processes = directory / REPLAY_NAME, ProcessGroup.current()
     if settings.replay is None:
@@ -181,10 +181,10 @@ def real_scenes(
     Args:
         prior: whose scene type is wanted.
         source: ``"grammar"``, or the directory of a dataset.
-        count: how many; a smaller dataset gives all it has.
+        count: number of scenes; a smaller dataset gives all it has.
         seed: of the grammar, or of the choice of rows.
-        slots: slots per scene at least; None takes as many as the prior was trained on. Real scenes keep all
-            their slots: a prior reads any number.
+        slots: smallest number of slots per scene; None takes as many as the prior was trained on. Real scenes keep all
+            their slots, because a prior reads any number of slots.
         progress: how the drawing is shown, a style of :class:`~scene_envs.progress.Progress`.
     """
     slots = max(prior.scene_type.slots, prior.config.slots if slots is None else slots)

@@ -42,7 +42,7 @@ from scene_envs.errors import TrainingError
 from scene_envs.folders import claimed
 
 _MOST_ROLLBACKS = 3
-"""Returns to the best checkpoint after which a run ends."""
+"""Number of returns to the best checkpoint that a run may make; one more ends it."""
 
 
 @dataclass(frozen=True)
@@ -65,17 +65,18 @@ class PostTrainResult:
 
 
 def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> PostTrainResult:
-    """Post-train a prior with DDPO-SF and regularisation on real scenes; resumes a run found in ``config.output``.
+    """Post-train a prior with regularisation on real scenes; resumes a run found in ``config.output``.
 
-    Processes that ``torchrun`` started share each batch and take the steps of one process. Only the first one writes.
+    Processes that ``torchrun`` started share each batch and take the same steps as a single process. Only the first
+    process writes files.
 
     Args:
         config: the run.
-        prior: the prior itself, in place of the one that ``config.prior`` names; it is left as it was.
+        prior: the prior itself, in place of the one that ``config.prior`` names; it is not changed.
 
     Raises:
-        TrainingError: NaN, no valid reward for too long, a full disk, or another process that ended. The run can be
-            resumed.
+        TrainingError: a gradient or a value of the prior is not finite, no reward was valid for too long, the disk is
+            full, or another process ended. The run can be resumed.
         CorruptFileError: the checkpoint in the run directory is truncated.
         InvalidInputError: a setting is wrong, the directory holds a run of another configuration, or the processes
             do not divide the batch.
@@ -105,7 +106,7 @@ class PostTrainer:
 
     Args:
         config: the run.
-        prior: in place of the one that ``config.prior`` names.
+        prior: prior to start from, in place of the one that ``config.prior`` names.
     """
 
     guard: Guard
@@ -133,7 +134,7 @@ class PostTrainer:
     # -- the loop -------------------------------------------------------------------------------
 
     def run(self) -> PostTrainResult:
-        """Go on to ``config.iterations``, or to the guard's stop, and return the best prior."""
+        """Train until ``config.iterations``, or until the guard stops the run; the result holds the best prior."""
         config = self.config
         state = load_resumable(self.directory, config)
         self.prepare(reuse_scenes=state is not None)
@@ -143,10 +144,10 @@ class PostTrainer:
             if self.processes.is_first:
                 write_config(self.directory, config)
             self.guard.start(self.prior)
-            self.files.keep(self.prior, self.guard, 0)  # until something better: the base
+            self.files.keep(self.prior, self.guard, 0)  # the best prior so far is the base
         title = f"post-train {self.prior.scene_type.name}"
         started = time.perf_counter() - self.seconds
-        self._write_log()  # that of an earlier run, or rows beyond the checkpoint, go
+        self._write_log()  # removes the rows of an earlier run, or rows beyond the checkpoint
         style = config.logger.progress if self.processes.is_first else "none"
         with (
             run_progress(title, config.iterations, style, self.iteration) as report,
@@ -161,8 +162,9 @@ class PostTrainer:
                 checked = self.iteration % config.guard.every == 0 or last or (sample and config.guard.sampled > 0)
                 if checked:
                     self._check(rollout, sample=sample)
+                # a rollback reads prior/, which must be of the same iteration as the checkpoint
                 due = self.iteration % config.logger.checkpoint_every == 0 or (
-                    checked and config.guard.action == "rollback"  # which reads prior/: both are of one iteration
+                    checked and config.guard.action == "rollback"
                 )
                 ending = self.processes.any(end.pending)
                 if due or last or self._stopped or ending:

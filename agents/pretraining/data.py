@@ -19,7 +19,7 @@ PROMPTS_PER_SCENE = 3
 
 
 class TrainingData(Protocol):
-    """Draws scenes by a generator alone, so that a run can be resumed at any step."""
+    """Training scenes; a draw depends only on the generator, so that a run can be resumed at any step."""
 
     @property
     def size(self) -> int:
@@ -43,7 +43,7 @@ class SceneTable:
 
     @property
     def size(self) -> int:
-        """M."""
+        """Number of scenes, M."""
         return len(self.scenes)
 
     def draw(self, count: int, generator: Generator, *, prompts: bool) -> tuple[Tensor, list[Sequence[str]]]:
@@ -57,7 +57,7 @@ class UnionTable:
 
     Args:
         datasets: one per scene type.
-        prior: of the union; encodes what is drawn.
+        prior: prior of the union, which encodes the drawn scenes.
     """
 
     def __init__(self, datasets: Sequence[SceneDataset], prior: ScenePrior) -> None:
@@ -66,7 +66,7 @@ class UnionTable:
 
     @property
     def size(self) -> int:
-        """Scenes of all types."""
+        """Number of scenes of all types."""
         return sum(len(dataset) for dataset in self.datasets)
 
     def draw(self, count: int, generator: Generator, *, prompts: bool) -> tuple[Tensor, list[Sequence[str]]]:

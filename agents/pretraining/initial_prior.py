@@ -1,4 +1,4 @@
-"""Fresh priors for a pretraining run."""
+"""Initial priors of pretraining runs: fresh ones, and older ones that are trained further."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from scene_envs.scene import POSE_FEATURES
 from scene_envs.scene_types import get_scene_type
 
 MOMENTS = ("category", "feature", "scene")
-"""Whose mean and standard deviation precondition a network."""
+"""Groups of values whose mean and standard deviation the preconditioning of a network uses."""
 
 FITTED_ON = 20_000
 """Scenes to which moments are fitted."""
@@ -43,7 +43,7 @@ FITTED_ON = 20_000
 def build_prior(
     config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts: Sequence[Sequence[str]] = ()
 ) -> ScenePrior:
-    """The prior that ``config`` starts from: a fresh one, its preconditioning fitted to raw scenes, or an older one.
+    """The prior that ``config`` starts from: an older one, or a fresh one with preconditioning fitted to raw scenes.
 
     Args:
         config: the run.
@@ -63,14 +63,14 @@ def build_prior(
 
 
 def _started(config: PretrainConfig, raw: Tensor, prompts: Sequence[Sequence[str]]) -> ScenePrior:
-    """The prior that ``config`` names, for raw scenes (M, N, D) of its type, which keep its normalizer.
+    """The prior that ``config`` names, with its own normalizer, for raw scenes (M, N, D) of its type.
 
-    Of its settings of process and loss only the share of masks that open all empty slots is that of ``config``.
-    Its vocabulary stays as it is; words of ``prompts`` that it lacks are listed in a warning.
+    It keeps its settings of process and loss, except for ``open_empty_share``, which is that of ``config``. It keeps
+    its vocabulary; words of ``prompts`` that it lacks are listed in a warning.
 
     Raises:
-        InvalidInputError: its scene type or its slots are not those of the data, or what it takes as constant varies in
-            the scenes.
+        InvalidInputError: its scene type or its slots are not those of the data, or a feature that it takes as constant
+            varies in the scenes.
     """
     slots = raw.shape[1]
     prior = ScenePrior.load(config.prior)
@@ -85,11 +85,11 @@ def _started(config: PretrainConfig, raw: Tensor, prompts: Sequence[Sequence[str
 
 
 def _check_constants(prior: ScenePrior, free: Tensor, name: str) -> None:
-    """Refuse scenes in which something varies that the prior would overwrite with a constant."""
+    """Refuse scenes in which a feature varies that the prior would overwrite with a constant."""
     normalizer = prior.normalizer
     constant = normalizer.is_constant.cpu().clone()
     if prior.process_name == "mixed":
-        constant[POSE_FEATURES:] = False  # categories are states there
+        constant[POSE_FEATURES:] = False  # its categories are discrete states
     objects = free[free[..., -1] == 0]
     off = ((objects - normalizer.input_min.cpu()).abs() > 1e-4).any(dim=0) & constant
     if bool(off.any()):
@@ -197,7 +197,7 @@ def _network(
 
 
 def _modules(config: PretrainConfig, slots: int, text_width: int) -> list[ModuleConfig]:
-    """The modules of the mixed flux network but for its Fourier features."""
+    """The modules of the mixed flux network, except for its Fourier features."""
     chosen = config.network.modules
     relations = chosen.relations != "none"
     offered: list[tuple[bool, Callable[[], ModuleConfig]]] = [
@@ -213,14 +213,14 @@ def _modules(config: PretrainConfig, slots: int, text_width: int) -> list[Module
 
 
 def _kinds(scene: str) -> tuple[int, ...]:
-    """The kind of each asset: assets of one display name are one kind to a prompt."""
+    """The kind of each asset: assets with the same display name are one kind in prompts."""
     names = [asset.display_name for asset in get_scene_type(scene).library]
     order = {name: number for number, name in enumerate(dict.fromkeys(names))}
     return tuple(order[name] for name in names)
 
 
 def _conditions_counts(config: PretrainConfig) -> bool:
-    """Whether the network is told what a prompt asks of each kind of object."""
+    """Whether the network is told how many objects of each kind a prompt asks for."""
     return (
         config.text.count_conditioning
         and config.network.name == "flux"

@@ -20,7 +20,7 @@ FIELDS = ("step", "loss", "heldout", "gradient_norm", "learning_rate", "seconds"
 
 
 class TrainingLog:
-    """Writes rows as they come.
+    """Log of a run; each row is written when it comes.
 
     Args:
         directory: where ``log.csv`` goes.
@@ -32,7 +32,7 @@ class TrainingLog:
         self._also = RunLogger() if also is None else also
 
     def begin(self, step: int) -> None:
-        """Keep the rows of this run up to ``step``, each once; those of another run, and beyond a checkpoint, go."""
+        """Keep each row up to ``step`` once; remove rows beyond a checkpoint and, with ``step`` 0, of another run."""
         path = self.directory / "log.csv"
         if not path.exists():
             return
@@ -53,7 +53,7 @@ class TrainingLog:
         self._also.close()
 
     def write(self, row: dict[str, float], last_step: int) -> None:
-        """One row; the time left is worked out from ``last_step``."""
+        """Write one row; the time left is estimated from ``last_step``."""
         step, seconds = int(row["step"]), row["seconds"]
         left = (last_step - step) * seconds / max(1, step)
         logger.info("%s  left %.0f s", "  ".join(f"{key} {value:.6g}" for key, value in row.items()), left)
@@ -68,12 +68,12 @@ class TrainingLog:
 
 
 def _is_whole(row: Mapping[str, Any]) -> bool:
-    """Whether a row of the file has all its numbers; the last of a killed run may not."""
+    """Whether a row of the file has all its numbers; the last row of a killed run may lack some."""
     return str(row.get("step") or "").isdigit() and all(row.get(name) is not None for name in FIELDS)
 
 
 def draw_samples(prior: ScenePrior, directory: Path, step: int, seed: int) -> None:
-    """A gallery of samples of a prior, ``samples-STEP.png`` in ``directory``; left out without PyBullet."""
+    """Draw a gallery of samples of a prior, ``samples-STEP.png`` in ``directory``; skipped without PyBullet."""
     from scene_envs.render import gallery, render
 
     batch = prior.sample(8, num_steps=50, seed=seed).to("cpu")

@@ -23,7 +23,7 @@ _COEFFICIENTS = (3.4445, -4.7750, 2.0315)
 
 
 def learning_rate_at(step: int, config: PretrainConfig) -> float:
-    """Linear warm-up, the peak, and in the last ``decay_share`` of the steps a cosine to ``final_lr``."""
+    """Linear warm-up, then the peak, then a cosine to ``final_lr`` over the last ``decay_share`` of the steps."""
     optimizer = config.optimizer
     if step < optimizer.warmup:
         return optimizer.lr * (step + 1) / optimizer.warmup
@@ -36,14 +36,14 @@ def learning_rate_at(step: int, config: PretrainConfig) -> float:
 def build_optimizer(
     name: str, network: nn.Module, weight_decay: float, text_rate: float = 1.0
 ) -> torch.optim.Optimizer:
-    """An optimiser of ``network``, whose groups say under ``rate`` what share of the learning rate is theirs.
+    """An optimiser of ``network``; ``rate`` of a parameter group is its share of the learning rate.
 
     Args:
         name: ``"adamw"``, or ``"muon"`` for Muon on the matrices inside ``blocks`` and AdamW on the rest.
         network: what is trained.
-        weight_decay: decoupled.
-        text_rate: of the parameters under ``text_encoder``. A few percent of the loss depend on prompts at first, and
-            steps as long as elsewhere blur all words to one before any is read.
+        weight_decay: decoupled weight decay.
+        text_rate: ``rate`` of the parameters under ``text_encoder``. At first, only a few percent of the loss depend on
+            prompts. With steps as long as elsewhere, all words become alike before the network reads any of them.
     """
     if name not in OPTIMIZERS:
         raise unknown_name("optimizer", name, OPTIMIZERS)
@@ -67,8 +67,9 @@ def build_optimizer(
 class MuonAdamW(torch.optim.Optimizer):
     """Muon (Jordan et al. 2024) on matrices and AdamW on everything else, under one learning rate.
 
-    The update of a matrix is its momentum made orthogonal, scaled so that its root mean square is that of AdamW's
-    (Liu et al. 2025), in float32: ``torch.optim.Muon`` iterates in bfloat16, which is very slow on most CPUs.
+    The update of a matrix is its momentum made orthogonal, scaled so that its root mean square is that of an AdamW
+    update (Liu et al. 2025). It is computed in float32, because ``torch.optim.Muon`` iterates in bfloat16, which is
+    very slow on most CPUs.
 
     Args:
         matrices: two-dimensional parameters, updated by Muon.

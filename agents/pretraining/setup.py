@@ -1,4 +1,4 @@
-"""Initial state of a pretraining run: a fresh prior, its training scenes and held-out scenes."""
+"""Initial state of a pretraining run: prior, training scenes and held-out scenes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _HELD_OUT = 512
 def prepare(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
     """The prior that a run starts from, its training scenes, and held-out scenes (K, N, D).
 
-    A run from an older prior has the scene type of its data, or of the prior where a grammar makes the data.
+    A run from an older prior takes the scene type of its data; if a grammar makes the data, it takes that of the prior.
     """
     older = _older(config) if config.prior else None
     if config.data == "grammar":
@@ -58,7 +58,7 @@ def prepare(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
 
 
 def _older(config: PretrainConfig) -> PriorFacts:
-    """The prior that the run starts from; raises InvalidInputError where it does not read the text asked for."""
+    """Facts of the prior that the run starts from; raises InvalidInputError if the run needs text and it reads none."""
     older = PriorFacts.of(config.prior)
     if config.text.is_read and not older.text:
         raise InvalidInputError(
@@ -77,7 +77,7 @@ def split_heldout(dataset: SceneDataset) -> tuple[SceneDataset, SceneDataset]:
 def prepare_from(
     config: PretrainConfig, training: SceneDataset, heldout: SceneDataset
 ) -> tuple[ScenePrior, TrainingData, Tensor]:
-    """A fresh prior, its training scenes, and at most 2,048 held-out scenes (K, N, D), both as it encodes them."""
+    """The initial prior, its training scenes, and at most 2,048 held-out scenes (K, N, D), both as it encodes them."""
     prior = build_prior(config, training.tensor, training.normalizer, training.prompt_sets)
 
     def encode(scenes: Tensor) -> Tensor:

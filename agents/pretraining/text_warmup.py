@@ -22,17 +22,17 @@ _RATE, _RISE = 3e-3, 0.2
 
 
 def warm_up_text(prior: ScenePrior, data: TrainingData, steps: int, batch_size: int, seed: int) -> float | None:
-    """Train the text encoder, and what reads numbers from it, on prompts and the counts of their scenes alone.
+    """Train the text encoder, and the layers that read numbers from it, only on prompts and counts of their scenes.
 
-    No scene is denoised, so that hundreds of such steps take a minute, and the run that follows starts with numbers it
-    can subtract from.
+    No scene is denoised, so hundreds of such steps take a minute. The run that follows starts with predicted numbers,
+    from which the network can subtract the objects it sees.
 
     Args:
-        prior: changed in place; one whose network has no count conditioning is left alone.
+        prior: changed in place; a prior whose network has no count conditioning is not changed.
         data: scenes and their prompts.
         steps: optimiser steps.
         batch_size: scenes per step.
-        seed: of what is drawn; the same seed gives the same weights.
+        seed: seed of all draws; the same seed gives the same weights.
 
     Returns:
         Mean loss of the last tenth of the steps, in nats per kind of object; None where there was nothing to learn.
@@ -64,6 +64,6 @@ def warm_up_text(prior: ScenePrior, data: TrainingData, steps: int, batch_size: 
 
 
 def _rate(step: int, steps: int) -> float:
-    """Up along a line, down along a cosine."""
+    """Factor on the learning rate: a linear rise, then a fall along a cosine."""
     done = (step + 1) / steps
     return done / _RISE if done < _RISE else 0.5 * (1.0 + math.cos(math.pi * (done - _RISE) / (1.0 - _RISE)))

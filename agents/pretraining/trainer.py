@@ -51,8 +51,8 @@ def heldout_loss(prior: ScenePrior, x0: Tensor, seed: int = 1234, batch_size: in
 class Pretrainer:
     """The state of one run: prior, average, optimiser, step.
 
-    What a step draws is a function of (seed, step, part) alone, where the parts of a step are those of all processes:
-    two processes take the same steps as one with twice the parts, and a killed run goes on bit for bit.
+    The draws of a step depend only on (seed, step, part). The parts of a step are counted over all processes, so two
+    processes take the same steps as one process with twice the parts. A killed run continues bit for bit.
 
     Args:
         config: the run.
@@ -114,7 +114,7 @@ class Pretrainer:
         return self.save_prior()
 
     def _warm_up_text(self) -> None:
-        """Every process learns the same, and begins with the weights of the first."""
+        """Warm up the text encoder in the same way in every process, then take the weights of the first process."""
         steps = min(self.config.text.warmup, self.config.iterations)
         if warm_up_text(self.prior, self.data, steps, self.config.batch_size, self.config.seed) is not None:
             self.processes.share(self.network.parameters())
@@ -176,7 +176,7 @@ class Pretrainer:
         return value, float(norm)
 
     def _part_loss(self, count: int, generator: Generator) -> Tensor:
-        """The loss of ``count`` scenes; of each scene's prompts one is read, or none where it is withheld."""
+        """The loss of ``count`` scenes, each with one of its prompts, or without a prompt if it is withheld."""
         reads = self.prior.conditional
         scenes, prompts = self.data.draw(count, generator, prompts=reads)
         x0 = scenes.to(self.config.device)
@@ -190,7 +190,7 @@ class Pretrainer:
         return self.prior.pretraining_loss(x0, generator, text=self.prior.encode_prompts(texts))
 
     def _schedule(self) -> LambdaLR:
-        """The learning rate from the present step on; what it has been hangs on the number of the step alone."""
+        """Schedule of the learning rate from the present step on; it depends only on the number of the step."""
         for group in self.optimizer.param_groups:
             group["initial_lr"] = group["rate"]
         return LambdaLR(self.optimizer, lambda step: learning_rate_at(step, self.config), last_epoch=self.step - 1)
@@ -248,7 +248,7 @@ class Pretrainer:
         logger.info("resumed at step %d", self.step)
 
     def _started_with(self, state: dict[str, Any]) -> str:
-        """The keys of the run in a checkpoint that are not those of this one; empty when all are the same."""
+        """Keys of the checkpoint's run with values other than in this run; empty if all are the same."""
         before, now = dotted(state["config"]), dotted(asdict(self.config))
         keys = [
             f"{key}={value}"
@@ -258,7 +258,7 @@ class Pretrainer:
         return ", ".join(keys)
 
     def save_prior(self) -> ScenePrior:
-        """Write the averaged prior to ``output/prior`` and return the prior holding the averaged weights."""
+        """Write the prior with averaged weights to ``output/prior``, and return it."""
         with self._averaged():
             self.prior.card = {
                 "trained_steps": self.step,

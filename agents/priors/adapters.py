@@ -1,4 +1,4 @@
-"""Adapters of priors: updates of the weights of one prior, low-rank ones in a file or those of a fine-tuned prior."""
+"""Adapters of priors: updates of the weights of one prior, from a low-rank file or from a fine-tuned prior."""
 
 from __future__ import annotations
 
@@ -111,10 +111,10 @@ def attach_adapter(prior: Adaptable, name: str, *, rank: int, scale: float, seed
 
     Args:
         prior: is changed.
-        name: that the adapter's file gives for it.
+        name: name of the prior, which the adapter's file records.
         rank: of the updates.
         scale: of the updates.
-        seed: of their random halves.
+        seed: of the random initial values of the updates.
     """
     prior.adapter = AdapterFacts(rank, scale, name, weights_digest(prior))
     prior.requires_grad_(False)
@@ -130,7 +130,7 @@ def save_adapter(prior: Adaptable, directory: str | os.PathLike[str]) -> Path:
 
 
 def with_adapter_of(prior: Prior, directory: str | os.PathLike[str]) -> Prior:
-    """A copy of a prior with low-rank updates that has those saved in ``directory``."""
+    """A copy of a prior with low-rank updates, which are replaced by those saved in ``directory``."""
     copy = deepcopy(prior)
     set_low_rank(copy.denoiser.network, read_tensors(Path(directory) / ADAPTER_NAME)[0])
     return copy
@@ -168,7 +168,7 @@ def merge_adapters(prior: Adaptable, name: str, terms: Sequence[AdapterTerm]) ->
 
 
 def _read_whole(term: AdapterTerm) -> StoredPrior | None:
-    """The fine-tuned prior that a term names; None where it has a file of low-rank updates, or is no prior."""
+    """The fine-tuned prior that a term names; None if the term has a file of low-rank updates, or is no prior."""
     if term.file.exists():
         return None
     try:
@@ -179,7 +179,7 @@ def _read_whole(term: AdapterTerm) -> StoredPrior | None:
 
 
 def _difference(prior: Adaptable, name: str, term: AdapterTerm, stored: StoredPrior) -> dict[str, Tensor]:
-    """What a fine-tuned prior adds to the weights of its base prior, times the factor of the term."""
+    """Weights of a fine-tuned prior minus those of its base prior, times the factor of the term."""
     weights, own = prior.weights(), Path(name).name
     base = (stored.card.get("post_training") or {}).get("base", own)
     shapes, others = ({key: tensor.shape for key, tensor in each.items()} for each in (weights, stored.tensors))
@@ -201,7 +201,7 @@ def _difference(prior: Adaptable, name: str, term: AdapterTerm, stored: StoredPr
 
 
 def _runs(term: AdapterTerm, stored: StoredPrior | None) -> list[dict[str, Any]]:
-    """The runs whose updates a term has, each with its factor; those of a sum are the runs of its terms."""
+    """The runs that made the updates of a term, each with its factor; for a sum, the runs of all its terms."""
     card = stored.card if stored is not None else {}
     run = card.get("post_training") or {"name": (term.path if term.path.is_dir() else term.path.parent).name}
     if "sum" in run:
@@ -216,7 +216,7 @@ def weights_digest(prior: Adaptable) -> str:
 
 
 def _read_facts(term: AdapterTerm, name: str, digest: str) -> AdapterFacts:
-    """The facts of a low-rank adapter, which must be of the prior ``name`` with weights of this digest."""
+    """The facts of a low-rank adapter, which must have been trained on prior ``name`` with weights of this digest."""
     file = term.file.with_suffix(".json")
     try:
         facts = AdapterFacts(**json.loads(file.read_text(encoding="utf-8")))

@@ -39,7 +39,7 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
     """A trained denoiser with its schedule, layout and normalizer. Tensors x are normalised scenes (B, N, D).
 
     Fixed welded objects and constant features are *known*: clamped to their values while sampling and left
-    out of the loss and of every log-probability. The two kinds are
+    out of the loss and of every log-probability. The two kinds of prior are
     :class:`~agents.priors.continuous.ContinuousPrior` and :class:`~agents.priors.mixed.MixedPrior`.
 
     >>> from agents.priors.testing import tiny_prior
@@ -93,11 +93,11 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
         """Warn of words in ``prompts`` that the prior cannot read; does nothing for a prior without prompts."""
 
     def freeze_text(self) -> None:
-        """Keep the text encoder, if there is one, as it is in any training that follows."""
+        """Freeze the text encoder, if there is one: training does not change it from then on."""
 
     @property
     def count_conditioning(self) -> CountConditioning | None:
-        """The part of the network that is told how many objects a prompt asks for; None where there is none."""
+        """The part of the network that reads how many objects a prompt asks for; None if there is none."""
         return None
 
     # -- the reverse chain ----------------------------------------------------------------------
@@ -108,7 +108,7 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
 
     @property
     def features(self) -> int:
-        """D, numbers per slot of what is denoised."""
+        """D, numbers per slot of the denoised tensor."""
         return self.scene_type.features
 
     @property
@@ -131,9 +131,9 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
         return x
 
     def with_union(self: Prior, union: str) -> Prior:
-        """This prior, for scenes of ``"one_type"`` of a union of scene types or of ``"any"`` of its assets.
+        """This prior, whose scenes of a union of scene types hold the assets of ``"one_type"``, or ``"any"`` assets.
 
-        A prior whose categories are continuous has no such choice, and stays as it is.
+        A prior with continuous categories has no such setting and is not changed.
 
         Raises:
             UnknownNameError: another word.
@@ -143,9 +143,9 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
         return self
 
     def with_open_empty(self: Prior, share: float) -> Prior:
-        """This prior, ``share`` of whose training masks of whole slots open every empty slot.
+        """This prior; in its training, ``share`` of the masks of whole slots include every empty slot.
 
-        A prior that is not told of observed entries has no such masks, and stays as it is.
+        A prior that is not told of observed entries has no such masks and is not changed.
         """
         return self
 
@@ -158,8 +158,8 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
     def transition(self, x_t: Tensor, step: int, table: StepTableLike, *, eta: float = 1.0) -> ReverseStep:
         """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters.
 
-        Known entries are certain; at the last step all are. ``eta`` scales the noise of what is continuous, as in
-        :meth:`sample`.
+        Known entries are certain; at the last step all entries are. ``eta`` scales the noise of the continuous
+        features, as in :meth:`sample`.
         """
 
     def estimate(self, step: int, table: StepTable) -> tuple[float, Tensor]:
@@ -213,8 +213,8 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
             slots: slots per scene; more than trained is allowed.
             seed: of the torch generator; the same seed and batch size give the same scenes.
             batch_size: scenes denoised at once.
-            eta: noise of the reverse steps of what is continuous (Song et al. 2021, Eq. 16): 1 is the ancestral chain,
-                0 makes all but x_T, and the discrete categories of a mixed prior, deterministic.
+            eta: noise of the continuous features in the reverse steps (Song et al. 2021, Eq. 16). 1 is the ancestral
+                chain. With 0, only x_T and the discrete categories of a mixed prior are random.
         """
         if count < 1:
             raise InvalidInputError(f"count={count}: ask for at least one scene")

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 README = "README.md"
 _TITLE = "# Prior `"
-"""What the first line of a model card starts with."""
+"""Start of the first line of a model card."""
 OWN_LICENSE = "MIT, as this package, whose grammars and assets made the scenes."
-"""Of the data of priors that were trained on what ``scene-envs generate`` makes."""
+"""Licence of the data of priors that were trained on scenes of ``scene-envs generate``."""
 _OPTIMIZERS = {"adamw": "AdamW", "muon": "Muon and AdamW"}
 
 
@@ -48,15 +48,15 @@ def package_prior(
         evaluation: ``metrics.json`` of ``scene-envs evaluate``, or the folder it is in; None for a prior that was not
             measured.
         precision: of the weights, ``"float16"`` or ``"float32"``.
-        data: what it was trained on, a sentence.
+        data: the training data, in a sentence.
         license: of the data; empty for that of this package, unless the prior was imported.
-        machine: what it was trained on, as in ``"one NVIDIA H200"``.
-        limits: what it is not good at, in sentences.
+        machine: the hardware of the training, as in ``"one NVIDIA H200"``.
+        limits: weaknesses of the prior, in sentences.
 
     Raises:
         InvalidInputError: no such evaluation, a weight that half precision cannot hold, or a folder that holds
             anything but a packaged prior.
-        CorruptFileError: the evaluation is not what the command writes.
+        CorruptFileError: the evaluation is not a JSON mapping, as the command writes it.
     """
     from agents.priors.base import ScenePrior
 
@@ -66,7 +66,7 @@ def package_prior(
     prior = ScenePrior.load(source)
     told = {"data": data, "license": license or _license(prior.card), "machine": machine, "limits": limits}
     kept = prior.card
-    # the run of a post-trained prior says how it was steered; its card says how it was trained before
+    # the settings of a post-training run describe the post-training; the card has those of the pretraining
     steered = bool(kept.get("post_training"))
     trained = {} if isinstance(source, ScenePrior) or steered else _training_of(Path(source))
     prior.card = {**kept, **trained, **{key: text for key, text in told.items() if text}}
@@ -100,7 +100,7 @@ def _check_folder(folder: Path) -> None:
 
 
 def read_measures(path: str | os.PathLike[str]) -> dict[str, float]:
-    """The figures of ``scene-envs evaluate``, those that are numbers.
+    """The figures of ``scene-envs evaluate`` that are numbers.
 
     Args:
         path: ``metrics.json``, or the folder it is in.
@@ -219,7 +219,7 @@ def _post_training(card: Mapping[str, Any]) -> str:
 
 
 def _iterations(run: Mapping[str, Any]) -> str:
-    """What a run did, or the name of the prior that it made."""
+    """Iterations, algorithm and reward of a run, or the name of the prior that it made."""
     if "reward" not in run:
         return f"`{run.get('name', 'a run without a card')}`"
     algorithm = f" of {run['algorithm'].upper().replace('_', '-')}" if "algorithm" in run else ""
@@ -230,7 +230,7 @@ def _iterations(run: Mapping[str, Any]) -> str:
 
 
 def _training_of(source: Path) -> dict[str, Any]:
-    """How a run was trained, from the ``config.yaml`` beside its prior."""
+    """Training settings of a run, from the ``config.yaml`` beside its prior."""
     import yaml
 
     folder = source.parent if source.name == "prior" else source
@@ -248,7 +248,7 @@ def _training_of(source: Path) -> dict[str, Any]:
 
 
 def _without_folders(state: dict[str, Any]) -> dict[str, Any]:
-    """A configuration that names no folder of this machine; of the folder of a BERT model only the last part stays."""
+    """A configuration without absolute paths: of the folder of a BERT model, only the last part stays."""
     text = state["prior"].get("text")
     if not text or not os.path.isabs(text.get("model", "")):
         return state

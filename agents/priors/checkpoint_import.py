@@ -53,7 +53,7 @@ _RULES: tuple[tuple[str, str], ...] = (
     (r"to_continous_out\.out_layer\.", "pose_out.2."),
     (r"to_logits\.", "logits_out."),
 )
-"""Names of their tensors, as patterns, and what ours are called."""
+"""Patterns of the tensor names in the authors' checkpoints, and the names in this package."""
 
 
 def import_checkpoint(
@@ -72,11 +72,11 @@ def import_checkpoint(
         file: the ``.ckpt``.
         metadata: the ``metadata.json``.
         scene: scene type of the prior; its assets are matched with the model paths by name. None makes a scene type
-            from the metadata, whose assets have names and no geometry: it samples, and knows no physics.
-        aliases: model path, or its stem, to asset name.
-        text_encoder: folder or hub name of the BERT that the checkpoint reads prompts with. Empty takes BERT-base where
-            it is at hand; where it is not, a checkpoint with text becomes a prior without prompts, and a warning says
-            so.
+            from the metadata, whose assets have names but no geometry: its scenes can be sampled, without physics.
+        aliases: asset names, by model path or by its stem.
+        text_encoder: folder or hub name of the BERT that the checkpoint reads prompts with. Empty takes BERT-base if it
+            can be loaded without a download. Otherwise a checkpoint with text becomes a prior without prompts, and a
+            warning says so.
 
     Raises:
         MissingDependencyError: ``text_encoder`` is named and ``transformers`` is not installed.
@@ -123,7 +123,7 @@ def bert_of(width: int, name: str, file: str | os.PathLike[str]) -> BertTextConf
 
     Args:
         width: of the checkpoint's text tokens; 0 for none.
-        name: folder or hub name; empty for BERT-base, if it is at hand.
+        name: folder or hub name; empty for BERT-base, if it can be loaded without a download.
         file: the checkpoint, for messages.
 
     Raises:
@@ -155,7 +155,7 @@ def bert_of(width: int, name: str, file: str | os.PathLike[str]) -> BertTextConf
 def scene_type_of(info: DatasetInfo, name: str) -> SceneType:
     """A scene type made only from a dataset's metadata, registered as ``name``.
 
-    Its workspace is the range of the normalizer, its camera looks straight down on that.
+    Its workspace is the range of the normalizer. Its camera looks straight down on the workspace.
     """
     low, high = (tuple(float(v) for v in bound[:3]) for bound in (info.normalizer.input_min, info.normalizer.input_max))
     stems = dict(zip(info.model_paths, info.stems, strict=True))
@@ -187,7 +187,7 @@ def _reorder(tensors: dict[str, Tensor], order: Tensor) -> None:
 
 
 def rename(state: Mapping[str, Any], file: str | os.PathLike[str]) -> dict[str, Tensor]:
-    """Tensors under our names; raises CorruptFileError that names what is not of this model."""
+    """Tensors under the names of this package; raises CorruptFileError that names tensors of another model."""
     prefix = _AVERAGED if any(name.startswith(_AVERAGED) for name in state) else _RAW
     tensors: dict[str, Tensor] = {}
     extra: list[str] = []
@@ -211,7 +211,7 @@ def sizes(tensors: Mapping[str, Tensor], file: str | os.PathLike[str]) -> MixedF
     """The size of the network, read from its tensors.
 
     Raises:
-        CorruptFileError: a tensor that sizes are read from is missing.
+        CorruptFileError: a tensor from which a size is read is missing.
     """
     try:
         hidden, width = tensors["scene_in.weight"].shape
@@ -271,7 +271,7 @@ def _list(names: list[str]) -> str:
 
 
 def _with_categories(normalizer: Normalizer, scene: SceneType) -> Normalizer:
-    """The normalizer over all D features; theirs covers poses, and may cover one-hots as well."""
+    """The normalizer over all D features; the imported one covers poses, and may cover one-hots as well."""
     low, high = (torch.zeros(scene.features), torch.ones(scene.features))
     low[:POSE_FEATURES], high[:POSE_FEATURES] = (
         normalizer.input_min[:POSE_FEATURES],

@@ -118,7 +118,7 @@ class MixedPriorConfig(PoseDiffusionConfig, DenoiserConfig):
 
 
 def current_names(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a prior's configuration with the names of today, from those of a file of an earlier version."""
+    """Fields of a prior's configuration under their present names; a file of an earlier version may have others."""
     renamed = {"given_share": "observed_share"}
     return {
         renamed.get(key, key): current_prediction(value) if key == "prediction" else value

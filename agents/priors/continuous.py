@@ -31,18 +31,18 @@ from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type
 
 SCENE_MOMENTS = ("feature", "scene")
-"""Whose mean and standard deviation precondition the network of a continuous prior."""
+"""Moments that precondition the network of a continuous prior: of each feature, or one standard deviation for all."""
 
 
 class ContinuousPrior(ScenePrior):
     """A :class:`~agents.priors.base.ScenePrior` whose categories are diffused as numbers.
 
-    What is denoised, x (B, N, D), is a scene in the representation of rotations that ``config.rotation`` names: in the
-    scene type's own layout for ``"matrix"``, narrower for the others. :meth:`encode` and :meth:`decode` go there and
-    back.
+    The denoised tensor x (B, N, D) holds scenes with the representation of rotations that ``config.rotation`` names.
+    For ``"matrix"`` it has the scene type's own layout; for the others it is narrower. :meth:`encode` and
+    :meth:`decode` convert scenes to x and back.
 
     Args:
-        config: what it is made of.
+        config: its configuration.
         normalizer: of raw scenes in the scene type's layout.
         preconditioning: moments (D,) of encoded scenes.
         card: facts about its training.
@@ -83,7 +83,7 @@ class ContinuousPrior(ScenePrior):
         """A fresh prior whose preconditioning is fitted to raw scenes (M, N, 3 + 9 + C + 1).
 
         Args:
-            config: what it is made of.
+            config: its configuration.
             normalizer: of raw scenes.
             raw: scenes in the scene type's layout.
             moments: one of :data:`SCENE_MOMENTS`: those of each feature, or one standard deviation for all.
@@ -113,7 +113,7 @@ class ContinuousPrior(ScenePrior):
 
     @property
     def features(self) -> int:
-        """D, numbers per slot of what is denoised."""
+        """D, numbers per slot of the denoised tensor."""
         return self.code.features
 
     @property
@@ -133,7 +133,8 @@ class ContinuousPrior(ScenePrior):
     def decode(self, x: Tensor) -> SceneBatch:
         """Scenes from normalised x_0 (B, N, D); known entries take their exact values.
 
-        The category of a slot is the arg-max over those that it can hold: the assets of fixed objects are in no other.
+        The category of a slot is the arg-max over those that it can hold. Free slots cannot hold assets of fixed
+        objects.
         """
         x = self.clamp(x)
         free, barred = len(self.scene_type.fixed), self.scene_type.fixed_categories
@@ -149,7 +150,7 @@ class ContinuousPrior(ScenePrior):
     def posterior(self, x_t: Tensor, step: int, table: StepTableLike, eta: float = 1.0) -> tuple[Tensor, Tensor]:
         """Mean (B, N, D) and std (N, D) of x_{t-1} given x_t; differentiable in the network's parameters.
 
-        The std is 0 on known entries, and everywhere at the last step, which is deterministic, or where ``eta`` is 0.
+        The std is 0 on known entries. All entries are 0 at the last step, which is deterministic, and if ``eta`` is 0.
         """
         return self._reverse(x_t, step, table, eta)[:2]
 
@@ -170,19 +171,19 @@ class ContinuousPrior(ScenePrior):
     ) -> GaussianStep:  # fmt: skip
         """p(x_{t-1} | x_t) of scenes whose observed entries are certain; :class:`Inpainting` says more.
 
-        They have the noise of their level: :meth:`write_observed` replaces them by those of the next.
+        Observed entries stay as in x_t, with its noise; :meth:`write_observed` then writes those of the next level.
         """
         return self._reverse(x_t, step, table, 1.0).observing(self._entries(observed), x_t)
 
     def write_observed(self, x: Tensor, x0: Tensor, observed: Tensor, level: int, noise: Noise | None = None) -> Tensor:
-        """States with the observed entries of ``x0``, which have the noise of ``level``."""
+        """``x`` with the observed entries of ``x0`` in place, to which the noise of ``level`` is added."""
         if level > 0:
             drawn = torch.randn_like(x0) if noise is None else noise()
             x0 = self.process.add_noise(x0, torch.tensor(level), drawn)
         return self.clamp(torch.where(self._entries(observed), x0, x))
 
     def _entries(self, observed: Tensor) -> Tensor:
-        """(B, N, D) bool of (B, N, 2) for pose and category."""
+        """(B, N, D) bool per feature, from (B, N, 2) bool for pose and category."""
         widths = torch.tensor([self.pose_width, self.features - self.pose_width], device=observed.device)
         return observed.repeat_interleave(widths, dim=-1)
 
@@ -209,7 +210,7 @@ class ContinuousPrior(ScenePrior):
                 if again:
                     x = self.process.renoise(x, after, int(level), draw_noise(x0, generators))
                 noised = self.process.add_noise(x0, level, draw_noise(x0, generators))
-                x = self.clamp(torch.where(keep, noised, x))  # what is kept has the noise of every level
+                x = self.clamp(torch.where(keep, noised, x))  # kept entries have the noise of this level
                 reverse: ReverseStep = self.transition(x, step, table)
                 if hook is not None and again == rounds - 1:
                     reverse = hook(step, x, reverse)
@@ -269,7 +270,7 @@ class ContinuousPrior(ScenePrior):
 
 
 def _check_network(config: PriorConfig, code: SceneCode) -> None:
-    """Raise InvalidInputError when the network does not fit what is denoised."""
+    """Raise InvalidInputError when the network does not fit the denoised tensor."""
     features = getattr(config.network, "features", None)
     if features is None:
         raise InvalidInputError(

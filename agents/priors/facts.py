@@ -18,7 +18,7 @@ HEADLINES = {
     "prompt_following": "prompts followed",
     "novelty": "novelty",
 }
-"""The figures of :mod:`agents.evaluation` that a listing shows, and what it calls them."""
+"""The figures of :mod:`agents.evaluation` that a listing shows, and their labels."""
 _RATIOS = ("novelty",)
 _FLOOR = "floor_"
 
@@ -31,9 +31,9 @@ class PriorFacts:
         name: as it was asked for.
         scene_type: its scene type.
         process: ``"continuous"`` or ``"mixed"``.
-        slots: that it was trained on.
-        text: what reads its prompts; empty for a prior without text.
-        parameters: trained numbers in its file.
+        slots: slots per scene that it was trained on.
+        text: description of its text encoder; empty for a prior without text.
+        parameters: number of trained parameters in its file.
         megabytes: size of its weights on disk, MB.
         card: facts about its training and, under ``measures``, its figures.
     """
@@ -91,7 +91,7 @@ class PriorFacts:
 
 
 def headlines(measures: Mapping[str, float]) -> list[tuple[str, str, str]]:
-    """(label, samples, real scenes) of the figures that a listing shows; what was not measured is left out.
+    """(label, samples, real scenes) of the figures that a listing shows; figures that were not measured are left out.
 
     >>> headlines({"feasible_fraction": 0.81, "floor_feasible_fraction": 0.99, "novelty": 0.954})
     [('free objects feasible as sampled', '81 %', '99 %'), ('novelty', '0.95', '')]

@@ -21,7 +21,7 @@ from scene_envs.tensor_files import read_tensors, write_tensors
 
 WEIGHTS_NAME = "model.safetensors"
 RESIDUAL = "residual."
-"""What the names of measured tensors, which are no weights, start with."""
+"""Prefix of the names of measured tensors, which are not weights."""
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
 """Number formats of the weights in a file."""
 
@@ -66,7 +66,7 @@ def write_config(directory: Path, config: Mapping[str, Any]) -> None:
 
 
 def read_config(name: str | os.PathLike[str]) -> dict[str, Any]:
-    """Configuration of a prior, without the digest that it is compared with; errors as for :func:`read_prior`."""
+    """Configuration of a prior, compared with its digest and returned without it; errors as for :func:`read_prior`."""
     file = find_prior(name) / CONFIG_NAME
     try:
         config: dict[str, Any] = json.loads(file.read_text())
@@ -80,7 +80,7 @@ def read_config(name: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def count_parameters(name: str | os.PathLike[str]) -> int:
-    """Trained numbers in the file of a prior, whose weights are not read; errors as for :func:`read_prior`."""
+    """Number of trained parameters of a prior, without reading its weights; errors as for :func:`read_prior`."""
     with _weights_of(name) as file, safe_open(file, "pt") as tensors:
         shapes = [tensors.get_slice(key).get_shape() for key in tensors.keys() if not key.startswith(RESIDUAL)]  # noqa: SIM118
     return sum(math.prod(shape) for shape in shapes)

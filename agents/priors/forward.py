@@ -77,7 +77,7 @@ class Trainable(ABC):
         """(slots, D) bool: entries that are clamped, and so have no part in the loss."""
 
     def draw_timesteps(self, count: int, generator: Generator | None = None) -> Tensor:
-        """(count,) int64 training timesteps, ln(noise-to-signal) being normal."""
+        """(count,) int64 training timesteps, from the distribution that the configuration names."""
         return torch.multinomial(self._timestep_weights, count, replacement=True, generator=generator)
 
     def pretraining_loss(
@@ -114,8 +114,8 @@ class Trainable(ABC):
             x0: normalised scenes.
             generator: source of timesteps, noise and observed entries (CPU).
             t: (B,) timesteps, drawn when None.
-            observed: entries that have no part in the loss; None draws them as in pretraining, which a continuous
-                prior does not.
+            observed: entries that have no part in the loss; None draws them as in pretraining. A continuous prior draws
+                none.
         """
 
     @abstractmethod
@@ -137,14 +137,14 @@ class Trainable(ABC):
         return observed
 
     def category_kl(self, noised: NoisedScenes, now: DenoiserOutput, then: DenoiserOutput) -> Tensor | None:
-        """(B, N) KL divergences of the categories' reverse steps t -> t - 1 by two outputs, nats.
+        """(B, N) KL divergences between the categories' reverse steps t -> t - 1 under two outputs, nats.
 
         ``None`` where categories are a part of the continuous output.
         """
         return None
 
     def observed_by_mask(self, x: Tensor, observed: Tensor | None) -> Observed | None:
-        """Observed entries of scenes ``x`` (B, N, D) from flags (B, N, 2) for pose and category; None of None."""
+        """Observed entries of scenes ``x`` (B, N, D) from flags (B, N, 2) for pose and category; None for None."""
         return None if observed is None else Observed(x, observed[..., 0], observed[..., 1])
 
     @property

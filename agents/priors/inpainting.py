@@ -20,31 +20,33 @@ from scene_envs.scene import TRANSLATION, SceneBatch
 from scene_envs.scene_types import SceneType
 
 Hook = Callable[[int, Tensor, ReverseStep], ReverseStep]
-"""``(step, x_t, reverse) -> reverse``: called at every step before x_{t-1} is drawn; may take other rows or shift it.
+"""``(step, x_t, reverse) -> reverse``: called at every step before x_{t-1} is drawn; may change the rows of
+``reverse`` or shift it.
 """
 Start = tuple[int, Tensor]
-"""A step of a chain, and x_t (B, N, D) at it: where the chain begins instead of at x_T."""
+"""A step of a chain, and x_t (B, N, D) at this step. The chain begins there instead of at x_T."""
 Guide = Callable[[int, int, Callable[[], SceneBatch]], Tensor | None]
 """``(step, steps, denoised) -> gradient``: d log w / d translation (B, N, 3), 1/m, of a weight w of scenes.
 
-Scenes then follow the prior times w. ``denoised`` is as for :data:`Watch`; None leaves a step alone.
+Scenes are then distributed as the prior times w. ``denoised`` is as for :data:`Watch`. If the gradient is None, the
+step is not changed.
 """
 Watch = Callable[[int, int, Callable[[], SceneBatch]], Tensor | None]
-"""``(step, steps, denoised) -> rows``: what happens to scenes while they are denoised.
+"""``(step, steps, denoised) -> rows``: called at the steps of the denoising; chooses the scenes that continue.
 
-``denoised()`` gives the B scenes as the network sees them at this step. ``rows`` (B,) are the scenes that go on in the
-place of each, such as ``[0, 0, 2]``; None for all as they are.
+``denoised()`` gives the B scenes that the network expects at this step. ``rows`` (B,) is the index of the scene that
+each place continues with, such as ``[0, 0, 2]``; if it is None, every scene continues in its own place.
 
-Where a watch has ``start(steps)``, the chain begins at the :data:`Start` that it gives, if any; where it has
-``see(step, steps, x)``, it is shown x_t (B, N, D) at every step.
+If a watch has a method ``start(steps)``, the chain begins at the :data:`Start` that the method returns, if any. If a
+watch has a method ``see(step, steps, x)``, the method is called with x_t (B, N, D) at every step.
 """
 
 
 class Inpainting(ABC):
     """The part of a prior that regenerates some of a scene and keeps the rest: inpainting, completion, rearrangement.
 
-    A mixed prior sees what is kept without noise. A continuous prior sees it with the noise of every level (Lugmayr et
-    al. 2022, Eq. 8).
+    The network of a mixed prior reads the kept entries without noise. That of a continuous prior reads them with the
+    noise of each level (Lugmayr et al. 2022, Eq. 8).
     """
 
     scene_type: SceneType
@@ -98,14 +100,14 @@ class Inpainting(ABC):
         text: Text | None = None,
         guidance: float = 0.0,
     ) -> ReverseStep:
-        """p(x_{t-1} | x_t) of scenes (B, N, D) whose observed entries are certain, and so no part of log p.
+        """p(x_{t-1} | x_t) of scenes (B, N, D) whose observed entries are certain, and so add nothing to log p.
 
         Args:
             x_t: scenes with the observed entries in place, see :meth:`observe`.
             step: index in the table.
             table: the chain.
             observed: (B, N, 2) bool, True where the pose, or the category, of a slot is observed.
-            text, guidance: of a prompt, for priors that read some.
+            text, guidance: tokens of a prompt and weight of its guidance, for priors that read prompts.
         """
 
     @abstractmethod
@@ -117,10 +119,10 @@ class Inpainting(ABC):
         """Normalised x_0 (B, N, D) of scenes."""
 
     def closed_categories(self, batch: SceneBatch, mask: Tensor) -> Tensor:
-        """(B, K) bool: categories that the slots under ``mask`` (B, N, 2) do not take.
+        """(B, K) bool: categories that the slots under ``mask`` (B, N, 2) must not take.
 
         These are the welded assets, in scenes that keep generated furniture and regenerate none. No mask generator
-        masks furniture, so every further inpainting of empty slots would add some.
+        masks furniture, so without this rule every further inpainting of empty slots would add furniture.
         """
         changed = mask[..., 1]
         masked = self.closed_by_furniture(batch.categories, changed).any(dim=1)
@@ -166,23 +168,24 @@ class Inpainting(ABC):
         watch: Watch | None = None,
         guide: Guide | None = None,
     ) -> SceneBatch:
-        """Regenerate what is masked, given the rest.
+        """Regenerate the masked entries, given the rest.
 
-        A room keeps its furniture: where generated welded objects are kept and none is masked, masked slots take no
+        A room keeps its furniture: if generated welded objects are kept and none is masked, masked slots take no
         welded asset.
 
         Args:
             batch: scenes to change.
             mask: bool, True where something is regenerated: (B, N) for whole slots, or (B, N, 2) for the pose and the
-                category of each slot. Fixed welded slots never are.
+                category of each slot. Fixed welded slots are never regenerated.
             prompt: what the whole scenes should hold in the end, one text for all or one per scene; None for anything.
             guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional; it needs a prompt.
             num_steps: denoiser evaluations of one pass, 1..T.
             generators: one per scene, so that a scene's result does not depend on its neighbours' noise.
             seed: used to make the generators when none are given.
-            resample: how often each step is taken, going back in between (Lugmayr et al. 2022, Algorithm 1); 1 is once.
-            watch: told of every step, and says which scenes go on; a scene may give way only to one of the same
-                ``batch`` and ``mask``.
+            resample: number of times that each step is taken, with noise added again in between (Lugmayr et al. 2022,
+                Algorithm 1).
+            watch: called at every step; chooses the scenes that continue. A scene may be replaced only by one with the
+                same rows of ``batch`` and ``mask``.
             guide: gradient of a log-weight of scenes; moves the poses that are regenerated.
 
         Returns:
@@ -235,10 +238,11 @@ class Inpainting(ABC):
         return None if watch is None and guide is None else hook
 
     def _tilted(self, step: int, table: StepTable, gradient: Tensor) -> Tensor:
-        """(B, N, 3) shift of x_{t-1} by which p(x_0 | x_t) is tilted by a weight.
+        """(B, N, 3) shift of x_{t-1} that tilts p(x_0 | x_t) by a weight w.
 
-        Given x_t, x_0 is about normal around the denoised scene. Its mean moves by its variance times ``gradient``
-        (B, N, 3), of ln w by metres: exact where the gradient is constant. No object moves by more than a deviation.
+        Given x_t, x_0 is approximately normal around the denoised scene. The tilt moves its mean by its variance times
+        ``gradient`` (B, N, 3), that of ln w by metres. This is exact if the gradient is constant. No object moves by
+        more than one standard deviation.
         """
         weight, std = self.estimate(step, table)
         scale = self.normalizer.scale[TRANSLATION].to(std)
@@ -258,7 +262,7 @@ class Inpainting(ABC):
     ) -> SceneBatch:
         """Fill the empty slots of ``batch``, keeping its objects.
 
-        With all empty slots open a prior crowds a scene; with ``fill`` of them it adds that many at most.
+        With all empty slots open, a prior crowds a scene. With ``fill`` open slots, it adds at most that many objects.
 
         Args:
             batch: scenes.
@@ -284,7 +288,7 @@ class Inpainting(ABC):
         num_steps: int = 50,
         seed: int = 0,
     ) -> SceneBatch:
-        """New poses for the free objects of ``batch``; what is there, and what is welded, stays.
+        """New poses for the free objects of ``batch``; all categories, and the poses of welded objects, stay.
 
         Arguments as in :meth:`complete`.
         """

@@ -32,7 +32,7 @@ def read_lightning(file: str | os.PathLike[str]) -> dict[str, Any]:
             content = torch.load(path, map_location="cpu", weights_only=True)
         except pickle.UnpicklingError:
             content = torch.load(path, map_location="cpu", weights_only=False, pickle_module=_Inert)
-    except Exception as error:  # a damaged file fails in any way; torch's own advice would be to run its code
+    except Exception as error:  # a damaged file may raise any error; torch's message would advise to run its code
         raise CorruptFileError(
             f"{str(file)!r} is truncated or not a checkpoint of PyTorch ({type(error).__name__})"
         ) from error
@@ -87,5 +87,5 @@ class _Inert:
 
     @classmethod
     def load(cls, file: IO[bytes], **options: Any) -> Any:
-        """Object that :class:`Unpickler` reads from ``file``; files older than the zip format begin like this."""
+        """Object that :class:`Unpickler` reads from ``file``; torch calls it for files older than the zip format."""
         return cls.Unpickler(file, **options).load()

@@ -125,7 +125,7 @@ class Loadable(ABC):
 
 
 def prior_class(process: str) -> type[Any]:
-    """The class of priors of a process, ``"continuous"`` or ``"mixed"`` or that of a class of your own."""
+    """The class of priors of a process: ``"continuous"``, ``"mixed"``, or the ``process_name`` of another subclass."""
     if process not in _CLASSES:
         raise unknown_name("process", process, _CLASSES)
     return _CLASSES[process]

@@ -51,7 +51,7 @@ class MixedPrior(TrainableMixedPrior):
     """A :class:`~agents.priors.base.ScenePrior` whose categories are discrete.
 
     Args:
-        config: what it is made of.
+        config: its configuration.
         normalizer: of raw scenes; only its pose features are used.
         preconditioning: moments (12,) of normalised poses.
         card: facts about its training.
@@ -162,8 +162,8 @@ class MixedPrior(TrainableMixedPrior):
             observed: entries that carry no noise; None for the fixed objects alone.
             text: tokens (B, L, W) and their mask (B, L); None for no prompt.
             guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional, on poses and logits.
-            free: what stands for no prompt, as :meth:`unconditional` gives it; encoded anew when None.
-            eta: noise of the pose, 1 for the ancestral step and 0 for a certain one; categories are drawn all the same.
+            free: text of the empty prompt, as :meth:`unconditional` gives it; encoded anew when None.
+            eta: noise of the pose, 1 for the ancestral step and 0 for none; categories are drawn in either case.
             closed: (B, K) bool, further categories with probability 0 in slots that are not observed.
         """
         t, previous = int(table.timesteps[step]), int(table.previous[step])
@@ -210,7 +210,7 @@ class MixedPrior(TrainableMixedPrior):
     ) -> MixedStep:  # fmt: skip
         """p(x_{t-1} | x_t) of scenes whose observed entries are certain; see :class:`Inpainting`.
 
-        A room that keeps generated furniture gets no more of it.
+        A room that keeps generated furniture gets no further furniture.
         """
         entries = Observed(x_t, observed[..., 0], observed[..., 1])
         closed = self.closed_by_furniture(state_of(x_t[..., POSE_FEATURES:]), observed[..., 1])
@@ -252,8 +252,8 @@ class MixedPrior(TrainableMixedPrior):
             noises: one generator for all scenes, or one per scene; None for torch's own.
             observed: entries that carry no noise.
             text, guidance, eta, closed: as in :meth:`transition`.
-            resample: how often each step is taken, going back in between.
-            hook: called at the last taking of every step.
+            resample: number of times that each step is taken, with noise added again in between.
+            hook: called at the last time that each step is taken.
             first: step that the chain begins at.
         """
         free = self.unconditional(len(x)) if text is None or guidance else None

@@ -32,7 +32,8 @@ class MixedStates(PromptReader, ScenePrior):
     def observed_entries(self, x: Tensor, observed: Observed | None = None) -> Observed | None:
         """Observed entries of scenes ``x`` (B, N, D) for the network: ``observed``, or else the fixed objects.
 
-        A prior trained with observed entries has always been told of its fixed objects; one trained without is not.
+        A prior trained with observed entries was always told of its fixed objects. A prior trained without them is not
+        told of any.
         """
         if observed is not None or self.config.observed_share <= 0:
             return observed
@@ -66,14 +67,15 @@ class MixedStates(PromptReader, ScenePrior):
     def normalised(self, batch: SceneBatch) -> Tensor:
         """(B, N, D): normalised pose, one-hot category as it is.
 
-        The pose of an empty slot means nothing; it takes the mean of poses, where it asks nothing of the network.
+        The pose of an empty slot has no meaning. It is set to the mean of poses, so that it asks nothing of the
+        network.
         """
         pose = batch.to_tensor(normalised=self.normalizer)[..., :POSE_FEATURES]
         pose = torch.where(batch.is_empty[..., None], self.preconditioning.mean.to(pose), pose)
         return torch.cat([pose, batch.tensor[..., POSE_FEATURES:]], dim=-1)
 
     def initial(self, count: int, slots: int, generator: Generator | None = None) -> Tensor:
-        """x_T (count, slots, D): normal poses, categories from the end of their chain, known entries clamped."""
+        """x_T (count, slots, D): normal poses, categories from their distribution at T, known entries clamped."""
         noise = torch.randn(count, slots, self.scene_type.features, generator=generator, device=self._fixed.device)
         probs = self.categories.prior().to(noise).expand(count, slots, -1)
         return self.clamp(self.with_states(noise[..., :POSE_FEATURES], probs, noise))
@@ -93,9 +95,9 @@ class MixedStates(PromptReader, ScenePrior):
     def barred_categories(self, state: Tensor, closed: Tensor | None = None) -> Tensor:
         """(B, N, K) bool: categories of x_0 with probability 0, given states (B, N) of x_t.
 
-        These are the categories of fixed objects, in all slots but theirs, and ``closed`` (B, K). A slot that holds one
-        as an observed entry keeps it where the chain only absorbs. With ``union="one_type"`` they are also the assets
-        that no member has beside what the scene holds already.
+        These are the categories of fixed objects, in all slots but theirs, and ``closed`` (B, K). With
+        ``union="one_type"``, they are also the assets that no member has together with all assets that the scene holds
+        already. If the chain only absorbs, the category that a slot holds already is not barred in this slot.
         """
         barred = torch.zeros(*state.shape, self.num_categories, dtype=torch.bool, device=state.device)
         barred[:, len(self.scene_type.fixed) :, list(self.scene_type.fixed_categories)] = True
@@ -111,7 +113,7 @@ class MixedStates(PromptReader, ScenePrior):
     def step_table(self, num_steps: int) -> StepTable:
         """The reverse steps of a chain of ``num_steps``, any number in 1..T.
 
-        Where scenes are those of one member of a union, the first steps decide about one slot each.
+        If a scene holds the assets of one member of a union only, each of the first steps unmasks about one slot.
         """
         if self._separates_members:
             return StepTable.gradual(self.categories.schedule.mask, self.config.slots, num_steps)
@@ -129,7 +131,7 @@ class MixedStates(PromptReader, ScenePrior):
         return torch.tensor([[asset in member.assets for asset in assets] for member in members_of(self.scene_type)])
 
     def _fitting_assets(self, present: Tensor) -> Tensor:
-        """(B, C) bool: assets of the members that have all of ``present`` (B, C) bool; all where no member has."""
+        """(B, C) bool: assets of the members that have all of ``present`` (B, C) bool; all if no member has them."""
         members = self._members.to(present.device)
         fits = ~(present[:, None] & ~members).any(dim=-1)  # (B, M)
         allowed = (fits[..., None] & members).any(dim=1)

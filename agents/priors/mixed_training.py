@@ -17,20 +17,20 @@ from agents.priors.mixed_states import MixedStates
 from scene_envs.scene import POSE_FEATURES
 
 _EMPTY_WEIGHT = 0.1
-"""Weight of the pose of an empty slot in the loss: it means nothing, but chains should not drift on it."""
+"""Weight of the pose of an empty slot in the loss. The pose has no meaning, but chains should not drift on it."""
 
 _COUNT_WEIGHT = 0.5
-"""Weight of the numbers that a prompt asks for, read from the text alone, where the network subtracts from them."""
+"""Weight of the count loss of networks with count conditioning, which read numbers of objects from the text alone."""
 
 _AT_ONCE = 32
-"""Scenes whose residual is measured at once: features of all pairs of slots of 512 rooms would be gigabytes."""
+"""Scenes whose residual is measured in one batch: features of all pairs of slots of 512 rooms would be gigabytes."""
 
 
 class TrainableMixedPrior(MixedStates):
     """The part of :class:`~agents.priors.mixed.MixedPrior` that is needed to train it."""
 
     def noised_loss(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
-        """(B,) mean squares of the pose output plus ``category_weight`` times the category loss, where unobserved."""
+        """(B,) mean squared pose error plus ``category_weight`` times the category loss, over unobserved entries."""
         config = self.config
         text = self.unconditional(len(noised.t)) if text is None else text
         output = self.output(noised, text)
@@ -76,7 +76,7 @@ class TrainableMixedPrior(MixedStates):
         if observed is not None:
             weight = weight * (~observed.pose)[..., None]
             drawn = drawn * (~observed.category)
-        if self.denoiser.drops_empty:  # what is seen is certain
+        if self.denoiser.drops_empty:  # an unmasked category is certain
             drawn = drawn * (states == self.num_categories)
         scale = loss_weights(self.process.schedule, t, config.prediction, config.loss_weighting).to(device)
         return NoisedScenes(x_t, t, target, weight, scale, category, drawn, observed)
@@ -93,7 +93,7 @@ class TrainableMixedPrior(MixedStates):
         return self.process.x0_from_output(poses, noised.t, output.continuous, moments)
 
     def category_kl(self, noised: NoisedScenes, now: DenoiserOutput, then: DenoiserOutput) -> Tensor:
-        """(B, N) KL divergences of the categories' reverse steps t -> t - 1, nats; 0 where nothing is drawn."""
+        """(B, N) KL divergences of the categories' reverse steps t -> t - 1, nats; 0 where ``drawn`` is 0."""
         assert now.logits is not None
         assert then.logits is not None
         assert noised.drawn is not None
@@ -107,8 +107,9 @@ class TrainableMixedPrior(MixedStates):
     def draw_observed(self, x0: Tensor, generator: Generator | None) -> Observed:
         """Random observed entries: slots (completion), all categories (rearrangement), or any attribute of any slot.
 
-        ``open_empty_share`` of the completions observe objects alone. A search masks slots because they are empty;
-        under random masks alone, many open slots beside many objects mean that the scene is full.
+        In ``open_empty_share`` of the completions, only objects are observed and all empty slots are open. A search
+        masks slots because they are empty. Under random masks alone, many open slots beside many observed objects are
+        a sign of a full scene.
         """
         batch, slots = x0.shape[:2]
         kind, share = torch.rand(2, batch, 1, generator=generator)

@@ -1,4 +1,4 @@
-"""Scenes of which a part is observed: the mask of the rest, and what a chain of states holds of the observed part."""
+"""Partly observed scenes: the mask of the regenerated entries, and the observed entries in the states of a chain."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ class Writer(Protocol):
 
 @dataclass(frozen=True)
 class ObservedScenes:
-    """B scenes whose observed entries every state and every result of a chain has.
+    """B scenes with observed entries, which every state and every result of a chain holds.
 
     Made by :meth:`ScenePrior.observe`; environments take it for the episodes of an inpainting.
 
     Attributes:
-        prior: that denoises the rest.
+        prior: the prior that denoises the other entries.
         batch: the scenes.
         mask: (B, N, 2) bool, True where the pose, or the category, of a slot is regenerated.
         x0: (B, N, D) the scenes as the prior encodes them.
@@ -59,8 +59,8 @@ class ObservedScenes:
         Args:
             x: states.
             level: timestep, 0 for finished scenes.
-            noise: gives standard normal noise (B, N, D) for priors that see observed entries with the noise of every
-                level; torch's own without.
+            noise: gives standard normal noise (B, N, D), for priors that read observed entries with the noise of each
+                level; None for torch's own.
         """
         return self.prior.write_observed(x, self.x0, self.entries.to(x.device), level, noise)
 
@@ -89,7 +89,7 @@ def check_mask(
 def merge(batch: SceneBatch, new: SceneBatch, mask: Tensor) -> SceneBatch:
     """``batch`` with the poses and categories of ``new`` where ``mask`` (B, N, 2) says so."""
     empty = batch.scene_type.num_assets
-    taken = mask[..., 1] & (mask[..., 0] | (new.is_empty == batch.is_empty))  # a kept pose, or none, stays one
+    taken = mask[..., 1] & (mask[..., 0] | (new.is_empty == batch.is_empty))  # if the pose is kept, emptiness is too
     category = torch.where(taken[..., None], new.tensor[..., CATEGORY], batch.tensor[..., CATEGORY])
     pose = torch.where(mask[..., :1], new.tensor[..., POSE], batch.tensor[..., POSE])
     gone = category.argmax(dim=-1, keepdim=True) == empty

@@ -66,7 +66,7 @@ def no_text(scene_type: SceneType, prompt: str) -> InvalidInputError:
 
 
 def check_object_count(prompts: Sequence[str], scene_type: SceneType, slots: int) -> None:
-    """Refuse prompts that ask for more objects than a scene has slots; free text is not looked into.
+    """Refuse prompts that ask for more objects than a scene has slots; free text is not checked.
 
     Raises:
         InvalidInputError: names the prompt, the number and the remedy.

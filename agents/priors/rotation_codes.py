@@ -1,6 +1,6 @@
 """Rotation codes: the numbers in which a continuous prior diffuses rotations.
 
-The scene type's own layout (translation | rotation matrix | one-hot) stays what crosses module boundaries.
+Other modules exchange scenes in the scene type's own layout (translation | rotation matrix | one-hot) only.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ ROTATIONS = tuple(ROTATION_WIDTHS)
 """Representations of rotations: a matrix that ends in an SVD, a unit quaternion, or axis times angle."""
 
 _HALF_TURN = 1e-6
-"""A quaternion whose w is below this is a half turn, of which both signs are as good."""
+"""A quaternion with abs(w) below this is a half turn, for which w does not decide between q and -q."""
 _ZERO = 1e-9
 
 
 def encode_rotations(matrices: Tensor, rotation: str) -> Tensor:
     """Rotation matrices (..., 3, 3) as (..., R) numbers of the representation ``rotation``; same dtype.
 
-    Quaternions are (w, x, y, z) with w >= 0; of a half turn, whose w is 0, the first of x, y, z that is not 0 is
-    positive. Axis-angle vectors are at most pi long, and half turns have the same sign.
+    Quaternions are (w, x, y, z) with w >= 0. For a half turn w is 0, and the first of x, y, z that is not 0 is
+    positive. Axis-angle vectors are at most pi long, and those of half turns have the sign of the quaternion.
 
     >>> encode_rotations(torch.diag(torch.tensor([-1.0, -1.0, 1.0])), "quaternion").tolist()
     [0.0, 0.0, 0.0, 1.0]
@@ -43,9 +43,9 @@ def encode_rotations(matrices: Tensor, rotation: str) -> Tensor:
 
 
 def decode_rotations(code: Tensor, rotation: str) -> Tensor:
-    """Inverse of :func:`encode_rotations` that makes rotations (..., 3, 3) of any finite numbers (..., R).
+    """Inverse of :func:`encode_rotations` that makes rotations (..., 3, 3) from any finite numbers (..., R).
 
-    Matrices are projected to SO(3), quaternions normalised (zeros become no rotation).
+    Matrices are projected to SO(3), quaternions are normalised (zeros become the identity).
 
     >>> decode_rotations(torch.tensor([0.0, 0.0, 2 * torch.pi]), "axis_angle").round().abs()
     tensor([[1., 0., 0.],
@@ -65,9 +65,10 @@ def decode_rotations(code: Tensor, rotation: str) -> Tensor:
 class SceneCode:
     """Scenes as normalised numbers (B, N, F) of a continuous prior, and back.
 
-    With ``"matrix"`` these are the scene type's own layout under the given normalizer. The other representations take
-    translations and categories from it as they are; rotations are scaled by the range of the representation. Where
-    the normalizer says that things turn about one axis only, or not at all, the other components are constant.
+    With ``"matrix"`` these are the scene type's own layout under the given normalizer. With the other representations,
+    translations and categories are normalised as by the given normalizer, and rotations are scaled by the range of the
+    representation. If the range of the given normalizer shows that objects turn about one axis only, or not at all, the
+    other components are constant.
 
     Args:
         scene_type: of the scenes.
@@ -114,7 +115,7 @@ class SceneCode:
         )
 
     def decode(self, x: Tensor) -> SceneBatch:
-        """Scenes of normalised numbers (B, N, F): valid rotations, arg-max categories.
+        """Scenes from normalised numbers (B, N, F): valid rotations, arg-max categories.
 
         Raises:
             InvalidInputError: ``x`` has another shape or is not finite.
@@ -133,7 +134,7 @@ def _check_rotation(rotation: str) -> None:
 
 
 def _canonical(quaternion: Tensor) -> Tensor:
-    """Of two quaternions (..., 4) of the same rotation always the same one: w >= 0, and half turns by their axis."""
+    """q or -q of quaternions (..., 4), which are one rotation: that with w >= 0; for half turns, the axis decides."""
     w, axis = quaternion[..., 0], quaternion[..., 1:]
     first = (axis.abs() > _HALF_TURN).to(torch.int8).argmax(dim=-1, keepdim=True)
     leading = axis.gather(-1, first).squeeze(-1)
@@ -158,7 +159,7 @@ def _from_axis_angle(vector: Tensor) -> Tensor:
 
 
 def _code_normalizer(normalizer: Normalizer, rotation: str) -> Normalizer:
-    """The normalizer of codes that goes with one of scenes."""
+    """The normalizer of scene codes, made from one of raw scenes."""
     turns = _free_axes(normalizer).float()
     if rotation == "quaternion":
         low, high = torch.cat([torch.zeros(1), -turns]), torch.cat([torch.ones(1), turns])
@@ -174,10 +175,10 @@ def _code_normalizer(normalizer: Normalizer, rotation: str) -> Normalizer:
 
 
 def _free_axes(normalizer: Normalizer) -> Tensor:
-    """(3,) bool: components of the rotation vector that may vary, from the matrix entries that never do.
+    """(3,) bool: components of the rotation vector that may vary, from the range of the matrix entries.
 
-    Things turn about axis k alone when the entries that mix k with the others are always 0, and that of k with itself
-    is never negative.
+    Objects turn about axis k alone if the matrix entries that mix k with another axis are always 0, and the diagonal
+    entry of k is never negative.
     """
     low, high = (side[ROTATION].reshape(3, 3).cpu() for side in (normalizer.input_min, normalizer.input_max))
     zero = (low.abs() < _HALF_TURN) & (high.abs() < _HALF_TURN)

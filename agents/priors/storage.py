@@ -33,7 +33,7 @@ class StoredPrior:
 
     Attributes:
         process: name of its process.
-        fields: what it is made of, as its class reads it.
+        fields: its configuration, as its class reads it.
         scene_type: its scene type.
         normalizer: of raw scenes.
         preconditioning: moments of encoded scenes.
@@ -76,7 +76,7 @@ def read_stored(name: str | os.PathLike[str]) -> StoredPrior:
 
 @contextmanager
 def explained(name: str | os.PathLike[str]) -> Iterator[None]:
-    """Let errors of what a prior's files hold name the prior; those of Python become CorruptFileErrors."""
+    """Make errors about the content of a prior's files name the prior; Python's own become CorruptFileErrors."""
     try:
         yield
     except (InvalidInputError, UnknownNameError) as error:
@@ -118,7 +118,8 @@ def write_stored(directory: str | os.PathLike[str], stored: StoredPrior, precisi
 def _known_scene_type(state: dict[str, Any], directory: Path) -> SceneType:
     """The scene type that a prior was saved with; it is registered unless its name is already known.
 
-    Of its folders of assets, those in the prior's own are read, and those that the user named in ``ASSET_FOLDERS``.
+    Of its folders of assets, only those inside the prior's own folder, or inside a folder that the user named in
+    ``ASSET_FOLDERS``, are read.
     """
     try:
         return get_scene_type(state["prior"]["scene_type"])

@@ -34,7 +34,7 @@ def tiny_prior(
         seed: of the weights.
         slots: slots per scene; the scene type's when None.
         process: ``"continuous"`` or ``"mixed"``.
-        text: whether it reads prompts, with a vocabulary of what can be said of scenes of this type; mixed only.
+        text: whether it reads prompts, with the vocabulary of prompts about scenes of this type; mixed only.
     """
     scene_type = get_scene_type(scene_type)
     if process not in PROCESSES:

@@ -46,7 +46,7 @@ class PromptReader:
         return self._encoder("").token_space
 
     def read_prompts(self, prompts: Sequence[str], slots: int) -> Tensor:
-        """Token indices (B, L) int64 on the CPU, padded to the longest prompt there can be.
+        """Token indices (B, L) int64 on the CPU, padded to the length of the longest possible prompt.
 
         Unknown words are listed in a warning.
 
@@ -62,7 +62,7 @@ class PromptReader:
         return torch.nn.functional.pad(indices, (0, longest - indices.shape[1]), value=PADDING)
 
     def encode_tokens(self, indices: Tensor) -> Text:
-        """Tokens (B, L', W) and mask (B, L') of token indices (B, L), each different row being encoded once."""
+        """Tokens (B, L', W) and mask (B, L') of token indices (B, L); equal rows are encoded once."""
         used = (indices != PADDING).any(dim=0)
         rows, place = torch.unique(indices[:, used].cpu(), dim=0, return_inverse=True)
         tokens, mask = self._encoder("").encode(rows)
@@ -70,7 +70,7 @@ class PromptReader:
         return tokens[place], mask[place]
 
     def encode_prompts(self, prompts: Sequence[str]) -> Text:
-        """Tokens (B, L, W) and mask (B, L) of prompts, each different one being encoded once.
+        """Tokens (B, L, W) and mask (B, L) of prompts; equal prompts are encoded once.
 
         Raises:
             InvalidInputError: the prior reads no prompts, or one is too long.
@@ -94,11 +94,11 @@ class PromptReader:
 
     @property
     def count_conditioning(self) -> CountConditioning | None:
-        """The part of the network that is told how many objects a prompt asks for; None where there is none."""
+        """The part of the network that reads how many objects a prompt asks for; None if there is none."""
         return getattr(self.denoiser.network, "count_conditioning", None) if self.conditional else None
 
     def freeze_text(self) -> None:
-        """Keep the text encoder, if there is one, as it is in any training that follows."""
+        """Freeze the text encoder, if there is one: training does not change it from then on."""
         if self.conditional:
             self.denoiser.text_encoder.requires_grad_(False)
 

@@ -1,1 +1,1 @@
-"""Helpers that several rooms of agents share; import the module that has them."""
+"""Helpers that several subpackages of ``agents`` share; import them from the module that defines them."""

@@ -1,4 +1,4 @@
-"""Resumable state on disk: written whole or not at all, read without running anything."""
+"""Checkpoints on disk: written whole or not at all, and read without running code in the file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def save_checkpoint(path: str | os.PathLike[str], state: dict[str, Any]) -> None
     """Write ``state`` (tensors, numbers, strings, containers) to ``path``, replacing it atomically.
 
     Raises:
-        TrainingError: the disk refused; the previous checkpoint is untouched.
+        TrainingError: the file could not be written; the previous checkpoint is untouched.
     """
     try:
         with replacing(path) as partial, partial.open("w+b") as file:
@@ -62,7 +62,7 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
             )
     try:
         state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-    except Exception as error:  # a damaged file fails in any way; torch's own advice would be to run its code
+    except Exception as error:  # a damaged file may raise anything; torch's own message advises to run its code
         raise CorruptFileError(
             f"{str(path)!r} is truncated or not a checkpoint ({type(error).__name__}); delete it to start the run anew"
         ) from error
@@ -75,7 +75,7 @@ def check_tensors(module: nn.Module, tensors: Mapping[str, Tensor], path: str | 
     """Refuse weights of a checkpoint whose names and shapes are not those of ``module``.
 
     Args:
-        module: what is to be restored.
+        module: the module to restore.
         tensors: its state dict in the checkpoint.
         path: the checkpoint, for the message.
 

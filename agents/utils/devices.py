@@ -8,10 +8,10 @@ from scene_envs.errors import InvalidInputError
 
 
 def check_device(name: str) -> None:
-    """Refuse a device that torch does not know or that is not here.
+    """Refuse a device that torch does not know or that this machine does not have.
 
     Raises:
-        InvalidInputError: says which would work.
+        InvalidInputError: the device cannot be used; the message says which would work.
 
     >>> check_device("cpu")
     """

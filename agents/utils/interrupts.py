@@ -22,11 +22,11 @@ class Terminated(KeyboardInterrupt):
 
 @contextmanager
 def terminable(received: list[int] | None = None) -> Iterator[None]:
-    """Context in which SIGTERM raises :class:`Terminated`; in other threads than the first nothing is changed.
+    """Context in which SIGTERM raises :class:`Terminated`; outside the main thread it changes nothing.
 
     Args:
-        received: gets the number of each such signal, for who meets another error that compiled code made of it, as an
-            import of an extension module does.
+        received: a list to which the number of each such signal is appended. Compiled code, such as the import of an
+            extension module, may turn the exception into another error; the list then tells that a signal came.
     """
 
     def note_and_raise(number: int, frame: FrameType | None) -> None:
@@ -42,7 +42,7 @@ def terminable(received: list[int] | None = None) -> Iterator[None]:
 def finishing_steps() -> Iterator[Ending]:
     """Context in which SIGINT and SIGTERM wait for the end of a step, at most 15 s; a second one does not wait.
 
-    Yields what is to be called after each step, once the state is saved if a signal is ``pending``.
+    Yields an :class:`Ending`, to be called after each step. If a signal is ``pending``, save the state before the call.
     """
     end = Ending()
     with _handling({signal.SIGINT: end.note, signal.SIGTERM: end.note, signal.SIGALRM: end.late}):
@@ -54,7 +54,7 @@ def finishing_steps() -> Iterator[Ending]:
 
 
 class Ending:
-    """A signal that waits for the end of a step; called after it, raises what waits."""
+    """A signal that waits for the end of a step; a call after the step raises the exception of that signal."""
 
     def __init__(self) -> None:
         self.number = 0
@@ -73,11 +73,11 @@ class Ending:
         logger.info("finishing this step and saving; the same signal again ends at once")
 
     def late(self, number: int, frame: FrameType | None) -> None:
-        """The step took too long."""
+        """Raise the exception of the waiting signal, as the step took too long."""
         _raise(self.number, frame)
 
     def __call__(self, elsewhere: bool = False) -> None:
-        """Raise what waits; a signal that waits ``elsewhere``, in another process of the run, counts as SIGTERM."""
+        """Raise if a signal waits; one that waits ``elsewhere``, in another process of the run, counts as SIGTERM."""
         if self.number or elsewhere:
             _raise(self.number or signal.SIGTERM, None)
 

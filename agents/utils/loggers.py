@@ -15,7 +15,7 @@ LOGGERS = ("csv", "tensorboard", "wandb")
 
 
 class RunLogger:
-    """Takes the rows of a run; this one adds nothing to ``log.csv``, which every run writes itself.
+    """Logger of the rows of a run; this base class writes nothing, as every run writes ``log.csv`` itself.
 
     >>> logger = RunLogger()
     >>> logger.log({"reward": 1.0}, step=1)

@@ -21,7 +21,7 @@ _LAUNCHERS = {
     "RANK": ("PMI_RANK", "OMPI_COMM_WORLD_RANK", "MV2_COMM_WORLD_RANK"),
     "LOCAL_RANK": ("MPI_LOCALRANKID", "OMPI_COMM_WORLD_LOCAL_RANK", "MV2_COMM_WORLD_LOCAL_RANK"),
 }
-"""Variables of ``torchrun``, and what Intel MPI, Open MPI and MVAPICH call them."""
+"""Variables of ``torchrun``, and their names in Intel MPI, Open MPI and MVAPICH."""
 _PATIENCE = 600.0
 """Seconds that a process waits for the others."""
 
@@ -30,7 +30,8 @@ _PATIENCE = 600.0
 class ProcessGroup:
     """The processes of a run.
 
-    A process that ends or hangs ends the others: what they wait for raises a :class:`TrainingError`.
+    If a process ends or hangs, the others end too: the call in which they wait for it raises a
+    :class:`TrainingError`.
 
     Attributes:
         rank: number of this process.
@@ -46,7 +47,7 @@ class ProcessGroup:
 
     @classmethod
     def join(cls, device: str = "cpu", patience: float = _PATIENCE) -> ProcessGroup:
-        """The group that the launcher set up, joined on first use; this process alone without one.
+        """The group that the launcher set up, joined on first use; without a launcher, this process alone.
 
         Args:
             device: of the training; each process of ``"cuda"`` takes a GPU of its own.
@@ -54,13 +55,13 @@ class ProcessGroup:
 
         Raises:
             InvalidInputError: ``WORLD_SIZE`` is set, and the other variables of a launcher are not.
-            TrainingError: the others do not come.
+            TrainingError: the other processes do not join.
         """
         size = launched_processes()
         _check_accelerate()
         if size == 1:
             return cls()
-        for name in _LAUNCHERS:  # torch reads the first names alone
+        for name in _LAUNCHERS:  # torch reads only the names of torchrun
             if (value := _launched_as(name)) is not None:
                 os.environ.setdefault(name, value)
         if device == "cuda":  # each process on a GPU of its own
@@ -79,7 +80,7 @@ class ProcessGroup:
 
     @classmethod
     def current(cls) -> ProcessGroup:
-        """The group that was joined; this process alone before."""
+        """The group that was joined; before that, this process alone."""
         if not (distributed.is_available() and distributed.is_initialized()):
             return cls()
         return cls(distributed.get_rank(), distributed.get_world_size())
@@ -90,7 +91,7 @@ class ProcessGroup:
         return self.rank == 0
 
     def rows(self, count: int) -> slice:
-        """The rows of this process in a batch of ``count`` of all."""
+        """The rows of this process in a batch of ``count`` rows over all processes."""
         return slice(count * self.rank // self.size, count * (self.rank + 1) // self.size)
 
     def sum(self, value: Tensor) -> Tensor:
@@ -149,7 +150,7 @@ class ProcessGroup:
         return found
 
     def from_first(self, make: Callable[[], Value]) -> Value:
-        """What ``make`` returns in the first process, in all of them."""
+        """In every process, the value that ``make`` returns in the first one."""
         if self.size == 1:
             return make()
         made: list[Any] = [make() if self.is_first else None]
@@ -158,7 +159,7 @@ class ProcessGroup:
         return made[0]  # type: ignore[no-any-return]
 
     def wait(self) -> None:
-        """Go on when all processes are here."""
+        """Wait until all processes have reached this call."""
         self.sum_numbers(0.0)
 
 
@@ -179,17 +180,17 @@ def launched_processes() -> int:
 
 
 def is_first_process() -> bool:
-    """Whether this process, of those that a launcher started, is the one that writes files and speaks."""
+    """Whether this process is the one, of those that a launcher started, that writes files and messages."""
     return int(_launched_as("RANK") or "0") == 0
 
 
 def _launched_as(name: str) -> str | None:
-    """The value of a variable of ``torchrun``, or of its like under MPI."""
+    """The value of a variable of ``torchrun``, or of the corresponding variable of MPI."""
     return next((os.environ[known] for known in (name, *_LAUNCHERS[name]) if known in os.environ), None)
 
 
 def _check_accelerate() -> None:
-    """Refuse to run alone where Accelerate was asked for several processes on a CPU, of which it starts one."""
+    """Refuse to run where Accelerate was asked for several processes on a CPU, because it starts only one."""
     asked = os.environ.get("ACCELERATE_USE_CPU", "").lower() == "true" and "MASTER_ADDR" in os.environ
     if asked and _launched_as("WORLD_SIZE") is None:
         raise InvalidInputError(

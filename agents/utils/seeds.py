@@ -7,7 +7,7 @@ from torch import Generator
 
 
 def derived_seed(*key: int) -> int:
-    """A seed below 2^31 that hangs on all numbers of ``key``, such as (seed, purpose, iteration); none is negative.
+    """A seed below 2^31 that depends on all numbers of ``key``, such as (seed, purpose, iteration); none is negative.
 
     >>> derived_seed(0, 1) != derived_seed(1, 0)
     True
@@ -16,5 +16,5 @@ def derived_seed(*key: int) -> int:
 
 
 def derived_generator(*key: int) -> Generator:
-    """A CPU generator whose seed below 2^63 hangs on all numbers of ``key``, none of them negative."""
+    """A CPU generator with a seed below 2^63 that depends on all numbers of ``key``, none of them negative."""
     return Generator().manual_seed(int(np.random.SeedSequence(key).generate_state(1, np.uint64)[0]) >> 1)

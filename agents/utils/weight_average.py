@@ -43,7 +43,7 @@ class WeightAverage:
 
 
 class AveragedWeights(Generic[Module]):
-    """Context in which a module holds its averaged weights, and in the end its own again.
+    """Context in which a module holds its averaged weights; at the end it gets its own weights back.
 
     Args:
         module: whose parameters are exchanged.

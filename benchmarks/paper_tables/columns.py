@@ -22,8 +22,8 @@ class Column:
         scale: the figure is shown times this.
         digits: significant digits.
         better: ``"low"``, ``"high"``, or ``""`` where neither is.
-        error: name of a figure that holds the standard error or deviation, or of the number of trials of which the
-            figure is the share (see ``binomial``).
+        error: name of the figure that holds the standard error or deviation. With ``binomial``, name of the number of
+            trials of which the figure is a share.
         binomial: whether ``error`` names a number of trials.
     """
 
@@ -81,7 +81,7 @@ def expand(names: Iterable[str], lines: Sequence[Figures]) -> list[Column]:
 
 
 def value(column: Column, figures: Figures) -> float | None:
-    """What the column shows of a line, None where it has nothing."""
+    """The number that the column shows for a line, None where there is none."""
     number = figures.get(column.name)
     return None if number is None or not math.isfinite(number) else number * column.scale
 
@@ -89,7 +89,7 @@ def value(column: Column, figures: Figures) -> float | None:
 def error(column: Column, figures: Figures) -> float | None:
     """The standard error beside :func:`value`: √(p (1 − p) / n) of a share of n, or as it was measured.
 
-    None where nothing was measured, and for a share of all or none, of which the formula says nothing.
+    None where nothing was measured, and for a share of 0 or 1, for which the formula is of no use.
 
     >>> share = Column("good", "good %", 100.0, error="trials", binomial=True)
     >>> error(share, {"good": 0.5, "trials": 100})

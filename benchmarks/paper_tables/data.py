@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from scene_envs.scene import SceneBatch
 
 _SAMPLE = 512
-"""Scenes from which a prior is built whose parameters are counted."""
+"""Scenes from which a prior is built when only its parameters are to be counted."""
 _GRAMMAR_SEED = 7_000_003
-"""Beside the seed of the runs: their real scenes are not those that they train on."""
+"""Second part of the seed of real scenes, beside the seed of the runs; so they are no scenes that runs train on."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class RowData:
         return cls(*split_heldout(whole))
 
     def prepare(self, config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
-        """A fresh prior, its training scenes, and held-out scenes (K, N, D), both as it encodes them."""
+        """A fresh prior, its training scenes, and held-out scenes (K, N, D), both as the prior encodes them."""
         from agents.pretraining.setup import prepare, prepare_from
 
         if self.training is None or self.heldout is None:
@@ -66,7 +66,7 @@ class RowData:
         return prepare_from(config, self.training, self.heldout)
 
     def count_parameters(self, config: PretrainConfig) -> int:
-        """Trained numbers of the prior that ``config`` asks for."""
+        """Number of trained parameters of the prior that ``config`` asks for."""
         from agents.pretraining.initial_prior import build_prior
 
         if self.training is None:
@@ -76,7 +76,7 @@ class RowData:
 
 
 def trained_numbers(prior: ScenePrior) -> int:
-    """How many numbers of the network of ``prior`` are trained; its text encoder is not part of it."""
+    """Number of trained parameters of the network of ``prior``, without its text encoder."""
     return sum(parameter.numel() for parameter in prior.denoiser.network.parameters() if parameter.requires_grad)
 
 

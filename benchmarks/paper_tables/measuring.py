@@ -53,8 +53,8 @@ def measure(
 ) -> dict[str, float]:
     """The figures of the tables' columns that can be measured and are finite.
 
-    A measure that refuses these scenes (too few of them for a classifier, say) leaves its columns out and a line in
-    the log.
+    If a measure refuses these scenes (too few of them for a classifier, say), its columns are left out and the log gets
+    a line.
 
     Args:
         samples: what is measured.

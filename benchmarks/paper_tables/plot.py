@@ -106,13 +106,13 @@ def _draw_panel(panel: Axes, column: Column, lines: Sequence[Line], real: Line) 
 
 
 def _scale(panel: Axes, column: Column, numbers: Sequence[float]) -> None:
-    """Shares from none to all; other columns as wide as their numbers, logarithmic where they differ much."""
+    """Set the axis: 0 to 100 for shares, otherwise the range of the numbers, logarithmic where they differ much."""
     some = [number for number in numbers if number > 1e-4]
     if column.scale == 100.0:
         panel.set_xlim(0, 100)
     elif some and max(some) > _LOGARITHMIC * min(some):
         if len(some) == len(numbers):
             panel.set_xscale("log")
-            panel.xaxis.set_minor_formatter("")  # over less than two decades it labels every minor tick, on each other
+            panel.xaxis.set_minor_formatter("")  # over less than two decades the labels of minor ticks overlap
         else:
             panel.set_xscale("symlog", linthresh=min(some))

@@ -21,7 +21,7 @@ _COLUMNS = (
 )
 
 Setting = tuple[str, dict[str, Any]]
-"""What the reader sees, and keys of ``pretrain``."""
+"""Label of a line, and keys of ``pretrain``."""
 
 
 def _each(title: str, key: str, *values: Any) -> list[Setting]:
@@ -61,7 +61,7 @@ FACTORS: tuple[Setting, ...] = (
     ("categories: mask and replace, cross-entropy", _categories("mask_and_replace", "attended", "cross_entropy")),
     ("categories: absorbing, bound", _categories("absorbing", "attended", "bound")),
 )
-"""What the precision table changes, one at a time."""
+"""Settings that the precision table changes, one at a time."""
 
 _NEEDS = {
     "process.noise_floor": ("process.schedule", "karras"),

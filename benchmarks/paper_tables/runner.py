@@ -49,8 +49,8 @@ class RowResult:
 def run_tables(settings: TablesConfig, say: Say) -> dict[str, Any]:
     """Train and measure every row of the tables that ``settings`` asks for, and write them into ``output``.
 
-    What an earlier call in the same folder has finished is read, what it has begun goes on where it stopped. Tables
-    are written anew after every row.
+    Rows that an earlier call in the same folder has finished are read; rows that it has begun go on where they stopped.
+    Tables are written anew after every row.
 
     Args:
         settings: the keys of the command.
@@ -60,7 +60,7 @@ def run_tables(settings: TablesConfig, say: Say) -> dict[str, Any]:
         ``rows``: the figures of each row, ``real``: those of real scenes, ``failed``: names and reasons.
 
     Raises:
-        InvalidInputError: what was asked for cannot be; no row was begun.
+        InvalidInputError: the settings are impossible; no row was begun.
         TrainingError: some rows failed; the tables say which and why, and have the others.
     """
     with _alone_in(Path(settings.output)):
@@ -153,7 +153,7 @@ def _run_row(
     real: HeldoutScenes,
     pool: PhysicsPool,
 ) -> tuple[RowResult, bool]:
-    """The row's result, and whether it took work; a row that fails says why and stops nothing."""
+    """The row's result, and whether work was needed; a row that fails says why and does not stop the others."""
     settings = sizes.settings
     kinds = sorted({entry.prompted for table in tables for entry in table.entries if entry.row.name == row.name})
     result, fresh = RowResult({}), False
@@ -184,7 +184,7 @@ def _run_row(
 
 
 def _measured_once(path: Path, asked: dict[str, Any], compute: Callable[[], dict[str, float]]) -> dict[str, float]:
-    """The figures in ``path`` when they answer what is ``asked``, or else computed and written there."""
+    """The figures in ``path`` if they were measured for ``asked``; otherwise they are computed and written there."""
     found = read_json(path)
     if found is not None and found.get("asked") == asked:
         return dict(found["figures"])
@@ -194,7 +194,7 @@ def _measured_once(path: Path, asked: dict[str, Any], compute: Callable[[], dict
 
 
 def _evaluation(settings: TablesConfig, real: HeldoutScenes, prompted: bool | None = None) -> dict[str, Any]:
-    """What figures depend on beside the prior; ``prompted`` is None for real scenes."""
+    """The settings that figures depend on beside the prior; ``prompted`` is None for real scenes."""
     asked: dict[str, Any] = {
         "count": settings.measured,
         "real_scenes": len(real.reference),
@@ -224,14 +224,14 @@ def _fill(table: Table, results: dict[str, RowResult], floor: dict[str, float], 
 
 
 def _chance(floor: dict[str, float]) -> str:
-    """What ignoring the prompt scores, in words."""
+    """A sentence on the score by chance, which a prior that ignores its prompts would get."""
     kinds = ("counts", "names", "relations")
     found = [f"{kind} {100 * floor[name]:.0f} %" for kind in kinds if (name := f"chance_prompt_{kind}") in floor]
     return f" Real scenes that were given the prompts of others follow {', '.join(found)}." if found else ""
 
 
 def _lead(settings: TablesConfig, real: HeldoutScenes) -> str:
-    """What holds for all tables."""
+    """The introduction, with the settings that hold for all tables."""
     common = settings.common()
     return (
         f"Scene type `{settings.scene}`; each row trained for {common['iterations']:,} steps of {common['batch_size']} "
@@ -248,7 +248,7 @@ def _kind(prompted: bool) -> str:
 
 
 def _duration(seconds: float) -> str:
-    """Roughly, in the unit that suits.
+    """A duration in words, rounded, in a suitable unit.
 
     >>> _duration(40.0), _duration(600.0), _duration(9000.0)
     ('40 s', '10 min', '2.5 h')

@@ -13,12 +13,12 @@ from scene_envs.errors import InvalidInputError, unknown_name
 
 @dataclass(frozen=True)
 class Size:
-    """What every row of the tables has in common.
+    """Settings that all rows of the tables have in common.
 
     Attributes:
         iterations: optimiser steps of a row.
         batch_size: scenes per step.
-        parameters: trained numbers of a row's network, its text encoder not counted.
+        parameters: number of trained parameters of a row's network, without its text encoder.
         count: samples that are measured.
         num_steps: denoising steps per sample.
         classifier_seeds: splits over which a classifier's accuracy is averaged.
@@ -54,7 +54,7 @@ _NOT_OF_PRETRAINING = {
     "prior": "rows start from fresh weights",
     "recipe": "it is a set of keys; give those",
 }
-"""Keys of ``pretrain`` that are not the user's to give in ``pretraining``, and why."""
+"""Keys of ``pretrain`` that the user cannot give in ``pretraining``, and the reasons."""
 
 ALL_TABLES = ("unconditional", "conditional", "objective", "rotation", "precision")
 
@@ -144,11 +144,11 @@ class TablesConfig:
 
     @property
     def target_parameters(self) -> int:
-        """Trained numbers of a row's network."""
+        """Number of trained parameters of a row's network."""
         return self.preset.parameters if self.parameters is None else self.parameters
 
     def common(self) -> dict[str, Any]:
-        """Keys of ``pretrain`` that every row has, those that the user gave winning."""
+        """Keys of ``pretrain`` that every row has; those that the user gave override the others."""
         preset = self.preset
         iterations = preset.iterations if self.iterations is None else self.iterations
         return {

@@ -59,7 +59,7 @@ def run_config(row: Row, settings: TablesConfig, hidden: int | None = None) -> P
 
 
 def run_folder(row: Row, settings: TablesConfig) -> Path:
-    """Where the run of ``row`` lives."""
+    """The folder of the run of ``row``."""
     return Path(settings.output) / "runs" / row.name
 
 
@@ -85,7 +85,7 @@ class Sizes:
 
     Args:
         settings: the keys of the command.
-        data: what priors are built for.
+        data: the scenes for which priors are built.
     """
 
     def __init__(self, settings: TablesConfig, data: RowData) -> None:
@@ -160,7 +160,7 @@ def train(config: PretrainConfig, target: int, data: RowData) -> dict[str, Any]:
 
 
 def read_json(path: Path) -> dict[str, Any] | None:
-    """What :func:`~scene_envs.files.write_json` wrote, None where there is nothing; raises CorruptFileError."""
+    """The content of a file by :func:`~scene_envs.files.write_json`, None without a file; raises CorruptFileError."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

@@ -1,10 +1,10 @@
-"""Processor seconds of an iteration of every algorithm, by what they go to.
+"""Processor seconds of an iteration of every algorithm, and the part of each kind of work.
 
     python -m benchmarks.post_training.cost [prior=dimsum_table] [reward=feasible_share] [iterations=3] [KEY=VALUE ...]
 
-Every algorithm starts from the same prior and takes as many iterations at its defaults; further keys are those of
-`post-train`. Seconds are of this process, which other work on the machine changes little. The first iteration, in
-which things are loaded, is left out.
+Every algorithm starts from the same prior and runs the same number of iterations at its defaults; further keys are
+those of `post-train`. Seconds are of this process, so other work on the machine changes them little. The first
+iteration, in which modules and data are loaded, is left out.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def main(words: list[str]) -> None:
     prior = ScenePrior.load(given["prior"])
     print("| algorithm | denoising | reward | policy gradient | regularisation | the rest | seconds per iteration "
           "| scenes per second |\n|---|---|---|---|---|---|---|---|")  # fmt: skip
-    for seed, name in enumerate(list_algorithms()):  # verdicts of physics are kept by content: other scenes for each
+    for seed, name in enumerate(list_algorithms()):  # another seed for each: verdicts of physics are kept by scene
         with tempfile.TemporaryDirectory() as folder:
             config = PostTrainConfig(algorithm={"name": name}, seed=seed, output=f"{folder}/run")
             config = changed(config, {key: yaml.safe_load(value) for key, value in given.items()})

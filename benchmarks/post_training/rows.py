@@ -55,7 +55,7 @@ class Table:
 
 
 def _stability() -> tuple[Row, ...]:
-    """300 iterations of each algorithm on Dimsum with three seeds, of the forward process on two more types."""
+    """300 iterations: each algorithm on Dimsum with three seeds, and the forward process on two more scene types."""
     dimsum = [
         Row(f"dimsum_table-{name}-{seed}", "dimsum_table", _keys(name, "feasible_share", seed), 300)
         for name in (FORWARD, "awm", CHAIN)
@@ -151,4 +151,4 @@ TABLES: dict[str, Table] = {
     "frontier": Table("Reward against realism", _frontier(), _MEASURES,
                       ("feasible", "share", "free", "loss", "classifier")),
 }  # fmt: skip
-"""Tables by the word that asks for them."""
+"""Tables by the name that ``table=`` takes."""

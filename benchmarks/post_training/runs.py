@@ -1,4 +1,4 @@
-"""Training and measuring of one row through the command line's own programs, resumed where a folder has them."""
+"""Training and measuring of one row by the commands ``post-train`` and ``evaluate``; results in folders are kept."""
 
 from __future__ import annotations
 

@@ -39,12 +39,12 @@ _SMALL = {
 _SLOW = ("demo", "package-prior")
 """Commands that run in full whatever their keys are; their lines are read and not run."""
 _IMPORTING = ("post-train", "search", "sample", "export", "view", "evaluate")
-"""Commands that import for longer than they work."""
+"""Commands that spend more time on imports than on work."""
 _RUN_SECONDS, _END_SECONDS = 6.0, 30.0
 
 
 def fuzzed_lines(count: int, seed: int = 0, ran: float = 0.25) -> Figures:
-    """Lines with values, keys and words that no command expects: done, or refused in the project's own words.
+    """Lines with values, keys and words that no command expects; each must be done, or refused in the project's words.
 
     Args:
         count: lines.
@@ -59,7 +59,7 @@ def fuzzed_lines(count: int, seed: int = 0, ran: float = 0.25) -> Figures:
             line = _line(rng, f"{folder}/{number}", run)
             figures.tried += 1
             if run:
-                if line[0] in _IMPORTING:  # what starts here, the copy finds imported
+                if line[0] in _IMPORTING:  # imports here what the copy then need not import
                     undisturbed(shorter((RESUMABLE | REPEATABLE)[line[0]]), runs=1)
                 status, err = _run_in_copy(line)
             else:
@@ -70,7 +70,7 @@ def fuzzed_lines(count: int, seed: int = 0, ran: float = 0.25) -> Figures:
 
 
 def two_ways(count: int, seed: int = 0) -> Figures:
-    """Lines in a copy of this process and in an interpreter of its own: both say the same."""
+    """Lines that run in a copy of this process and in an interpreter of their own; both must say the same."""
     rng, figures = random.Random(seed), Figures()
     with tempfile.TemporaryDirectory() as folder:
         while figures.tried < count:
@@ -131,7 +131,7 @@ def _all_keys(name: str) -> tuple[str, ...]:
 
 
 def _spoil(line: list[str], rng: random.Random) -> None:
-    """Twist a word, or add one that is no key and value; what says where the output goes stays."""
+    """Twist, double or drop a word, or add one that is no key and value; output, iterations and count stay."""
     places = [place for place, word in enumerate(line) if not word.startswith(("output=", "iterations=", "count="))]
     kind = rng.choice(("twist", "twist", "add", "double", "drop"))
     if kind == "add" or not places:
@@ -175,7 +175,7 @@ def _read_here(line: Sequence[str]) -> tuple[int | None, str]:
     try:
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(err):
             return main(list(line)), err.getvalue()
-    except BaseException as error:  # nothing may come through
+    except BaseException as error:  # no exception may come through
         return None, f"{type(error).__name__}: {error}"
 
 

@@ -17,8 +17,8 @@ from pathlib import Path
 class Started:
     """A command that runs in a process of its own.
 
-    A copy of this process has not to import anything, so that a kill meets the work and not the imports; it is a
-    process all the same, with its own signals, descriptors and memory.
+    A copy of this process need not import anything, so a kill hits the work and not the imports. The copy is still a
+    process of its own, with its own signals, descriptors and memory.
 
     Args:
         words: the command and its keys.
@@ -41,7 +41,7 @@ class Started:
     def _fork(self) -> int:
         sys.stdout.flush()
         sys.stderr.flush()
-        gc.freeze()  # the copy need not touch the pages of what exists
+        gc.freeze()  # so that the copy leaves memory pages of existing objects alone
         pid = os.fork()
         if pid:
             return pid
@@ -54,7 +54,7 @@ class Started:
             from agents.cli import main
 
             status = main(self.words)
-        except BaseException as error:  # nothing may come through
+        except BaseException as error:  # no exception may come through
             os.write(2, f"Traceback: {type(error).__name__}: {error}".encode(errors="replace"))
         finally:
             with contextlib.suppress(BaseException):

@@ -26,7 +26,7 @@ ixy="0" ixz="0" iyz="0"/></inertial><collision><geometry><mesh filename="cube.ob
 
 @dataclass(frozen=True)
 class _Kind:
-    """A file, what reads it, and whether it carries a digest: one without may be read with other values."""
+    """A file, the function that reads it, and whether it has a digest; a file without may be read with other values."""
 
     path: Path
     read: Callable[[], bytes]
@@ -36,8 +36,8 @@ class _Kind:
 def fuzzed_files(count: int, seed: int = 0) -> Figures:
     """Flipped, cut and replaced bytes in every file that is read back.
 
-    The file is refused by name, in the project's own words, or nothing has changed. What people may edit by hand
-    carries no digest: it may be read with other values.
+    Each damaged file must be refused by name, in the project's own words, or be read with the same values. Files that
+    people may edit by hand carry no digest; they may be read with other values.
     """
     from scene_envs.errors import SceneEnvsError
 

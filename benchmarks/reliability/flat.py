@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _POINTS = 10
 _RISE = 8.0
-"""MiB by which memory may rise over the second half, which is what an allocator varies by."""
+"""MiB by which memory may rise over the second half; an allocator alone varies by as much."""
 
 
 def episodes(count: int, seed: int = 0) -> Figures:
@@ -84,7 +84,7 @@ def _play(env: gymnasium.Env[Any, Any], seed: int) -> None:
 
 
 def _flat(one: Callable[[int], None], count: int, what: str) -> Figures:
-    """Figures of ``count`` calls, ``silent`` counting what rose: memory, descriptors."""
+    """Figures of ``count`` calls; ``silent`` is the number of quantities that rose, out of memory and descriptors."""
     figures, points = Figures(), []
     for point in range(_POINTS):
         for number in range(point * count // _POINTS, (point + 1) * count // _POINTS):

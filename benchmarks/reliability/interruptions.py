@@ -24,7 +24,7 @@ from benchmarks.reliability.small_commands import (
 
 ALL = RESUMABLE | REPEATABLE
 _LATE = 60.0
-"""Seconds after which a command of a second counts as one that hangs."""
+"""Seconds after which a command counts as hanging; undisturbed commands take about one second."""
 
 
 def kills(
@@ -37,7 +37,7 @@ def kills(
         count: signals that met a running command.
         seed: of the moments, and of the command to begin with.
         number: the signal.
-        fresh: whether every command starts with an interpreter of its own; copies of this process do otherwise.
+        fresh: whether every command starts in an interpreter of its own, instead of in a copy of this process.
         commands: by name.
     """
     figures, rng, names = Figures(), random.Random(f"{seed} {number}"), list(commands)
@@ -101,7 +101,7 @@ def _compare(name: str, command: Command, folder: Path, expected: Undisturbed, f
 
 
 def full_disks(count: int, seed: int = 0) -> Figures:
-    """Commands on a disk of a random number of bytes: one sentence, no empty file, and they go on with more room."""
+    """Commands on a disk of random size: each must say one sentence, leave no empty file, and go on with more room."""
     rng, figures, names = random.Random(seed), Figures(), list(ALL)
     with tempfile.TemporaryDirectory() as place:
         for number in range(count):
@@ -139,7 +139,10 @@ def _judge_full(name: str, size: int, done: Started, place: Path, figures: Figur
 
 
 def two_writers(count: int, seed: int = 0) -> Figures:
-    """Two processes with one folder: one of them works, the other is told who does; the result is that of one."""
+    """Two processes write into one folder.
+
+    One of them must work, the other must be told who is writing, and the result must be that of one process.
+    """
     rng, figures, names = random.Random(seed), Figures(), list(RESUMABLE)
     with tempfile.TemporaryDirectory() as place:
         for number in range(count):

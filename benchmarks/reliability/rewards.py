@@ -11,7 +11,7 @@ from benchmarks.reliability.figures import Figures
 
 
 def hostile_rewards(count: int, seed: int = 0) -> Figures:
-    """Rewards that exit, hang, crash, fill memory or talk: invalid scenes and one short sentence, in time."""
+    """Rewards that exit, hang, crash, fill memory or talk; each must give invalid scenes and one sentence, in time."""
     from rewards import IsolatedReward, allow_local_rewards, evaluate_reward
     from scene_envs import SceneBatch
 

@@ -61,7 +61,7 @@ RESUMABLE = {
     ),
     "search evolution": Command(("search", _PRIORS[1], *_SEARCHING, "budget=24", "planner=evolution"), _SEARCHED),
 }  # fmt: skip
-"""Commands that go on where they were."""
+"""Commands that go on where they stopped."""
 REPEATABLE = {
     "sample": Command(("sample", _PRIORS[1], "count=3", "num_steps=2", "workers=0", "project=true", "pictures=2"),
                       ("scenes.safetensors", "ready.safetensors")),
@@ -112,7 +112,7 @@ def words_of(command: Command, output: Path | str) -> list[str]:
 
 @dataclass(frozen=True)
 class Undisturbed:
-    """What a command does when nobody disturbs it: its seconds, the bytes it writes, digests of its results."""
+    """An undisturbed run of a command: its seconds, the bytes that it writes, digests of its results."""
 
     seconds: float
     size: int

@@ -77,7 +77,7 @@ class Asset:
         inertia: (3, 3) kg m^2 about the centre of mass, asset axes.
         visual: coloured mesh for pictures (m).
         fine: convex parts that keep hollows hollow.
-        coarse: fewer convex parts, used where the verdict is the same.
+        coarse: fewer convex parts, used where the result is the same.
         color: (r, g, b) in 0..255, the class colour of semantic renders.
         static: True for tables, shelves and floors.
     """

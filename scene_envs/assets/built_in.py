@@ -13,7 +13,7 @@ from scene_envs.errors import unknown_name
 
 
 def _recipes() -> dict[str, RecipeEntry]:
-    """All recipes, those of this package imported (they load trimesh)."""
+    """All recipes; imports the recipes of this package first, which load trimesh."""
     from scene_envs.assets import recipes  # noqa: F401
 
     return RECIPES

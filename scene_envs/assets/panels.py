@@ -39,7 +39,7 @@ def painted_face(
         corner: (3,) m, the lower left corner.
         along: (3,) m, from there to the lower right corner.
         up: (3,) m, from there to the upper left corner; ``along x up`` points outward.
-        color: the ground.
+        color: colour of the background.
         patches: what is painted on it.
     """
     start, right, rise = (np.asarray(v, dtype=np.float64) for v in (corner, along, up))
@@ -64,7 +64,10 @@ def painted_face(
 
 
 def _rectangles(owner: NDArray[np.int64]) -> dict[int, list[tuple[int, int, int, int]]]:
-    """Cells of one owner joined to rectangles (left, low, right, high), exclusive above: strips of equal width."""
+    """Rectangles (left, low, right, high) of cells, by owner; ``right`` and ``high`` are exclusive.
+
+    Strips of one owner that have the same ends in successive rows are joined.
+    """
     joined: dict[int, list[tuple[int, int, int, int]]] = {}
     open_strips: dict[tuple[int, int, int], int] = {}
     for j in range(owner.shape[1] + 1):

@@ -52,7 +52,7 @@ def convex_hull(points: ArrayLike) -> ConvexPart:
 
 
 def hull_of(parts: Iterable[ConvexPart]) -> ConvexPart:
-    """The one convex part around several: what a coarse model is made of."""
+    """The convex hull of several parts, as coarse models use it."""
     return convex_hull(np.concatenate([part.vertices for part in parts]))
 
 

@@ -56,7 +56,7 @@ class LibraryShapes:
     static: Mask
 
     def cells(self, category: Index, points: Array) -> tuple[Index, ...]:
-        """Indices (category, i, j) of asset-frame ``points`` (..., 3) into the maps; the edge is empty."""
+        """Indices (category, i, j) of asset-frame ``points`` (..., 3) into the maps; cells at the edge are empty."""
         where = np.floor((points[..., :2] - self.low[category]) / self.cell[category])
         where = np.clip(where, 0, _GRID - 1).astype(np.int64)
         return category, where[..., 0], where[..., 1]

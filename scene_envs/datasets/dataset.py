@@ -77,7 +77,7 @@ class SceneDataset:
         fixed_tolerance: float = FIXED_TOLERANCE,
         slots: int | None = None,
     ) -> SceneDataset:
-        """Read a dataset from disk, whole: parquet or arrow, ours or another's.
+        """Read a whole dataset from disk: parquet or arrow, of this package or of others.
 
         Categories are matched by model path, never by index; the scene type's fixed objects move to the first
         slots, and are added to scenes that lack them. A folder that is still being generated gives the shards
@@ -90,13 +90,13 @@ class SceneDataset:
             aliases: model path, or its stem, to asset name, for datasets with other asset names.
             limit: read at most this many scenes.
             metadata: ``metadata.json``, when it is neither beside the files nor in the folder above.
-            fixed_tolerance: how far (m, rotation entries) fixed objects may stand from the scene type's pose, which
-                they are given; ``math.inf`` accepts any.
+            fixed_tolerance: how far (m, rotation entries) fixed objects may stand from the scene type's pose; they are
+                then put at that pose. ``math.inf`` accepts any.
             slots: N of the scenes, at least the files'; None takes the files'.
 
         Raises:
             InvalidInputError: nothing there, no scene type given or named, or a fixed object stands elsewhere.
-            CorruptFileError: a file cannot be read, lacks columns or keys, or holds what is no scene (row named).
+            CorruptFileError: a file cannot be read, lacks columns or keys, or holds a row that is no scene (row named).
             UnknownNameError: a model path that is no asset of the scene type.
         """
         files = find_files(path)
@@ -163,14 +163,14 @@ class SceneDataset:
         scene_type: str | SceneType,
         metadata: dict[str, Any] | None = None,
     ) -> SceneDataset:
-        """From raw scenes (M, N, D) with a tuple of prompts each; their first is the prompt."""
+        """From raw scenes (M, N, D) with a tuple of prompts each; the first of each tuple is the prompt."""
         sets = list(prompt_sets)
         first = [prompts[0] for prompts in sets]
         return cls(tensor, first, normalizer, get_scene_type(scene_type), metadata or {}, sets)
 
     @property
     def complete(self) -> bool:
-        """Whether all scenes that were asked for are here (True for datasets that do not say)."""
+        """Whether all scenes that were asked for are here (True for datasets without a ``count`` in their metadata)."""
         return len(self) >= int(self.metadata.get("count") or 0)
 
     @property

@@ -89,7 +89,7 @@ def find_files(path: str | os.PathLike[str]) -> list[Path]:
 def find_metadata(path: str | os.PathLike[str]) -> Path:
     """``metadata.json`` in the folder of a dataset or file, or in the folder above (splits share one).
 
-    Where there is none, the place it should have.
+    Where there is none, this is the place that it should have.
     """
     path = Path(path)
     folder = path if path.is_dir() else path.parent
@@ -212,7 +212,7 @@ def _within_group(batches: Iterator[pa.RecordBatch], block: Block) -> pa.Table:
 
 
 def _columns(names: Sequence[str], place: str) -> list[str]:
-    """Those columns of a file that are read."""
+    """Names of the columns that are read from a file with the columns ``names``."""
     missing = [name for name in (store.SCENES, store.PROMPTS) if name not in names]
     if missing:
         raise CorruptFileError(f"{place!r} lacks the column(s) {missing}; it has {list(names)}")
@@ -230,7 +230,7 @@ def _prompt_sets(table: pa.Table) -> list[tuple[str, ...]]:
 
 
 def _one_array(column: pa.ChunkedArray) -> pa.Array:
-    """The column as one array, extension types (``Array2D`` of Hugging Face ``datasets``) as what they store."""
+    """The column as one array; extension types (``Array2D`` of Hugging Face ``datasets``) give their storage."""
     chunks = [chunk.storage if isinstance(chunk, pa.ExtensionArray) else chunk for chunk in column.chunks]
     if not chunks:
         kind = column.type.storage_type if isinstance(column.type, pa.BaseExtensionType) else column.type

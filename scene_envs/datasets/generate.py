@@ -162,7 +162,7 @@ def _prepare(folder: Path, grammar: Grammar, settings: dict[str, Any]) -> Normal
 
 
 def _is_made(job: Job) -> bool:
-    """Whether the shard is there; raises CorruptFileError when it is not what it should be."""
+    """Whether the shard is there; raises CorruptFileError when it is damaged or has another number of scenes."""
     path = Path(job.path)
     if not path.is_file():
         return False

@@ -29,9 +29,9 @@ class DatasetInfo:
         model_paths: C paths; the position of a path is its category *in the files*, C is empty.
         normalizer: of the files, D = 3 + 9 + C + 1 features in the files' order.
         welded_model_paths: paths of the assets that are welded.
-        slots: N, slots per scene; None when it is not said.
+        slots: N, slots per scene; None when the file does not say.
         scene_type: name of the scene type; None in datasets of others.
-        count: scenes that were asked for; None when it is not said.
+        count: scenes that were asked for; None when the file does not say.
         metadata: all keys but the digest, as they stand in the file.
     """
 
@@ -55,7 +55,7 @@ class DatasetInfo:
         return tuple(Path(path).stem for path in self.model_paths)
 
     def categories_in(self, scene_type: SceneType, aliases: Mapping[str, str] | None = None) -> Tensor:
-        """(C + 1,) int64: for each category of the files, the one of ``scene_type``; empty goes to empty.
+        """(C + 1,) int64: the category of ``scene_type`` for each category of the files; empty maps to empty.
 
         Args:
             scene_type: whose categories are wanted; it may have assets that the files lack.
@@ -81,7 +81,7 @@ def read_metadata(path: str | os.PathLike[str]) -> DatasetInfo:
 
     Raises:
         InvalidInputError: there is no such file.
-        CorruptFileError: it is not JSON, is not what its digest says, lacks keys (they are named), or its lengths
+        CorruptFileError: it is not JSON, does not match its digest, lacks keys (they are named), or its lengths
             contradict each other.
     """
     file = Path(path) / METADATA if Path(path).is_dir() else Path(path)
@@ -132,7 +132,7 @@ def _whole(metadata: dict[str, Any], key: str) -> int | None:
 
 
 def _whole_slot(normalizer: Normalizer, one_hot: int, file: Path) -> Normalizer:
-    """The normalizer of all features of a slot; one that covers the pose alone leaves one-hots as they are."""
+    """The normalizer of all features of a slot; one of the pose alone is extended to leave one-hots as they are."""
     vectors = (normalizer.scale, normalizer.min, normalizer.input_min, normalizer.input_max)
     lengths = {len(vector) for vector in vectors}
     if lengths == {POSE_FEATURES}:

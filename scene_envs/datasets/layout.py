@@ -19,11 +19,11 @@ from scene_envs.scene import CATEGORY, POSE, POSE_FEATURES, ROTATION, SceneBatch
 from scene_envs.scene_types import FixedObject, SceneType
 
 FIXED_TOLERANCE = 1e-3
-"""Largest difference (m, and entries of the rotation matrix) of a fixed object to its scene type's pose."""
+"""Largest difference (m, and entries of the rotation matrix) of a fixed object's pose from the scene type's."""
 _ONE_HOT = 0.1
-"""Largest difference of a one-hot entry to 0 or 1."""
+"""Largest difference of a one-hot entry from 0 or 1."""
 _ROTATION = 0.05
-"""How far entries of R^T R may be from the identity; what is further than 1e-5 is projected to SO(3)."""
+"""Largest difference of R^T R from the identity per entry; above 1e-5, the matrix is projected to SO(3)."""
 _KEYS_AT_ONCE = 1024
 """Scenes whose keys are computed together: small enough for the processor's cache."""
 
@@ -36,8 +36,8 @@ class Layout:
         info: of the files.
         scene_type: of the scenes.
         aliases: model path, or its stem, to asset name.
-        fixed_tolerance: how far (m, rotation entries) a fixed object may stand from the scene type's pose; it is
-            put there exactly. ``math.inf`` accepts any pose.
+        fixed_tolerance: how far (m, rotation entries) a fixed object may stand from the scene type's pose; the object
+            is then put at that pose. ``math.inf`` accepts any pose.
         slots: N of the scenes; None takes as many as the file has.
     """
 
@@ -69,7 +69,7 @@ class Layout:
         """(M, N, D) float32 raw scenes of ``rows``: fixed objects in the first slots, exact one-hots and rotations.
 
         Raises:
-            CorruptFileError: a value is not finite, a slot is not one-hot, or a rotation is none (row and slot named).
+            CorruptFileError: a value is not finite, a slot is not one-hot or has no rotation (row and slot named).
             InvalidInputError: a fixed object is missing and no slot is empty, or stands elsewhere (row named).
         """
         values = torch.from_numpy(np.array(rows.scenes))  # a copy: arrow's memory is read-only
@@ -148,7 +148,7 @@ def place_fixed(batch: SceneBatch, tolerance: float, place: str = "the batch", s
 
 
 def _to_slot(tensor: Tensor, source: Tensor, slot: int) -> Tensor:
-    """Slot ``source`` (B,) moved to ``slot``; those between move up by one."""
+    """Slot ``source`` (B,) moved to ``slot``; the slots between move up by one."""
     index = torch.arange(tensor.shape[1]).expand(tensor.shape[:2])
     moved = (index > slot) & (index <= source[:, None])
     index = torch.where(moved, index - 1, index)
@@ -173,7 +173,7 @@ def _check(bad: Tensor, rows: Rows, what: str) -> None:
 def scene_keys(tensor: Tensor) -> NDArray[np.uint64]:
     """(M,) keys of raw scenes (M, N, D): equal for the same objects in the same poses, in any order of slots.
 
-    Rows of a dataset that repeat a scene with another prompt have one key. The poses must be equal to the last bit.
+    Rows of a dataset that repeat a scene with another prompt share one key. The poses must be equal to the last bit.
     """
     chunks = [_chunk_keys(chunk) for chunk in tensor.split(_KEYS_AT_ONCE)]
     return np.concatenate(chunks) if chunks else np.empty(0, dtype=np.uint64)

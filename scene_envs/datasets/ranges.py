@@ -11,13 +11,13 @@ from scene_envs.normalizer import Normalizer
 from scene_envs.scene import CATEGORY
 
 _OBJECTS = 10_000
-"""Objects the sample holds at least while all of them stand upright, unless that takes more than ``_SCENES``."""
+"""Least number of objects in a sample in which all stand upright, unless that takes more than ``_SCENES`` scenes."""
 _SCENES = 4096
 _STEP = 128
-"""Scenes drawn at a time; as many are enough once a tilted object was seen."""
+"""Scenes drawn at a time; no more are drawn once a tilted object was seen."""
 _SEED = 20_250_101
 _UPRIGHT = 1e-6
-"""A rotation entry that tells of tilt counts as zero below this."""
+"""A rotation entry that encodes tilt counts as zero below this."""
 _TILT = [5, 8, 9, 10]
 """Features of a rotation that are zero when the object only turns about z: xz, yz, zx, zy."""
 _PLANE = [3, 4, 6, 7]

@@ -71,7 +71,7 @@ def run_ray(jobs: Sequence[Job], work: Work, workers: int, address: str | None, 
 
 @contextmanager
 def _cluster(ray: Any, workers: int, address: str | None) -> Iterator[None]:
-    """A connection to Ray; what is started here ends here."""
+    """Context with a connection to Ray; a connection that is opened here is closed here."""
     if ray.is_initialized():
         yield
         return

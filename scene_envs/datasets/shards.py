@@ -26,7 +26,7 @@ _MAX_CHUNK = 32
 _CHUNK_SECONDS = 0.5
 """About how long a chunk may take, so that slow grammars report often; chunks do not change the result."""
 _MAX_FRUITLESS = 2000
-"""Scenes thrown away in a row before the grammar is called hopeless."""
+"""Scenes thrown away in a row before generation stops with an error."""
 _UNFIT = "outside the normalizer"
 
 
@@ -121,7 +121,7 @@ def _draw(grammar: Grammar, job: Job, first: int, count: int) -> tuple[Tensor, l
 def _judge(scenes: Tensor, grammar: Grammar, normalizer: Normalizer, verify: bool) -> list[str]:
     batch = SceneBatch(scenes, grammar.scene_type)
     error = (normalizer.unnormalize(normalizer.normalize(scenes)) - scenes).abs().amax(dim=(1, 2))
-    fits = error < 1e-4  # it does not where a constant feature varies
+    fits = error < 1e-4  # False where a feature varies that is constant in the normalizer
     verdicts = judge_scenes(batch) if verify else [KEPT] * len(batch)
     return [v if v != KEPT or ok else _UNFIT for v, ok in zip(verdicts, fits.tolist(), strict=True)]
 

@@ -28,7 +28,7 @@ class Part:
         seed: not negative; another seed makes other parts.
 
     Raises:
-        InvalidInputError: fractions, index or seed are not as said.
+        InvalidInputError: fractions, index or seed are not as described above.
 
     >>> keys = mix_bits(np.arange(10_000, dtype=np.uint64))
     >>> train, test = (Part((0.9, 0.1), index).contains(keys) for index in (0, 1))

@@ -29,7 +29,7 @@ PROMPT_SETS = "language_annotations"
 _NOTES = b"scene_envs"
 _MODEL_PATH = "scene_envs/assets/{name}"
 _ROW_GROUP = 500
-"""Scenes per row group: what a streaming reader has to hold at least."""
+"""Scenes per row group, the least that a streaming reader has to hold in memory."""
 
 
 def shard_name(index: int) -> str:
@@ -127,7 +127,7 @@ def open_parquet(path: Path) -> pq.ParquetFile:
     """The parquet file at ``path``; raises InvalidInputError (none there) or CorruptFileError."""
     try:
         file = pq.ParquetFile(path, page_checksum_verification=True)
-        _ = file.schema_arrow.names, file.metadata.num_rows  # what is damaged there shows when it is read
+        _ = file.schema_arrow.names, file.metadata.num_rows  # reading these raises when they are damaged
         return file
     except FileNotFoundError:
         raise InvalidInputError(f"no parquet file at {str(path)!r}") from None
@@ -138,6 +138,6 @@ def open_parquet(path: Path) -> pq.ParquetFile:
 
 
 def remove_partial(folder: Path) -> None:
-    """Remove what killed processes left half-written in ``folder``."""
+    """Remove files that killed processes left half-written in ``folder``."""
     for path in folder.glob(".*.partial"):
         path.unlink(missing_ok=True)

@@ -13,7 +13,7 @@ from scene_envs.scene_types import SceneType
 
 
 def to_union(batch: SceneBatch, union: SceneType) -> SceneBatch:
-    """The same scenes in the categories of ``union``, with empty slots added up to its number.
+    """The same scenes in the categories of ``union``, with empty slots added up to the slots of ``union``.
 
     Args:
         batch: B scenes of a type whose assets ``union`` has.

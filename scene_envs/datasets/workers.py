@@ -47,7 +47,7 @@ class Work:
 
     @classmethod
     def of(cls, factory: Callable[[], Grammar], scene_type: SceneType, normalizer: Normalizer) -> Work:
-        """With a copy of the scene type that holds its data alone (no built assets)."""
+        """The inputs, with a copy of the scene type that holds its data alone (no built assets)."""
         plain = SceneType(**{field.name: getattr(scene_type, field.name) for field in fields(scene_type)})
         return cls(factory, plain, normalizer.state())
 
@@ -88,7 +88,7 @@ def run_processes(jobs: Sequence[Job], work: Work, workers: int, report: Report)
         )
     context = get_context("spawn")
     for _ in range(_RESTARTS):
-        with no_current_folder():  # a process that counts semaphores starts with the first of them
+        with no_current_folder():  # the first semaphore starts a process that tracks semaphores
             queue, stop = context.Queue(), context.Event()
         left = [job for job in jobs if not Path(job.path).is_file()]
         executor = ProcessPoolExecutor(workers, context, _start_worker, (payload, queue, stop))
@@ -98,7 +98,7 @@ def run_processes(jobs: Sequence[Job], work: Work, workers: int, report: Report)
             _follow(futures, queue, report)
             return
         except BrokenProcessPool:
-            continue  # the shards that were under way go on
+            continue  # the next round resumes the unfinished shards
         finally:
             stop.set()  # after an error, the other workers end with their chunk
             executor.shutdown(cancel_futures=True)

@@ -15,7 +15,7 @@ from scene_envs.errors import SceneEnvsError
 
 _PLAIN = (bool, int, float, complex, str, bytes, type(None), np.ndarray, np.generic, Tensor, PurePath)
 _ROUNDING = 1e-3
-"""How much a scene may differ with the batch it was made in: the rounding of a network, metres."""
+"""Largest difference (m) between copies of a scene made in different batches: the rounding of a network."""
 
 
 class NotBranchableError(SceneEnvsError):
@@ -23,18 +23,18 @@ class NotBranchableError(SceneEnvsError):
 
 
 def check_branchable(env: Any, *, seed: int = 0, children: int = 3) -> None:
-    """Check that trees over ``env`` are well defined; resets it.
+    """Check that trees over ``env`` are well defined; resets ``env``.
 
-    States are immutable, picklable and hold plain data alone (no simulator, no network); :meth:`restore_state` brings
-    one back; values are in [0, 1]; a child depends on its parent and the action alone, so that siblings made in another
-    order, in other batches, after other work or from a pickled parent are the same up to the rounding of a network; and
-    expansion moves neither the current state nor its parent.
+    States are immutable, picklable and hold plain data alone (no simulator, no network). :meth:`restore_state` brings a
+    state back. Values are in [0, 1]. A child depends on its parent and the action alone: siblings made in another
+    order, in other batches, after other work or from a pickled parent are the same up to the rounding of a network.
+    Expansion changes neither the current state of ``env`` nor the state that is expanded.
 
     Args:
         env: has ``reset``, ``clone_state``, ``restore_state``, ``legal_actions``, ``expand``, ``expand_batch`` and
             ``evaluate``, as ``SceneEnvs/Search-v0`` (wrappers are taken off).
         seed: of the reset.
-        children: siblings that are made; two are branched from again.
+        children: number of siblings that are made; two of them are expanded again.
 
     Raises:
         NotBranchableError: a promise is broken; the message says which.
@@ -91,7 +91,7 @@ def _check_state(env: Any, state: Any, name: str) -> None:
 
 
 def _parts(value: Any, where: str) -> Iterator[tuple[str, Any]]:
-    """The leaves of nested data, with where they are."""
+    """The leaves of nested data, each with its place in the data."""
     if is_dataclass(value) and not isinstance(value, type):
         for field in fields(value):
             yield from _parts(getattr(value, field.name), f"{where}.{field.name}")

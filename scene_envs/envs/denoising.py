@@ -85,7 +85,7 @@ class DenoisingCore:
 
     @property
     def features(self) -> int:
-        """D, numbers per slot of what the prior denoises; the scene type's but for priors with other rotations."""
+        """D, numbers per slot that the prior denoises; the scene type's D, except for priors with other rotations."""
         return self._features
 
     @property
@@ -119,7 +119,7 @@ class DenoisingCore:
         return scenes if self._observed is None else self._observed.merge(scenes)
 
     def object_mask(self) -> Tensor:
-        """(B, N) int8: slots whose arg-max category is not empty; those not drawn yet are empty."""
+        """(B, N) int8: slots whose arg-max category is not empty; slots that are not drawn yet count as empty."""
         return occupied(self._x, self.scene_type)
 
     @property
@@ -176,11 +176,11 @@ class DenoisingCore:
                 its prompt, if there are several.
             mask: (B,) bool, which environments; None means all.
             prompts: B prompts, in place of drawn ones; those of environments that are not reset are ignored.
-            observed: B scenes, on the CPU, whose observed entries all states have until the next reset: actions decide
-                the rest alone. None lets actions decide whole scenes.
+            observed: B scenes, on the CPU. Until the next reset all states have their observed entries, and actions
+                decide only the rest. None lets actions decide whole scenes.
 
         Raises:
-            InvalidInputError: observed scenes, or their end, for some of the environments only.
+            InvalidInputError: only some of the environments are reset, and observed scenes are given or were in use.
         """
         partial = mask is not None and not bool(mask.all())
         if partial and (observed is not None or self._observed is not None):
@@ -202,7 +202,7 @@ class DenoisingCore:
         self._read_prompts()
 
     def _read_prompts(self) -> None:
-        """Token indices of the prompts; what the network makes of them is found when it is needed."""
+        """Set the token indices of the prompts; the network encodes them when the encoding is first needed."""
         reader = self.prompting.reader
         self._tokens = None if reader is None else self.prompting.read(self._prompts).to(self.device)
         self._text: tuple[Tensor, ...] | None = None
@@ -217,7 +217,7 @@ class DenoisingCore:
         return tuple(take_rows(part, rows) for part in self._text)
 
     def _draw_noise(self) -> Tensor:
-        """(B, N, D) of all episodes, each from its own generator."""
+        """Normal noise (B, N, D) of all episodes, each from its own generator."""
         shape = self._x.shape[1:]
         return torch.stack([torch.randn(shape, generator=noise) for noise in self._noises]).to(self.device)
 

@@ -101,7 +101,7 @@ class DenoisingTorchRLEnv(EnvBase):
         return TensorDict(fields, batch_size=self.batch_size, device=self.device)
 
     def collect(self, policy: Callable[[Tensor, int], Tensor], prompts: Sequence[str] | None = None) -> Trajectories:
-        """Reset, then run ``policy`` to the end of all episodes: what training calls.
+        """Reset, then run ``policy`` to the end of all episodes. Training calls this method.
 
         Args:
             policy: ``(x_t (B, N, D), step) -> action (B, N, D)``. Called without gradients.

@@ -7,7 +7,7 @@ import gymnasium.error
 from scene_envs.errors import InvalidInputError, SceneEnvsError
 
 _RENAMED_MASKS = {"given": "explicit"}
-"""Masks as earlier versions called them, and their names."""
+"""Names of masks in earlier versions, and the present names."""
 
 
 class ResetNeededError(SceneEnvsError, gymnasium.error.ResetNeeded):
@@ -18,7 +18,7 @@ def check_mask_not_renamed(name: str) -> None:
     """Refuse a mask name of an earlier version.
 
     Raises:
-        InvalidInputError: the mask has another name now; says which.
+        InvalidInputError: the mask has another name now; the message says which.
 
     >>> check_mask_not_renamed("explicit")
     """

@@ -15,7 +15,7 @@ from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
 MAX_PENETRATION = 1e-3
-"""Object pairs that overlap deeper than this (m) count, as in feasibility."""
+"""Object pairs that overlap deeper than this (m) count as overlapping, as in feasibility."""
 
 
 def bad_objects(scene: SceneBatch, score: Score) -> Tensor | None:
@@ -34,8 +34,8 @@ def bad_objects(scene: SceneBatch, score: Score) -> Tensor | None:
 def infeasible_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
     """The free objects that physics calls infeasible, whatever the objective; none when all are feasible.
 
-    The verdict is the objective's flag ``feasible`` where it has one, and that of the reward ``feasible_objects``
-    otherwise, which simulates no scene twice.
+    The verdict is the objective's flag ``feasible`` where the objective has one. Otherwise it is the flag of the reward
+    ``feasible_objects``, which simulates no scene twice.
     """
     flags = score.object_flags.get("feasible")
     if flags is None:
@@ -181,7 +181,7 @@ class OffPromptMask:
     prompt: str | None = None
 
     def for_prompt(self, prompt: str | None) -> OffPromptMask:
-        """The mask for scenes of ``prompt``; a text of its own stays."""
+        """The mask for scenes of ``prompt``; a mask that has a prompt already keeps it."""
         return self if self.prompt is not None else OffPromptMask(prompt)
 
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
@@ -205,7 +205,7 @@ class OffPromptMask:
                 continue
             relation = not hasattr(check.claim, "number")
             surplus = len(free) if relation else check.found - check.expected
-            if surplus > 0:  # of the total, what has no name in the prompt goes first
+            if surplus > 0:  # objects that the prompt does not name go first
                 order = sorted(rng.permutation(free).tolist(), key=lambda slot: slot in named)
                 mask[order[:surplus]] = True
             missing += max(0, check.expected - check.found)
@@ -227,7 +227,7 @@ class CulpritsMask:
     clamping therefore adds too many objects and spoils the observed ones.
 
     Args:
-        at_least: slots regenerated, when the scene has as many.
+        at_least: smallest number of slots to regenerate, if the scene has as many.
 
     A scene without free objects is regenerated whole.
     """
@@ -263,7 +263,7 @@ class BalancedMask:
     same. A mask of all empty slots depends on the content, and the prior then adds too many objects.
 
     Args:
-        at_least: slots regenerated, when the scene has as many; the share grows until there are.
+        at_least: smallest number of slots to regenerate, if the scene has as many; the share grows until it is reached.
     """
 
     at_least: int = 4

@@ -23,8 +23,8 @@ MaskGenerator = Callable[[SceneBatch, Score, np.random.Generator], Tensor]
 """``(scene, score, rng) -> (N,) bool``, True where a slot is regenerated.
 
 ``scene`` is a batch of one, ``score`` the objective's verdict on it with its credit and flags per object, and ``rng``
-the only source of randomness. Slots of welded objects are taken out afterwards. A generator that reads the prompt has a
-method ``for_prompt(prompt) -> MaskGenerator`` as well; see :func:`mask_for_prompt`.
+the only source of randomness. Slots of welded objects are taken out of the mask afterwards. A generator that reads the
+prompt also has a method ``for_prompt(prompt) -> MaskGenerator``; see :func:`mask_for_prompt`.
 """
 
 ENTRY_POINT_GROUP = "scene_envs.masks"
@@ -56,7 +56,7 @@ def register_mask(name: str) -> Callable[[Generator], Generator]:
     """Make a mask generator available as ``mask=name``; the same name again replaces it.
 
     Raises:
-        InvalidInputError: the name is not one word, or what is decorated cannot be called.
+        InvalidInputError: the name is not one word, or the decorated object cannot be called.
 
     >>> @register_mask("doctest_empty")
     ... def empty_slots(scene, score, rng):
@@ -84,7 +84,7 @@ def resolve_mask(mask: Any) -> MaskGenerator:
 
     Raises:
         UnknownNameError: no mask generator has that name, or it has no such setting; the nearest known is offered.
-        InvalidInputError: none of these, or a name of an earlier version.
+        InvalidInputError: ``mask`` is none of these, or a name of an earlier version.
 
     >>> resolve_mask({"name": "lowest_scoring", "count": 2})
     LowestScoringMask(count=2)
@@ -101,7 +101,7 @@ def resolve_mask(mask: Any) -> MaskGenerator:
 
 
 def mask_for_prompt(generator: MaskGenerator, prompt: str | None) -> MaskGenerator:
-    """The generator for scenes of ``prompt``: what its method ``for_prompt`` gives, or itself without one.
+    """The generator for scenes of ``prompt``: the result of its ``for_prompt``, or itself without such a method.
 
     >>> mask_for_prompt(resolve_mask("off_prompt"), "A scene with two cups.")
     OffPromptMask(prompt='A scene with two cups.')
@@ -111,10 +111,10 @@ def mask_for_prompt(generator: MaskGenerator, prompt: str | None) -> MaskGenerat
 
 
 def masked_slots(generator: MaskGenerator, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-    """(N,) bool: what a mask generator says of a batch of one.
+    """(N,) bool: the mask that a generator gives for a batch of one.
 
     Raises:
-        InvalidInputError: it raised an error, or returned something else.
+        InvalidInputError: the generator raised an error, or returned something else.
     """
     name = getattr(generator, "__name__", type(generator).__name__)
     slots = scene.tensor.shape[1]

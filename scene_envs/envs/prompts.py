@@ -19,15 +19,15 @@ from scene_envs.scene_types import SceneType
 _BANK = 64
 """Scenes of a grammar that prompts are drawn from, with three prompts each."""
 _MOST_ROWS = 4096
-"""Prompts whose tokens are remembered."""
+"""Number of prompts whose tokens are remembered; beyond it, all of them are forgotten."""
 
 
 class EnvPrompts:
     """The prompts of an environment's episodes.
 
     Args:
-        prior: what the environment steps with.
-        prompt: None for scenes without; one prompt; a list to draw from; or ``"grammar"`` (or ``"data"``, which is the
+        prior: the prior of the environment.
+        prompt: None for no prompts; one prompt; a list to draw from; or ``"grammar"`` (or ``"data"``, which is the
             same here) for descriptions of the grammar's scenes.
         guidance: w of classifier-free guidance in the prior's own steps.
         slots: slots per scene; a prompt that asks for more objects is refused.
@@ -65,7 +65,7 @@ class EnvPrompts:
                 "leave prompt= out, or give a prior that reads prompts"
             )
         if self._choices:
-            self.read(self._choices)  # says now, not later, what cannot be followed
+            self.read(self._choices)  # raises now, not later, if a prompt cannot be followed
 
     @property
     def reader(self) -> PromptedPriorLike | None:
@@ -74,7 +74,7 @@ class EnvPrompts:
 
     @property
     def space(self) -> tuple[int, int] | None:
-        """Tokens per prompt, and how many different ones there are; None when the prior reads no prompts."""
+        """Tokens per prompt, and size of the vocabulary; None when the prior reads no prompts."""
         return None if self.reader is None else self.reader.prompt_space
 
     def draw(self, rng: np.random.Generator) -> str:

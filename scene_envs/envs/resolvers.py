@@ -10,9 +10,9 @@ from scene_envs.plugins import plugin_entry_points
 from scene_envs.protocols import PriorLike, SceneScorer
 
 ENTRY_POINT_GROUP = "scene_envs.resolvers"
-"""``reward = "module:function"`` names a function from whatever names a reward to a
-:class:`~scene_envs.protocols.SceneScorer`, ``prior`` one from a name or path to a
-:class:`~scene_envs.protocols.PriorLike`."""
+"""Entry points of this group. ``reward = "module:function"`` names a function that takes what :func:`resolve_reward`
+takes, and returns a :class:`~scene_envs.protocols.SceneScorer`. ``prior = "module:function"`` names a function that
+takes a name or path, and returns a :class:`~scene_envs.protocols.PriorLike`."""
 
 
 def resolve_reward(reward: Any) -> SceneScorer:

@@ -1,4 +1,4 @@
-"""Search MDP: states, and roots, children and values as pure functions. No episode, no Gymnasium."""
+"""Search MDP: states, and pure functions that make roots, children and values. No episode, no Gymnasium."""
 
 from __future__ import annotations
 
@@ -23,19 +23,20 @@ from scene_envs.scene import SceneBatch
 
 _LOGGER = logging.getLogger(__name__)
 _SAME = 1e-4
-"""Scenes are the same when their objects agree to this, m."""
+"""Scenes are the same when their objects agree to within this (m)."""
 
 Steering = Callable[[Sequence[tuple["SearchState", int]], Callable[[SceneBatch], Tensor]], Any]
 """``(pairs, values) -> watch``: makes the object that a prior's ``inpaint`` calls during the denoising of ``pairs``.
 
 ``values`` gives Φ (B,) of scenes that are being denoised, 0 where the objective cannot score one. The object may have
-the methods ``trace(row)``, the ``trace`` of that child, and ``first_step(steps)``, the first step of its denoising.
+two methods: ``trace(row)`` returns the ``trace`` of that child, and ``first_step(steps)`` returns the step at which the
+denoising begins.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class SearchState:
-    """A partial scene: what is there, what will be regenerated, and how it came about. Immutable and picklable.
+    """A partial scene, with the slots to regenerate and the actions that led to it. Immutable and picklable.
 
     Attributes:
         scene: (N, D) float32 raw scene; never write into it.
@@ -46,9 +47,9 @@ class SearchState:
         value: Φ in [0, 1]; the parent's where ``valid`` is False.
         objective: the objective's raw value; 0 where not valid.
         valid: whether the objective could score this scene.
-        trace: tensors that what steered the denoising left behind, such as the scene on its way; None mostly.
+        trace: tensors from the object that steered the denoising, such as an intermediate scene; usually None.
 
-    Two states are equal when they are the same node: same seed, path and scene.
+    Two states are equal when they are the same node: same seed, path, scene and mask.
     """
 
     scene: Tensor
@@ -141,7 +142,7 @@ class SearchProblem:
         self.device = prior_device(self.prior)
         self.branching, self.max_depth, self.num_steps = chosen.branching, chosen.max_depth, chosen.num_steps
         self.num_actions, self.max_nfe = chosen.branching, chosen.max_nfe
-        self.prior.step_table(self.num_steps)  # says now, not later, that num_steps is more than the prior has
+        self.prior.step_table(self.num_steps)  # raises now, not later, if the prior has fewer steps
         self.prompting = EnvPrompts(self.prior, chosen.prompt, chosen.guidance, self.slots)
         self.prompt = self.prompting.draw(np.random.default_rng(0)) if self.prompting.given else None
         self.scorer = RewardScorer(chosen.objective, chosen.workers)
@@ -209,16 +210,16 @@ class SearchProblem:
         return state.mask
 
     def is_solved(self, state: SearchState) -> bool:
-        """Whether nothing is left to improve: no slot is masked, or Φ is 1, the most there is."""
+        """Whether nothing is left to improve: no slot is masked, or Φ is 1, its largest value."""
         return state.value >= 1.0 or not bool(state.mask.any())
 
     def without_masked(self, state: SearchState) -> SearchState:
-        """The same node with the objects that are still masked removed: what a search may return in the end."""
+        """The same node without the objects that are still masked; a search may return it in the end."""
         empty = SceneBatch.empty(self.scene_type, 1, self.slots).tensor[0]
         return self.with_scene(state, torch.where(state.mask[:, None], empty, state.scene))
 
     def with_scene(self, state: SearchState, scene: Tensor) -> SearchState:
-        """The node of ``state`` with another ``scene`` (N, D), scored, and with its mask; nothing is denoised."""
+        """The node of ``state`` with another ``scene`` (N, D), scored and masked anew; nothing is denoised."""
         batch = SceneBatch(scene.unsqueeze(0), self.scene_type)
         return self._score(batch, [(state.seed, state.path, state.value)])[0]
 
@@ -312,7 +313,7 @@ class SearchProblem:
     def _mask(
         self, generator: MaskGenerator, scene: SceneBatch, score: Score, seed: int, path: tuple[int, ...]
     ) -> Tensor:
-        """(N,) bool: what ``generator`` masks at this node, welded objects left out; all without free objects."""
+        """(N,) bool: slots that ``generator`` masks at this node, or all if no object is free; welded ones left out."""
         changeable = self._changeable() & ~scene.is_welded[0]
         if bool(scene.is_free.any()):
             changeable &= masked_slots(generator, scene, score, NodeRandomness.at(seed, path).mask)

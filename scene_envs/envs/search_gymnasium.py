@@ -116,7 +116,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         self._begin(problem, render_mode, spaces.MultiBinary(problem.slots))
 
     def _begin(self, problem: SearchProblem, render_mode: str | None, regenerate: spaces.MultiBinary) -> None:
-        """Spaces and state of an environment over ``problem``; ``regenerate`` is what is observed of its masks."""
+        """Set up an environment over ``problem``; ``regenerate`` is the space of the observed masks."""
         self.render_mode = render_mode
         self._rendering = SearchRendering(render_mode)
         self.problem = problem
@@ -217,7 +217,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         return self.state
 
     def restore_state(self, state: SearchState) -> None:
-        """Make ``state`` the current one. The best state and the NFE count go on."""
+        """Make ``state`` the current one. The best state and the NFE count are kept."""
         self._state = self._check_state(state)
         self._remember([self._state])
 
@@ -226,7 +226,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         return self.problem.legal_actions(self.state if state is None else state)
 
     def action_masks(self) -> np.ndarray:
-        """(number of actions,) bool, the legal ones of the current state, as maskable agents ask for them."""
+        """(number of actions,) bool, the legal ones of the current state, in the form that maskable agents expect."""
         return np.isin(np.arange(self.problem.num_actions), list(self.legal_actions()))
 
     def expand(self, state: SearchState, action: int) -> SearchState:
@@ -259,7 +259,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         return self.problem.without_masked(state)
 
     def with_scene(self, state: SearchState, scene: Tensor) -> SearchState:
-        """``state`` with another ``scene`` (N, D), scored, and with its mask; nothing is denoised."""
+        """``state`` with another ``scene`` (N, D), scored and masked anew; nothing is denoised."""
         return self.problem.with_scene(state, scene)
 
     def scene(self, state: SearchState | None = None) -> SceneBatch:

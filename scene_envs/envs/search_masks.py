@@ -35,10 +35,10 @@ class MaskChoiceState(SearchState):
 
 
 class MaskChoiceProblem(SearchProblem):
-    """The tree of partial scenes in which an action says what is regenerated as well.
+    """The tree of partial scenes in which an action also chooses the mask of slots to regenerate.
 
-    Action ``k * branching + j`` is inpainting j of mask k. It is legal where mask k has a slot. With the one mask of a
-    :class:`~scene_envs.envs.search.SearchProblem` the tree is that problem's, bit for bit.
+    Action ``k * branching + j`` is inpainting j of mask k. It is legal where mask k has a slot. With a single mask
+    the tree equals that of a :class:`~scene_envs.envs.search.SearchProblem` with this mask, bit for bit.
 
     Args:
         **settings: fields of :class:`~scene_envs.envs.settings.SearchMaskSettings`.
@@ -90,7 +90,7 @@ class MaskChoiceProblem(SearchProblem):
 
 
 def _name(mask: Any) -> str:
-    """A mask's name as a user gives it; of a function, its own."""
+    """A mask's name as a user gives it; for a function, the function's own name."""
     if isinstance(mask, str):
         return mask
     return str(mask["name"]) if hasattr(mask, "keys") else getattr(mask, "__name__", type(mask).__name__)

@@ -14,7 +14,7 @@ from scene_envs.scene_types import SceneType
 
 ACTION_MODES = ("next_sample", "noise")
 PROMPT_SOURCES = ("data", "grammar")
-"""Values of ``prompt`` that stand for prompts of scenes; all others are prompts themselves."""
+"""Values of ``prompt`` that stand for descriptions of scenes; any other text is a prompt itself."""
 
 _MOST_SLOTS = 100_000
 _LARGEST = 1e30

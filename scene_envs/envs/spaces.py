@@ -24,7 +24,7 @@ STATE_BOUND = 10.0
 def resolve_scene_and_prior(scene: str | SceneType | None, prior: Any) -> tuple[SceneType, PriorLike]:
     """The scene type, and its prior: the given one, or the shipped one of the scene type's name.
 
-    Without a scene type it is that of the prior, and without either ``dimsum_table``.
+    Without a scene type, that of the prior is taken; without both, ``dimsum_table``.
     """
     if scene is None and prior is None:
         scene = DEFAULT_SCENE
@@ -77,7 +77,7 @@ def decode_scenes(prior: PriorLike, x: Tensor) -> SceneBatch:
 def occupied(x: Tensor, scene_type: SceneType) -> Tensor:
     """(B, N) int8: 1 where the arg-max category of normalised or raw scenes (B, N, D) is not *empty*.
 
-    Slots whose category is not drawn yet, rows of zeros of a mixed prior, count as empty.
+    Slots whose category is not drawn yet (rows of zeros, from a mixed prior) count as empty.
     """
     category = x[..., -(scene_type.num_assets + 1) :]
     drawn = (category != 0).any(dim=-1)

@@ -1,4 +1,4 @@
-"""Specs of environments: a clear error where a keyword argument does not go into JSON."""
+"""Specs of environments, with a clear error where a keyword argument cannot be written as JSON."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scene_envs.errors import InvalidInputError
 
 
 class SceneEnvSpec(EnvSpec):
-    """A spec whose ``to_json`` names the keyword argument that is in the way."""
+    """A spec whose ``to_json`` names the keyword argument that cannot be written as JSON."""
 
     def to_json(self) -> str:
         """The spec as JSON; InvalidInputError for a function or an object: give its name instead."""
@@ -34,7 +34,7 @@ class SpecMixin:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """Keyword arguments of ``gym.make``."""
+        """The environment's spec, with the keyword arguments of ``gym.make``."""
         return self._spec
 
     @spec.setter

@@ -90,7 +90,7 @@ def export(
 
 
 def _claim(root: Path, batch: SceneBatch, friction: float) -> dict[str, Any]:
-    """Make the folder this export's; the manifest of an earlier export of the same scenes, or a new one."""
+    """Claim the folder for this export; returns the manifest of an earlier export of the same scenes, or a new one."""
     try:
         root.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
@@ -130,7 +130,7 @@ def _write_manifest(root: Path, manifest: Mapping[str, Any]) -> None:
 
 
 def _digest(batch: SceneBatch) -> str:
-    """What the files depend on: poses, and the geometry and mass of the assets."""
+    """Digest of all that the files depend on: poses, and the geometry and mass of the assets."""
     digest = hashlib.sha256(batch.tensor.cpu().contiguous().numpy().tobytes())
     scene_type: SceneType = batch.scene_type
     digest.update(repr((scene_type.assets, scene_type.welded)).encode())

@@ -1,4 +1,4 @@
-"""Plain arrays: ``.npz``, and a pickled dictionary for programs that read those."""
+"""Plain arrays: ``.npz``, and a pickled dictionary for programs that read pickles."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ def scene_arrays(scene: PlacedScene) -> dict[str, Any]:
 
 
 def write_npz(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
-    """``scene.npz``; reads with ``numpy.load`` and nothing else."""
+    """``scene.npz``, which ``numpy.load`` alone can read."""
     path = folder / "scene.npz"
     np.savez(path, **scene_arrays(scene))
     return path
 
 
 def write_pickle(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
-    """``scene.pkl``: the same as a dictionary of arrays; needs numpy alone to load."""
+    """``scene.pkl``: the same arrays as a dictionary; only numpy is needed to load it."""
     path = folder / "scene.pkl"
     path.write_bytes(pickle.dumps(scene_arrays(scene), protocol=4))
     return path

@@ -26,7 +26,7 @@ class AssetFiles:
 
     Args:
         folder: the ``assets`` folder.
-        assets: all assets that may be asked for; they settle the names.
+        assets: all assets that may be asked for; their unique identifiers are derived from all names together.
         friction: friction coefficient that formats write into their files.
         package: a name for the whole export, for formats whose paths need one.
 
@@ -45,7 +45,7 @@ class AssetFiles:
         self._textured: dict[str, trimesh.Trimesh] = {}
 
     def name(self, asset: Asset) -> str:
-        """The asset's name as an identifier, which is also that of its folder."""
+        """The asset's name as an identifier, which is also the name of its folder."""
         return self._names[asset.name]
 
     def folder(self, asset: Asset) -> Path:
@@ -116,7 +116,7 @@ class Palette:
 
     @classmethod
     def of(cls, mesh: trimesh.Trimesh) -> Palette:
-        """At most 1024 colours; more are rounded."""
+        """The palette of a mesh, of at most 1024 colours; if there are more, they are rounded."""
         colors, cells = np.unique(_few_colors(face_colors(mesh)), axis=0, return_inverse=True)
         side = int(np.ceil(np.sqrt(len(colors))))
         pixels = np.zeros((side * side, 3), dtype=np.uint8)
@@ -192,7 +192,7 @@ def _write_visual(mesh: trimesh.Trimesh, folder: Path) -> Path:
 
 
 def _few_colors(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The colours with as many bits per channel as keep them within the palette."""
+    """The colours, rounded to the largest number of bits per channel with which they fit into the palette."""
     for bits in range(8, 2, -1):
         step = 1 << (8 - bits)
         rounded = np.minimum(colors.astype(np.int64) // step * step + step // 2, 255).astype(np.uint8)

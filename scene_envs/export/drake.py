@@ -14,11 +14,11 @@ from scene_envs.export.urdf import asset_urdf, relative
 
 
 class _AngleAxis(dict[str, Any]):
-    """Written with the tag ``!AngleAxis``."""
+    """Mapping that is written with the YAML tag ``!AngleAxis``."""
 
 
 class _Dumper(yaml.SafeDumper):
-    """Block style outside, flow style for lists of numbers, doubles in full."""
+    """YAML writer: block style outside, flow style for lists of numbers, doubles in full precision."""
 
 
 _Dumper.add_representer(
@@ -40,7 +40,7 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
 
 
 def write_package(files: AssetFiles) -> str:
-    """The name in ``package.xml`` of the export folder, which is written unless the folder has one already."""
+    """Write ``package.xml`` into the export folder unless it is there already; returns the name in it."""
     path = files.root.parent / "package.xml"
     if path.exists():
         found = re.search(r"<name>\s*([^<\s]+)\s*</name>", path.read_text())

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from scene_envs.export.placed import PlacedScene
 
 SceneWriter = Callable[["PlacedScene", "AssetFiles", Path], Path]
-"""Writes one scene into its folder, what assets need into theirs, and returns the main file."""
+"""Writes one scene into its folder and files of assets into the assets' folders, and returns the main file."""
 
 ENTRY_POINT_GROUP = "scene_envs.export_formats"
 """Packages offer formats under this group: an entry named after the format, whose value is a SceneWriter."""
@@ -42,7 +42,7 @@ class ExportFormat:
     install: str = ""
 
     def check(self) -> None:
-        """Raise MissingDependencyError where what it needs is not installed."""
+        """Raise MissingDependencyError where the module that the format requires is not installed."""
         if self.requires and find_spec(self.requires) is None:
             raise MissingDependencyError(
                 f"format {self.name!r} needs {self.install}, which is not installed; "
@@ -50,7 +50,7 @@ class ExportFormat:
             )
 
     def writer(self) -> SceneWriter:
-        """The writer, imported; raises MissingDependencyError where what it needs is not installed."""
+        """The writer, imported; raises MissingDependencyError where the required module is not installed."""
         self.check()
         if not isinstance(self.write, str):
             return self.write
@@ -80,8 +80,8 @@ _FORMATS = Registry(
 def register_format(name: str, *, summary: str = "") -> Callable[[SceneWriter], SceneWriter]:
     """Make the decorated function the writer of format ``name``; the same name again replaces it.
 
-    It takes ``(scene: PlacedScene, files: AssetFiles, folder: Path)``, writes the scene into ``folder`` and returns
-    the path of its main file. ``files`` gives the meshes of assets, which are shared by all scenes.
+    The function takes ``(scene: PlacedScene, files: AssetFiles, folder: Path)``, writes the scene into ``folder`` and
+    returns the path of its main file. ``files`` gives the meshes of assets, which are shared by all scenes.
 
     >>> @register_format("doctest_poses", summary="one line per object")
     ... def write(scene, files, folder):

@@ -15,9 +15,9 @@ from scene_envs.physics.rigid import principal_inertia
 from scene_envs.scene_types import Camera
 
 TIMESTEP = 0.002
-"""s."""
+"""Time step of the simulation, s."""
 _CONTACT = {"solref": "0.004 1", "solimp": "0.95 0.99 0.001"}
-"""As stiff as the time step allows: objects at rest sink by micrometres, by 0.1 mm under MuJoCo's defaults."""
+"""As stiff as the time step allows: objects at rest sink by micrometres, instead of 0.1 mm with MuJoCo's defaults."""
 
 
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:

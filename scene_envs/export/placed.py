@@ -88,7 +88,7 @@ def place(batch: SceneBatch) -> list[PlacedScene]:
     their rounding. Objects are named after their asset and numbered in slot order. An asset without mass is welded.
 
     Raises:
-        InvalidInputError: a rotation is not one; its scene and slot are named.
+        InvalidInputError: a matrix is not a rotation; the message names its scene and slot.
 
     >>> scene = place(SceneBatch.empty("dimsum_table", 1))[0]
     >>> [(thing.name, thing.welded) for thing in scene.objects]
@@ -125,7 +125,7 @@ def place(batch: SceneBatch) -> list[PlacedScene]:
 
 
 def identifiers(names: Iterable[str]) -> dict[str, str]:
-    """For each name, a unique one of letters, digits and underscores that starts with a letter or underscore.
+    """For each name, a unique identifier of letters, digits and underscores that does not start with a digit.
 
     >>> identifiers(["tea cup", "tea-cup", "7up", "plate"])
     {'tea cup': 'tea_cup', 'tea-cup': 'tea_cup_2', '7up': '_7up', 'plate': 'plate'}
@@ -161,7 +161,9 @@ def quaternion(rotation: Array) -> Array:
 
 
 def angle_axis(rotation: Array) -> tuple[float, Array]:
-    """Angle (degrees, 0..180) and unit axis (3,) of a rotation (3, 3); well defined at every rotation, unlike Euler's.
+    """Angle (degrees, 0..180) and unit axis (3,) of a rotation (3, 3).
+
+    Unlike Euler angles, they are well defined at every rotation.
 
     >>> angle, axis = angle_axis(np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]))
     >>> round(angle, 12), axis.round(12).tolist()
@@ -184,7 +186,7 @@ def number(value: float) -> str:
 
 
 def numbers(values: Sequence[float] | Array) -> str:
-    """Several of them, separated by spaces."""
+    """Several numbers as :func:`number` writes them, separated by spaces."""
     return " ".join(number(value) for value in np.asarray(values, dtype=np.float64).ravel())
 
 

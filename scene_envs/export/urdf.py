@@ -15,13 +15,13 @@ from scene_envs.export.placed import PlacedScene, number, numbers
 BULLET_MARGIN = 1e-3
 """Bullet grows each convex mesh by this much (m); the parts of its URDF are smaller by as much."""
 DRAKE = "http://drake.mit.edu"
-"""Name space of what Drake alone reads."""
+"""XML namespace of the elements that only Drake reads."""
 _MODULUS = 1e8
 """Hydroelastic modulus (Pa): objects at rest sink by micrometres."""
 
 
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
-    """``objects.json``: name, URDF, pose and whether it is welded, per object; URDFs go to the assets."""
+    """``objects.json``: name, URDF, pose and whether it is welded, per object; URDFs go into the assets' folders."""
     objects = [
         {
             "name": thing.name,
@@ -39,7 +39,7 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
 
 
 def asset_urdf(asset: Asset, files: AssetFiles) -> Path:
-    """``<name>.urdf`` with exact parts, for everything but PyBullet. An asset without mass has none here either."""
+    """``<name>.urdf`` with exact parts, for everything but PyBullet. An asset without mass has mass 0 here."""
     return files.once(
         asset, "urdf", lambda folder: _write(asset, files, files.parts(asset), folder / f"{files.name(asset)}.urdf")
     )

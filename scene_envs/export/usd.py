@@ -40,7 +40,7 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
 
 
 def asset_usd(asset: Asset, files: AssetFiles) -> Path:
-    """``<name>.usda``: a coloured mesh, and convex colliders of purpose *guide*; the scene makes it a body."""
+    """``<name>.usda``: a coloured mesh, and convex colliders of purpose *guide*; the scene's file makes it a body."""
     return files.once(asset, "usd", lambda folder: _write_asset(asset, files, folder))
 
 
@@ -84,7 +84,7 @@ def _new_stage(path: Path) -> Any:
     """An empty stage in metres and kilograms with z up, replacing the file at ``path``."""
     from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
-    layer = Sdf.Layer.Find(str(path))  # one that this process wrote before is still in memory
+    layer = Sdf.Layer.Find(str(path))  # a layer that this process wrote before is still in memory
     if layer:
         layer.Clear()
     else:

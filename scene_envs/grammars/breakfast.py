@@ -15,7 +15,7 @@ from scene_envs.grammars.surface import Region
 from scene_envs.grammars.towers import Node
 
 HALF_DEPTH, HALF_LENGTH = 0.2575, 0.65
-"""How far (m) the frames of what stands on the table are from its middle, at most."""
+"""Largest distances (m) in x and y of object frames from the middle of the table."""
 TABLE = Region(HALF_DEPTH, HALF_LENGTH, overhang=0.09)
 """Nothing hangs over the edge of the table, which is 0.375 and 0.75 m from its middle."""
 
@@ -29,7 +29,7 @@ ACROSS = Yaw(std=0.06, choices=(math.pi / 2, -math.pi / 2))
 
 
 def near(x: float, y: float) -> Uniform:
-    """A place of the setting, within 1.5 cm: x toward the middle of the table, y to the left of who sits there, m."""
+    """A place of the setting, within 1.5 cm: x toward the middle of the table, y to the left of the person there, m."""
     return Uniform(0.015, 0.015, x, y)
 
 

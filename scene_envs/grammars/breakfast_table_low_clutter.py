@@ -1,7 +1,8 @@
 """Breakfast Table, low clutter: laid for two who face each other, with shared food and a crock of cutlery.
 
 Probabilities follow the scene grammar of the paper's dataset (Pfaff et al., CoRL 2025). Most published scenes
-lack the crock's cutlery; with it, settings are rarer here, so that counts match the published ones.
+lack the crock's cutlery. Here the crock holds its cutlery, and settings are rarer, so that counts match the published
+ones.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _TRIES = 6
 _SETTLE = 1.5
-"""How long (s) contents come to rest."""
+"""Time (s) in which contents come to rest."""
 _NOWHERE = Camera((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
 
 
@@ -162,7 +162,7 @@ class Containers:
 
     @staticmethod
     def _is_inside(container: Asset, assets: Sequence[Asset], batch: SceneBatch) -> bool:
-        """Whether every centre of mass is above the container's floor and within its outline."""
+        """Whether every centre of mass is above the bottom of the container's bounding box and between its sides."""
         low, high = container.bounds
         centers = np.stack([asset.center_of_mass for asset in assets])
         turned = np.einsum("nij,nj->ni", batch.rotations[0, 1:].double().numpy(), centers)

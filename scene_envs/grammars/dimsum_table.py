@@ -16,10 +16,10 @@ from scene_envs.grammars.towers import Node, Surface
 from scene_envs.scene_types import get_scene_type
 
 KEEP_OUT = {"dinner_plate": 0.14, "teacup": 0.07, "teapot": 0.10, "serving_dish": 0.20, "steamer_bottom": 0.12}
-"""Circles (m) that two things on the table never share."""
+"""Radii (m) of circles around objects; the circles of two objects on the table never overlap."""
 
 FOOTPRINT = {"dinner_plate": 0.135, "teacup": 0.07, "teapot": 0.10, "serving_dish": 0.191, "steamer_bottom": 0.12}
-"""Circles (m) that lie wholly on the table top."""
+"""Radii (m) of circles around objects that lie wholly on the table top."""
 
 STEP = 0.091
 """Height of one steamer, m."""
@@ -42,7 +42,7 @@ def dishes(present: float) -> Node:
 
 
 def steamers(another: float, lid: float, nothing: float, three: float = 0.6) -> Node:
-    """Three or four stacks of steamers, the tallest of at least four."""
+    """Three or four stacks of steamers; the tallest has at least four objects."""
     then = {"steamer_bottom": another, "steamer_lid": lid, None: nothing}
     return Repeat(
         Stack("steamer_bottom", then, step=STEP, where=Gaussian(along=0.158), at_most=10),

@@ -18,7 +18,7 @@ class PositionDistribution(Protocol):
         """One place."""
 
     def log_density(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """(P,) log density up to a constant, at ``points`` (P, 2); None when it lives on a line or point."""
+        """(P,) log density up to a constant, at ``points`` (P, 2); None for a distribution on a line or point."""
 
 
 @dataclass(frozen=True)

@@ -72,9 +72,9 @@ class Layout:
         Args:
             surface: the surface.
             towers: what stands on it.
-            frame: the frame of what carries it; the world's when nothing does.
+            frame: the frame of the object that carries it; the world frame when no object does.
             carrier: asset that carries it, if any.
-            rng: source of chance.
+            rng: random generator.
         """
         if surface.height is not None:
             level = surface.height
@@ -95,14 +95,14 @@ class Layout:
             noted = self.reasons.total()
             placed = self._add(free, surface, tower, frame, height, rng)
             if placed is None:
-                if self.reasons.total() == noted:  # nothing on it or in it was the cause
+                if self.reasons.total() == noted:  # no failure on it or in it was the cause
                     self._note_failure(tower, towers[:count])
                 return None
             poses += placed
         return poses
 
     def _note_failure(self, tower: Tower, standing: Sequence[Tower]) -> None:
-        """Count that ``tower`` has no room, and what stands on its surface most."""
+        """Count that ``tower`` has no room, together with the most frequent asset on its surface."""
         name = tower.assets[0] if tower.assets else "what stands on a fixed object"
         others = Counter(other.assets[0] for other in standing if other.assets).most_common(1)
         where = f"beside {others[0][0]!r}" if others else "on its empty surface"
@@ -197,7 +197,7 @@ class Layout:
                 footprint: tuple[Plan, ...] = (Disc(surface.footprint[bottom]),)
             else:
                 footprint = tuple(self._plan(asset) for asset in assets)
-            self._outlines[key] = surface, Outline(keep_out, footprint)  # holds the surface: its id stays taken
+            self._outlines[key] = surface, Outline(keep_out, footprint)  # keeps the surface, so its id stays unique
         return self._outlines[key][1]
 
 

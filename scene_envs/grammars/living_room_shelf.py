@@ -1,7 +1,7 @@
 """Living Room Shelf: board games, drinks, a book, toys and lamps on four tiers.
 
-Probabilities follow the scene grammar of the paper's dataset (Pfaff et al., CoRL 2025). Its own constraints reject
-stacks of small games; here they are kept.
+Probabilities follow the scene grammar of the paper's dataset (Pfaff et al., CoRL 2025). The paper's constraints
+reject stacks of small games; here such stacks are kept.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ def toast(another: float) -> Node:
 
 
 def at_least(objects: int) -> dict[str, Callable[[Sequence[Tower]], bool]]:
-    """The condition that a scene has ``objects`` of them besides the table."""
+    """The condition that a scene has at least ``objects`` objects besides the fixed ones."""
 
     def enough(towers: Sequence[Tower]) -> bool:
         return sum(len(tower.assets) + len(tower.contents) for tower in towers) >= objects

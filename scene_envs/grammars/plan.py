@@ -31,7 +31,7 @@ class Disc:
 
 @dataclass(frozen=True)
 class Rectangle:
-    """An upright rectangle in the frame of an object.
+    """An axis-aligned rectangle in the frame of an object.
 
     Attributes:
         half_x, half_y: half sides, m.
@@ -141,7 +141,7 @@ def _apart(box: Placed, other: Placed) -> bool:
 
 
 def plan_of(asset: Asset) -> Plan:
-    """The smaller of the disc about the frame and the upright rectangle that hold ``asset``, with a little margin."""
+    """The smaller of the disc about the frame and the axis-aligned rectangle that hold ``asset``, with a margin."""
     corners = np.concatenate([part.vertices for part in asset.fine])
     radius = float(np.hypot(corners[:, 0], corners[:, 1]).max()) + CLEARANCE
     low, high = corners[:, :2].min(axis=0), corners[:, :2].max(axis=0)
@@ -183,5 +183,5 @@ def _top_on_axis(triangles: NDArray[np.float64]) -> float | None:
 
 
 def _tidy(value: float) -> float:
-    """A length without the dust of the arithmetic that made it."""
+    """A length rounded to nine decimals, to remove rounding errors."""
     return float(np.round(value, 9)) + 0.0

@@ -20,7 +20,7 @@ FLOOR = -0.785
 """z of the floor (m); table tops are at 0."""
 ROOM = Region(4.9, 4.9)
 KEEP_OUT = {"cafe_table": 0.72, "chair": 0.35}
-"""Circles (m) that two things on the floor never share, so that people can pass."""
+"""Radii (m) of circles around objects; circles of two objects on the floor never overlap, so that people can pass."""
 TABLES = Uniform(2.75, 3.0, x=0.25)
 WALL = Line((-4.75, -3.0), (-4.75, 3.0))
 
@@ -28,8 +28,8 @@ WALL = Line((-4.75, -3.0), (-4.75, 3.0))
 def chairs() -> Node:
     """Four chairs around a table, one on each side and facing it, in the frame of the table.
 
-    Their places have the spread of the paper's, 7 cm to the table and 17 cm along it, but no tails: a table that finds
-    no room for its chairs stands somewhere else.
+    The places have the same spread as in the paper, 7 cm toward the table and 17 cm along it, but no tails. A table
+    without room for its chairs is placed somewhere else.
     """
     chair = Object("chair", Uniform(0.12, 0.29, x=1.12), Yaw(0.14, (math.pi,)))
     center = Gaussian(along=0.0)
@@ -68,7 +68,7 @@ def laid(
 
 
 def tables(numbers: Mapping[int, float], table: Node) -> Node:
-    """So many tables, by weight; on one of them stands a stack of at least three."""
+    """A number of tables, drawn by weight; at least one of them carries a stack of at least three steamers."""
     conditions = {"no stack of 3": stack_of_three}
     return OneOf(*((weight, Repeat(table, Geometric(1.0, n, n), conditions)) for n, weight in numbers.items()))
 
@@ -85,5 +85,5 @@ def shelves(count: Geometric) -> Node:
 
 
 def floor(*children: Node) -> Surface:
-    """The floor, with what stands on it in this order."""
+    """The floor with ``children`` on it, placed in this order."""
     return Surface(children, ROOM, keep_out=KEEP_OUT, height=FLOOR, layouts=30)

@@ -1,8 +1,8 @@
 """Restaurant, low clutter: one to four laid tables and up to three shelves.
 
 Probabilities follow the scene grammar of the paper's dataset (Pfaff et al., CoRL 2025); the number of tables is
-drawn from what its rejection leaves. A few quiet rooms and a few feasts widen the range of object counts to that of
-the published data (9 to 107).
+drawn from the distribution that its rejection sampling leaves. A few quiet rooms and a few feasts widen the range of
+object counts to that of the published data (9 to 107).
 """
 
 from __future__ import annotations

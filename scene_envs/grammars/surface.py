@@ -92,8 +92,8 @@ class Outline:
     """Area that a child needs on its support.
 
     Attributes:
-        keep_out: what no other child's keep-out may meet; one plan per level of a stack.
-        footprint: what must lie in the region; one plan per level.
+        keep_out: area that no other child's keep-out may meet; one plan per level of a stack.
+        footprint: area that must lie in the region; one plan per level.
     """
 
     keep_out: tuple[Plan, ...]
@@ -174,7 +174,10 @@ class FreeSurface:
         return self._place_in_cells(where, yaw, outline, rng, levels)
 
     def _is_taken(self, x: float, y: float, core: float) -> bool:
-        """Whether a disc of radius ``core`` (m) at (x, y) meets another child's inner disc: a quick, generous test."""
+        """Whether a disc of radius ``core`` (m) at (x, y) meets another child's inner disc.
+
+        This test is quick, but misses some overlaps.
+        """
         for other_x, other_y, other in self._cores:
             dx, dy, reach = x - other_x, y - other_y, core + other
             if dx * dx + dy * dy < reach * reach:
@@ -216,7 +219,10 @@ class FreeSurface:
         return None
 
     def _roomy(self, cells: NDArray[np.float64], outline: Outline) -> NDArray[np.bool_]:
-        """(P,) cells that are not ruled out by circles within the plans: a quick, generous test."""
+        """(P,) bool: cells that discs within the plans do not rule out.
+
+        This test is quick, but some of these cells may have no room.
+        """
         inner, foot = outline.core, outline.foot
         region = self.region
         free = np.hypot(cells[:, 0], cells[:, 1]) + foot <= region.radius
@@ -228,5 +234,5 @@ class FreeSurface:
 
 
 def _inner(plan: Plan) -> float:
-    """Radius (m) of the largest disc about the centre of the plan."""
+    """Radius (m) of the largest disc about the centre of the plan that lies within it."""
     return plan.radius if isinstance(plan, Disc) else min(plan.half_x, plan.half_y)

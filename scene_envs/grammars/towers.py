@@ -34,7 +34,7 @@ class Tower:
         filling: how the contents get there.
         beside: towers on the same support whose places are in the frame of the bottom object.
 
-    A tower without assets is nothing but its loads: surfaces in the frame of what carries the tower.
+    A tower without assets consists of its loads alone: surfaces in the frame of the object that carries the tower.
     """
 
     assets: tuple[str, ...]
@@ -69,8 +69,8 @@ class Surface:
     Attributes:
         children: what stands here; drawn and placed in this order.
         region: where children may stand.
-        keep_out: per asset, the radius (m) no other child's keep-out may meet; by default the plan of the asset.
-        footprint: per asset, the radius (m) that must lie wholly on the support; by default the plan of the asset.
+        keep_out: per asset, radius (m) of a disc that no other keep-out may meet; by default the asset's plan.
+        footprint: per asset, radius (m) of a disc that must lie wholly on the support; by default the asset's plan.
         height: z of the surface (m), in the world or in the frame of the object that carries it; None takes the
             height at which something rests in the middle of that object.
         layouts: how often the whole layout is tried before the structure is thrown away.

@@ -1,4 +1,4 @@
-"""Physics of scenes: overlap, feasibility, settling, projection, and the worker processes that do it.
+"""Physics of scenes: overlap, feasibility, settling, projection, and the worker processes that compute them.
 
 Names load on first use, so that worker processes start without torch.
 """

@@ -34,8 +34,8 @@ def feasibility(
     A free object is feasible when its frame is in the workspace, when it is in no object pair that overlaps deeper than
     ``max_penetration``, and when it moves and turns no further than the limits in ``duration`` seconds of simulation
     under gravity, after all overlapping objects are removed. Welded objects support others but are not judged. A scene
-    whose simulation takes more work than :func:`settle` may spend is invalid. If exact depths of a heap would take
-    long, ``depth`` is that of the enclosing coarse parts.
+    whose simulation takes more work than :func:`settle` may spend is invalid. In a heap whose exact
+    depths would take too long, ``depth`` is that of the enclosing coarse parts.
 
     Args:
         batch: B scenes of N slots.
@@ -46,7 +46,7 @@ def feasibility(
         pool: worker processes; None computes in this process.
 
     Raises:
-        InvalidInputError: a pose is not finite, or a rotation is not one; its scene and slot are named.
+        InvalidInputError: a pose is not finite, or a matrix is not a rotation; the message names its scene and slot.
         MissingDependencyError: pybullet is not installed.
     """
     options = {
@@ -70,7 +70,7 @@ def feasibility(
 def penetration(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> PenetrationResult:
     """Overlap of every object pair, and the total over pairs of convex parts.
 
-    No simulator is needed. A heap of objects whose exact depths would take long is invalid.
+    No simulator is needed. A scene with a heap of objects whose exact depths would take too long is invalid.
 
     Raises InvalidInputError as :func:`feasibility` does.
     """
@@ -107,7 +107,7 @@ def furniture_overlap(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> 
 def equilibrium(batch: SceneBatch, *, duration: float = 0.1, pool: PhysicsPool | None = None) -> EquilibriumResult:
     """Displacement of every object under gravity in ``duration`` seconds, nothing removed.
 
-    A heap whose objects overlap so deeply that its simulation would take long is invalid: project it first. A scene
+    A heap is invalid: its objects overlap so deeply that its simulation would take too long. Project it first. A scene
     that takes more work than :func:`settle` may spend is invalid as well.
 
     Raises InvalidInputError and MissingDependencyError as :func:`feasibility` does.
@@ -122,10 +122,10 @@ def settle(
     """Let every scene come to rest under gravity, with slight damping.
 
     The simulation lasts up to ``duration`` seconds and stops earlier when nothing moves any more. Objects that fall off
-    their support end where they fell to, outside the workspace; they stop once they are a metre below it. A heap whose
-    objects overlap so deeply that its simulation would take long is invalid: project it first. The work per scene has
-    a limit, which is smaller if many objects overlap deeply (:mod:`scene_envs.physics.budget`). When the limit is
-    reached, objects stay at the poses reached, and ``finished`` is False.
+    their support end outside the workspace; they are stopped once they are a metre below it. A heap is invalid: its
+    objects overlap so deeply that its simulation would take too long. Project it first. The work per scene has a limit,
+    which is smaller if many objects overlap deeply (:mod:`scene_envs.physics.budget`). When the limit is reached,
+    objects stay at the poses reached, and ``finished`` is False.
 
     Args:
         batch: B scenes of N slots.

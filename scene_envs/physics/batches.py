@@ -40,7 +40,7 @@ def run_kernel(
         units: (B,) float64, units that the simulation of each scene may spend; None derives them from its objects.
 
     Raises:
-        InvalidInputError: a pose is not finite, or a rotation is not one; its scene and slot are named.
+        InvalidInputError: a pose is not finite, or a matrix is not a rotation; the message names its scene and slot.
     """
     _check(batch)
     translations = batch.translations.double().cpu().numpy()
@@ -78,7 +78,7 @@ def valid_rows(rows: Rows) -> Tensor:
 
 
 def spent(rows: Rows) -> Tensor:
-    """(B,) float64, units of simulation that each scene took; all of its units if the scene failed twice."""
+    """(B,) float64, units of simulation that each scene took; infinitely many if the scene failed twice."""
     return torch.tensor([np.inf if row is None else float(row["spent"]) for row in rows], dtype=torch.float64)
 
 

@@ -21,8 +21,9 @@ BodyKey = tuple[int, str]
 """Asset category and level of detail ("fine" or "coarse") of a body."""
 
 SCALE = 20.0
-"""Bullet length units per metre. Bullet grows each convex mesh by 0.001 units and rounds its edges by as much: 1 mm if
-a unit were a metre, 0.05 mm like this. Times and masses are as they are; gravity and inertia are scaled to match."""
+"""Bullet length units per metre. Bullet grows each convex mesh by 0.001 units and rounds its edges by as much. With one
+unit per metre this would be 1 mm; with this scale it is 0.05 mm. Times and masses are not scaled; gravity and inertia
+are scaled to match."""
 MARGIN = 1e-3 / SCALE
 """Margin (m) that Bullet adds to each convex mesh. Hulls are shrunk by it, so that they act at their true size."""
 
@@ -31,8 +32,8 @@ _PARKING = 1000.0
 _PARKING_STEP = 10.0 * SCALE
 _SPARE_BODIES = 64
 _SPARE_FACTOR = 3
-"""A pool with more bodies than this many times what a scene needs, and the spare ones, is built anew: Bullet compares
-the boxes of all bodies in every step, the parked ones too."""
+"""A pool is built anew when it has more bodies than this many times the bodies that a scene needs, plus
+``_SPARE_BODIES``: in every step Bullet compares the boxes of all bodies, including parked ones."""
 _ZERO = (0.0, 0.0, 0.0)
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
@@ -73,7 +74,7 @@ class BodyPool:
         return self._frames[category]
 
     def take(self, needed: Mapping[BodyKey, int]) -> dict[BodyKey, list[int]]:
-        """Parked bodies, ``needed[key]`` of each key; the same ones in the same order whatever was taken before.
+        """Parked bodies: the first ``needed[key]`` of each key, whatever earlier calls took.
 
         Raises:
             PhysicsError: PyBullet refuses a shape or a body.
@@ -142,14 +143,15 @@ class BodyPool:
             deterministicOverlappingPairs=1,
             enableFileCaching=0,
             solverResidualThreshold=0.0,
-            contactERP=0.1,  # overlaps within the limits close in 20 ms; with more, fruit that is pushed out rolls on
+            # Overlaps within the limits close in 20 ms. With a larger value, fruit that is pushed out keeps rolling.
+            contactERP=0.1,
             physicsClientId=client,
         )
         # A shared small visual: without one PyBullet would read the collision mesh again for every body.
         visual = bullet.createVisualShape(bullet.GEOM_BOX, halfExtents=(1e-3, 1e-3, 1e-3), physicsClientId=client)
         self._bodies, self._parking = {}, {}
         with tempfile.TemporaryDirectory() as folder:
-            for key in sorted(sizes):  # one order in every process, whatever was asked for first
+            for key in sorted(sizes):  # the same order in every process, whatever was asked for first
                 shape = self._shape(key, Path(folder))
                 self._bodies[key] = []
                 for _ in range(sizes[key]):
@@ -196,7 +198,7 @@ class BodyPool:
         # Bullet multiplies the friction coefficients of the two bodies.
         settings: dict[str, Any] = {"lateralFriction": math.sqrt(FRICTION), "restitution": 0.0}
         if not static:
-            # The mass goes in with the inertia: alone, the inertia call would reset the mass.
+            # Mass and inertia are set in one call: setting the inertia alone would reset the mass.
             settings |= {"mass": mass, "localInertiaDiagonal": self._inertia(category)}
             settings["activationState"] = self.bullet.ACTIVATION_STATE_SLEEP
         self.bullet.changeDynamics(body, -1, physicsClientId=self.client, **settings)

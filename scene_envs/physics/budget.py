@@ -10,17 +10,18 @@ from scene_envs.physics.pairs import ObjectPairs
 from scene_envs.physics.placement import Objects
 
 PER_SCENE, PER_OBJECT, PER_PAIR, MOST_PER_OBJECT = 1_000.0, 1_200.0, 500.0, 10_000.0
-"""Units of simulation (see :class:`Budget`) that a scene may take: so many, so many more for each free object and for
-each pair of them, which may meet, and in all at most so many for each object beyond the first number,"""
+"""Units of simulation (see :class:`Budget`) that a scene may take: ``PER_SCENE``, plus ``PER_OBJECT`` for each free
+object, plus ``PER_PAIR`` for each pair of free objects, because they may meet. The sum of the last two is at most
+``MOST_PER_OBJECT`` for each free object."""
 LEAST = 20_000.0
-"""but at least so many beyond the first number where that is no more than the most for each object: a scene of five
-objects goes through all rounds of :func:`~scene_envs.physics.make_ready` with them,"""
+"""Smallest number of units beyond ``PER_SCENE``, unless ``MOST_PER_OBJECT`` gives fewer. It lets a scene of five
+objects go through all rounds of :func:`~scene_envs.physics.make_ready`."""
 _CROWDED = 0.75
-"""unless more than this share of them do not stand clear of each other."""
+"""Above this share of free objects that do not stand clear of each other, a scene gets only ``PER_SCENE`` units."""
 _COINCIDENT = 0.9
 """Two objects coincide when the common part of their boxes is at least this share of the larger box."""
 _DEEP = 1e-2
-"""A free object deeper than this (m) in another one, or that coincides with it, does not stand clear."""
+"""A free object does not stand clear when it is deeper than this (m) in another free one, or coincides with one."""
 
 
 @dataclass

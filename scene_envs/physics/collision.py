@@ -17,11 +17,11 @@ from scene_envs.physics.separation import separations
 TOUCHING = 2e-5
 """Overlap (m) below which the face-plane bound is taken as the depth, without looking for the exact one."""
 NEAR = 3e-3
-"""Object pairs whose boxes are at most this far apart (m) are listed,"""
+"""Object pairs are listed when their boxes are at most this far apart (m)."""
 NEAR_FIXED = 0.06
-"""and up to this far (m) in height where one of the two is fixed: what falls onto it has a closed form."""
+"""The same limit in height (m) where one of the two is fixed: the fall of an object onto it has a closed form."""
 _TOO_MANY = 20_000_000
-"""Corner tests in the overlapping object pairs of one scene from which its depths are upper bounds."""
+"""Limit of corner tests in the overlapping object pairs of one scene; above it, depths are upper bounds."""
 
 
 class Collider:
@@ -66,7 +66,7 @@ class Collider:
         Args:
             objects: the objects.
             pairs: what :meth:`pairs` found for these objects.
-            fine: (P,) which of the pairs.
+            fine: (P,) bool, the pairs whose fine parts are taken.
         """
         if not fine.any():
             return pairs.contacts
@@ -114,8 +114,8 @@ class Collider:
         part_count: Index,
         totals: bool,
     ) -> None:
-        # Barely touching: the face planes of the enclosing coarse parts have said enough. Sums over part pairs
-        # need the parts themselves, unless there is one of each.
+        # Objects that barely touch: the bound from the face planes of the enclosing coarse parts is taken as the depth.
+        # Sums over part pairs need the fine parts, unless each of the two objects has only one.
         single = np.array([len(asset.fine.parts) == 1 for asset in self.library.assets])
         simple = gap > -TOUCHING
         if totals:
@@ -149,7 +149,7 @@ class Collider:
 
 
 def corner_tests(library: LibraryGeometry, objects: Objects, first: Index, second: Index) -> Array:
-    """(P,) corners of one object's parts times face directions of the other's, both ways: the work of one test."""
+    """(P,) work to test each pair: corners of one object's parts times face directions of the other's, both ways."""
     corners, directions = library.corners[objects.category], library.directions[objects.category]
     return (corners[first] * directions[second] + directions[first] * corners[second]).astype(np.float64)
 
@@ -159,9 +159,9 @@ def _rounds(target: Index, bound: Array, depth: Array, every: bool) -> Iterator[
 
     Args:
         target: (Q,) object pair of each candidate, those of one pair together.
-        bound: (Q,) m, at most this deep; descending within a pair.
-        depth: (P,) m, found so far; the caller updates it between rounds.
-        every: all candidates at once.
+        bound: (Q,) m, upper bound of each candidate's depth; descending within a pair.
+        depth: (P,) m, depths found so far; the caller updates them between rounds.
+        every: give all candidates at once.
     """
     rows = np.arange(len(target))
     if every:

@@ -41,8 +41,8 @@ class ContactFace:
 def contact_face(fine: Sequence[PartGeometry], coarse: Sequence[PartGeometry], side: int) -> ContactFace | None:
     """The face at the lowest (``side`` -1) or highest (+1) z, or None.
 
-    None also when the two levels of detail have different outlines there, or when the outline is not solid all the way
-    round (four legs), because fine and coarse parts then support objects differently.
+    The result is None also when the two levels of detail have different outlines there, or when the outline is not
+    solid all the way round (four legs). In these cases fine and coarse parts support objects differently.
     """
     height = side * max(float((side * part.vertices[:, 2]).max()) for part in fine)
     polygons = [polygon for part in fine if (polygon := _flat_corners(part, height)) is not None]

@@ -1,7 +1,8 @@
 """Corners, faces and edges of a convex part, with the normals at which each of them can touch another part.
 
-The outward normals at which a corner, edge or face of a convex part is extreme form a region, an arc and a point of
-the unit sphere: the part's Gauss map. The arc of an edge leads from the normal of one of its faces to the other's.
+The Gauss map of a convex part gives, for each feature, the outward normals at which the feature is extreme. They form a
+region of the unit sphere for a corner, an arc for an edge, and a point for a face. The arc of an edge leads from the
+normal of one of its faces to the other's.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from scene_envs.arrays import Array, Index
 _SAME_NORMAL = 1e-10
 """Faces whose unit normals differ by less than this are one face."""
 _FLAT = 1e-12
-"""Relative thickness below which a part is a flat polygon, and width below which that is a line."""
+"""Relative size below which a part is a point, width below which a flat part is a line, and height that counts as 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,18 +86,18 @@ class PartFeatures:
         along, ends, faces = along[length > 0] / length[length > 0, None], ends[length > 0], faces[length > 0]
         one, two = normals[faces[:, 0]], normals[faces[:, 1]]
         blunt = np.einsum("ei,ei->e", one, two) > 0
-        # between opposite normals the sum is lost to rounding, between equal ones the difference
+        # the sum of nearly opposite normals is lost to rounding, and so is the difference of nearly equal ones
         outward = np.where(blunt[:, None], one + two, np.cross(along, two - one))
         outward /= np.linalg.norm(outward, axis=1, keepdims=True)
         middle = corners.mean(axis=0)
         height = np.einsum("ei,ei->e", outward, ends.mean(axis=1) - middle)
-        # the two edges of a line, at height 0, are opposite already
+        # the outward vectors of the two edges of a line, at height 0, are opposite already
         outward[height < -_FLAT * np.abs(corners - middle).max()] *= -1.0
         return cls(corners, normals, offsets, ends[:, 0], along, faces, outward)
 
 
 def _distinct(normals: Array) -> tuple[Array, Index]:
-    """Distinct unit normals (K, 3), and the one (F,) of each face."""
+    """Distinct unit normals (K, 3), and the index (F,) of each face's normal among them."""
     exact, face = np.unique(normals, axis=0, return_inverse=True)
     face = face.ravel()
     group = np.arange(len(exact))

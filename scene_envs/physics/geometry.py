@@ -15,7 +15,7 @@ from scene_envs.physics.contact_faces import ContactFace, contact_face
 from scene_envs.physics.parts import PartGeometry
 
 _CONTAINED = 1e-6
-"""A fine corner this far (m) outside every coarse part still counts as inside."""
+"""A corner of a fine part up to this far (m) outside a coarse part still counts as inside."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class AssetGeometry:
     Attributes:
         asset: the asset.
         fine: parts that are hollow where the asset is hollow.
-        coarse: parts that enclose ``fine``; the same object as ``fine`` where simpler parts gain nothing.
+        coarse: fewer parts that enclose ``fine``; the same object as ``fine`` where there are none.
         bottom: the flat face at the lowest z of the asset frame, or None.
         top: the flat face at the highest z, or None.
     """

@@ -22,13 +22,13 @@ from scene_envs.physics.separation import separations
 from scene_envs.scene import SceneBatch
 
 TOUCHING = 1e-4
-"""Overlap (m) of the gripper with anything up to which it only touches."""
+"""Overlap (m) of the gripper with an object up to which it only touches the object."""
 TURNS = tuple(np.arange(4) * np.pi / 4)
-"""Angles (rad) of the closing direction about the approach, counted from a level direction of the object."""
+"""Angles (rad) of the closing direction about the approach, counted from an axis of the object."""
 PLACES = (0.5, 0.0, 1.0)
-"""Where along the object's extent in the closing direction it is grasped: its middle, then its two edges."""
+"""Grasp positions as fractions of the object's extent in the closing direction: its middle, then its two edges."""
 PART_PAIRS = 35_000.0
-"""Pairs of convex parts that one scene may take, six times what a crowded one takes: about 0.6 s."""
+"""Limit of pairs of convex parts tested per scene: six times what a crowded scene takes, about 0.6 s."""
 
 
 @dataclass(frozen=True)
@@ -36,14 +36,14 @@ class Gripper:
     """A parallel gripper of boxes; the defaults are about those of a Franka hand. All lengths in m.
 
     Attributes:
-        opening: between the open fingers.
+        opening: distance between the open fingers.
         finger_length: along the approach.
         finger_width: across the approach and the closing direction.
         finger_thickness: along the closing direction.
-        palm: (closing direction, across) of the body above the fingers.
-        path: how far the body is followed back along the approach.
-        reaches: how deep the fingertips go below the near side of the object, but no deeper than its far side; in the
-            order in which they are tried.
+        palm: size (along the closing direction, across) of the body above the fingers.
+        path: how far back along the approach the palm must have room.
+        reaches: depths of the fingertips below the near side of the object, in the order in which they are tried; the
+            fingertips go no deeper than its far side.
 
     Raises:
         InvalidInputError: a length is not positive, the palm is narrower than the open fingers, or a reach is longer
@@ -68,7 +68,10 @@ class Gripper:
             raise InvalidInputError(f"{self}: reaches {self.reaches} must not be longer than the fingers")
 
     def body(self) -> tuple[ConvexPart, ...]:
-        """Fingers, and palm with its path; z points back along the approach, x closes, the tips are at z = 0."""
+        """The two fingers, and the palm with its path.
+
+        z points back along the approach, x is the closing direction, and the fingertips are at z = 0.
+        """
         aside = 0.5 * (self.opening + self.finger_thickness)
         finger = (self.finger_thickness, self.finger_width, self.finger_length)
         palm = (*self.palm, self.path)
@@ -85,7 +88,7 @@ class ReachResult:
 
     Attributes:
         reached: (A, B, N) bool, for each approach; False for welded and empty slots.
-        valid: (B,) bool; False for heaps of objects that would take more work than a scene may.
+        valid: (B,) bool; False for scenes, such as heaps of objects, that would take more work than a scene may.
     """
 
     reached: Tensor
@@ -126,7 +129,7 @@ def reachable(batch: SceneBatch, approaches: Sequence[Sequence[float]], gripper:
 
 
 class _Hand:
-    """A gripper among the assets of a library, of which it is the last but one; the space in it is the last."""
+    """A gripper with the assets of a library: the last asset but one is the gripper, the last its space for a grasp."""
 
     def __init__(self, library: AssetLibrary, gripper: Gripper) -> None:
         self.gripper = gripper
@@ -175,7 +178,7 @@ class _Hand:
         return owner, rotation.reshape(-1, 3, 3), low.reshape(-1, 3), high.reshape(-1, 3)
 
     def _succeed(self, objects: Objects, owner: Index, rotation: Array, translation: Array, budget: Budget) -> Index:
-        """Which of G poses have some of the object between the fingers, and the gripper overlapping nothing."""
+        """Those of G poses at which part of the object is between the fingers and the gripper overlaps nothing."""
         left = np.arange(len(owner))
         for tool, wanted in ((self.grasp, True), (self.body, False)):
             both = _concatenate(objects, tool, rotation[left], translation[left])
@@ -216,9 +219,9 @@ _hand = lru_cache(maxsize=16)(_Hand)
 
 
 def _frames(rotation: Array, back: Array) -> Array:
-    """(n, T, 3, 3) gripper to world: z along ``back`` (3,), x at :data:`TURNS` from an axis of each object across it.
+    """(n, T, 3, 3) gripper to world: z along ``back`` (3,), x turned by :data:`TURNS` from an axis of each object.
 
-    That is the object's x or z axis, whichever lies more across.
+    The axis is the object's x or z axis, whichever is closer to perpendicular to ``back``, made perpendicular to it.
     """
     axes = rotation[:, :, [0, 2]].swapaxes(1, 2)  # (n, 2, 3)
     across = axes - (axes @ back)[..., None] * back

@@ -34,7 +34,7 @@ class Chunk:
         translations: (b, N, 3) float64 m.
         rotations: (b, N, 3, 3) float64.
         categories: (b, N) int64.
-        units: (b,) of simulation that each scene may spend; None leaves that to its objects.
+        units: (b,) units of simulation that each scene may spend; None derives them from its objects.
     """
 
     scene_type: SceneType
@@ -219,7 +219,7 @@ def projection_kernel(chunk: Chunk) -> dict[str, Any]:
 
 
 def units_kernel(chunk: Chunk) -> dict[str, Any]:
-    """Units of simulation that each scene may spend; none for heaps, which are not simulated."""
+    """Units of simulation that each scene may spend; 0 for heaps, which are not simulated."""
     physics = physics_of(chunk.scene_type)
     units = np.zeros(len(chunk))
     for index in range(len(chunk)):

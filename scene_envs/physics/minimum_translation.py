@@ -17,21 +17,21 @@ from scene_envs.physics.planes import CLEARANCE
 from scene_envs.physics.separation import grouped_gaps
 
 _AROUND = 0.06
-"""Parts further away than this (m) are not looked at when a translation is measured."""
+"""Parts further apart than this (m) are not looked at when a translation is measured."""
 _OWN = 4
-"""How many face directions of the overlapping parts are tried per pair, beside the common ones."""
+"""Face directions tried per object pair from its deepest parts, and from its shallowest, besides the common ones."""
 _STEPS = 6
-"""Parts that a walk leaves, one after the other."""
+"""Largest number of steps of a walk; each step leaves one overlapping part."""
 _DOWN = 3.0
-"""A translation down, out of a fixed object counts this many times: what lies in a board belongs on it."""
+"""Cost factor of a translation down, out of a fixed object: an object that lies in a board belongs on it."""
 _UP = 1.4
-"""A translation up counts this many times: the lower object rests on something and cannot share it."""
+"""Cost factor of a vertical translation of two free objects: the lower one rests on something and cannot share it."""
 _BLOCKED = 20.0
-"""A translation that leaves the workspace or ends in a fixed object counts this many times."""
+"""Cost factor of a translation that leaves the workspace or ends in a fixed object."""
 _REPEATED = 2.5
-"""A direction that was tried and did not help counts this many times more each time."""
+"""Cost factor of a direction for each time that it was tried and did not help."""
 _SAME_DIRECTION = 0.7
-"""Cosine from which two directions are the same."""
+"""Cosine above which two directions count as the same."""
 _AXES = np.concatenate([np.eye(3), -np.eye(3)])
 
 Tried = dict[tuple[int, int], list[Array]]
@@ -47,7 +47,7 @@ def minimum_translations(
     tried: Tried,
     budget: Budget,
 ) -> Array:
-    """(P, 3) m: what to add to the offset of each overlapping object pair to free it.
+    """(P, 3) m: translations that free overlapping object pairs when they are added to the offsets of the pairs.
 
     Args:
         collider: geometry of the assets.
@@ -55,7 +55,7 @@ def minimum_translations(
         first: (P,) object rows.
         second: (P,) object rows.
         bounds: lowest and highest translations (n, 3), (n, 3) m.
-        tried: directions that did not help; those of the translations returned are added.
+        tried: directions that did not help; the directions of the returned translations are added to them.
         budget: charged with one unit per pair of parts.
     """
     placed = place(collider.library, objects, "fine")
@@ -80,7 +80,11 @@ def minimum_translations(
 
 
 def _directions(count: int, pair: Index, groups: list[tuple[Index, Array, Array]], offset: Array, walk: Array) -> Array:
-    """(P, D, 3) directions to try: the axes, away from and toward the other's centre, the parts' own, the walk's."""
+    """(P, D, 3) directions to try.
+
+    They are the axes, the level directions away from and toward the other object, face normals of the overlapping
+    parts, and the direction of ``walk``.
+    """
     directions = np.zeros((count, 9 + 2 * _OWN, 3))
     directions[:, :6] = _AXES
     level = offset * np.array([1.0, 1.0, 0.0])
@@ -117,7 +121,7 @@ def _walk(
     groups: list[tuple[Index, Array, Array]],
     bounds: tuple[Array, Array],
 ) -> Array:
-    """(P, 3) m: out of the deepest parts, then out of those that are deepest then, and so on; out of corners.
+    """(P, 3) m: sum of several steps, each out of the part that is deepest by then; leads out of corners.
 
     From fixed objects, steps down and steps out of the workspace are avoided.
     """
@@ -188,7 +192,7 @@ def _weights(
     lengths: Array,
     bounds: tuple[Array, Array],
 ) -> Array:
-    """(P, D) how much more a metre in each direction counts."""
+    """(P, D) cost factors of a metre in each direction."""
     weight = np.ones(lengths.shape)
     fixed = objects.fixed[first] | objects.fixed[second]
     # The motion of the free object, or of the upper one of two.

@@ -23,28 +23,30 @@ from scene_envs.scene_types import SceneType
 _LOGGER = logging.getLogger(__name__)
 
 _FAR, _MARGIN = 2e-3, 1e-3
-"""What moved further than this (m) may have met others, whose boxes are within that distance (m) of its way."""
+"""An object that moved further than ``_FAR`` (m) may have met others, whose boxes are within ``_MARGIN`` (m) of the box
+around its way."""
 _MEETINGS = 4
-"""How often to look again with what was met."""
+"""Largest number of simulations of a scene; each after the first repeats objects that met."""
 _TALL = 3
-"""Objects on this many others are where the solver's own sinking becomes visible."""
+"""Number of carrying objects from which the sinking that the solver itself causes becomes visible."""
 _HIGH = 7
-"""Objects on this many others are judged with the finest steps at once."""
+"""Number of carrying objects from which stacks are simulated with the finest steps at once."""
 _DOUBT = 6e-4, 3e-3
-"""Motion (m) of an object high in a stack that calls for a finer integration before it is believed."""
+"""Range of motion (m) of an object high in a stack that is integrated again, finer, before it is believed."""
 ITERATIONS, CONVERGED = 35, 150
-"""Solver iterations per step: the usual ones, and those after which contacts neither creep nor give way."""
+"""Solver iterations per step: the usual number, and the number after which contacts neither creep nor give way."""
 FINEST = SolverSettings(1.0 / 960.0, ITERATIONS)
-"""What stacks are judged with in doubt: a tower of ten boxes sinks by about half a millimetre."""
+"""Settings for stacks in doubt: with them, a tower of ten boxes sinks by about half a millimetre."""
 _LONG, _CREEP = 1.0, 1e-2
-"""In simulations longer than this (s), motion below this (m) may be creep, and is simulated again, converged."""
+"""In simulations longer than ``_LONG`` (s), motion below ``_CREEP`` (m) may be creep of the solver. It is simulated
+again with ``CONVERGED`` iterations."""
 _DAMPING = 0.3
-"""Fraction of velocity that objects lose per second while they settle. Coarser steps do not pay here: with 1/240 s
+"""Fraction of velocity that objects lose per second while they settle. Coarser steps are no gain here: with 1/240 s
 jittered Dimsum scenes took 1.4 times as long to come to rest, and 1.5 % of objects were not ready afterwards."""
 
 
 class Physics:
-    """Everything this process keeps for one asset library.
+    """Collision geometry, tests of support and rest, and simulator of one asset library, kept by this process.
 
     Args:
         library: geometry of the assets.
@@ -151,17 +153,18 @@ def advance(
     """The objects of one scene ``duration`` seconds later.
 
     Objects at rest get the pose of their closed form; all others are simulated with the objects they touch. When a
-    simulated object reaches one that was not simulated, or one that had come to rest and left, the two are simulated
-    again together.
+    simulated object reaches an object that was not simulated, or that had come to rest and left the simulation, the two
+    are simulated again together.
 
     Args:
         physics: of the scene's assets.
         objects: of one scene.
         pairs: their near pairs.
-        rest: which of them have a closed form.
+        rest: which of the objects have a closed form, and their motion.
         duration: s.
         budget: units of simulation; when they are spent, objects stay where they have got to.
-        settling: solver iterations per step of a damped motion; None judges undamped, and looks again in doubt.
+        settling: solver iterations per step of a damped motion. None simulates undamped, and doubtful motion again with
+            other settings.
         tilt: (x, y) rad by which gravity is tilted in simulations.
     """
     translation = objects.translation.copy()
@@ -196,7 +199,7 @@ def _simulate(
     settling: int | None,
     tilt: tuple[float, float],
 ) -> Mask:
-    """Simulate the objects ``due`` (n,), write where they get into ``moved``, and say which left early (n,)."""
+    """Simulate the objects ``due`` (n,), write their new poses into ``moved``, and return which left early (n,)."""
     left = np.zeros(len(objects), dtype=bool)
     rows = np.flatnonzero(due | objects.fixed)
     among, near = objects[rows], pairs.among(rows)
@@ -225,7 +228,7 @@ def _simulate(
     doubtful = due & (height >= _TALL) & (displacement > _DOUBT[0]) & (displacement < _DOUBT[1])
     again = np.unique(group[doubtful])
     again = again[tallest[again] < _HIGH]
-    if len(again):  # high in a stack, a millimetre may be the integrator's: look again, closer
+    if len(again):  # high in a stack, a millimetre may be an integration error: simulate again with finer steps
         run(due & np.isin(group, again), FINEST)
     if duration > _LONG:
         displacement = np.linalg.norm(moved.translation - objects.translation, axis=1)
@@ -238,7 +241,7 @@ def _simulate(
 def _meetings(
     physics: Physics, objects: Objects, pairs: ObjectPairs, due: Mask, group: Index, left: Mask, moved: Moved
 ) -> tuple[Index, Index] | None:
-    """Pairs of objects, the first simulated just now, that come together although not simulated together."""
+    """Pairs of objects that met but were not simulated together; the first of each was simulated just now."""
     far = np.linalg.norm(moved.translation - objects.translation, axis=1)
     reach = np.linalg.norm(pairs.high - pairs.low, axis=1)
     movers = np.flatnonzero(due & (far + moved.angle * reach > _FAR))
@@ -259,20 +262,20 @@ def _meetings(
 
 
 def _merge(objects: Objects, pairs: ObjectPairs, group: Index, first: Index, second: Index) -> Mask:
-    """Join the clusters of objects that met, in ``group`` and in place; what is to be simulated again (n,)."""
+    """Join the clusters of objects that met, in ``group`` in place; returns which objects to simulate again (n,)."""
     count = len(objects)
     touched = np.zeros(count, dtype=bool)
     touched[first] = touched[second] = True
     touched |= np.isin(group, group[touched & (group >= 0)])
     due = company(objects, pairs, touched)
     due |= np.isin(group, group[due & (group >= 0)])
-    # One cluster for all of them: they are few, and what was at rest is at rest again.
+    # One cluster for all of them: they are few, and objects that were at rest are at rest again.
     group[due] = int(group.max()) + 1
     return due
 
 
 def settings_for(height: int) -> SolverSettings:
-    """Integration of a stack: a taller stack gets a finer one, so that it stands as still as in reality.
+    """Solver settings of a stack: a taller stack gets finer steps, so that it stands as still as in reality.
 
     Args:
         height: how many objects carry the topmost one.

@@ -2,13 +2,13 @@
 
 The depth of two convex parts is the least distance from the origin to a face of their Minkowski difference. Its faces
 come from the faces of either part and from pairs of edges whose arcs cross on the sphere of directions (see
-:mod:`scene_envs.physics.features`; the second part's normals count negated). All are looked at, so that the result is
-exact for any pair: coincident, nested or touching parts are no special cases.
+:mod:`scene_envs.physics.features`; the normals of the second part are negated). All faces are looked at, so that the
+result is exact for any pair: coincident, nested or touching parts are no special cases.
 
-An edge can improve on a depth ``d`` that was found already only if no corner of the other part lies ``d`` deep under
-both of its faces, because depth is concave in direction as long as the deepest corner is the same. Of two parts
-that touch, this leaves a few edges. Every operation is elementwise or a minimum within a pair, so that the result of a
-pair does not depend on the others.
+When a depth ``d`` is already found, an edge can give a smaller one only if no corner of the other part lies ``d`` deep
+under both faces of the edge. The reason is that depth is concave in direction as long as the deepest corner is the
+same. For two parts that touch, only a few edges remain. Every operation is elementwise or a minimum within a pair, so
+that the result of a pair does not depend on the others.
 
 References: D. Gregorius, "The Separating Axis Test between Convex Polyhedra", GDC 2013.
 """
@@ -26,7 +26,7 @@ from scene_envs.physics.separation import PlacedParts
 _BLOCK = 1 << 15
 """Elements of the arrays that hold face-corner or edge-edge combinations at a time (they stay in the cache)."""
 _ROUNDING = 1e-13
-"""Sine of an angle, or length (m), that means nothing."""
+"""Sine of an angle, or length (m), that may be a rounding error."""
 
 
 class PenetrationDepth:
@@ -113,8 +113,9 @@ class PenetrationDepth:
         better = np.flatnonzero(value < depth[pair])
         better = better[np.lexsort((value[better], pair[better]))]
         pair, value, direction = pair[better], value[better], direction[:, better]
-        # A crossing of nearly parallel edges can be one by rounding only. The width along its direction is an upper
-        # bound on the depth in any case, so widths are taken, the most promising first, until no other can be less.
+        # Nearly parallel edges may seem to cross by rounding only. The width along the direction of a crossing is an
+        # upper bound on the depth in any case. So widths are computed, for the smallest depths first, until no other
+        # crossing can give a smaller one.
         current = np.flatnonzero(np.diff(pair, prepend=-1))
         while len(current):
             width = self._width(halves, pair[current], direction[:, current])
@@ -141,7 +142,7 @@ class PenetrationDepth:
         return _Edges(half, self._edges.vectors.take(edge, axis=2))
 
     def _width(self, halves: _Halves, pair: Index, direction: Array) -> Array:
-        """Overlap (Q,) m of the shadows of some pairs on a direction (3, Q) each, frame of the first part."""
+        """Overlap (Q,) m of the projections of some pairs onto one direction (3, Q) each, frame of the first part."""
         turned = -_turned(halves.turn.take(2 * pair, axis=2), direction)
         part = np.concatenate([halves.owner[2 * pair], halves.owner[2 * pair + 1]])
         count = self._corners.count[part]
@@ -153,7 +154,7 @@ class PenetrationDepth:
 
 
 class _Ragged:
-    """Vectors of all parts in one array: ``vectors`` (3, ..., n), where each part's begin, and how many they are."""
+    """Vectors of all parts in one array ``vectors`` (3, ..., n), with ``start`` and ``count`` of each part's."""
 
     def __init__(self, vectors: list[Array]) -> None:
         self.vectors = np.concatenate(vectors).T.copy()
@@ -187,7 +188,7 @@ class _Faces:
 
     Attributes:
         start: (2 P,) first face of each half pair.
-        normal: (n,) which normal of the library.
+        normal: (n,) index of the face's normal in the library.
         support: (n,) number of the deepest corner within its part.
     """
 
@@ -227,14 +228,14 @@ class _Faces:
         pair = self._half >> 1
         best = np.flatnonzero(self.depth == depth[pair])[::-1]
         face = self.start[::2].copy()
-        face[pair[best]] = best  # the first of equal ones is written last
+        face[pair[best]] = best  # the first of equal depths is written last, and stays
         of_second = (self._half[face] & 1).astype(bool)
         normal = np.where(of_second, -self._seen[:, face], self._own[:, face])
         normal[:, np.isnan(depth)] = np.nan
         return depth, normal
 
     def corner_depth(self, one: Index, two: Index) -> Array:
-        """Depth (m) of the deepest corner under face ``one`` under face ``two``."""
+        """Depth (m) under face ``two`` of the corner that is deepest under face ``one``."""
         return self._level[two] - _dot(self._seen.take(two, axis=1), self._corner.take(one, axis=1))
 
 
@@ -262,7 +263,8 @@ def _crossings(a: _Edges, i: Index, b: _Edges, j: Index) -> tuple[Index, Array, 
     sines = _dot(a.vectors[:, 3:].take(i, axis=2), along[:, None])
     kept = _opposite(sines)
     i, j, along, sines = i[kept], j[kept], along[:, kept], sines[:, kept]
-    # The point of the arc at right angles to the other edge, between the arc's middle and the end beyond that edge
+    # The point of the arc at right angles to the other edge: it is between the middle of the arc and the end at which
+    # the sine has the opposite sign.
     point, _, middle, one, two = a.vectors.take(i, axis=2).swapaxes(0, 1)
     sine = _dot(middle, along)
     use_one = (sines[0] > 0) != (sine > 0)
@@ -289,7 +291,7 @@ def _turned(rotation: Array, vectors: Array) -> Array:
 
 
 def _expand(count: Index) -> tuple[Index, Index]:
-    """Rows of which ``count`` (n,) belong to each item: the item (m,), and the number within it (m,)."""
+    """Rows for ``count`` (n,) entries per item: the item of each row (m,), and its number within the item (m,)."""
     item = np.repeat(np.arange(len(count)), count)
     return item, np.arange(len(item)) - np.repeat(np.cumsum(count) - count, count)
 

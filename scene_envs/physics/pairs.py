@@ -51,8 +51,8 @@ class ObjectPairs:
         low: (n, 3) lowest corner of each object's box, m.
         high: (n, 3) highest corner of each object's box, m.
         contacts: near pairs of their coarse parts.
-        rough: (P,) bool; the depth is an upper bound, from face planes of the coarse parts, because exact depths of the
-            scene would take too long.
+        rough: (P,) bool, True where the depth is an upper bound, from face planes of the coarse parts, because exact
+            depths of the scene would take too long.
     """
 
     first: Index

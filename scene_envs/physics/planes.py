@@ -25,7 +25,7 @@ _SLACK = 300.0
 _MET = 1e-7
 """A plane broken by less than this (m) is met."""
 _APART = 1e-6
-"""Parts whose best face plane leaves at least minus this (m) count as apart."""
+"""Parts count as apart when the gap at their best face plane is at least minus this (m)."""
 _EXACT = 200
 """Planes up to which the least-distance problem is solved exactly."""
 _STEPS = 400
@@ -33,7 +33,7 @@ _STEPS = 400
 _ITERATIONS = 1e8
 """Matrix entries that the exact method may visit."""
 _ROWS_SQUARED = 25.0
-"""Squared rows of one least-distance problem that cost one unit of work."""
+"""A least-distance problem costs the square of its number of rows, divided by this, in units of work."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ def separating_planes(
         first: (P,) object rows.
         second: (P,) object rows.
         extra: (P, 3) m, added to the offset of each pair: the minimum translation, for pairs that overlap.
-        home: (n, 3) translations that the objects would rather have, m.
+        home: (n, 3) wanted translations of the objects, m.
         budget: charged with one unit per plane.
     """
     coarse, apart = _planes_at("coarse", collider, objects, first, second, extra, home)
@@ -130,9 +130,9 @@ def _planes_at(
 
 
 def nearest(objects: Objects, home: Array, planes: Planes, budget: Budget) -> Array:
-    """Translations (n, 3) nearest to ``home`` that satisfy the planes, as well as they can be.
+    """Translations (n, 3) nearest to ``home`` that satisfy the planes as well as possible.
 
-    Objects that no plane connects are solved on their own. ``budget`` is charged with the rows solved.
+    Groups of objects that no plane connects are solved separately. ``budget`` is charged with the rows solved.
     """
     result = home.copy()
     free = ~objects.fixed
@@ -161,9 +161,9 @@ def least_distance(matrix: Array, needed: Array, budget: Budget) -> Array:
     """The shortest x with ``matrix @ x + s >= needed``, slack s costing ``_SLACK`` squared.
 
     Lawson and Hanson's least-distance programme (1974, ch. 23) through non-negative least squares on its dual.
-    Most rows hold anyway: a row joins only when a solution without it violates it. Problems of more than
-    ``_EXACT`` rows, and those on which the exact method fails, are solved approximately. When ``budget`` is spent,
-    the last solution is returned.
+    Most rows hold anyway, so a row joins the problem only when a solution without the row violates it. Problems of
+    more than ``_EXACT`` rows, and those on which the exact method fails, are solved approximately. When ``budget`` is
+    spent, the last solution is returned.
     """
     x = np.zeros(matrix.shape[1])
     used = needed > 0

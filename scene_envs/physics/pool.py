@@ -21,7 +21,7 @@ from scene_envs.worker_processes import module_command, module_environment
 
 _LOGGER = logging.getLogger(__name__)
 _NO_MESH: Any = None
-"""Workers draw nothing, so the meshes stay here."""
+"""In place of an asset's mesh: workers draw nothing, so meshes are not sent to them."""
 START_UP = 120.0
 """Seconds that a worker may take to start, or to build the geometry of a scene type."""
 _MOST_FAILED_STARTS = 3
@@ -60,7 +60,7 @@ class _Worker:
         self.deadline = time.monotonic() + START_UP
 
     def send(self, message: tuple[Any, ...]) -> None:
-        """Give the process a message; one that died is noticed by :meth:`receive`."""
+        """Give the process a message; a process that died is noticed by :meth:`receive`."""
         with contextlib.suppress(OSError):
             self.outbox.send(message)
 
@@ -70,7 +70,7 @@ class _Worker:
 
     @property
     def process_id(self) -> int:
-        """Of the operating system."""
+        """Id of the process in the operating system."""
         return self.process.pid
 
     @property
@@ -288,7 +288,7 @@ def _store(task: _Task, result: dict[str, Any], results: list[dict[str, Any] | N
 
 
 def _retry(task: _Task, tasks: deque[_Task], how: str) -> None:
-    """Try again scene by scene; give up on what was tried again already."""
+    """Try a task again, scene by scene; give up on a scene that was tried again already."""
     if task.is_retry:
         _LOGGER.warning("physics of scene %d %s twice; the scene is invalid", task.rows[0], how)
         return

@@ -15,7 +15,7 @@ def make_pool(workers: int | str, timeout: float = 60.0) -> PhysicsPool:
         timeout: as for :class:`PhysicsPool`.
 
     Raises:
-        InvalidInputError: neither.
+        InvalidInputError: ``workers`` is neither a whole number nor ``"ray"``.
 
     >>> make_pool(0).workers
     0

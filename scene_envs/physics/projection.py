@@ -1,14 +1,14 @@
 """Projection: the nearest translations at which no two objects overlap, rotations kept.
 
-With rotations fixed, "this part lies on that side of a plane with normal d" is exactly linear in the translations. Each
-object pair that overlaps gets a minimum translation. The planes that separate its parts after this translation are
-consistent with each other, so an object that straddles a thin wall cannot get opposite moves. The nearest point under
-all planes is a least-distance problem, with slack that costs far more than distance, so that a crowded scene has a best
-effort. Exact depths check the result of every round. Once nothing overlaps, planes are chosen anew at the solution as
-long as this shortens the distance moved.
+With rotations fixed, the condition that a part lies on one side of a plane with a given normal is exactly linear in the
+translations. Each object pair that overlaps gets a minimum translation. The planes that separate its parts after this
+translation are consistent with each other, so an object that straddles a thin wall cannot get opposite moves. The
+nearest translations that satisfy all planes solve a least-distance problem. Its slack costs far more than distance, so
+a crowded scene still has a best-effort solution. Exact depths check the result of every round. Once nothing overlaps,
+planes are chosen anew at the solution as long as this shortens the distance moved.
 
-The rounds end when their work budget is spent. Objects that then overlap are spread to free places, and the rounds
-continue from there. Heaps of objects are spread before the first round.
+The rounds end when their work budget is spent. Objects that still overlap then are spread to free places, and the
+rounds continue from there. Heaps of objects are spread before the first round.
 """
 
 from __future__ import annotations
@@ -32,26 +32,27 @@ TOLERANCE = 1e-4
 WORK = 10_000.0
 """Units of work (pairs of convex parts, or rows solved) until a search ends."""
 SEARCHES = 5
-"""Searches for a scene: the first from where the objects are, the others after what overlaps was spread.
+"""Limit of searches per scene: the first from where the objects are, the others after overlapping objects were spread.
 
-With three, whether the last two of 22 objects at one point came apart depended on the rounding of the processor's BLAS.
+With three searches, it depended on the rounding of the processor's BLAS whether the last two of 22 objects at one point
+came apart.
 """
 _OVERLAPPING = 2_000_000
-"""Corner tests in overlapping object pairs that are too many for minimum translations."""
+"""Limit of corner tests in overlapping object pairs; more are too much work for minimum translations."""
 _ROUNDS = 30
-"""Rounds until what still overlaps is left as it is,"""
+"""Largest number of rounds of a search; objects that still overlap after them are left as they are."""
 _PATIENCE = 10
-"""or rounds without any improvement."""
+"""A search also ends after more rounds than this without any improvement."""
 _REFINEMENTS = 8
-"""Rounds spent on shortening the way of a scene that is free of overlap."""
+"""Largest number of rounds spent on shortening the distances moved in a scene that is free of overlap."""
 _GAIN = 0.005
-"""Relative decrease of the squared way that makes another refinement worth it."""
+"""Relative decrease of the squared distances moved from which another refinement is made."""
 _NEGLIGIBLE = 1e-8
-"""Sum of squared ways (m^2) that is not worth shortening."""
+"""Sum of squared distances moved (m^2) below which no refinement is made."""
 _INSIDE = 1e-5
 """Objects stay this far (m) inside the workspace, so that rounding does not take them out."""
 _OUTSIDE = 0.05
-"""Objects further than this (m) outside the workspace are no part of the scene's arrangement and stay there."""
+"""Objects further than this (m) outside the workspace are no part of the arrangement and are not moved back inside."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +78,7 @@ def project_objects(collider: Collider, objects: Objects, workspace: Corners) ->
     """Project the objects of one scene.
 
     Args:
-        collider: geometry, and measures overlap.
+        collider: geometry of the assets, and the measure of overlap.
         objects: one scene; fixed objects do not move.
         workspace: lowest and highest corner (m) for the translations of objects in it or close to it.
     """
@@ -122,7 +123,7 @@ def _search(collider: Collider, objects: Objects, bounds: tuple[Array, Array]) -
         elif waited > _PATIENCE:
             break
         elif best_way < np.inf:
-            break  # a refinement that ran into something else: what was free of overlap stands
+            break  # a refinement led to another overlap: the last result without overlap is kept
         if budget.is_spent or corner_tests(collider.library, current, first, second).sum() > _OVERLAPPING:
             break
         translation = _round(collider, current, home, first, second, bounds, walls, tried, budget)
@@ -156,7 +157,7 @@ def _round(
 
 
 def _measure(collider: Collider, objects: Objects, budget: Budget) -> tuple[Index, Index, Projection]:
-    """Object pairs whose fine parts overlap beyond the tolerance, and the overlap of all."""
+    """Object pairs whose fine parts overlap deeper than half the tolerance, and the overlap of the whole scene."""
     pairs = collider.pairs(objects)
     budget.spend(len(pairs.contacts.gap))
     deep = pairs.depth > 0.5 * TOLERANCE
@@ -167,14 +168,14 @@ def _measure(collider: Collider, objects: Objects, budget: Budget) -> tuple[Inde
 
 
 def _bounds(home: Array, objects: Objects, workspace: Corners) -> tuple[Array, Array]:
-    """Lowest and highest translations (n, 3); none for fixed objects and for those far outside."""
+    """Lowest and highest translations (n, 3); infinite for fixed objects and for objects far outside."""
     low, high = np.array(workspace[0]), np.array(workspace[1])
     loose = objects.fixed | ((home < low - _OUTSIDE) | (home > high + _OUTSIDE)).any(axis=1)
     return np.where(loose[:, None], -np.inf, low + _INSIDE), np.where(loose[:, None], np.inf, high - _INSIDE)
 
 
 def _inside(translation: Array, bounds: tuple[Array, Array]) -> Array:
-    """The translations; those that slack let leave the workspace are put back."""
+    """The translations; if slack let some leave the workspace, they are put back."""
     clipped = np.clip(translation, *bounds)
     return clipped if (np.abs(clipped - translation) > 0.9 * _INSIDE).any() else translation
 

@@ -16,15 +16,15 @@ from scene_envs.physics.pool import START_UP, PhysicsPool
 from scene_envs.physics.worker import answer
 
 _users = 0
-"""Pools of this process that use the connection to Ray which one of them made."""
+"""Number of pools of this process that use the connection to Ray; one of these pools made it."""
 
 
 class RayPhysicsPool(PhysicsPool):
     """A :class:`PhysicsPool` whose workers are actors of a Ray cluster, as many as it has CPUs.
 
     Order, retries, timeouts and results are those of a pool of processes. The cluster is the one that this process is
-    connected to, or that ``RAY_ADDRESS`` names, or else one on this machine, which ends with the last pool. Actors are
-    spread over its machines. Each machine needs this package.
+    connected to, or else the one that ``RAY_ADDRESS`` names. Without either it is a cluster on this machine, which ends
+    with the last pool. Actors are spread over the machines of the cluster. Each machine needs this package.
 
     Args:
         timeout: seconds that a chunk of up to eight scenes may take.
@@ -50,7 +50,7 @@ class RayPhysicsPool(PhysicsPool):
     def _connect(self) -> None:
         global _users
         if self._ray.is_initialized() and not _users:
-            return  # somebody else's
+            return  # other code made the connection
         if not _users:
             options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "configure_logging": False}
             try:
@@ -88,7 +88,7 @@ class _RayWorker:
 
     def __init__(self, ray: Any) -> None:
         self._ray = ray
-        # no CPU is reserved: a pool that has nothing to do must not keep another from its workers
+        # no CPU is reserved: a pool that has nothing to do must not keep another pool from starting workers
         options = {"num_cpus": 0, "max_restarts": 0, "scheduling_strategy": "SPREAD"}
         self.actor = ray.remote(_Actor).options(**options).remote([path or os.getcwd() for path in sys.path])
         self.reply = self.actor.answer.remote(("hello",))
@@ -99,11 +99,11 @@ class _RayWorker:
 
     @property
     def process_id(self) -> int:
-        """Of the operating system of the actor's machine."""
+        """Id of the actor's process in the operating system of its machine."""
         return int(self._ray.get(self.actor.process_id.remote()))
 
     def send(self, message: tuple[Any, ...]) -> None:
-        """Give the actor a message; one that died is noticed by :meth:`receive`."""
+        """Give the actor a message; an actor that died is noticed by :meth:`receive`."""
         self.reply = self.actor.answer.remote(message)
 
     def receive(self) -> tuple[str, Any]:
@@ -112,7 +112,7 @@ class _RayWorker:
             kind, body = self._ray.get(self.reply)
         except self._ray.exceptions.RayError as error:
             raise EOFError(str(error)) from error
-        if kind == "done":  # arrays of the object store cannot be written
+        if kind == "done":  # arrays of the object store are read-only
             body = {name: part.copy() if isinstance(part, np.ndarray) else part for name, part in body.items()}
         return kind, body
 
@@ -126,11 +126,11 @@ class _Actor:
     """A worker of the pool inside an actor."""
 
     def __init__(self, paths: Sequence[str]) -> None:
-        sys.path.extend(path for path in paths if path not in sys.path)  # where machines share a disk
+        sys.path.extend(path for path in paths if path not in sys.path)  # for machines that share a disk
         self.scene_types: dict[int, Any] = {}
 
     def process_id(self) -> int:
-        """Of the operating system."""
+        """Id of this process in the operating system."""
         return os.getpid()
 
     def answer(self, message: tuple[Any, ...]) -> tuple[str, Any]:

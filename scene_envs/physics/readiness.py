@@ -21,18 +21,19 @@ from scene_envs.scene import SceneBatch
 _READY_DEPTH = 1e-4
 """Deepest overlap (m) of a ready object with another one."""
 _LEAN = 0.12
-"""Angle (rad) by which gravity may lean before a ready object gives way: what leans and only just holds in one
-simulator creeps in the next."""
+"""Angle (rad) by which gravity is tilted when a ready object has to hold: a leaning object that only just holds in one
+simulator creeps in another."""
 _STAYS: dict[str, Any] = {"max_displacement": 1e-3, "max_rotation": 1e-2}
 _HOLDS: dict[str, Any] = {"max_displacement": 2e-3, "max_rotation": 2e-2, "duration": 0.5}
 _LASTING: tuple[dict[str, Any], ...] = ({"duration": 2.0} | _STAYS, {"duration": 2.0} | _STAYS)
-"""Time (s) and limits of motion (m, rad) of what is ready: once, and again where something was struck."""
+"""The longest trials: time (s) and limits of motion (m, rad). The second is made where the first removed an object."""
 _UPRIGHT: tuple[dict[str, Any], ...] = ({"duration": 0.1} | _STAYS, {"duration": 0.5} | _STAYS)
-"""The shorter trials by which every round is judged first: they find most of what moves, at less cost."""
+"""The shorter trials, which come first in every round: they find most of the objects that move, at less cost."""
 _LEANING: tuple[dict[str, Any], ...] = tuple(
     {"tilt": (x * _LEAN / math.sqrt(2), y * _LEAN / math.sqrt(2))} | _HOLDS for x in (-1, 1) for y in (-1, 1)
 )
-"""The same and directions of gravity: in a round for scenes that stay upright, in the end for the others."""
+"""Trials with tilted gravity, in four directions. In a round they are made for scenes that pass the shorter trials, and
+at the end for scenes that did not pass all trials of their round."""
 _PATIENCE = 2
 """Rounds without more ready objects after which a scene is left as it is."""
 _ROUNDS_SHARE = 0.5
@@ -114,8 +115,8 @@ class _Round:
         batch: the settled scenes.
         ready: (B, N) free objects that passed the trials of a round.
         valid: (B,) whether projection and settling gave an answer.
-        finished: (B,) whether the work did not end early.
-        lasting: (B,) whether all that is ready stayed for the whole time.
+        finished: (B,) whether the round ended before its work was spent.
+        lasting: (B,) whether all trials of the round were made, the longest included, and no object moved in them.
     """
 
     batch: SceneBatch
@@ -133,7 +134,7 @@ class _Round:
 def _make_ready_once(
     batch: SceneBatch, duration: float, iterations: int, units: Tensor, pool: PhysicsPool | None
 ) -> _Round:
-    """One round of :func:`make_ready`; takes the work done off ``units`` (B,), in place."""
+    """One round of :func:`make_ready`; subtracts the work done from ``units`` (B,), in place."""
     projected = project(batch, pool=pool)
     rows = (projected.valid & ~projected.heap).nonzero()[:, 0]
     options = {"duration": duration, "iterations": iterations}
@@ -149,10 +150,11 @@ def _make_ready_once(
 
 
 def _judge_round(batch: SceneBatch, units: Tensor, pool: PhysicsPool | None) -> tuple[Tensor, Tensor]:
-    """(B, N) free objects that stay in the trials of a round, and (B,) whether no trial at all found one that moves.
+    """(B, N) free objects that stay in the trials of a round, and (B,) whether all objects stayed in all trials.
 
-    Only scenes of which everything in the workspace stays in the short trials go through the others, leaning gravity
-    first and then the longest: scenes that fail have another round. Takes the work done off ``units`` (B,), in place.
+    Only scenes in which every free object in the workspace stays in the shorter trials go through the others: first
+    tilted gravity, then the longest trial. Scenes that fail have another round. The work done is subtracted from
+    ``units`` (B,), in place.
     """
     candidates = batch.is_free & batch.in_workspace
     ready = _strike(batch, candidates & (units > 0)[:, None], _UPRIGHT, units, pool)
@@ -171,7 +173,7 @@ def _judge_round(batch: SceneBatch, units: Tensor, pool: PhysicsPool | None) -> 
 def _strike(
     batch: SceneBatch, ready: Tensor, trials: Sequence[dict[str, Any]], units: Tensor, pool: PhysicsPool | None
 ) -> Tensor:
-    """``ready`` (B, N) without the objects that move in one of the trials, each without those struck before."""
+    """``ready`` (B, N) without the objects that move in a trial; each trial is made without those removed before."""
     ready = ready.clone()
     scenes = ready.any(dim=-1).nonzero()[:, 0]
     for trial in trials if len(scenes) else ():
@@ -180,9 +182,9 @@ def _strike(
 
 
 def _strike_until_still(batch: SceneBatch, ready: Tensor, units: Tensor, pool: PhysicsPool | None) -> Tensor:
-    """``ready`` (B, N) without the objects that move in the longest trial, repeated where it struck something.
+    """``ready`` (B, N) without the objects that move in the longest trial, which is repeated where it removed objects.
 
-    Where it strikes something again, everything that moved is struck with it.
+    Where the repeated trial removes objects again, all objects that moved in it by ``_UNMOVED`` or more are removed.
     """
     ready = ready.clone()
     scenes = ready.any(dim=-1).nonzero()[:, 0]
@@ -201,7 +203,7 @@ def _strike_until_still(batch: SceneBatch, ready: Tensor, units: Tensor, pool: P
 def _judge(
     kept: SceneBatch, scenes: Tensor, trial: dict[str, Any], units: Tensor, pool: PhysicsPool | None
 ) -> tuple[Tensor, Tensor]:
-    """Which objects (b, N) stay where they are, none where invalid, and their displacement (b, N) m."""
+    """Objects (b, N) that stay where they are, none in invalid scenes, and the displacement (b, N) m of all objects."""
     options = {"max_penetration": _READY_DEPTH} | trial
     rows = run_kernel("feasibility", kept, options, pool, units[scenes])
     units[scenes] -= spent(rows)

@@ -1,4 +1,4 @@
-"""Statics of upright stacks: objects that are at rest without simulation.
+"""Statics of upright stacks: objects whose rest is found without simulation.
 
 An upright object rests on the one object under it when the centre of mass of the object and everything it carries lies
 inside both the object's foot and the flat face below. From the lowest object up, gaps are closed and small overlaps
@@ -27,13 +27,13 @@ _FLAT = 3e-4
 _FOOT = 1e-4
 """Corners this close (m) to the lowest one belong to the foot."""
 _MEETS = 2e-4
-"""A contact is the foot's own when its height agrees this well (m)."""
+"""A contact belongs to the foot when its height agrees with the foot's height to this (m)."""
 _BALANCE = 5e-3
 """The centre of mass must lie at least this far (m) inside the foot and the face below."""
 _TOUCHING = 1e-4
-"""Overlap (m) beside an object that is too small to move it."""
+"""Overlap (m) with a neighbouring object that is too small to move an object."""
 _DEEPEST = 2e-3
-"""An object sunk deeper than this (m) does not simply rise."""
+"""An object that is sunk deeper than this (m) into its support does not simply rise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +106,7 @@ class Statics:
         self._solid = np.array([asset.bottom is not None and asset.bottom.hole == 0 for asset in library.assets])
         self._surface = _Polygons.of([_surface(part) for part in library.parts])
         for asset in library.assets:
-            if asset.is_hollow:  # solid hulls have tops where there is nothing to stand on
+            if asset.is_hollow:  # the coarse parts have tops where there is nothing to stand on
                 self._surface.offsets[asset.coarse.ids] = -np.inf
         self._rim = _Polygons.of([_rim(asset) for asset in library.assets])
         tops, bottoms = [asset.top for asset in library.assets], [asset.bottom for asset in library.assets]
@@ -123,7 +123,7 @@ class Statics:
         Args:
             objects: the objects of one or more scenes.
             pairs: their near pairs.
-            contacts: the near parts of those.
+            contacts: the near parts of these pairs.
             duration: s.
         """
         count = len(objects)
@@ -147,7 +147,7 @@ class Statics:
         still = best & (support >= 0) & ~objects.fixed & upright
         rise = np.maximum(rise, -0.5 * GRAVITY * duration**2)
         self._clear(objects, pairs, contacts, support, rise, still)
-        while True:  # what stands on something that has to be simulated has to be simulated
+        while True:  # an object on a simulated object has to be simulated too
             lost = still & ~(still | objects.fixed)[np.maximum(support, 0)]
             if not lost.any():
                 break
@@ -193,7 +193,7 @@ class Statics:
         up = objects.category[upper[q]]
         corners = _into(objects, lower[q], _out_of(objects, upper[q], self._foot.corners[up]))
         good[q] = self._solid[up] | (self._surface.outside(part[q], corners).max(axis=1) < 0.0)
-        # The rim question is the same for all parts of the two objects.
+        # The test of the rim gives the same result for all parts of the two objects.
         _, leading = np.unique(upper, return_index=True)
         q = leading[candidates[leading]]
         up, down = objects.category[upper[q]], objects.category[lower[q]]
@@ -212,12 +212,12 @@ class Statics:
     def _clear(
         self, objects: Objects, pairs: ObjectPairs, contacts: Contacts, support: Index, rise: Array, still: Mask
     ) -> None:
-        """Strike from ``still``, in place, what meets something on its way."""
+        """Remove from ``still``, in place, the objects that meet another object on their way."""
         while True:
             moved = np.where(still, rise, 0.0)
             relative = contacts.direction[:, 2] * (moved[contacts.second] - moved[contacts.first])
             bad = contacts.gap + relative < -_TOUCHING
-            # An overlap with what is simulated is not this object's to judge, but that one's company is simulated.
+            # Both objects of such a contact leave ``still``. Objects that touch a simulated one are simulated anyway.
             struck = np.zeros(len(still), dtype=bool)
             struck[contacts.first[bad]] = True
             struck[contacts.second[bad]] = True
@@ -292,7 +292,7 @@ def _surface(part: PartGeometry) -> tuple[float, Array] | None:
 
 
 def _rim(asset: AssetGeometry) -> tuple[float, Array] | None:
-    """Height and outline of the top face that closes round a hole."""
+    """Height and outline of the asset's top face, which may be a rim round a hole."""
     if asset.top is None:
         return None
     vertices = asset.fine.vertices

@@ -15,7 +15,7 @@ from scene_envs.physics.rest import Rest
 from scene_envs.physics.support import company
 
 _SEGMENT = 0.25
-"""Seconds after which settling looks again at which shapes it needs, and whether anything still moves."""
+"""Length (s) of a segment; after each, settling chooses the shapes again and checks whether anything still moves."""
 _STILL, _STILL_ANGLE = 5e-5, 5e-4
 """An object that moved less than this (m, rad) in a segment has come to rest."""
 
@@ -29,7 +29,7 @@ def settle_scene(
     bottom: float,
     budget: Budget,
 ) -> tuple[Array, Array, bool]:
-    """Let one scene come to rest: rotation (n, 3, 3), translation (n, 3) m, and whether it stayed finite.
+    """Let one scene come to rest: rotation (n, 3, 3), translation (n, 3) m, and whether they stayed finite.
 
     Args:
         physics: of the scene's assets.

@@ -18,11 +18,11 @@ from scene_envs.physics.planes import CLEARANCE
 from scene_envs.physics.support import components
 
 _HEAP = 3_000_000
-"""Corner tests from which a group of objects whose boxes meet may be a heap,"""
+"""A group of objects whose boxes meet may be a heap when it takes more corner tests than this."""
 _DEEP = 5e-3
-"""which it is when the two that have most in common overlap deeper than this (m)."""
+"""Such a group is a heap when objects whose boxes have most in common overlap deeper than this (m)."""
 _LOOKED_AT = 3
-"""Object pairs of a group that are measured to find out."""
+"""Object pairs that are measured for this: those whose common box is the largest share of the smaller box."""
 _WINDOWS = (0.3, 1.0, 4.0, 20.0)
 """Half widths (m) of the cubes around a wanted place that are searched, one after the other."""
 _BINS = 16
@@ -92,7 +92,10 @@ def spread(
 
 
 def _free_place(wanted: Array, low: Array, high: Array, weight: Index, limits: tuple[Array, Array]) -> Array:
-    """The place (3,) near ``wanted`` in the fewest of the blocked open boxes ``low``, ``high`` (M, 3), best in none."""
+    """The place (3,) near ``wanted`` that lies in the fewest of the blocked open boxes ``low``, ``high`` (M, 3).
+
+    It lies in none of them if there is such a place. A box counts as ``weight`` (M,) boxes.
+    """
     found = wanted
     for reach in _WINDOWS:
         start, end = np.maximum(wanted - reach, limits[0]), np.minimum(wanted + reach, limits[1])

@@ -21,9 +21,10 @@ _SAME_DEPTH = 1e-4
 _UPRIGHT = 0.999
 """Cosine of the tilt up to which faces count as facing each other."""
 _CLEAR = 0.01
-"""Objects within this distance (m) of each other sideways,"""
+"""Objects are simulated in one cluster when they are within this distance (m) of each other sideways, and
+within ``_CLEAR_ABOVE`` in height."""
 _CLEAR_ABOVE = 0.06
-"""and within this distance (m) in height, are simulated in one cluster."""
+"""Distance (m) in height within which such objects are simulated in one cluster."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +74,9 @@ class Support:
     def differs(self, objects: Objects, pairs: ObjectPairs) -> Mask:
         """(P,) pairs whose coarse parts do not carry each other as the fine ones do.
 
-        Coarse shapes act like fine ones in a contact when the solid outlines of two facing flat faces
-        meet all the way round, on a flat surface that is larger than the object, or side by side.
+        Coarse shapes act like fine ones in three kinds of contact. The solid outlines of two facing flat faces meet
+        all the way round; or an object lies on a flat surface that is larger than it; or two upright objects are side
+        by side.
 
         Args:
             objects: the objects.

@@ -31,7 +31,7 @@ def serve(inbox: Connection, outbox: Connection) -> None:
 
 
 def answer(scene_types: dict[int, SceneType], message: tuple[Any, ...]) -> tuple[str, Any]:
-    """The reply to one message; ``scene_types`` are those received so far, to which it may add."""
+    """The reply to one message; ``scene_types`` are those received so far, and the message may add one."""
     kind, *body = message
     if kind == "scene_type":
         key, scene_type, assets = body

@@ -15,11 +15,11 @@ from scene_envs.physics.geometry import LibraryGeometry
 from scene_envs.physics.placement import Objects
 
 _LOOK = 12
-"""Steps after which to see whether everything is at rest."""
+"""Steps between checks of which clusters are at rest."""
 _USUAL_ITERATIONS = 35
 """Solver iterations of a step that costs one unit of work per free object."""
 _STILL_WAY, _STILL_ANGLE = 1e-4, 1e-3
-"""An object at rest whose present speed takes it less far than this (m, rad) in the whole duration stays at rest."""
+"""An object is at rest when its present speed would take it less far than this (m, rad) in the whole duration."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,8 @@ class World:
         Args:
             objects: the n objects.
             fine: (n,) whether each object collides with its fine parts.
-            group: (n,) number of the cluster of each free object; a cluster leaves when all of it is at rest.
+            group: (n,) number of the cluster of each free object; a cluster leaves the
+                simulation when all of it is at rest.
             duration: s.
             settings: integration.
             budget: units of simulation; when they are spent, everything stays where it is.
@@ -95,7 +96,7 @@ class World:
         # After waking: Bullet sets the gravity of active bodies only.
         down = SCALE * GRAVITY * np.array([*np.sin(settings.tilt), -np.cos(np.hypot(*settings.tilt))])
         bullet.setGravity(*down.tolist(), physicsClientId=client)
-        # Bullet refreshes a body's world inertia only when it integrates: a step out of contact does that.
+        # Bullet refreshes a body's world inertia only when it integrates. Some steps out of contact do that.
         steps = max(1, round(duration / settings.time_step))
         for _ in range(2 + steps % 2):
             bullet.stepSimulation(physicsClientId=client)
@@ -110,7 +111,7 @@ class World:
         done = 0
         while done < steps:
             ahead = min(_LOOK, steps - done)
-            for _ in range(ahead if running else ahead % 2):  # always an even number in all
+            for _ in range(ahead if running else ahead % 2):  # the number of all steps is always even
                 bullet.stepSimulation(physicsClientId=client)
             done += ahead
             budget.spend(ahead * sum(map(len, running.values())) * settings.iterations / _USUAL_ITERATIONS)
@@ -152,7 +153,7 @@ class World:
         return bodies, order
 
     def _is_still(self, bodies: Index, duration: float) -> bool:
-        """Whether nothing moves or starts to: what is at rest stays at rest."""
+        """Whether all of these bodies are at rest, that is slower than the limits."""
         speed, turn = _STILL_WAY * SCALE / duration, _STILL_ANGLE / duration
         for body in bodies.tolist():
             linear, angular = self._pool.bullet.getBaseVelocity(body, physicsClientId=self._pool.client)

@@ -12,7 +12,7 @@ from scene_envs.scene_types import Camera, SceneType, get_scene_type
 _FOV = 28.0
 _MARGIN = 0.05
 _LAMP_PIXELS = 512, 1024
-"""Resolution of the lamp's depth image for workspaces up to 2 m, and for larger ones."""
+"""Resolution of the lamp's depth image for framings of a radius up to 2 m, and for larger ones."""
 
 
 def picture_camera(scene_type: str | SceneType, width: int = 480, height: int = 360) -> Camera:

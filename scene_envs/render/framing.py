@@ -75,7 +75,7 @@ def frame_scene_type(scene_type: SceneType) -> Framing:
 
 
 def scene_type_of_one(scene_type: SceneType, translations: Array, rotations: Array, categories: Index) -> SceneType:
-    """Scene type by which one scene is framed: that of its only support, in types that hold tables and rooms.
+    """Scene type for the framing of one scene: its only support counts as fixed, in types that hold tables and rooms.
 
     A union of scene types has no fixed objects and the workspace of the largest type, in which a table would be tiny. A
     scene with one welded object is framed as if this object were fixed there; any other scene is framed as
@@ -145,7 +145,7 @@ def _fixed_geometry(scene_type: SceneType) -> tuple[Array, Array]:
 
 
 def _open_side(boxes: Array) -> Array | None:
-    """The horizontal direction from which most can be seen; None when that is straight from above."""
+    """The horizontal direction from which most can be seen; None if as much can be seen from straight above."""
     covered = [_covered(boxes, side) for side in _SIDES]
     return None if _covered(boxes, _TOP) <= min(covered) else _SIDES[int(np.argmin(covered))]
 

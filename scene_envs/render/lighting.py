@@ -20,9 +20,9 @@ def camera_points(frame: Frame) -> Image:
 
 
 def surface_normals(frame: Frame, *, stride: int = 2) -> Image:
-    """(H, W, 3): unit normals in the camera frame, facing it; worked out at every ``stride``-th pixel and repeated.
+    """(H, W, 3): unit normals in the camera frame, facing the camera; those of every ``stride``-th pixel are repeated.
 
-    A difference of neighbours takes the nearer of the two along each axis, so that edges of objects stay sharp.
+    Along each axis the difference to the nearer neighbour is taken, so that edges of objects stay sharp.
     """
     points = camera_points(frame)[::stride, ::stride]
     along = [_shorter(np.diff(points, axis=axis), axis) for axis in (1, 0)]

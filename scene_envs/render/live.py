@@ -42,7 +42,7 @@ class LiveViewer:
             logger.warn(f"no browser was found; open {self.path} in one")
 
     def close(self) -> None:
-        """Let the page stay as it is."""
+        """Write the page once more, so that it is no longer read again; it stays in its folder."""
         if self._scenes:
             self._write(None)
             self._scenes, self._captions = [], []

@@ -22,12 +22,12 @@ Style = Literal["picture", "semantic"]
 _BACKDROP = np.array([[250.0, 249.0, 247.0], [226.0, 230.0, 235.0]], dtype=np.float32)
 _HIGHLIGHT = np.array([226.0, 52.0, 40.0], dtype=np.float32)
 _SHADOW = np.array([0.40, 0.38, 0.34], dtype=np.float32)
-"""What a full shadow takes from red, green and blue."""
+"""Share of red, green and blue that a full shadow takes away."""
 _SEMANTIC_BACKGROUND = 255
 _SUPERSAMPLING = 2
 _STYLES = ("picture", "semantic")
 _TABLE = 0.68
-"""Radius (m) of what a picture of a dim sum table shows; contact shading is tuned there."""
+"""Radius (m) of the framing of a dim sum table, for which contact shading is tuned."""
 
 
 def render(
@@ -43,9 +43,9 @@ def render(
 
     Args:
         batch: B scenes.
-        style: ``"picture"`` is a lit three-quarter view with soft shadows. In types without fixed objects it shows the
-            only support of a scene that has just one. ``"semantic"`` is one flat colour per asset on white, seen by the
-            camera of the scene type (the paper's: 640 x 480, 45 degrees).
+        style: ``"picture"`` is a lit three-quarter view with soft shadows. In types without fixed objects, a scene with
+            just one support is framed by this support. ``"semantic"`` is one flat colour per asset on white, seen by
+            the camera of the scene type (the paper's: 640 x 480, 45 degrees).
         camera: replaces the camera of the style.
         width: image width, pixels; the camera's by default. The view of a picture is fitted to the image.
         height: image height, pixels; the camera's by default.
@@ -85,7 +85,7 @@ def render(
 
 
 def _fitted_camera(scene_type: SceneType, width: int | None, height: int | None) -> Camera:
-    """The picture camera at the size asked for; where one side is missing, at the default proportions."""
+    """The picture camera at the size asked for; a side that is not given has its default size."""
     default = picture_camera(scene_type)
     width, height = default.width if width is None else width, default.height if height is None else height
     return picture_camera(scene_type, width, height)
@@ -116,7 +116,8 @@ def _picture(
     framing = frame_scene_type(scene_type)
     frame = stage.look(camera, scale * width, scale * height, framing.to_light.tolist())
     lamp = light_camera(scene_type)
-    texel = 2.0 * np.linalg.norm(np.subtract(lamp.position, lamp.target)) / lamp.height  # m, in the lamp's image
+    # Size (m) of a pixel of the lamp's image
+    texel = 2.0 * np.linalg.norm(np.subtract(lamp.position, lamp.target)) / lamp.height
     texel *= np.tan(np.radians(lamp.fov_y) / 2.0)
     light = stage.look(lamp, lamp.width, lamp.height)
     color = frame.color

@@ -52,7 +52,7 @@ def load_pybullet() -> ModuleType:
 
 
 class Stage:
-    """Bodies of the assets ``names``, made on demand and kept; poses move between pictures.
+    """Bodies of the assets ``names``, made on demand and kept; between pictures they only change their poses.
 
     Args:
         names: asset names in category order.
@@ -175,14 +175,14 @@ class Stage:
 
 @cache
 def get_stage(names: tuple[str, ...], folders: tuple[str, ...] = ()) -> Stage:
-    """The stage of this process for the library ``names``, taken from ``folders`` first."""
+    """The stage of this process for the assets ``names``, which are looked up in ``folders`` first."""
     return Stage(names, folders)
 
 
 def make_palette(codes: NDArray[np.int64], limit: int) -> tuple[NDArray[np.int64], int]:
-    """The colours (0xRRGGBB, sorted) that stand for ``codes``, at most ``limit``, and the bits of a colour they keep.
+    """The colours (0xRRGGBB, sorted) that stand for ``codes``, at most ``limit``, and the mask of the bits they keep.
 
-    Colours are exact as long as they fit; meshes with more (scans) lose the lowest bits of each channel.
+    Colours are exact as long as they fit. If there are more (in scans), the lowest bits of each channel are dropped.
     """
     for bits in range(8, 0, -1):
         channel = (0xFF << (8 - bits)) & 0xFF

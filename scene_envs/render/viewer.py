@@ -28,7 +28,7 @@ _FOV = 28.0
 _STEPS = 65535
 """Positions of vertices are whole numbers up to this in the bounding box of their mesh."""
 _CONTACT, _TABLE = 0.05, 0.68
-"""Reach (m) of contact shading on a workspace of this radius (m)."""
+"""Reach (m) of contact shading, ``_CONTACT``, in a framing of radius ``_TABLE`` (m)."""
 
 
 def write_viewer(
@@ -41,8 +41,9 @@ def write_viewer(
 ) -> Path:
     """Write scenes as one HTML file that any browser with WebGL 2 draws, without a network.
 
-    The geometry of each used asset is embedded once, the scenes as poses. ``#scene=3&azimuth=-60&elevation=30`` behind
-    the address opens a scene (counted from 0) from a direction (degrees); the page keeps its address up to date.
+    The geometry of each used asset is embedded once, and scenes are embedded as poses. An address that ends with
+    ``#scene=3&azimuth=-60&elevation=30`` opens a scene (counted from 0) from a direction (degrees); the page keeps its
+    address up to date.
 
     Args:
         batch: B scenes, at least one.
@@ -69,7 +70,10 @@ def viewer_page(
     title: str | None = None,
     refresh: float | None = None,
 ) -> str:
-    """The page of :func:`write_viewer`; a script around its frame shows scene k with ``sceneViewer.showScene(k)``."""
+    """The page of :func:`write_viewer` as text.
+
+    A page that shows it in a frame can call ``sceneViewer.showScene(k)`` of the frame's window to show scene k.
+    """
     if len(batch) == 0:
         raise InvalidInputError("a viewer needs at least one scene; the batch is empty")
     if captions is None:
@@ -81,7 +85,7 @@ def viewer_page(
 
 
 def _page(title: str, data: dict[str, Any]) -> str:
-    """The template with everything filled in; nothing in the data can end the element that holds it."""
+    """The filled-in template; the data is escaped, so that it cannot end the HTML element that holds it."""
     from jinja2.utils import htmlsafe_json_dumps
     from markupsafe import Markup
 
@@ -151,7 +155,7 @@ def _parts(parts: Sequence[ConvexPart]) -> dict[str, Any]:
 
 
 def _positions(vertices: NDArray[np.float64]) -> dict[str, Any]:
-    """Quantised to the bounding box: 4 um in a steamer, 0.15 mm in a floor of 10 m."""
+    """Vertices quantised to their bounding box: in steps of 4 um in a steamer, and 0.15 mm in a floor of 10 m."""
     low = vertices.min(axis=0)
     size = np.maximum(vertices.max(axis=0) - low, 1e-9)
     steps = np.rint((vertices - low) / size * _STEPS).astype(np.uint16)
@@ -176,7 +180,7 @@ def _view(scene_type: SceneType) -> dict[str, Any]:
 
 
 def _outermost(points: NDArray[np.float64], directions: int = 200) -> NDArray[np.float64]:
-    """The points that are farthest in some of many directions: enough to fit a view to."""
+    """The points that are farthest in at least one of many directions; these are enough to fit a view to."""
     step = np.arange(directions) + 0.5
     z, angle = 1.0 - 2.0 * step / directions, step * np.pi * (3.0 - np.sqrt(5.0))
     r = np.sqrt(1.0 - z**2)
@@ -185,6 +189,6 @@ def _outermost(points: NDArray[np.float64], directions: int = 200) -> NDArray[np
 
 
 def _text(values: NDArray[Any]) -> str:
-    """Little-endian bytes as base64."""
+    """The values as little-endian bytes in base64."""
     little = np.ascontiguousarray(values).astype(values.dtype.newbyteorder("<"))
     return base64.b64encode(little.tobytes()).decode("ascii")

@@ -59,7 +59,7 @@ class FixedObject:
 
 @dataclass(frozen=True)
 class SceneType:
-    """Assets, workspace, welded assets, camera and grammar under one name.
+    """Assets, workspace, welded assets and camera under one name.
 
     Attributes:
         name: registry key, such as ``"dimsum_table"``.
@@ -153,9 +153,10 @@ class SceneType:
 
     @property
     def has_geometry(self) -> bool:
-        """Whether every asset has a model here; those of a scene type made from a dataset's metadata may have none.
+        """Whether every asset has a model, built-in or in the folders of the scene type.
 
-        Without models there are no physics and no pictures, but priors can be sampled.
+        Assets of a scene type made from a dataset's metadata may have no models. Without models there are no
+        physics and no pictures, but priors can be sampled.
 
         >>> from scene_envs import get_scene_type
         >>> get_scene_type("dimsum_table").has_geometry
@@ -176,5 +177,5 @@ class SceneType:
 
 
 def _tuples(value: Any) -> Any:
-    """Lists as tuples, all the way down."""
+    """``value`` with lists turned into tuples at every level."""
     return tuple(_tuples(item) for item in value) if isinstance(value, list | tuple) else value

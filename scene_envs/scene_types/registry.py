@@ -30,7 +30,7 @@ def get_scene_type(name: str | SceneType) -> SceneType:
     """The scene type called ``name``; names joined by ``+`` are their union.
 
     Raises:
-        UnknownNameError: no scene type has that name; says which is nearest.
+        UnknownNameError: no scene type has that name; the nearest known one is offered.
         InvalidInputError: ``name`` is neither text nor a scene type.
 
     >>> get_scene_type("dimsum_table+pantry_shelf").slots
@@ -53,14 +53,16 @@ def list_scene_types() -> list[str]:
 def union_scene_type(types: Sequence[str | SceneType], name: str | None = None) -> SceneType:
     """The scene type that holds the scenes of all ``types``.
 
-    Its assets are all of theirs by name, its slots the most of any, its workspace the box around theirs. Assets that
-    are welded in one type are welded in the union; its folders of users' assets are those of all. Only objects that
-    are fixed in the same pose in *every* type stay fixed; the others are objects like any other, in any slot.
+    The union has the assets of all types, sorted by name, the largest number of slots, and the box around all
+    workspaces. Assets that are welded in one type are welded in the union. Its folders of users' assets are those of
+    all types. Only objects that are fixed in the same pose in *every* type stay fixed; the others are objects like any
+    other, in any slot.
 
     Args:
         types: at least one scene type or name.
-        name: of the union; the names joined by ``+`` when None, by which it is known everywhere. Another name is not
-            registered: files that hold it need :func:`~scene_envs.scene_types.register_scene_type`.
+        name: of the union. None joins the names of the types by ``+``, and :func:`get_scene_type` knows such a name.
+            Another name is not registered: files that hold it need
+            :func:`~scene_envs.scene_types.register_scene_type`.
 
     Raises:
         InvalidInputError: no types given.
@@ -77,9 +79,9 @@ def union_scene_type(types: Sequence[str | SceneType], name: str | None = None) 
 
 
 def members_of(scene_type: SceneType) -> tuple[SceneType, ...]:
-    """The scene types of which ``scene_type`` is the union by its name; itself where it is none.
+    """The scene types that the name of a union lists; ``scene_type`` itself where it is no union.
 
-    A union from a file is known by its members only where they are registered and have its assets.
+    The members are found only where all of them are registered and together have the assets of the union.
 
     >>> [member.name for member in members_of(get_scene_type("dimsum_table+pantry_shelf"))]
     ['dimsum_table', 'pantry_shelf']

@@ -8,7 +8,7 @@ from scene_envs.scene_types.base import SceneType
 
 
 def union_of(members: Sequence[SceneType], name: str) -> SceneType:
-    """The scene type called ``name`` that holds the scenes of all ``members``, of which there is at least one."""
+    """The scene type called ``name`` that holds the scenes of all ``members`` (at least one)."""
     lows, highs = ([member.workspace[end] for member in members] for end in (0, 1))
     largest = max(members, key=lambda member: member.workspace[1][0] - member.workspace[0][0])
     return SceneType(

@@ -1,8 +1,8 @@
 """The commands of ``scene-envs``, one module each, imported when the command is called.
 
-A command module has ``run(settings, run)``, which does the work. The keys of the command are the dataclass that
-``settings`` is annotated with, a sentence per field under ``Attributes:``. A module with ``WRITES = False`` has no run
-folder.
+A command module has ``run(settings, run)``, which does the work. The annotation of ``settings`` is a dataclass; its
+fields are the keys of the command, each with a sentence under ``Attributes:``. A module with ``WRITES = False`` has no
+run folder.
 """
 
 COMMANDS = {
@@ -31,4 +31,4 @@ RENAMED = {
     "ship": "scene-envs package-prior",
     "tables": "python -m benchmarks.paper_tables, in the repository",
 }
-"""Commands of earlier versions, and what does their work now."""
+"""Commands of earlier versions, and the commands that do their work now."""

@@ -24,7 +24,7 @@ _SAMPLES, _PROMPTED = "scenes.safetensors", "prompted.safetensors"
 _NOT_PART = ("measures", "project", "fid_weights", "pictures", "workers", "device", "output")
 """Keys that change no figure of a group."""
 _OF_PROMPTS = {"prompt_count", "guidance"}
-"""Keys that change the figures of the group ``prompts`` alone."""
+"""Keys that change only the figures of the group ``prompts``."""
 
 
 @dataclass
@@ -83,7 +83,7 @@ class EvaluateConfig(RealSceneKeys, OutputKeys):
 
 
 def check(settings: EvaluateConfig) -> None:
-    """Refuse what cannot be, before the prior is read."""
+    """Refuse impossible settings before the prior is read."""
     groups = choose_measures(settings.measures, project=settings.project)
     if settings.heldout and not settings.data:
         raise InvalidInputError("heldout= needs data=, the dataset that the prior was trained on")
@@ -150,10 +150,10 @@ def run(settings: EvaluateConfig, run: Run) -> None:
 
 
 def _read_figures(path: Path) -> tuple[dict[str, Any], dict[str, dict[str, float]]]:
-    """What the figures in ``metrics.json`` depend on, and the figures by group; nothing where there are none.
+    """The identity of the figures in ``metrics.json``, and the figures by group; both empty where there are none.
 
     Raises:
-        CorruptFileError: it is cut off, or was changed after it was written.
+        CorruptFileError: the file is cut off, or was changed after it was written.
     """
     try:
         found = dict(json.loads(path.read_text(encoding="utf-8"))).get("evaluation")
@@ -177,11 +177,11 @@ def _digest(evaluation: dict[str, Any]) -> str:
 
 
 class _Results:
-    """Figures by group, in ``metrics.json`` after each group, and the samples they are of.
+    """Figures by group, written to ``metrics.json`` after each group, and the samples that they are of.
 
     Args:
-        run: whose folder they are in.
-        identity: what the figures depend on.
+        run: the run in whose folder they are.
+        identity: the keys, and the digest of the prior, on which the figures depend.
         groups: figures measured already.
     """
 
@@ -192,10 +192,10 @@ class _Results:
 
     @classmethod
     def of(cls, run: Run, identity: dict[str, Any]) -> _Results:
-        """Go on with what the folder holds, as far as it depends on the same.
+        """Go on with the figures in the folder, as far as they depend on the same ``identity``.
 
         Raises:
-            InvalidInputError: its figures are of other keys, those of the prompts alone aside.
+            InvalidInputError: the figures were measured with other keys; other keys of the prompts are allowed.
         """
         path = run.directory / "metrics.json"
         known, groups = _read_figures(path)
@@ -240,7 +240,7 @@ class _Results:
         self.write()
 
     def skip(self, name: str, reason: str) -> None:
-        """Keep why a group was not measured."""
+        """Keep the reason why a group was not measured."""
         self.skipped[name] = reason
         self.run_.log(f"{name} not measured: {reason}")
 
@@ -251,7 +251,7 @@ class _Results:
         self.run_.write_metrics({**self._steps, **flat, "evaluation": {**evaluation, "sha256": _digest(evaluation)}})
 
     def report(self, groups: list[str]) -> str:
-        """The figures of ``groups`` as Markdown, and what was not measured."""
+        """The figures of ``groups`` as Markdown, and the groups that were not measured."""
         from agents.evaluation.report import figure_table
 
         self.write()
@@ -262,7 +262,7 @@ class _Results:
 
 
 def _identity(settings: EvaluateConfig, prior: ScenePrior) -> dict[str, Any]:
-    """The keys that figures depend on, and a digest of what the prior is made of and of its weights."""
+    """The keys that figures depend on, and a digest of the configuration and the weights of the prior."""
     digest = hashlib.sha256(json.dumps(prior.config_state(), sort_keys=True).encode())
     for name, tensor in sorted(prior.weights().items()):
         digest.update(name.encode())
@@ -283,7 +283,7 @@ def _sample(prior: ScenePrior, settings: EvaluateConfig, prompts: list[str] | No
 
 
 def _draw(samples: SceneBatch, count: int, run: Run) -> None:
-    """``gallery.png``, where pictures can be drawn."""
+    """Draw ``gallery.png``, if the packages for pictures are installed."""
     from agents.cli.commands.scenes import draw_scenes
 
     try:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from scene_envs.scene import SceneBatch
 
 _OVERLAP = 1e-3
-"""Overlap (m) that a simulator pushes apart visibly."""
+"""Overlap (m) above which a simulator visibly pushes objects apart."""
 
 
 @dataclass
@@ -53,7 +53,7 @@ class ExportConfig:
 
 
 def check(settings: ExportConfig) -> None:
-    """Refuse what cannot be, before scenes are read."""
+    """Refuse impossible settings before scenes are read."""
     from scene_envs.export.formats import check_formats
 
     if bool(settings.scenes) == bool(settings.prior):
@@ -84,7 +84,7 @@ def run(settings: ExportConfig, run: Run) -> None:
 def export_scenes(
     batch: SceneBatch, formats: Sequence[str], output: Path, pool: PhysicsPool, run: Run, *, friction: float = 0.6
 ) -> dict[str, Any]:
-    """Export into ``output`` and say so, and whether the scenes overlap; returns the figures."""
+    """Export into ``output``; say what was written and in how many scenes objects overlap; return the figures."""
     from scene_envs.export import export
     from scene_envs.physics import penetration
 

@@ -43,7 +43,7 @@ class GenerateConfig:
 
 
 def check(settings: GenerateConfig) -> None:
-    """Refuse what cannot be, before anything is imported."""
+    """Refuse impossible settings before anything is imported."""
     one_of(settings, "backend", ("processes", "ray"))
 
 

@@ -57,7 +57,7 @@ def check(settings: ImportCheckpointConfig) -> None:
 
 
 def run(settings: ImportCheckpointConfig, run: Run) -> None:
-    """Read, save, try."""
+    """Read the checkpoint, save the prior and sample a trial."""
     from agents.priors.checkpoint_import import import_checkpoint
 
     prior = import_checkpoint(

@@ -51,7 +51,7 @@ class InpaintingConfig:
 
 
 def check(settings: InpaintingConfig) -> None:
-    """Refuse to work on nothing."""
+    """Refuse settings that name neither scenes nor a prior."""
     if not settings.scenes and not settings.prior:
         raise InvalidInputError("name a scene file, run or dataset, as in scenes=runs/mine, or a prior= to sample from")
 

@@ -40,7 +40,7 @@ class PackagePriorConfig:
 
 
 def check(settings: PackagePriorConfig) -> None:
-    """Refuse what cannot be, before the prior is read."""
+    """Refuse impossible settings before the prior is read."""
     from agents.configuration.checks import one_of
 
     if not settings.prior or not settings.output:
@@ -51,7 +51,7 @@ def check(settings: PackagePriorConfig) -> None:
 
 
 def run(settings: PackagePriorConfig) -> None:
-    """Write the folder; it is the prior itself, so that no log goes into it."""
+    """Write the folder. The folder is the prior itself, so no log is written into it."""
     from agents.priors.card import package_prior
     from agents.priors.facts import PriorFacts
 

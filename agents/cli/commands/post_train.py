@@ -32,7 +32,7 @@ def run(settings: PostTrainConfig, run: Run) -> None:
 
 
 def say_change(metrics: Mapping[str, Any], run: Run) -> None:
-    """Before and after, a line each."""
+    """Report each figure before and after the training, one line each."""
     before, after = metrics["before"], metrics["after"]
     for name, label in (
         ("reward", "the trained reward"),

@@ -34,13 +34,13 @@ class ProjectConfig:
 
 
 def check(settings: ProjectConfig) -> None:
-    """Refuse to work on nothing."""
+    """Refuse settings that name no scenes."""
     if not settings.scenes:
         raise InvalidInputError("project: name a scene file, run or dataset, as in scenes=runs/mine")
 
 
 def run(settings: ProjectConfig, run: Run) -> None:
-    """Project, settle, count what is ready."""
+    """Project and settle the scenes, and count the ready objects."""
     from scene_envs.physics import PhysicsPool
 
     batch = load_scenes(Path(settings.scenes), settings.count)

@@ -13,7 +13,7 @@ __all__ = ["check", "run"]
 
 
 def run(settings: InpaintingConfig, run: Run) -> None:
-    """New poses for the free objects; what is welded stays."""
+    """Give the free objects new poses; welded objects stay."""
     prior, batch = load_prior_and_scenes("rearrange", settings)
     moved = prior.rearrange(
         batch, prompt=settings.prompt, guidance=settings.guidance, num_steps=settings.num_steps, seed=settings.seed

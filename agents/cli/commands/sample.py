@@ -47,7 +47,7 @@ class SampleConfig(SamplingKeys, OutputKeys):
 
 
 def check(settings: SampleConfig) -> None:
-    """Refuse what cannot be, before a prior is loaded."""
+    """Refuse impossible settings before a prior is loaded."""
     from scene_envs.export.formats import check_formats
 
     one_of(settings, "union", ("one_type", "any"))

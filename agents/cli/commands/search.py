@@ -92,7 +92,7 @@ def run(settings: SearchKeys, run: Run) -> None:
 def _search_progress(nfe_per_scene: int) -> Iterator[Callable[[str, int, int, float], None]]:
     """A bar, or lines, for each planner in turn; yields the function that advances it.
 
-    It is called with the planner, the scenes made, the scenes that will be made, and the best value.
+    The function is called with the planner, the scenes made, the scenes that will be made, and the best value.
     """
     from scene_envs.progress import Progress
 

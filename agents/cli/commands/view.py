@@ -50,7 +50,7 @@ class ViewConfig:
 
 
 def check(settings: ViewConfig) -> None:
-    """Refuse to show nothing, or two things at once."""
+    """Refuse settings that name no source of scenes, or two."""
     if settings.scenes and settings.prior:
         raise InvalidInputError("view: give either scenes= or prior=, not both")
     if settings.prior and settings.scene:

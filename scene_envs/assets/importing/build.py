@@ -28,20 +28,20 @@ if TYPE_CHECKING:
     import trimesh
 
 _CONVEX = 0.01
-"""Depth below the hull, in parts of the diagonal, up to which a body counts as convex ..."""
+"""Depth below the hull, as a fraction of the diagonal, up to which a body counts as convex."""
 _MOST_CONVEX = 2e-3
-"""... and never more than this, m."""
+"""Upper limit (m) of that depth."""
 _THIN = 3e-3
-"""Parts thinner than this (m) lose much of themselves to the margins of physics engines."""
+"""Parts thinner than this (m) get a note: the collision margins of physics engines take up much of them."""
 _MANY_PARTS, _MANY_TRIANGLES = 64, 200_000
 _UNLIKE = 0.01
-"""Difference (m) between the boxes of what is seen and what collides that is worth a note."""
+"""Difference (m) between the bounding boxes of visual and collision geometry that is worth a note."""
 _SMALL, _LARGE = 2e-3, 20.0
-"""Diagonals (m) outside of which the unit is probably another."""
+"""Smallest and largest plausible diagonal (m); beyond them the file is probably not in metres."""
 
 
 def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
-    """The asset that ``entry`` makes of the file at ``path``, and what was done.
+    """The asset that ``entry`` makes of the file at ``path``, and its import report.
 
     Raises:
         InvalidInputError: a mesh that does not exist, or a model without volume.
@@ -106,7 +106,7 @@ def _read(path: Path) -> Model:
 
 
 def _scaled(model: Model, entry: AssetEntry) -> Model:
-    """The model with its axis pointing up, scaled; the material stays, so mass goes with the cube of the scale."""
+    """The model scaled, with its up axis turned to +z; the density stays, so mass goes with the cube of the scale."""
     turn, scale = _upright(entry.up), entry.scale
 
     def shape(old: Shape) -> Shape:
@@ -154,7 +154,7 @@ def _diagonal(shapes: Sequence[Shape]) -> float:
 def _collide(
     shapes: Sequence[Shape], entry: AssetEntry, size: float, path: Path, notes: list[str], warnings: list[str]
 ) -> tuple[list[ConvexPart], float]:
-    """Fine parts of all shapes and the volume (m^3) they fill; what is to be said is added to the lists."""
+    """Fine parts of all shapes and the volume (m^3) they fill; adds remarks to ``notes`` and ``warnings``."""
     tolerance = min(_CONVEX * size, _MOST_CONVEX)
     parts: list[ConvexPart] = []
     volume, repeated = 0.0, 0
@@ -185,7 +185,7 @@ def _collide(
 
 
 def _unlike(visual: trimesh.Trimesh, parts: Sequence[ConvexPart], size: float) -> list[str]:
-    """A note when what is seen and what collides have different bounding boxes."""
+    """A note when visual and collision geometry have different bounding boxes."""
     apart = float(np.abs(np.asarray(visual.bounds) - bounds_of(parts)).max())
     if apart <= max(_UNLIKE, 0.05 * size):
         return []
@@ -193,7 +193,7 @@ def _unlike(visual: trimesh.Trimesh, parts: Sequence[ConvexPart], size: float) -
 
 
 def _shift(parts: Sequence[ConvexPart], entry: AssetEntry, visual: trimesh.Trimesh | None) -> Array:
-    """(3,) m from the file's origin to the asset frame's; the visual counts too when there is one."""
+    """(3,) m: position of the file's origin in the asset frame; the box includes ``visual`` when it is given."""
     if entry.base == "origin":
         return np.zeros(3)
     low, high = bounds_of(parts)
@@ -203,7 +203,7 @@ def _shift(parts: Sequence[ConvexPart], entry: AssetEntry, visual: trimesh.Trime
 
 
 def _clean(vertices: Array) -> Array:
-    """Heights that are 0 up to rounding made exactly 0."""
+    """The vertices, with heights that are 0 up to rounding set to exactly 0."""
     vertices[np.abs(vertices[:, 2]) < 1e-9, 2] = 0.0
     return vertices
 

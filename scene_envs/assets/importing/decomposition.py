@@ -38,10 +38,10 @@ _LOGGER = logging.getLogger(__name__)
 _VERSION = 2
 """Version of the format on disk."""
 _DRAWN = 0.015
-"""CoACD rebuilds surfaces that are not closed on a grid; corners this near the true one, relative to the size
-of the body, are drawn back onto it, so that flat faces stay flat."""
+"""Distance from the true surface, relative to the size of the body, up to which corners are moved back onto it. CoACD
+rebuilds surfaces that are not closed on a grid; moving the corners keeps flat faces flat."""
 _MOST_BODIES = 128
-"""Closed bodies of one mesh that are taken one by one."""
+"""Largest number of bodies of one mesh that are handled one by one."""
 
 
 def cache_folder() -> Path:
@@ -64,7 +64,7 @@ def convex_parts(
     Args:
         mesh: triangles, m.
         method: ``"convex"`` takes one hull of everything; ``"coacd"`` insists on CoACD where a body is concave;
-            ``"auto"`` falls back to a hull without CoACD.
+            ``"auto"`` falls back to a hull where CoACD is not installed.
         tolerance: m; a body nowhere deeper than this below its hull is convex.
         threshold: CoACD's concavity, relative to the size of the body.
         what: name of the mesh, for messages.
@@ -103,7 +103,7 @@ def convex_parts(
 
 
 def _bodies(surface: trimesh.Trimesh, tolerance: float) -> tuple[list[trimesh.Trimesh], int]:
-    """Closed or convex bodies of a surface and the number of flat pieces; the whole when not all are bodies."""
+    """Closed or convex bodies of a surface and the number of flat pieces; else the whole surface as one body."""
     pieces: list[Any] = list(surface.split(only_watertight=False))
     solid = [piece for piece in pieces if has_volume(np.asarray(piece.vertices))]
     if not solid or len(solid) > _MOST_BODIES:
@@ -166,12 +166,12 @@ def coacd_settings(threshold: float) -> dict[str, Any]:
 def _has_coacd() -> bool:
     try:
         return find_spec("coacd") is not None
-    except ValueError:  # a module that was put out of reach
+    except ValueError:  # the module was replaced by one without a spec
         return False
 
 
 def run_coacd(vertices: Array, faces: Array, settings: dict[str, Any], what: str) -> list[Array]:
-    """Corners (P, 3) of the convex pieces, from a process that ends with the time of the import.
+    """Corners (P, 3) of the convex pieces, from a process that is ended when the time of the import is over.
 
     Args:
         vertices: (V, 3).
@@ -229,7 +229,7 @@ def drawn_to(body: trimesh.Trimesh, points: Array, reach: float) -> Array:
 
 
 def _key(body: trimesh.Trimesh, settings: dict[str, Any]) -> str:
-    """Hash of what goes into the decomposition."""
+    """Hash of the inputs of the decomposition."""
     digest = hashlib.sha256(json.dumps([_VERSION, settings], sort_keys=True).encode())
     digest.update(np.ascontiguousarray(body.vertices, dtype="<f8").tobytes())
     digest.update(np.ascontiguousarray(body.faces, dtype="<i8").tobytes())
@@ -252,7 +252,7 @@ def _read(path: Path) -> list[Array] | None:
 
 
 def _write(path: Path, pieces: Sequence[Array]) -> None:
-    """Keep the pieces; a cache that cannot be written costs time, not the result."""
+    """Write the pieces to the cache; a failure to write is only logged."""
     try:
         with replacing(path) as partial, partial.open("wb") as file:
             np.savez(file, vertices=np.concatenate(pieces), counts=np.array([len(piece) for piece in pieces]))

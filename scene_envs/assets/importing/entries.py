@@ -46,12 +46,12 @@ class AssetEntry(AssetNames):
     """One asset of a library: its names and how its file becomes a body.
 
     Attributes:
-        scale: factor on all lengths; a file in millimetres wants 0.001.
+        scale: factor on all lengths; a file in millimetres needs 0.001.
         density: kg/m^3; fills the shape evenly.
         mass: kg.
-        welded: fixed to the world; what the file says by default.
+        welded: whether the asset is fixed to the world; by default as the file says.
         up: axis of the file that points up.
-        color: (r, g, b) class colour, which also paints what has no colour.
+        color: (r, g, b) class colour, also used for surfaces without a colour.
         base: ``"bottom"`` puts the frame under the middle of the bounding box, ``"origin"`` leaves it.
         decomposition: ``"auto"``, ``"coacd"`` or ``"convex"``; see :func:`convex_parts`.
         concavity: CoACD's threshold, 0.01 (many parts) to 1 (one).
@@ -109,7 +109,7 @@ def check_names(entries: list[AssetEntry], where: str) -> None:
 
 
 def default_entry(file: str) -> AssetEntry:
-    """The entry of a file about which nothing is said."""
+    """The entry of a file for which the user gives no settings."""
     path = Path(file)
     stem = path.parent.name if path.stem.lower() == "model" and path.parent.name else path.stem
     return _named({"file": file, "name": "_".join(stem.split())})

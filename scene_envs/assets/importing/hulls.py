@@ -12,11 +12,11 @@ from scene_envs.assets.base import ConvexPart
 from scene_envs.assets.shapes import convex_hull
 
 MOST_CORNERS = 64
-"""Corners of a hull; collision tests cost in proportion."""
+"""Largest number of corners of a hull; the cost of collision tests grows in proportion."""
 _COARSE_CORNERS = 16
-"""Corners of the hull whose faces, moved outward, make an enclosing one."""
+"""Corners of the inner hull whose faces are moved outward to make an enclosing hull."""
 _DIRECTIONS = np.array(list(np.ndindex(3, 3, 3)), dtype=np.float64) - 1.0
-"""Towards the 26 neighbours of a cell, and the cell itself."""
+"""Directions to the 26 neighbours of a cell, and the zero vector."""
 
 
 def few_cornered_hull(points: Array, tolerance: float, corners: int = MOST_CORNERS) -> tuple[ConvexPart, float]:

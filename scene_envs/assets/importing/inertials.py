@@ -13,11 +13,11 @@ from scene_envs.assets.importing.model import Inertial
 from scene_envs.assets.shapes import MassProperties, mass_properties
 
 DEFAULT_DENSITY = 500.0
-"""kg/m^3, where neither the file nor the user says: wood, or a vessel of ceramic with its air."""
+"""kg/m^3, used where neither the file nor the user gives one: wood, or a ceramic vessel with the air in it."""
 _POSSIBLE = (1.0, 23_000.0)
-"""kg/m^3 between air and osmium."""
+"""Possible densities, kg/m^3, from air to osmium."""
 _FACTOR = 10.0
-"""By how much a moment of inertia may differ from that of the same shape filled evenly."""
+"""Largest factor between a moment of inertia and that of the same shape filled evenly."""
 
 
 class Weight(NamedTuple):
@@ -38,8 +38,8 @@ def weigh(
 ) -> Weight:
     """Mass properties of an asset.
 
-    The file's are kept when they can belong to a body of this shape. A user's ``mass`` keeps the file's
-    distribution of mass; a user's ``density`` fills the shape evenly.
+    The file's properties are kept when they can belong to a body of this shape. A user's ``mass`` keeps the
+    file's distribution of mass; a user's ``density`` fills the shape evenly.
 
     Args:
         given: what the file says; None when it says nothing.

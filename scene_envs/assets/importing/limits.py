@@ -22,17 +22,20 @@ from scene_envs.errors import InvalidInputError
 Result = TypeVar("Result")
 _PREFIX = "SCENE_ENVS_IMPORT_"
 _GRACE = 1.0
-"""Seconds beyond the limit for work that watches the time itself."""
+"""Seconds beyond the limit for work that checks the time itself."""
 _HEAD = 1 << 16
-"""Bytes in which the header of a mesh file ends."""
+"""Bytes at the start of a mesh file in which its header is looked for."""
 READ_HERE = 300_000
-"""Bytes of files that are imported in the calling process, in a thread that is left when the time is over. More is
-imported in a process that is ended then."""
+"""Largest number of bytes of files that are imported in the calling process. The import runs in a thread that is
+abandoned when the time is over. A larger import runs in a process of its own, which is ended when the time is over."""
 _BYTES_PER_TRIANGLE = 36
 
 
 class LargeImportError(BaseException):
-    """An import reads more than :data:`READ_HERE`; no error of the file, so that nothing takes it for one."""
+    """An import reads more than :data:`READ_HERE`.
+
+    This is a BaseException, so that no code takes it for an error of the file.
+    """
 
 
 @dataclass
@@ -40,10 +43,10 @@ class _Clock:
     """The import of one asset.
 
     Attributes:
-        path: its file.
-        end: when it must be done.
-        seconds: that it was given.
-        room: bytes that it may still read in this process.
+        path: file of the asset.
+        end: time of the monotonic clock at which the import must be done.
+        seconds: time that the import was given.
+        room: bytes of files that the import may still read in this process.
     """
 
     path: Path
@@ -60,12 +63,12 @@ class ImportLimits:
     """Limits for each file of a user's assets.
 
     The environment variables ``SCENE_ENVS_IMPORT_MEGABYTES``, ``SCENE_ENVS_IMPORT_TRIANGLES`` and
-    ``SCENE_ENVS_IMPORT_SECONDS`` replace the defaults: the folder, which may be another's, has no say.
+    ``SCENE_ENVS_IMPORT_SECONDS`` replace the defaults. The folder cannot, because it may come from someone else.
 
     Attributes:
         megabytes: size of a file, 10⁶ bytes.
         triangles: triangles (or corners) of a mesh file, as its header or its content says.
-        seconds: time for reading, decomposing and weighing one asset; what takes longer is not waited for.
+        seconds: time for reading, decomposing and weighing one asset; a longer import is not waited for.
     """
 
     megabytes: float = 256.0
@@ -74,10 +77,10 @@ class ImportLimits:
 
     @classmethod
     def current(cls) -> ImportLimits:
-        """The limits with what the environment says of them.
+        """The limits, with the values of the environment variables that are set.
 
         Raises:
-            InvalidInputError: a variable is no positive number.
+            InvalidInputError: a variable is not a positive number.
         """
         chosen = {}
         for field in fields(cls):
@@ -97,8 +100,8 @@ def check_file(path: Path) -> None:
     """Refuse a file that is larger, or whose header promises more triangles, than the limits.
 
     Raises:
-        InvalidInputError: it is; names the file, the limit and the variable that raises it.
-        LargeImportError: the import that runs belongs in a process of its own.
+        InvalidInputError: the file is beyond a limit; names the file, the limit and the variable that raises the limit.
+        LargeImportError: the running import must move to a process of its own.
     """
     limits = ImportLimits.current()
     try:
@@ -130,10 +133,10 @@ def check_triangles(path: Path, count: int) -> None:
 
 @contextmanager
 def timed(path: Path, room: float = math.inf) -> Iterator[None]:
-    """Context of the import of one asset, whose time runs; :func:`seconds_left` tells how much is left.
+    """Context in which the time of the import of one asset runs; :func:`seconds_left` tells how much is left.
 
     Args:
-        path: its file.
+        path: file of the asset.
         room: bytes of files beyond which :func:`check_file` raises LargeImportError.
     """
     seconds = ImportLimits.current().seconds
@@ -145,7 +148,7 @@ def timed(path: Path, room: float = math.inf) -> Iterator[None]:
 
 
 def seconds_left() -> float | None:
-    """Seconds until the import that runs has to be done; None outside of one.
+    """Seconds until the running import has to be done; None when no import runs.
 
     Raises:
         InvalidInputError: none are left.
@@ -160,10 +163,10 @@ def seconds_left() -> float | None:
 
 
 def in_time(work: Callable[[], Result]) -> Result:
-    """The result of ``work``, if it comes before the import that runs has to be done.
+    """The result of ``work``, if it comes before the running import has to be done.
 
     Work that takes longer goes on in a thread of its own, which ends at the next :func:`seconds_left`. Work that
-    watches the time itself, as that of CoACD does, has a second more to say what took so long.
+    checks the time itself, such as that of CoACD, gets one more second, in which it can say what took so long.
 
     Raises:
         InvalidInputError: the time is over.
@@ -230,7 +233,7 @@ def _count(path: Path, what: bytes) -> int:
 
 
 def _gltf_count(path: Path, head: bytes) -> int:
-    """The largest accessor of a glTF file."""
+    """The largest accessor count of a glTF file, divided by 3; 0 where it cannot be read."""
     if path.suffix.lower() == ".glb":
         length = struct.unpack("<I", head[12:16])[0] if len(head) >= 16 else 0
         with path.open("rb") as file:

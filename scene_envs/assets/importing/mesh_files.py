@@ -22,13 +22,13 @@ MESH_SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 
 _GREY: Color = (176, 176, 170)
 _UNSET = (102, 102, 102)
-"""What trimesh gives a mesh with texture coordinates and no material."""
+"""Colour that trimesh gives a mesh with texture coordinates and no material."""
 _SMOOTH = float(np.cos(np.radians(40.0)))
 """Faces that meet at less than 40 degrees are shaded as one curved surface."""
 _MOST_SMOOTHED = 100_000
-"""Triangles up to which corners are smoothed."""
+"""Largest number of triangles of a mesh whose corners are smoothed."""
 _FINE_TEXTURE, _TEXTURE_COLORS = 500, 32
-"""Textured meshes are cut into at least this many triangles, with at most so many colours."""
+"""Least number of triangles that a textured mesh is cut into, and largest number of its colours."""
 _MOST_PIXELS = 8192 * 8192
 """Most pixels of a texture."""
 _SAMPLES = np.array(
@@ -39,13 +39,13 @@ _Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def read_mesh(path: Path) -> list[trimesh.Trimesh]:
-    """The meshes of a file, each with merged positions' worth of triangles, z up, in the unit of the file.
+    """The triangle meshes of a file, z up, in the unit of the file.
 
-    Objects of an OBJ and nodes of a scene stay apart. glTF is y up by its specification and is turned; COLLADA
-    says which way is up and how long its unit is, and both are applied.
+    Objects of an OBJ and nodes of a scene stay apart. glTF is y up by its specification and is turned. A COLLADA file
+    names its up axis and its unit, and both are applied.
 
     Raises:
-        InvalidInputError: no such file, a format that cannot be read, or more than the limits of imports.
+        InvalidInputError: no such file, a format that cannot be read, or a file beyond the limits of imports.
         CorruptFileError: the file cannot be read, holds no triangles, or a coordinate that is not finite.
         MissingDependencyError: COLLADA without pycollada.
     """
@@ -114,7 +114,7 @@ def _check_mesh(mesh: trimesh.Trimesh, path: Path) -> None:
 
 
 def _check_texture(mesh: Any, path: Path) -> None:
-    """Refuse a texture of too many pixels before it is decoded: a file of some kB may hold a gigabyte of them."""
+    """Refuse a texture of too many pixels before it is decoded: a file of a few kB may hold a gigabyte of pixels."""
     image = _image(getattr(getattr(mesh, "visual", None), "material", None))
     width, height = getattr(image, "size", (0, 0))
     if width * height > _MOST_PIXELS:

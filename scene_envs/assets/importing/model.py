@@ -88,7 +88,7 @@ def moved_inertial(pose: Array, inertial: Inertial) -> Inertial:
 
 
 def merged_inertial(inertials: tuple[Inertial, ...]) -> Inertial:
-    """The one rigid body of several: masses add, inertias by the parallel-axis theorem."""
+    """The inertial of several bodies joined to one: masses add, inertias by the parallel-axis theorem."""
     mass = sum(inertial.mass for inertial in inertials)
     weights = [inertial.mass / mass if mass > 0 else 1.0 / len(inertials) for inertial in inertials]
     center = sum((w * i.center_of_mass for w, i in zip(weights, inertials, strict=True)), np.zeros(3))

@@ -12,13 +12,13 @@ class AssetReport:
 
     Attributes:
         name: of the asset.
-        file: it was read from.
+        file: file that the asset was read from.
         mass: kg; 0 for welded assets.
         density: kg/m^3 of the solid; 0 for welded assets.
         parts: number of fine convex parts.
         origin: (x, y, z) m: where the origin of the file lies in the asset frame.
         notes: what was assumed or chosen.
-        warnings: what was wrong in the file and is put right, or could not be.
+        warnings: faults of the file that were corrected, or could not be.
         error: why there is no asset; empty when there is one.
     """
 
@@ -45,7 +45,7 @@ class ImportReport:
     """Import report of a folder.
 
     Attributes:
-        folder: that was read.
+        folder: folder that was read.
         assets: one report per file.
         notes: about the folder as a whole.
     """

@@ -17,7 +17,7 @@ _RADII = {"cylinder": ("radius", "length"), "capsule": ("radius", "length"), "sp
 
 
 def read_sdf(path: Path) -> Model:
-    """The model in an SDF file, in the model frame; where the model stands in its world is left out.
+    """The model in an SDF file, in the model frame; the pose of the model in its world is ignored.
 
     Raises:
         CorruptFileError: not an SDF, or one that contradicts itself; the place is named.

@@ -24,7 +24,7 @@ _CAP = np.radians(15.0)
 
 
 class Collision(NamedTuple):
-    """Convex parts of one shape, the volume it fills (m^3), and what is to be said about it."""
+    """Convex parts of one shape, the volume it fills (m^3), and remarks for the report."""
 
     parts: list[ConvexPart]
     volume: float
@@ -59,7 +59,7 @@ def _transformed(mesh: trimesh.Trimesh, pose: Array, scale: tuple[float, ...]) -
 
 
 def visual_of(shape: Shape, color: Color | None) -> list[trimesh.Trimesh]:
-    """Coloured surfaces; ``color`` stands in where neither file nor model gives one."""
+    """Coloured surfaces; ``color`` is used where neither file nor model gives one."""
     chosen = shape.color or color
     if shape.kind == "mesh":
         return [painted(mesh, chosen) for mesh in meshes_of(shape)]
@@ -88,7 +88,7 @@ def _smooth(shape: Shape) -> trimesh.Trimesh:
 def collision_of(shape: Shape, method: Method, tolerance: float, threshold: float) -> Collision:
     """Convex parts of a shape.
 
-    Balls are polyhedra with flat faces at their poles, cylinders prisms of 16 sides whose corners lie on the
+    Balls are polyhedra with flat faces at their poles. Cylinders are prisms of 16 sides whose corners lie on the
     circle. For meshes see :func:`convex_parts`.
     """
     if shape.kind != "mesh":

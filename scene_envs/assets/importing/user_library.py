@@ -140,7 +140,7 @@ def find_asset(name: str, folders: Sequence[str | os.PathLike[str]]) -> Asset | 
 
 
 def _stamp(path: Path) -> tuple[int, int]:
-    """What changes when a file is written."""
+    """Modification time (ns) and size of a file, which change when the file is written; zeros without access."""
     try:
         status = path.stat()
     except OSError:
@@ -189,7 +189,7 @@ def _colored(entries: list[AssetEntry]) -> tuple[AssetEntry, ...]:
 
 @cache
 def _built(folder: Path, entry: AssetEntry, stamp: tuple[int, int]) -> tuple[Asset, AssetReport]:
-    from scene_envs.assets.importing.build import build_asset  # with trimesh, which the import of this package spares
+    from scene_envs.assets.importing.build import build_asset  # imported here, because it loads trimesh
 
     try:
         with timed(folder / entry.file, READ_HERE):

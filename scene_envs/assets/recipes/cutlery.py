@@ -19,7 +19,7 @@ _STEEL: Color = (196, 200, 207)
 _BRIGHT: Color = (222, 226, 231)
 _SHADE: Color = (168, 173, 182)
 _THICK = 0.0034
-"""m; thinner metal would vanish when engines shrink hulls by 1 mm."""
+"""Thickness of the metal, m; thinner metal would vanish when engines shrink hulls by 1 mm."""
 
 Station = tuple[float, float, float, float]
 """(x, width, lowest z, highest z) of a section across the length, m."""

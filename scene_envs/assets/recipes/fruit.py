@@ -41,7 +41,7 @@ def _tones(first: Color, last: Color, count: int = 5) -> list[Color]:
 
 
 def _cheek(spread: float) -> Paint:
-    """From the ground colour on the shaded side (0) to the cheek that the sun has seen (4), in streaks."""
+    """Paint in streaks, from the ground colour on the shaded side (0) to the cheek on the sunny side (4)."""
 
     def paint(angle: Array, z: Array) -> Cells:
         streaks = 0.35 * np.cos(5.0 * angle + 1.0) * np.cos(13.0 * angle)
@@ -51,7 +51,7 @@ def _cheek(spread: float) -> Paint:
 
 
 def _ripening(height: float) -> Paint:
-    """From the colour at the blossom end (0) to that at the stem (4)."""
+    """Paint from the colour at the blossom end (0) to the colour at the stem (4)."""
 
     def paint(angle: Array, z: Array) -> Cells:
         return np.clip(np.floor(5.0 * (z / height) + 0.0 * angle), 0, 4).astype(np.int64)
@@ -60,7 +60,7 @@ def _ripening(height: float) -> Paint:
 
 
 def _pebbled(height: float) -> Paint:
-    """As :func:`_ripening`, one tone up or down from cell to cell."""
+    """As :func:`_ripening`, with each cell shifted at random by at most one tone."""
 
     def paint(angle: Array, z: Array) -> Cells:
         turns = np.random.default_rng(7).integers(-1, 2, np.broadcast_shapes(angle.shape, z.shape))
@@ -116,7 +116,7 @@ def _pear(
     colors: list[Color],
     paint: Paint,
 ) -> Model:
-    """A pear; ``neck`` is the radius where it begins, near its top, and the height where it begins (fractions)."""
+    """A pear; ``neck`` is (radius at its start, radius near its top, height of its start), as fractions."""
     radius = diameter / 2.0
     begin, end, waist = neck
     belly = 0.58 * waist

@@ -65,7 +65,7 @@ def breakfast_table() -> Model:
 
 @asset_recipe("chair", display_name="chair", mass=6.0, color=(84, 52, 32))
 def chair() -> Model:
-    """A wooden chair; who sits on it looks toward +x. The seat is 0.45 m, the back 0.90 m high."""
+    """A wooden chair; a person on it looks toward +x. The seat is 0.45 m, the back 0.90 m high."""
     seat_low, seat, height, leg = 0.415, 0.45, 0.90, 0.04
     side, near = 0.45, 0.5 * (0.45 - 0.04)
     board = box((side, side, seat - seat_low), (0.0, 0.0, seat_low))

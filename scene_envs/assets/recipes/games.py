@@ -22,7 +22,7 @@ def _lidded(
     label: Sequence[Patch],
     front: Literal["-y", "+x"] = "-y",
 ) -> Model:
-    """A box in a lid that leaves a strip of its tray to be seen."""
+    """A box with a lid, below which a strip of the tray can be seen."""
     strip = 0.16
     tray = Patch(0.0, 0.0, 1.0, strip, _CARD)
     raised = [Patch(p.left, strip + (1 - strip) * p.low, p.right, strip + (1 - strip) * p.high, p.color) for p in label]

@@ -16,7 +16,8 @@ Cells = NDArray[np.int64]
 """Indices into the colours of a surface, one per cell."""
 
 Paint = Callable[[Array, Array], Cells]
-"""From the angles (1, S) rad and the heights (P, 1) m of cells, bottom to top along the profile, to their colours."""
+"""Function of the angles (1, S) rad and the heights (P, 1) m of cells, bottom to top along the profile, that gives the
+colours of the cells."""
 
 
 def curve(points: Profile, samples: int = 24) -> Array:
@@ -107,7 +108,7 @@ def sheet(outline: ArrayLike, color: Color) -> trimesh.Trimesh:
 
 
 def _normals(points: Array, section: Array) -> Array:
-    """(P, S, 3) unit normals of a revolved grid; on the axis, that of the axis."""
+    """(P, S, 3) unit normals of a revolved grid; on the axis, the normal is parallel to the axis."""
     along = np.gradient(points, axis=0)
     around = np.roll(points, -1, axis=1) - np.roll(points, 1, axis=1)
     normals = np.cross(around, along)

@@ -33,7 +33,7 @@ class Reference:
     place: Place | None = None
 
     def resolve(self, scene: SceneFacts) -> int:
-        """Index of the thing; -1 when there is none, or when there are several and the claim names the only one."""
+        """Index of the thing; -1 when there is none, or when there are several and the reference has no ordinal."""
         members = scene.named(self.name)
         if self.place is not None:
             members = members[self.place.holds(scene)[members]]
@@ -53,14 +53,14 @@ class Place:
 
     Attributes:
         unit: the piece of furniture.
-        tier: counted from the top from 0, or from the bottom from -1; None for the whole thing.
+        tier: 0, 1, … counted from the top, or -1, -2, … counted from the bottom; None for the whole piece.
     """
 
     unit: Reference
     tier: int | None = None
 
     def holds(self, scene: SceneFacts) -> NDArray[np.bool_]:
-        """(n,) bool: objects that are there, directly or on top of or in others."""
+        """(n,) bool: objects that are at this place, directly or on top of or in others."""
         unit = self.unit.resolve(scene)
         here = (scene.held.place == unit) & (unit >= 0)
         if self.tier is None or unit < 0:
@@ -75,11 +75,11 @@ class ClaimCheck:
 
     Attributes:
         claim: what was claimed.
-        expected: the number it gives; 1 for a relation between two things.
+        expected: the number that the claim gives; 1 for a relation between two things.
         found: the number in the scene; for a relation 1 when it holds, else 0.
-        score: 1 when it holds; below that the smaller number over the larger, and for a relation that does not
-            hold a quarter for each of its two things that is there.
-        slots: slots of the objects it speaks of, as far as they are there.
+        score: 1 when the claim holds. A number that does not hold scores the smaller number over the larger. A relation
+            that does not hold scores a quarter for each of its two things that is in the scene.
+        slots: slots of the objects that the claim is about, as far as they are in the scene.
     """
 
     claim: Claim
@@ -212,7 +212,7 @@ class PromptFacts:
 
     @property
     def count(self) -> int | None:
-        """The number of objects claimed; None when the prompt says nothing about it."""
+        """The number of objects claimed; None when the prompt claims no such number."""
         return next((claim.number for claim in self.claims if isinstance(claim, ObjectCount)), None)
 
     @property
@@ -222,11 +222,11 @@ class PromptFacts:
         return named or None
 
     def check(self, scene: SceneFacts) -> tuple[ClaimCheck, ...]:
-        """Each claim with its truth, the numbers claimed and found, and the slots it speaks of."""
+        """The check of each claim: its truth, the numbers claimed and found, and the slots it is about."""
         return tuple(claim.check(scene) for claim in self.claims)
 
     def holds(self, scene: SceneFacts) -> bool:
-        """Whether every claim is true of ``scene``; numbers are exact for what is named."""
+        """Whether every claim is true of ``scene``; the numbers of named objects must match exactly."""
         return all(check.holds for check in self.check(scene))
 
     def score(self, scene: SceneFacts) -> float:
@@ -241,5 +241,5 @@ def _count(claim: Claim, number: int, scene: SceneFacts, members: NDArray[np.int
 
 
 def _holder(scene: SceneFacts, inside: bool) -> NDArray[np.int64]:
-    """(n,) what each thing lies in, or what it stands on; -1 for none."""
+    """(n,) the container that each thing lies in if ``inside``, else the thing it stands on; -1 for none."""
     return scene.held.inside if inside else np.where(scene.held.contained, -1, scene.held.support)

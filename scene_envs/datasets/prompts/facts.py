@@ -26,11 +26,11 @@ _FURNITURE = 0.5
 
 @dataclass(frozen=True)
 class Tolerances:
-    """When a relation holds.
+    """Limits within which a relation holds.
 
     Attributes:
-        contact: surfaces this far (m) apart, or into each other, touch; what touches nothing is on the table or
-            tier within three times as much.
+        contact: surfaces this far (m) apart, or into each other, touch; an object that touches nothing is on the table
+            or tier within three times this distance.
         aside: least offset (m) of two centres to the left, right, front or back.
         cone: that offset is at least this many times the offset across.
         beside: largest horizontal distance (m) of two bounding boxes that are next to each other.
@@ -57,7 +57,7 @@ NOMINAL = Tolerances()
 """Tolerances of checks."""
 STRICT = Tolerances(contact=0.005, aside=0.03, cone=1.25, beside=0.04, beside_furniture=0.4, order=0.02)
 LOOSE = Tolerances(contact=0.015, beside=0.06, beside_furniture=0.6)
-"""Prompts are written only when they hold under all three, so that no prompt hangs on a millimetre."""
+"""Prompts are written only when they hold under all three tolerances, so that no prompt depends on a millimetre."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ class SceneFacts:
         fixed: (n,) bool, welded things such as tables, shelves and floors.
         tiers: (n,) tiers of each thing, 0 for what has none.
         held: what holds each object.
-        tolerances: when a relation holds.
+        tolerances: limits within which a relation holds.
 
     >>> (facts,) = scene_facts(SceneBatch.empty("dimsum_table", 1))
     >>> facts.count, facts.objects

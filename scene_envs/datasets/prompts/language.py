@@ -84,7 +84,7 @@ class Nouns:
 
 
 def say_reference(reference: Reference, *, near: Place | None = None) -> str:
-    """One thing: "the second cup from the left on the top shelf", or "… on the same shelf" when that is ``near``."""
+    """One thing: "the second cup from the left on the top shelf", or "… on the same shelf" if its place is ``near``."""
     first = f"{ORDINALS[reference.ordinal - 1]} " if reference.ordinal else ""
     last = f" from the {reference.edge}" if reference.ordinal else ""
     place = reference.place

@@ -113,7 +113,7 @@ class _Reader:
         return Reference(name, ordinal, edge, self.place() if at_place else None)
 
     def place(self) -> Place:
-        """Tiers first; what is no tier is a piece of furniture."""
+        """A tier if the text names one, else a piece of furniture."""
         before = self.rest
         self.need(["the"], "'the' and a place")
         ordinal = _ORDINALS.get(self.take(_ORDINALS), 1)

@@ -31,7 +31,7 @@ class ReferringExpressions:
     def references(self, index: int) -> list[Reference]:
         """The simplest expressions for one object; empty when there are none.
 
-        Its name alone; or its name and place; or its rank from the sides where that is lowest.
+        These are its name alone, or its name and place, or its rank counted from the sides where the rank is low.
         """
         if index not in self._known:
             self._known[index] = self._references(index)

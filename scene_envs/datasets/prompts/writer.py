@@ -42,7 +42,7 @@ _TRIES = 8
 
 
 def describe(batch: SceneBatch, rng: np.random.Generator, *, kinds: Sequence[str] = KINDS) -> list[str]:
-    """One prompt per scene, of a random kind among those that have something to say.
+    """One prompt per scene, of a random kind; a count where that kind has nothing to say.
 
     Raises:
         InvalidInputError: an unknown kind.
@@ -81,7 +81,7 @@ class _Writer:
 
     @property
     def scene(self) -> SceneFacts:
-        """The scene as prompts are checked against it."""
+        """The facts of the scene under the tolerances with which prompts are checked."""
         return self.views[1]
 
     def write(self, kind: str) -> str:
@@ -106,7 +106,7 @@ class _Writer:
         return tuple(prompts)
 
     def _names(self) -> list[str]:
-        """All display names, or with even chance some, at most ten, in random order; not furniture alone."""
+        """Display names in random order, at most ten: all or some with even chance, but not furniture alone."""
         names = sorted(self.scene.objects)
         whole = self.rng.random() < 0.5
         size = len(names) if whole or len(names) < 2 else int(self.rng.integers(1, len(names) + 1))
@@ -132,7 +132,7 @@ class _Writer:
         return list(claims.values())
 
     def _topic(self, claim: Claim) -> Hashable:
-        """What a relation is about; a prompt speaks of each topic once."""
+        """The things that a relation is about; a prompt has at most one relation about the same things."""
         match claim:
             case PairCount(name, _, _, under):
                 return name, under
@@ -181,7 +181,10 @@ class _Writer:
 
     @cached_property
     def _stays(self) -> Counter[tuple[str, int, int]]:
-        """(name, place, tier) to numbers, where a scene has more than one place to be; the floor is no place."""
+        """(name, place, tier) to the number of such objects.
+
+        Only places that have tiers or stand on another place count; the floor is no place.
+        """
         held, scene = self.scene.held, self.scene
         named = (held.place[held.place] >= 0) | (scene.tiers[held.place] > 0)
         there = np.flatnonzero((held.place >= 0) & named & ~scene.fixed)
@@ -228,6 +231,6 @@ class _Writer:
 
 
 def _goes_without_saying(claim: SideClaim) -> bool:
-    """Whether it repeats an order, as in "the first cup from the left is to the left of the second from the left"."""
+    """Whether the claim repeats an order: "the first cup from the left is to the left of the second from the left"."""
     words = {claim.subject.edge, claim.side, claim.landmark.edge}
     return claim.subject.name == claim.landmark.name and (words <= {"left", "right"} or words <= {"front", "back"})
