@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from rewards.base import RewardContext, RewardOutput, averages_objects, depends_on_batch
+from rewards.base import RewardContext, RewardOutput, averages_objects, declared_maximum, depends_on_batch
 from rewards.local_files import allowed_files, is_local, names_in
 from rewards.registry import (
     RewardInfo,
@@ -126,6 +126,10 @@ class SeededReward:
         from rewards.evaluation import evaluate_reward
 
         return evaluate_reward(self.reward, batch, replace(context, seed=self.seed), strict=True)
+
+    def maximum(self, slots: int, free_slots: int) -> float | None:
+        """The largest value that the reward declares; see :func:`rewards.base.declared_maximum`."""
+        return declared_maximum(self.reward, slots, free_slots)
 
 
 def run_reward(reward: Any, *, seed: int = 0, timeout: float = 60.0, memory: float = 1.0, workers: int = 0) -> Any:

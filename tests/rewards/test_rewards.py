@@ -18,6 +18,7 @@ from rewards import (
     resolve_reward,
 )
 from rewards.base import averages_objects, declared_maximum
+from rewards.isolation import run_reward
 from scene_envs import SceneBatch
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
@@ -176,7 +177,9 @@ def test_what_stands_outside_the_workspace_counts_for_nothing(table):
     ],
 )
 def test_the_largest_value_is_declared(reward, largest):
+    """By the reward itself, and as runs use it."""
     assert declared_maximum(resolve_reward(reward), 40, 39) == largest
+    assert declared_maximum(run_reward(reward), 40, 39) == largest
 
 
 @pytest.mark.parametrize(
