@@ -184,20 +184,24 @@ def _difference(prior: Adaptable, name: str, term: AdapterTerm, stored: StoredPr
     base = (stored.card.get("post_training") or {}).get("base", own)
     shapes, others = ({key: tensor.shape for key, tensor in each.items()} for each in (weights, stored.tensors))
     same = (stored.process, stored.scene_type.name, others) == (prior.process_name, prior.scene_type.name, shapes)
-    units = [(each.normalizer.state(), each.preconditioning.state()) for each in (stored, prior)]
     origin = ""
     if base != own:
         origin = f"was trained from {base!r}"
     elif not same:
         origin = "has another network or scene type"
-    elif units[0] != units[1]:
-        origin = "has another normaliser or preconditioning"
+    elif _moments(stored) != _moments(prior):
+        origin = "has another normalizer or preconditioning"
     if origin:
         raise InvalidInputError(
             f"adapter={str(term.path)!r}: this prior {origin}, so it cannot be added to {name!r}; give priors that "
             f"were trained from {name!r}, or load its own base prior with prior="
         )
     return {key: term.factor * (stored.tensors[key].to(value) - value) for key, value in weights.items()}
+
+
+def _moments(prior: Adaptable | StoredPrior) -> tuple[dict[str, Any], dict[str, Any]]:
+    """State of the normalizer and of the preconditioning, in whose units the weights read and write poses."""
+    return prior.normalizer.state(), prior.preconditioning.state()
 
 
 def _runs(term: AdapterTerm, stored: StoredPrior | None) -> list[dict[str, Any]]:

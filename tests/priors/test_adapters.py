@@ -177,7 +177,7 @@ def test_priors_that_were_not_trained_from_this_one_are_refused(tmp_path: Path) 
             ScenePrior.load(folder, adapter=other.save(tmp_path / "other"))
     rescaled = _fine_tuned(base, 1, "base")
     rescaled.preconditioning.std.mul_(2)
-    with pytest.raises(InvalidInputError, match="another normaliser or preconditioning"):
+    with pytest.raises(InvalidInputError, match="another normalizer or preconditioning"):
         ScenePrior.load(folder, adapter=rescaled.save(tmp_path / "rescaled"))
 
 
