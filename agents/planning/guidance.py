@@ -66,8 +66,13 @@ class Guidance:
     def __init__(self, weight: Weight, strength: float, begin: float) -> None:
         self.weight, self.strength, self.begin = weight, strength, begin
 
-    def __call__(self, step: int, steps: int, denoised: Callable[[], SceneBatch]) -> Tensor | None:
-        """(B, N, 3) gradient by translation, 1/m; None at a step without guidance."""
+    def __call__(self, step: int, steps: int, denoised: Callable[[], SceneBatch], std: Tensor) -> Tensor | None:
+        """(B, N, 3) m, shift of the denoised translations; None at a step without guidance.
+
+        Given x_t, x_0 is approximately normal around the denoised scene, with standard deviation ``std`` (3,), m. The
+        weight moves its mean by the variance times the gradient of the log-weight. This is exact if the gradient is
+        constant. No object moves by more than one standard deviation.
+        """
         if step < int(self.begin * steps) or not self.strength:
             return None
         batch = denoised()
@@ -75,4 +80,5 @@ class Guidance:
             translations = batch.translations.detach().clone().requires_grad_()
             total = self.weight(batch, translations).sum()
             (gradient,) = torch.autograd.grad(total, translations)
-        return self.strength * torch.nan_to_num(gradient)
+        deviations = std * (self.strength * torch.nan_to_num(gradient)).to(std)
+        return std * deviations / deviations.norm(dim=-1, keepdim=True).clamp(min=1.0)

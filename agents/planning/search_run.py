@@ -238,6 +238,7 @@ class _Run:
             workers=config.workers,
             prompt=config.prompt,
             guidance=config.guidance,
+            claim_guidance=config.claim_guidance,
         )
         journal = None
         if self.folder is not None:

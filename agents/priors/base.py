@@ -19,7 +19,9 @@ from agents.diffusion import (
 from agents.networks.count_conditioning import CountConditioning
 from agents.networks.text import Text
 from agents.priors.adapters import AdapterFacts
+from agents.priors.claim_guidance import ClaimGuidance
 from agents.priors.forward import Trainable
+from agents.priors.hooks import Hook, make_hook
 from agents.priors.inpainting import Inpainting
 from agents.priors.loading import Loadable
 from agents.priors.prompt_validation import check_prompts, no_text
@@ -178,8 +180,11 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
         slots: int | None = None,
         generator: Generator | None = None,
         eta: float = 1.0,
+        hook: Hook | None = None,
     ) -> Tensor:
         """``count`` denoised scenes x_0 (count, slots, D), normalised, from one batch; arguments as in :meth:`sample`.
+
+        ``hook`` is called at every step, before x_{t-1} is drawn.
 
         Priors that read prompts override it.
         """
@@ -187,7 +192,8 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
         x = self.initial(count, self.config.slots if slots is None else slots, generator)
         for step in range(len(table)):
             noise = torch.randn(x.shape, generator=generator, device=x.device)
-            x = self.transition(x, step, table, eta=eta).from_noise(noise)
+            reverse: ReverseStep = self.transition(x, step, table, eta=eta)
+            x = (reverse if hook is None else hook(step, x, reverse)).from_noise(noise)
         return x
 
     def sample(
@@ -196,6 +202,7 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
         *,
         prompt: str | Sequence[str] | None = None,
         guidance: float = 0.0,
+        claim_guidance: float = 0.0,
         num_steps: int = 50,
         slots: int | None = None,
         seed: int = 0,
@@ -209,6 +216,8 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
             prompt: what the scenes should hold, one text for all or one per scene; None for anything.
             guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional (Ho and Salimans 2022); it
                 needs a prompt.
+            claim_guidance: strength of the moves toward the claims of the prompt, see
+                :class:`~agents.priors.claim_guidance.ClaimGuidance`; 2 is a good choice. It needs a prompt.
             num_steps: denoiser evaluations per scene, 1..T.
             slots: slots per scene; more than trained is allowed.
             seed: of the torch generator; the same seed and batch size give the same scenes.
@@ -220,18 +229,29 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
             raise InvalidInputError(f"count={count}: ask for at least one scene")
         wide = self.config.slots if slots is None else slots
         prompts = check_prompts(
-            prompt, guidance, count, scene_type=self.scene_type, slots=wide, conditional=self.conditional
-        )
+            prompt, guidance, count, scene_type=self.scene_type, slots=wide, conditional=self.conditional,
+            claim_guidance=claim_guidance,
+        )  # fmt: skip
         generator = Generator(str(self._fixed.device)).manual_seed(seed)
         chunks = []
         for start in range(0, count, batch_size):
             texts = None if prompts is None else prompts[start : start + batch_size]
             size = min(batch_size, count - start)
             x0 = self.sample_tensor(
-                size, prompts=texts, guidance=guidance, num_steps=num_steps, slots=slots, generator=generator, eta=eta
-            )
+                size, prompts=texts, guidance=guidance, num_steps=num_steps, slots=slots, generator=generator, eta=eta,
+                hook=self._claim_hook(texts, claim_guidance, num_steps, wide),
+            )  # fmt: skip
             chunks.append(x0)
         return self.decode(torch.cat(chunks))
+
+    def _claim_hook(self, prompts: Sequence[str] | None, strength: float, num_steps: int, slots: int) -> Hook | None:
+        """Hook of a chain that samples whole scenes, moved toward the claims of ``prompts``."""
+        if prompts is None or not strength:
+            return None
+        moved = torch.ones(len(prompts), slots, 1, dtype=torch.bool)
+        moved[:, : len(self.scene_type.fixed)] = False
+        guides = [ClaimGuidance(prompts, self.scene_type, strength)]
+        return make_hook(self, self.step_table(num_steps), self.decode, moved, guides=guides)
 
     def decode(self, x: Tensor) -> SceneBatch:
         """Scenes from normalised x_0 (B, N, D); known entries take their exact values."""

@@ -20,7 +20,8 @@ from agents.networks.text import Text
 from agents.priors.base import ScenePrior
 from agents.priors.config import PriorConfig, current_names
 from agents.priors.forward import DenoiserOutput, NoisedScenes
-from agents.priors.inpainting import Hook, Start, draw_noise
+from agents.priors.hooks import Hook, Start
+from agents.priors.inpainting import draw_noise
 from agents.priors.observed_scenes import Noise
 from agents.priors.prompt_validation import no_text
 from agents.priors.rotation_codes import SceneCode

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Generator, Tensor
@@ -11,35 +11,15 @@ from torch import Generator, Tensor
 from agents.diffusion.reverse_steps import ReverseStep
 from agents.diffusion.step_tables import StepTable
 from agents.networks.text import Text
+from agents.priors.claim_guidance import ClaimGuidance
+from agents.priors.hooks import Guide, Hook, Start, Watch, make_hook
 from agents.priors.observed_scenes import Noise, ObservedScenes, check_mask, merge
 from agents.priors.prompt_validation import check_prompts
 from scene_envs.errors import InvalidInputError
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
-from scene_envs.scene import TRANSLATION, SceneBatch
+from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
-
-Hook = Callable[[int, Tensor, ReverseStep], ReverseStep]
-"""``(step, x_t, reverse) -> reverse``: called at every step before x_{t-1} is drawn; may change the rows of
-``reverse`` or shift it.
-"""
-Start = tuple[int, Tensor]
-"""A step of a chain, and x_t (B, N, D) at this step. The chain begins there instead of at x_T."""
-Guide = Callable[[int, int, Callable[[], SceneBatch]], Tensor | None]
-"""``(step, steps, denoised) -> gradient``: d log w / d translation (B, N, 3), 1/m, of a weight w of scenes.
-
-Scenes are then distributed as the prior times w. ``denoised`` is as for :data:`Watch`. If the gradient is None, the
-step is not changed.
-"""
-Watch = Callable[[int, int, Callable[[], SceneBatch]], Tensor | None]
-"""``(step, steps, denoised) -> rows``: called at the steps of the denoising; chooses the scenes that continue.
-
-``denoised()`` gives the B scenes that the network expects at this step. ``rows`` (B,) is the index of the scene that
-each place continues with, such as ``[0, 0, 2]``; if it is None, every scene continues in its own place.
-
-If a watch has a method ``start(steps)``, the chain begins at the :data:`Start` that the method returns, if any. If a
-watch has a method ``see(step, steps, x)``, the method is called with x_t (B, N, D) at every step.
-"""
 
 
 class Inpainting(ABC):
@@ -161,6 +141,7 @@ class Inpainting(ABC):
         *,
         prompt: str | Sequence[str] | None = None,
         guidance: float = 0.0,
+        claim_guidance: float = 0.0,
         num_steps: int = 50,
         generators: Sequence[Generator] | None = None,
         seed: int = 0,
@@ -179,6 +160,8 @@ class Inpainting(ABC):
                 category of each slot. Fixed welded slots are never regenerated.
             prompt: what the whole scenes should hold in the end, one text for all or one per scene; None for anything.
             guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional; it needs a prompt.
+            claim_guidance: strength of the moves toward the claims of the prompt, see
+                :class:`~agents.priors.claim_guidance.ClaimGuidance`; it needs a prompt.
             num_steps: denoiser evaluations of one pass, 1..T.
             generators: one per scene, so that a scene's result does not depend on its neighbours' noise.
             seed: used to make the generators when none are given.
@@ -186,7 +169,7 @@ class Inpainting(ABC):
                 Algorithm 1).
             watch: called at every step; chooses the scenes that continue. A scene may be replaced only by one with the
                 same rows of ``batch`` and ``mask``.
-            guide: gradient of a log-weight of scenes; moves the poses that are regenerated.
+            guide: moves the poses that are regenerated.
 
         Returns:
             Scenes on the device of ``batch``, whose unmasked entries are bit-identical to its own. Where the category
@@ -194,18 +177,27 @@ class Inpainting(ABC):
 
         Raises:
             InvalidInputError: a mask of the wrong shape or type, not one generator per scene, ``resample`` below 1, a
-                prompt for a prior that reads none, or guidance without a prompt.
+                prompt for a prior that reads none, guidance without a prompt, or ``claim_guidance`` below 0.
         """
         both = check_mask(batch, mask, generators, resample).to(batch.tensor.device)
         both[:, : len(self.scene_type.fixed)] = False
         slots = batch.tensor.shape[1]
         prompts = check_prompts(
-            prompt, guidance, len(batch), scene_type=self.scene_type, slots=slots, conditional=self.conditional
-        )
+            prompt, guidance, len(batch), scene_type=self.scene_type, slots=slots, conditional=self.conditional,
+            claim_guidance=claim_guidance,
+        )  # fmt: skip
         if generators is None:
             generators = [Generator().manual_seed(seed + i) for i in range(len(batch))]
         device, table = self.device, self.step_table(num_steps)
-        hook = self._hook(watch, guide, batch, both, table)
+        moved = both[..., :1]
+        guides = [guide] if guide is not None else []
+        if prompts is not None and claim_guidance:
+            guides.append(ClaimGuidance(prompts, self.scene_type, claim_guidance, moved.squeeze(-1)))
+
+        def scenes(x: Tensor) -> SceneBatch:
+            return merge(batch, self.decode(x).to(batch.tensor.device), both)
+
+        hook = make_hook(self, table, scenes, moved, watch=watch, guides=guides)
         begins = getattr(watch, "start", None)
         start = None if begins is None else begins(len(table))
         x = self.regenerate(
@@ -213,48 +205,13 @@ class Inpainting(ABC):
         )
         return merge(batch, self.decode(x).to(batch.tensor.device), both)
 
-    def _hook(
-        self, watch: Watch | None, guide: Guide | None, batch: SceneBatch, both: Tensor, table: StepTable
-    ) -> Hook | None:
-        see = getattr(watch, "see", None)
-
-        def hook(step: int, x: Tensor, reverse: ReverseStep) -> ReverseStep:
-            estimate = reverse.denoised
-            if see is not None:
-                see(step, len(table), x)
-            if estimate is None:
-                return reverse
-
-            def denoised() -> SceneBatch:
-                return merge(batch, self.decode(estimate).to(batch.tensor.device), both)
-
-            gradient = None if guide is None else guide(step, len(table), denoised)
-            if gradient is not None:
-                shift = self._tilted(step, table, gradient.to(self.device))
-                reverse = reverse.shifted(shift * both[..., :1].to(shift))
-            rows = None if watch is None else watch(step, len(table), denoised)
-            return reverse if rows is None else reverse.take(rows.to(self.device))
-
-        return None if watch is None and guide is None else hook
-
-    def _tilted(self, step: int, table: StepTable, gradient: Tensor) -> Tensor:
-        """(B, N, 3) shift of x_{t-1} that tilts p(x_0 | x_t) by a weight w.
-
-        Given x_t, x_0 is approximately normal around the denoised scene. The tilt moves its mean by its variance times
-        ``gradient`` (B, N, 3), that of ln w by metres. This is exact if the gradient is constant. No object moves by
-        more than one standard deviation.
-        """
-        weight, std = self.estimate(step, table)
-        scale = self.normalizer.scale[TRANSLATION].to(std)
-        deviations = torch.where(scale == 0, torch.zeros_like(scale), std / scale) * gradient
-        return weight * std * deviations / deviations.norm(dim=-1, keepdim=True).clamp(min=1.0)
-
     def complete(
         self,
         batch: SceneBatch,
         *,
         prompt: str | Sequence[str] | None = None,
         guidance: float = 0.0,
+        claim_guidance: float = 0.0,
         slots: int | None = None,
         fill: int | None = None,
         num_steps: int = 50,
@@ -267,7 +224,7 @@ class Inpainting(ABC):
         Args:
             batch: scenes.
             prompt: what the completed scenes should hold, one text for all or one per scene; None for anything.
-            guidance: w of classifier-free guidance, as in :meth:`sample`.
+            guidance, claim_guidance: as in :meth:`inpaint`.
             slots: slots of the result, at least those of ``batch``; None keeps them.
             fill: most objects to add to a scene; None for as many as there are empty slots.
             num_steps: denoiser evaluations per scene.
@@ -277,7 +234,10 @@ class Inpainting(ABC):
         if fill is not None and fill < 0:
             raise InvalidInputError(f"fill={fill}: give the most objects to add, at least 0, or None")
         open_slots = wide.is_empty if fill is None else wide.is_empty & (wide.is_empty.cumsum(dim=1) <= fill)
-        return self.inpaint(wide, open_slots, prompt=prompt, guidance=guidance, num_steps=num_steps, seed=seed)
+        return self.inpaint(
+            wide, open_slots, prompt=prompt, guidance=guidance, claim_guidance=claim_guidance, num_steps=num_steps,
+            seed=seed,
+        )  # fmt: skip
 
     def rearrange(
         self,
@@ -285,6 +245,7 @@ class Inpainting(ABC):
         *,
         prompt: str | Sequence[str] | None = None,
         guidance: float = 0.0,
+        claim_guidance: float = 0.0,
         num_steps: int = 50,
         seed: int = 0,
     ) -> SceneBatch:
@@ -294,7 +255,9 @@ class Inpainting(ABC):
         """
         free = batch.is_free
         mask = torch.stack([free, torch.zeros_like(free)], dim=-1)
-        return self.inpaint(batch, mask, prompt=prompt, guidance=guidance, num_steps=num_steps, seed=seed)
+        return self.inpaint(
+            batch, mask, prompt=prompt, guidance=guidance, claim_guidance=claim_guidance, num_steps=num_steps, seed=seed
+        )
 
 
 def draw_noise(like: Tensor, generators: Sequence[Generator] | Generator | None) -> Tensor:

@@ -34,7 +34,8 @@ from agents.networks.text import Text
 from agents.networks.text_encoders import text_config_from_state, text_encoder
 from agents.priors.base import UNIONS
 from agents.priors.config import MixedPriorConfig, current_names
-from agents.priors.inpainting import Hook, Start, draw_noise
+from agents.priors.hooks import Hook, Start
+from agents.priors.inpainting import draw_noise
 from agents.priors.mixed_training import TrainableMixedPrior
 from agents.priors.observed_scenes import Noise
 from scene_envs.errors import InvalidInputError, unknown_name
@@ -291,8 +292,10 @@ class MixedPrior(TrainableMixedPrior):
         slots: int | None = None,
         generator: Generator | None = None,
         eta: float = 1.0,
+        hook: Hook | None = None,
     ) -> Tensor:
         """``count`` denoised scenes x_0 (count, slots, D), as :meth:`ScenePrior.sample_tensor` describes."""
         text = None if prompts is None else self.encode_prompts(prompts)
         start = self.initial(count, self.config.slots if slots is None else slots, generator)
-        return self.run_chain(start, self.step_table(num_steps), generator, text=text, guidance=guidance, eta=eta)
+        table = self.step_table(num_steps)
+        return self.run_chain(start, table, generator, text=text, guidance=guidance, eta=eta, hook=hook)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 from scene_envs.datasets.prompts import parse_prompt
+from scene_envs.envs.settings import check_claim_guidance
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene_types import SceneType
 
@@ -14,8 +15,9 @@ Prompt = str | Sequence[str] | None
 
 
 def check_prompts(
-    prompt: Prompt, guidance: float, count: int, *, scene_type: SceneType, slots: int, conditional: bool
-) -> list[str] | None:
+    prompt: Prompt, guidance: float, count: int, *, scene_type: SceneType, slots: int, conditional: bool,
+    claim_guidance: float = 0.0,
+) -> list[str] | None:  # fmt: skip
     """One prompt per scene, or None for scenes without.
 
     Args:
@@ -25,13 +27,15 @@ def check_prompts(
         scene_type: of the scenes.
         slots: slots per scene.
         conditional: whether the prior reads prompts.
+        claim_guidance: strength of claim guidance.
 
     Raises:
-        InvalidInputError: a prior that reads no prompts, not one prompt per scene, guidance without a prompt, or more
-            objects asked for than there are slots.
+        InvalidInputError: a prior that reads no prompts, not one prompt per scene, guidance without a prompt, claim
+            guidance below 0, or more objects asked for than there are slots.
     """
     if not math.isfinite(guidance):
         raise InvalidInputError(f"guidance={guidance} must be a finite number; 0 follows the prompt as it is")
+    check_claim_guidance(prompt, claim_guidance)
     if prompt is None:
         check_guidance(prompt, guidance)
         return None

@@ -142,6 +142,7 @@ class SearchProblem:
         self.device = prior_device(self.prior)
         self.branching, self.max_depth, self.num_steps = chosen.branching, chosen.max_depth, chosen.num_steps
         self.num_actions, self.max_nfe = chosen.branching, chosen.max_nfe
+        self.claim_guidance = chosen.claim_guidance
         self.prior.step_table(self.num_steps)  # raises now, not later, if the prior has fewer steps
         self.prompting = EnvPrompts(self.prior, chosen.prompt, chosen.guidance, self.slots)
         self.prompt = self.prompting.draw(np.random.default_rng(0)) if self.prompting.given else None
@@ -264,6 +265,9 @@ class SearchProblem:
             how[role] = watch
         if reader is None or self.prompt is None:
             return self.prior.inpaint(batch, masks, **how).to("cpu")
+        if self.claim_guidance:
+            _check_takes(self.prior, "claim_guidance")
+            how["claim_guidance"] = self.claim_guidance
         return reader.inpaint(batch, masks, prompt=self.prompt, guidance=guidance, **how).to("cpu")
 
     def _values(self, batch: SceneBatch) -> Tensor:

@@ -106,6 +106,7 @@ class TreeSettings(EnvSettings):
         objective_scale: objective at which Φ is 1; None means the largest value that it declares, or else the number
             of free slots.
         max_nfe: denoiser evaluations per episode; None for any number.
+        claim_guidance: strength of the moves of objects toward what the prompt says of their places; needs a prompt.
 
     Raises:
         InvalidInputError: a value is outside what is accepted.
@@ -116,6 +117,7 @@ class TreeSettings(EnvSettings):
     max_depth: int = 10
     objective_scale: float | None = None
     max_nfe: int | None = None
+    claim_guidance: float = 0.0
 
     def __post_init__(self) -> None:
         self._check_at_least_one("branching")
@@ -123,6 +125,7 @@ class TreeSettings(EnvSettings):
         if self.max_nfe is not None:
             self._check_at_least_one("max_nfe")
         super().__post_init__()
+        check_claim_guidance(self.prompt, self.claim_guidance)
         if self.objective_scale is not None:
             self._check_positive("objective_scale")
         if self.prompt is not None and not isinstance(self.prompt, str):
@@ -157,6 +160,21 @@ class SearchMaskSettings(TreeSettings):
         super().__post_init__()
         if isinstance(self.masks, str) or not isinstance(self.masks, Sequence) or not self.masks:
             raise InvalidInputError(f"masks={self.masks!r}: give a list of at least one mask, as ['culprits', 'empty']")
+
+
+def check_claim_guidance(prompt: Any, strength: Any) -> None:
+    """Refuse claim guidance that is not a number from 0 on, or has no prompt; ``""`` is no prompt.
+
+    Raises:
+        InvalidInputError: names the value and the remedy.
+    """
+    if not _is_finite(strength) or strength < 0:
+        raise InvalidInputError(f"claim_guidance={_shown(strength)} must be a finite number from 0 on; 0 moves nothing")
+    if strength and not prompt:
+        raise InvalidInputError(
+            f"claim_guidance={strength:g} moves objects toward the claims of a prompt, and prompt={prompt!r} has none; "
+            "give prompt=, or leave claim_guidance=0"
+        )
 
 
 def _is_finite(number: Any) -> bool:

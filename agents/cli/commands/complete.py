@@ -33,6 +33,7 @@ def run(settings: CompleteConfig, run: Run) -> None:
         batch,
         prompt=settings.prompt,
         guidance=settings.guidance,
+        claim_guidance=settings.claim_guidance,
         slots=settings.slots,
         fill=settings.fill,
         num_steps=settings.num_steps,

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _SAMPLES, _PROMPTED = "scenes.safetensors", "prompted.safetensors"
 _NOT_PART = ("measures", "project", "fid_weights", "pictures", "workers", "device", "output")
 """Keys that change no figure of a group."""
-_OF_PROMPTS = {"prompt_count", "guidance"}
+_OF_PROMPTS = {"prompt_count", "guidance", "claim_guidance"}
 """Keys that change only the figures of the group ``prompts``."""
 
 
@@ -53,6 +53,7 @@ class EvaluateConfig(RealSceneKeys, OutputKeys):
         prompt_count: number of samples with prompts of held-out scenes, at most count; null takes count.
         num_steps: denoising steps per sample.
         guidance: weight of classifier-free guidance for the samples with prompts, 0 for none.
+        claim_guidance: strength of the moves of objects toward what their prompts say of their places, 0 for none.
         seed: seed of the samples, the real scenes and the classifiers.
         measures: all, or some of layout, physics, ready, fsd, novelty, prompts, classifier, renders, fid, written as
             layout or [layout, physics].
@@ -68,6 +69,7 @@ class EvaluateConfig(RealSceneKeys, OutputKeys):
     prompt_count: int | None = None
     num_steps: int = 50
     guidance: float = 0.0
+    claim_guidance: float = 0.0
     seed: int = 0
     measures: Any = "all"
     project: bool = True
@@ -142,7 +144,7 @@ def run(settings: EvaluateConfig, run: Run) -> None:
                     raise
                 results.skip(name, str(error))
             else:
-                results.add(name, {"prompt_guidance": settings.guidance, **figures} if name == "prompts" else figures)
+                results.add(name, {**_guidance(settings), **figures} if name == "prompts" else figures)
                 run.log(f"{name} measured in {time.perf_counter() - started:.1f} s")
     report = results.report(groups)
     write_text(run.directory / "metrics.md", report + "\n")
@@ -276,10 +278,17 @@ def _sample(prior: ScenePrior, settings: EvaluateConfig, prompts: list[str] | No
         settings.count if prompts is None else len(prompts),
         prompt=prompts,
         guidance=0.0 if prompts is None else settings.guidance,
+        claim_guidance=0.0 if prompts is None else settings.claim_guidance,
         num_steps=settings.num_steps,
         seed=settings.seed,
         batch_size=settings.batch_size,
     ).to("cpu")
+
+
+def _guidance(settings: EvaluateConfig) -> dict[str, float]:
+    """Figures that say how samples with prompts were guided."""
+    claims = {"prompt_claim_guidance": settings.claim_guidance} if settings.claim_guidance else {}
+    return {"prompt_guidance": settings.guidance, **claims}
 
 
 def _draw(samples: SceneBatch, count: int, run: Run) -> None:

@@ -31,6 +31,8 @@ class InpaintingConfig:
         count: number of scenes, from the first; null for all, or for 12 fresh samples.
         prompt: text that the whole scenes should match, for priors that read prompts; null for no prompt.
         guidance: weight of classifier-free guidance, 0 for none; needs a prompt.
+        claim_guidance: strength of the moves of objects toward what the prompt says of their places, 0 for none; 2 is a
+            good choice; needs a prompt.
         num_steps: denoising steps per scene.
         seed: seed of the noise.
         pictures: number of scenes in the galleries; 0 draws none.
@@ -43,6 +45,7 @@ class InpaintingConfig:
     count: int | None = None
     prompt: str | None = None
     guidance: float = 0.0
+    claim_guidance: float = 0.0
     num_steps: int = 50
     seed: int = 0
     pictures: int = 12

@@ -25,6 +25,8 @@ class SampleConfig(SamplingKeys, OutputKeys):
     Attributes:
         prior: a shipped name, or the folder of a prior or a run.
         count: number of scenes to draw.
+        claim_guidance: strength of the moves of objects toward what the prompt says of their places, 0 for none; 2 is a
+            good choice; needs a prompt.
         eta: scale of the noise of the Gaussian steps: 1 for the ancestral chain, 0 for a deterministic chain (DDIM).
         union: objects in a scene of a prior of several scene types: one_type (only objects of one type) or any.
         reward: reward that scores the samples for metrics.json; null for none.
@@ -38,6 +40,7 @@ class SampleConfig(SamplingKeys, OutputKeys):
 
     prior: str = "dimsum_table"
     count: int = 16
+    claim_guidance: float = 0.0
     eta: float = 1.0
     union: str = "one_type"
     reward: Any = named("feasible_objects", "reward")
@@ -78,6 +81,7 @@ def run(settings: SampleConfig, run: Run) -> None:
         settings.count,
         prompt=settings.prompt,
         guidance=settings.guidance,
+        claim_guidance=settings.claim_guidance,
         num_steps=settings.num_steps,
         eta=settings.eta,
         slots=settings.slots,

@@ -152,7 +152,7 @@ class SupportCount:
         """Compare with ``scene``."""
         holder = self.landmark.resolve(scene)
         members = scene.named(self.name) if holder >= 0 else np.empty(0, dtype=np.int64)
-        return _count(self, self.number, scene, members[_holder(scene, self.inside)[members] == holder])
+        return _count(self, self.number, scene, members[holders(scene, self.inside)[members] == holder])
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ class PairCount:
     def check(self, scene: SceneFacts) -> ClaimCheck:
         """Compare with ``scene``."""
         members = scene.named(self.name)
-        held = np.isin(_holder(scene, self.inside)[members], scene.named(self.under))
+        held = np.isin(holders(scene, self.inside)[members], scene.named(self.under))
         return _count(self, self.number, scene, members[held])
 
 
@@ -240,6 +240,9 @@ def _count(claim: Claim, number: int, scene: SceneFacts, members: NDArray[np.int
     return ClaimCheck(claim, number, found, score, tuple(int(slot) for slot in scene.slots[members]))
 
 
-def _holder(scene: SceneFacts, inside: bool) -> NDArray[np.int64]:
-    """(n,) the container that each thing lies in if ``inside``, else the thing it stands on; -1 for none."""
+def holders(scene: SceneFacts, inside: bool) -> NDArray[np.int64]:
+    """(n,) index of the container that each thing lies in if ``inside``, else of the thing it stands on; -1 for none.
+
+    An object in a container stands on nothing.
+    """
     return scene.held.inside if inside else np.where(scene.held.contained, -1, scene.held.support)

@@ -1,0 +1,281 @@
+"""Linear constraints on pairs of objects that the claims of a prompt put on the positions of a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from scene_envs.arrays import Array, Index, Mask
+from scene_envs.datasets.prompts.claims import (
+    Claim,
+    PairCount,
+    PlaceCount,
+    Reference,
+    SideClaim,
+    SupportCount,
+    holders,
+)
+from scene_envs.datasets.prompts.facts import SceneFacts
+
+_AXES = np.eye(3)
+_OFFSET, _CONE = 0.035, 1.3
+"""Least offset (m) to a side, and its ratio to the offset across: the claim holds from 0.02 m and 1 on."""
+_BESIDE = 0.02
+"""Distance (m) of things that are next to each other; the claim holds up to 0.05 m."""
+_ORDER = 0.02
+"""Least distance (m) between neighbours in an order."""
+_UPON = 0.15
+"""Share of a thing's width within which the centre of what stands on it lies, to each side of its own centre."""
+_WITHIN = 0.25
+"""The same for things in a container."""
+_LEVEL = 0.004
+"""Heights of two things in contact differ by at most this (m)."""
+_FLOOR, _FILL = 0.01, 0.03
+"""Thickness (m) of the bottom of a container; height (m) above it that the lowest things lie within."""
+_REST = 0.01
+"""Height (m) above a tier that things on it stand within."""
+_NEAR = 0.35
+"""A thing whose centre is within this share of the width of another may stand on it, given the error of positions."""
+_SHARP = 0.1
+"""Error (m) of positions below which single supports can be told apart."""
+_CLEAR = 1.1
+"""Things that no longer stand on each other are apart by this times their mean width."""
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """``low <= axis . (position of first - position of second) <= high``, in the frame of :class:`SceneFacts`.
+
+    Attributes:
+        first, second: indices of the two objects.
+        axis: (3,) unit vector.
+        low, high: bounds in m; infinite for none.
+        second_stays: whether the first object alone may be moved.
+    """
+
+    first: int
+    second: int
+    axis: Array
+    low: float
+    high: float = np.inf
+    second_stays: bool = False
+
+
+def constraints(claims: Sequence[Claim], scene: SceneFacts, tiers: Array, error: Array) -> list[Constraint]:
+    """Constraints under which ``claims`` hold, with as few changes of supports and orders as possible.
+
+    Claims on numbers of objects have none. Nor do claims whose things are not in the scene (yet).
+
+    Args:
+        claims: of one prompt.
+        scene: n objects, expected at their places.
+        tiers: (n, L) heights of the tiers of each object relative to its position, m, from the top; NaN for none.
+        error: (3,) standard deviation of the positions, m.
+    """
+    found: list[Constraint] = []
+    for claim in claims:
+        if isinstance(claim, SideClaim):
+            found += _side(claim, scene)
+        elif isinstance(claim, PairCount | SupportCount):
+            found += _support(claim, scene, error)
+        elif isinstance(claim, PlaceCount):
+            found += _place(claim, scene, tiers)
+    return found
+
+
+# -- references -------------------------------------------------------------------------------------
+
+
+def _refer(reference: Reference, scene: SceneFacts, taken: int = -1) -> tuple[int, list[Constraint]]:
+    """The object that a reference means, or is to mean, and the constraints that keep it in its order; -1 for none.
+
+    ``taken`` is the other thing of the claim. Where both references mean the same object, the neighbour in the order
+    takes its place.
+    """
+    members = scene.named(reference.name)
+    if reference.place is not None:
+        here = members[reference.place.holds(scene)[members]]
+        members = here if len(here) else members
+    if not reference.ordinal:
+        return (int(members[0]), []) if len(members) == 1 else (-1, [])
+    if not 2 <= len(members) >= reference.ordinal:
+        return -1, []
+    along = scene.along(reference.edge)
+    ranked = [int(index) for index in members[np.argsort(-along[members], kind="stable")]]
+    rank = reference.ordinal - 1
+    chosen = ranked[rank]
+    if chosen == taken:
+        neighbours = [ranked[other] for other in (rank - 1, rank + 1) if 0 <= other < len(ranked)]
+        chosen = min(neighbours, key=lambda other: abs(along[other] - along[taken]))
+    rest = [index for index in ranked if index != chosen]
+    axis = _direction(reference.edge)
+    order = [Constraint(rest[rank - 1], chosen, axis, _ORDER)] if rank else []
+    if rank < len(rest):
+        order.append(Constraint(chosen, rest[rank], axis, _ORDER))
+    return chosen, order
+
+
+def _direction(side: str) -> Array:
+    """(3,) unit vector of a side: of right, front and up, as positions."""
+    axis, sign = {"left": (0, -1.0), "right": (0, 1.0), "front": (1, 1.0), "back": (1, -1.0)}[side]
+    return sign * _AXES[axis]
+
+
+# -- claims -----------------------------------------------------------------------------------------
+
+
+def _side(claim: SideClaim, scene: SceneFacts) -> list[Constraint]:
+    first, order = _refer(claim.subject, scene)
+    second, more = _refer(claim.landmark, scene, first)
+    if first < 0 or second < 0 or first == second:
+        return []
+    order += more
+    if claim.side == "next":
+        reach = (_sizes(scene)[first] + _sizes(scene)[second]) / 2 + _BESIDE
+        return order + [Constraint(first, second, _AXES[axis], -reach[axis], reach[axis]) for axis in (0, 1)]
+    ahead = _direction(claim.side)
+    across = np.cross(_AXES[2], ahead)
+    cone = [(ahead + sign * _CONE * across) / np.hypot(1.0, _CONE) for sign in (-1.0, 1.0)]
+    return [*order, Constraint(first, second, ahead, _OFFSET), *(Constraint(first, second, a, 0.0) for a in cone)]
+
+
+def _support(claim: PairCount | SupportCount, scene: SceneFacts, error: Array) -> list[Constraint]:
+    if isinstance(claim, PairCount):
+        found: list[Constraint] = []
+        holding = scene.named(claim.under)
+    else:
+        landmark, found = _refer(claim.landmark, scene)
+        holding = np.array([landmark] if landmark >= 0 else [], dtype=np.int64)
+    members = scene.named(claim.name)
+    if not len(holding) or not len(members):
+        return []
+    holder = _likely_holders(claim, scene, members, holding, error)
+    held = np.isin(holder[members], holding)
+    missing = claim.number - int(held.sum())
+    stays, leaves = list(members[held]), []
+    if missing > 0:
+        for upper, lower in _closest_pairs(claim, scene, members[~held], holding, holder)[:missing]:
+            found += _on(upper, lower, claim.inside, scene)
+    elif missing < 0 and error[:2].max() < _SHARP:
+        bears = set(holder.tolist()) | set(scene.held.support.tolist())
+        stays.sort(key=lambda index: (index in bears, -_across(scene, index, holder[index])))
+        leaves, stays = stays[:-missing], stays[-missing:]
+    for index in stays if missing >= 0 or leaves else []:
+        found += _on(int(index), int(holder[index]), claim.inside, scene)
+    return found + [_apart(int(index), int(holder[index]), scene) for index in leaves]
+
+
+def _place(claim: PlaceCount, scene: SceneFacts, tiers: Array) -> list[Constraint]:
+    unit, found = _refer(claim.place.unit, scene)
+    members = scene.named(claim.name)
+    if unit < 0 or not len(members):
+        return []
+    levels = tiers[unit][np.isfinite(tiers[unit])]
+    tier = None if claim.place.tier is None else claim.place.tier % max(len(levels), 1)
+    if claim.place.tier is not None and not len(levels):
+        return []
+    here = claim.place.holds(scene)[members]
+    missing = claim.number - int(here.sum())
+    height = scene.boxes[:, 0, 2] - scene.positions[unit, 2]
+    if missing > 0:
+        distance = np.abs(height - levels[tier]) if tier is not None else _across(scene, np.arange(scene.count), unit)
+        for index in sorted(members[~here], key=lambda index: distance[index])[:missing]:
+            found += _at(int(index), unit, scene, None if tier is None else levels[tier])
+    elif missing < 0 and tier is not None and len(levels) > 1:
+        others = np.delete(levels, tier)
+        for index in sorted(members[here], key=lambda index: np.abs(height[index] - others).min())[:-missing]:
+            found += _at(int(index), unit, scene, others[np.abs(height[index] - others).argmin()])
+    return found
+
+
+# -- geometry ---------------------------------------------------------------------------------------
+
+
+def _sizes(scene: SceneFacts) -> Array:
+    """(n, 3) extent of each object, m."""
+    return np.asarray(scene.boxes[:, 1] - scene.boxes[:, 0])
+
+
+def _across(scene: SceneFacts, first: int | Index, second: int | Index) -> Array:
+    """Horizontal distances of two sets of objects, m."""
+    offset = scene.positions[first] - scene.positions[second]
+    return np.asarray(np.hypot(offset[..., 0], offset[..., 1]))
+
+
+def _below(scene: SceneFacts, index: int) -> float:
+    """Height of an object's position above its lowest point, m."""
+    return float(scene.positions[index, 2] - scene.boxes[index, 0, 2])
+
+
+def _on(upper: int, lower: int, inside: bool, scene: SceneFacts) -> Iterator[Constraint]:
+    """One thing stands on another, or lies in it."""
+    share = _WITHIN if inside else _UPON
+    for axis in (0, 1):
+        reach = share * _sizes(scene)[lower, axis]
+        yield Constraint(upper, lower, _AXES[axis], -reach, reach)
+    surface = scene.boxes[lower, 0, 2] + _FLOOR if inside else scene.boxes[lower, 1, 2]
+    height = surface + _below(scene, upper) - scene.positions[lower, 2]
+    yield Constraint(upper, lower, _AXES[2], height - _LEVEL, height + _LEVEL + (_FILL if inside else 0.0))
+
+
+def _apart(upper: int, lower: int, scene: SceneFacts) -> Constraint:
+    """What stood on a thing stands beside it."""
+    offset = (scene.positions[upper] - scene.positions[lower]) * (1.0, 1.0, 0.0)
+    length = np.linalg.norm(offset)
+    away = offset / length if length > 1e-4 else _AXES[0]
+    clear = _CLEAR * float(_sizes(scene)[[upper, lower], :2].mean())
+    return Constraint(upper, lower, away, clear, second_stays=True)
+
+
+def _at(index: int, unit: int, scene: SceneFacts, level: float | None) -> Iterator[Constraint]:
+    """A thing is within the outline of a piece of furniture, and at the height ``level`` above its position."""
+    low, high = scene.boxes[unit] - scene.positions[unit]
+    margin = _sizes(scene)[index] / 2
+    for axis in (0, 1):
+        least, most = low[axis] + margin[axis], high[axis] - margin[axis]
+        if least < most:
+            yield Constraint(index, unit, _AXES[axis], least, most, second_stays=True)
+    if level is not None:
+        height = level + _below(scene, index)
+        yield Constraint(index, unit, _AXES[2], height - _LEVEL, height + _REST, second_stays=True)
+
+
+def _likely_holders(
+    claim: PairCount | SupportCount, scene: SceneFacts, members: Index, holding: Index, error: Array
+) -> Index:
+    """(n,) what holds each object; for ``members``, also what may hold them given the error of positions."""
+    holder = holders(scene, claim.inside).copy()
+    if claim.inside or error[:2].max() >= _SHARP:
+        return holder
+    reach = _NEAR * _sizes(scene)[holding, :2].max(axis=1)
+    for index in members[~np.isin(holder[members], holding)]:
+        gap = np.abs(scene.boxes[index, 0, 2] - scene.boxes[holding, 1, 2])
+        distance = _across(scene, index, holding)
+        likely: Mask = (distance < reach) & (gap < max(0.01, 1.5 * error[2])) & (holding != index)
+        if likely.any():
+            holder[index] = holding[np.where(likely, distance, np.inf).argmin()]
+    return holder
+
+
+def _closest_pairs(
+    claim: PairCount | SupportCount, scene: SceneFacts, free: Index, holding: Index, holder: Index
+) -> list[tuple[int, int]]:
+    """Pairs of a thing that nothing of ``holding`` holds and one that may hold it, the closest ones first.
+
+    Every thing is in one pair at most. Only containers, and the landmark of a claim, hold several.
+    """
+    one_each = isinstance(claim, PairCount) and not claim.inside
+    occupied = set(holder.tolist()) | set(scene.held.support[~scene.held.contained].tolist()) if one_each else set()
+    ranked = sorted(
+        (float(_across(scene, upper, lower)), int(upper), int(lower))
+        for upper in free
+        for lower in holding
+        if upper != lower and lower not in occupied and holder[lower] != upper and not scene.carries(upper, lower)
+    )
+    pairs: list[tuple[int, int]] = []
+    for _, upper, lower in ranked:
+        if all(upper != other and not (one_each and lower == under) for other, under in pairs):
+            pairs.append((upper, lower))
+    return pairs
