@@ -40,8 +40,14 @@ _NEAR = 0.35
 """A thing whose centre is within this share of the width of another may stand on it, given the error of positions."""
 _SHARP = 0.1
 """Error (m) of positions below which single supports can be told apart."""
+_STOREY = 0.2
+"""Difference of the heights (m) of two things that may stand on each other."""
 _CLEAR = 1.1
 """Things that no longer stand on each other are apart by this times their mean width."""
+_SPOT = 0.03
+"""They come within this distance (m) of the chosen place."""
+_OFF = 10.0
+"""A place outside the furniture counts as less roomy by this times its distance."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +69,20 @@ class Constraint:
     second_stays: bool = False
 
 
-def constraints(claims: Sequence[Claim], scene: SceneFacts, tiers: Array, error: Array) -> list[Constraint]:
+@dataclass(frozen=True)
+class Surfaces:
+    """Heights of the surfaces of n objects that carry others, relative to the positions of :class:`SceneFacts`, m.
+
+    Attributes:
+        top: (n,) of the upper side at the middle; of the rim of a hollow thing.
+        tiers: (n, L) of the tiers, from the top; NaN for none.
+    """
+
+    top: Array
+    tiers: Array
+
+
+def constraints(claims: Sequence[Claim], scene: SceneFacts, surfaces: Surfaces, error: Array) -> list[Constraint]:
     """Constraints under which ``claims`` hold, with as few changes of supports and orders as possible.
 
     Claims on numbers of objects have none. Nor do claims whose things are not in the scene (yet).
@@ -71,7 +90,7 @@ def constraints(claims: Sequence[Claim], scene: SceneFacts, tiers: Array, error:
     Args:
         claims: of one prompt.
         scene: n objects, expected at their places.
-        tiers: (n, L) heights of the tiers of each object relative to its position, m, from the top; NaN for none.
+        surfaces: of these objects.
         error: (3,) standard deviation of the positions, m.
     """
     found: list[Constraint] = []
@@ -79,9 +98,9 @@ def constraints(claims: Sequence[Claim], scene: SceneFacts, tiers: Array, error:
         if isinstance(claim, SideClaim):
             found += _side(claim, scene)
         elif isinstance(claim, PairCount | SupportCount):
-            found += _support(claim, scene, error)
+            found += _support(claim, scene, surfaces, error)
         elif isinstance(claim, PlaceCount):
-            found += _place(claim, scene, tiers)
+            found += _place(claim, scene, surfaces.tiers)
     return found
 
 
@@ -141,7 +160,7 @@ def _side(claim: SideClaim, scene: SceneFacts) -> list[Constraint]:
     return [*order, Constraint(first, second, ahead, _OFFSET), *(Constraint(first, second, a, 0.0) for a in cone)]
 
 
-def _support(claim: PairCount | SupportCount, scene: SceneFacts, error: Array) -> list[Constraint]:
+def _support(claim: PairCount | SupportCount, scene: SceneFacts, surfaces: Surfaces, error: Array) -> list[Constraint]:
     if isinstance(claim, PairCount):
         found: list[Constraint] = []
         holding = scene.named(claim.under)
@@ -157,14 +176,16 @@ def _support(claim: PairCount | SupportCount, scene: SceneFacts, error: Array) -
     stays, leaves = list(members[held]), []
     if missing > 0:
         for upper, lower in _closest_pairs(claim, scene, members[~held], holding, holder)[:missing]:
-            found += _on(upper, lower, claim.inside, scene)
+            found += _on(upper, lower, claim.inside, scene, surfaces)
     elif missing < 0 and error[:2].max() < _SHARP:
         bears = set(holder.tolist()) | set(scene.held.support.tolist())
         stays.sort(key=lambda index: (index in bears, -_across(scene, index, holder[index])))
         leaves, stays = stays[:-missing], stays[-missing:]
     for index in stays if missing >= 0 or leaves else []:
-        found += _on(int(index), int(holder[index]), claim.inside, scene)
-    return found + [_apart(int(index), int(holder[index]), scene) for index in leaves]
+        found += _on(int(index), int(holder[index]), claim.inside, scene, surfaces)
+    for index in leaves:
+        found += _beside(int(index), int(holder[index]), scene)
+    return found
 
 
 def _place(claim: PlaceCount, scene: SceneFacts, tiers: Array) -> list[Constraint]:
@@ -209,24 +230,42 @@ def _below(scene: SceneFacts, index: int) -> float:
     return float(scene.positions[index, 2] - scene.boxes[index, 0, 2])
 
 
-def _on(upper: int, lower: int, inside: bool, scene: SceneFacts) -> Iterator[Constraint]:
+def _on(upper: int, lower: int, inside: bool, scene: SceneFacts, surfaces: Surfaces) -> Iterator[Constraint]:
     """One thing stands on another, or lies in it."""
     share = _WITHIN if inside else _UPON
     for axis in (0, 1):
         reach = share * _sizes(scene)[lower, axis]
         yield Constraint(upper, lower, _AXES[axis], -reach, reach)
-    surface = scene.boxes[lower, 0, 2] + _FLOOR if inside else scene.boxes[lower, 1, 2]
-    height = surface + _below(scene, upper) - scene.positions[lower, 2]
+    surface = _FLOOR - _below(scene, lower) if inside else surfaces.top[lower]
+    height = surface + _below(scene, upper)
     yield Constraint(upper, lower, _AXES[2], height - _LEVEL, height + _LEVEL + (_FILL if inside else 0.0))
 
 
-def _apart(upper: int, lower: int, scene: SceneFacts) -> Constraint:
-    """What stood on a thing stands beside it."""
-    offset = (scene.positions[upper] - scene.positions[lower]) * (1.0, 1.0, 0.0)
-    length = np.linalg.norm(offset)
-    away = offset / length if length > 1e-4 else _AXES[0]
+def _beside(upper: int, lower: int, scene: SceneFacts) -> Iterator[Constraint]:
+    """What stands on a thing comes to stand beside it, where most room is."""
+    base = lower
+    while (below := int(scene.held.support[base])) >= 0 and not scene.fixed[below]:
+        base = below
+    target = _roomiest(upper, lower, scene) - scene.positions[lower, :2]
+    for axis in (0, 1):
+        yield Constraint(upper, lower, _AXES[axis], target[axis] - _SPOT, target[axis] + _SPOT, second_stays=True)
+    height = scene.boxes[base, 0, 2] + _below(scene, upper) - scene.positions[lower, 2]
+    yield Constraint(upper, lower, _AXES[2], height - _LEVEL, height + _LEVEL, second_stays=True)
+
+
+def _roomiest(upper: int, lower: int, scene: SceneFacts) -> Array:
+    """(2,) place around ``lower``, on the same furniture, that is farthest from all other things."""
     clear = _CLEAR * float(_sizes(scene)[[upper, lower], :2].mean())
-    return Constraint(upper, lower, away, clear, second_stays=True)
+    angles = np.arange(16) * np.pi / 8
+    places = scene.positions[lower, :2] + clear * np.stack([np.cos(angles), np.sin(angles)], axis=1)  # (16, 2)
+    others = ~scene.fixed & (np.arange(scene.count) != upper) & (np.arange(scene.count) != lower)
+    offsets = places[:, None] - scene.positions[None, others, :2]
+    room = np.hypot(offsets[..., 0], offsets[..., 1]).min(axis=1, initial=clear)
+    unit = int(scene.held.place[lower])
+    if unit >= 0:
+        low, high = scene.boxes[unit, 0, :2], scene.boxes[unit, 1, :2]
+        room -= np.maximum(low - places, places - high).max(axis=1).clip(min=0.0) * _OFF
+    return np.asarray(places[room.argmax()])
 
 
 def _at(index: int, unit: int, scene: SceneFacts, level: float | None) -> Iterator[Constraint]:
@@ -245,17 +284,22 @@ def _at(index: int, unit: int, scene: SceneFacts, level: float | None) -> Iterat
 def _likely_holders(
     claim: PairCount | SupportCount, scene: SceneFacts, members: Index, holding: Index, error: Array
 ) -> Index:
-    """(n,) what holds each object; for ``members``, also what may hold them given the error of positions."""
+    """(n,) what holds each object; for ``members`` not held by ``holding``, what may do so given the error.
+
+    While heights are uncertain, a thing is taken to stand on the highest of the things below its middle.
+    """
     holder = holders(scene, claim.inside).copy()
     if claim.inside or error[:2].max() >= _SHARP:
         return holder
-    reach = _NEAR * _sizes(scene)[holding, :2].max(axis=1)
+    reach = _NEAR * _sizes(scene)[:, :2].max(axis=1)
+    height = scene.boxes[:, 0, 2]
     for index in members[~np.isin(holder[members], holding)]:
-        gap = np.abs(scene.boxes[index, 0, 2] - scene.boxes[holding, 1, 2])
-        distance = _across(scene, index, holding)
-        likely: Mask = (distance < reach) & (gap < max(0.01, 1.5 * error[2])) & (holding != index)
-        if likely.any():
-            holder[index] = holding[np.where(likely, distance, np.inf).argmin()]
+        above = height[index] - height
+        below: Mask = (_across(scene, index, np.arange(scene.count)) < reach) & (0.0 < above) & (above < _STOREY)
+        below[index] = False
+        if below.any():
+            nearest = int(np.where(below, above, np.inf).argmin())
+            holder[index] = nearest if nearest in holding else holder[index]
     return holder
 
 

@@ -10,7 +10,7 @@ import torch
 from scipy.special import log_ndtr, ndtr
 from torch import Tensor
 
-from agents.priors.claim_constraints import Constraint, constraints
+from agents.priors.claim_constraints import Constraint, Surfaces, constraints
 from scene_envs.arrays import Array, Mask
 from scene_envs.assets.support_shapes import library_shapes
 from scene_envs.datasets.prompts import Tolerances, parse_prompt, scene_facts
@@ -23,6 +23,10 @@ from scene_envs.supports import CONTACT, LARGEST_CONTACT
 
 _FINEST = 0.02
 """Error (m) of positions below which nothing is moved: the denoising that is left separates objects again."""
+_SHALLOW = 0.02
+"""Depth (m) of a plate: up to it, things stand on the middle of a thing and not on its rim."""
+_UPRIGHT = 0.85
+"""Cosine of the tilt up to which a thing carries others on its upper side."""
 
 
 class ClaimGuidance:
@@ -71,7 +75,7 @@ class ClaimGuidance:
         moves = np.zeros((*batch.tensor.shape[:2], 3))
         for row, (claims, scene) in enumerate(zip(self._claims, facts, strict=True)):
             if claims and scene.count:
-                wanted = constraints(claims, scene, _tiers(batch, row, scene), error)
+                wanted = constraints(claims, scene, _surfaces(batch, row, scene), error)
                 moves[row, scene.slots] = self._moves(wanted, scene, error, self._free(batch, row, scene)) @ self._axes
         return torch.as_tensor(moves, dtype=batch.tensor.dtype, device=std.device)
 
@@ -87,17 +91,17 @@ class ClaimGuidance:
         for constraint in wanted:
             first = _without(carried, constraint.first, constraint.second)
             second = _without(carried, constraint.second, constraint.first)
-            if constraint.second_stays:
-                second = np.zeros_like(second)
-            sides = [(who, sign) for who, sign in ((first, 1.0), (second, -1.0)) if (who & free).any()]
+            sides = [(who & free, sign) for who, sign in ((first, 1.0), (second, -1.0)) if (who & free).any()]
+            uncertain = len(sides)
+            sides = [side for side in sides if side[1] > 0] if constraint.second_stays else sides
             if not sides:
                 continue
             offset = scene.positions[constraint.first] - scene.positions[constraint.second]
-            spread = np.sqrt(2.0) * float(np.linalg.norm(constraint.axis * error))
+            spread = np.sqrt(uncertain) * float(np.linalg.norm(constraint.axis * error))
             slope = probability_slope(float(constraint.axis @ offset), constraint.low, constraint.high, spread)
-            step = 2.0 / len(sides) * self.strength * slope * error**2 * constraint.axis
+            step = uncertain / len(sides) * self.strength * slope * error**2 * constraint.axis
             for who, sign in sides:
-                moves[who & free] += sign * step
+                moves[who] += sign * step
         return moves
 
 
@@ -142,12 +146,17 @@ def _without(carried: Mask, who: int, other: int) -> Mask:
     return moving
 
 
-def _tiers(batch: SceneBatch, row: int, scene: SceneFacts) -> Array:
-    """(n, L) heights of the tiers of each object relative to its position, m; NaN for none."""
+def _surfaces(batch: SceneBatch, row: int, scene: SceneFacts) -> Surfaces:
+    """Surfaces of the objects of one scene that carry others."""
+    shapes = library_shapes(batch.scene_type.library)
     categories = batch.categories[row].numpy()[scene.slots]
-    heights = batch.translations[row, :, 2].double().numpy()[scene.slots]
-    tiers = library_shapes(batch.scene_type.library).tiers[categories]
-    return np.asarray(tiers + (heights - scene.positions[:, 2])[:, None])
+    origin = batch.translations[row, :, 2].double().numpy()[scene.slots] - scene.positions[:, 2]
+    upright = batch.rotations[row, :, 2, 2].numpy()[scene.slots] > _UPRIGHT
+    middle = shapes.top[shapes.cells(categories, np.zeros((len(categories), 3)))]
+    highest = scene.boxes[:, 1, 2] - scene.positions[:, 2]
+    flat = upright & (middle + origin > highest - _SHALLOW)  # not so of a hollow thing, whose rim carries others
+    top = np.where(flat, middle + origin, highest)
+    return Surfaces(top, shapes.tiers[categories] + origin[:, None])
 
 
 @lru_cache(maxsize=4096)
