@@ -173,10 +173,10 @@ def _check_prompt(settings: Any) -> None:
         from agents.post_training.config import check_prompt
 
         check_prompt(prompt, guidance)
-    if (strength := getattr(settings, "claim_guidance", 0.0)) and hasattr(settings, "prompt"):
+    if strength := getattr(settings, "claim_guidance", 0.0):
         from scene_envs.envs.settings import check_claim_guidance
 
-        check_claim_guidance(prompt, strength)
+        check_claim_guidance(prompt if hasattr(settings, "prompt") else "those of real scenes", strength)
 
 
 def _dotted(settings: Any, key: str) -> Any:

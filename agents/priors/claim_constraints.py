@@ -295,7 +295,7 @@ def _likely_holders(
     height = scene.boxes[:, 0, 2]
     for index in members[~np.isin(holder[members], holding)]:
         above = height[index] - height
-        below: Mask = (_across(scene, index, np.arange(scene.count)) < reach) & (0.0 < above) & (above < _STOREY)
+        below: Mask = (_across(scene, index, np.arange(scene.count)) < reach) & (above > 0.0) & (above < _STOREY)
         below[index] = False
         if below.any():
             nearest = int(np.where(below, above, np.inf).argmin())

@@ -189,6 +189,20 @@ def test_search_inpaints_under_the_prompt(reader):
     assert (first.evaluations, guided.evaluations) == (6, 4)  # two roots and a child; one root with both branches
 
 
+def test_search_hands_on_claim_guidance(reader, monkeypatch):
+    told, inpaint = [], reader.inpaint
+
+    def listening(*args, claim_guidance=0.0, **kwargs):
+        told.append(claim_guidance)
+        return inpaint(*args, claim_guidance=claim_guidance, **kwargs)
+
+    monkeypatch.setattr(reader, "inpaint", listening)
+    for strength in (0.0, 2.0):
+        settings = {"objective": "prompt_match", "num_steps": 2, "claim_guidance": strength}
+        assert SearchProblem(prior=reader, prompt=PROMPTS[0], **settings).root(seed=3).valid
+    assert told == [0.0, 2.0]
+
+
 def test_search_shows_its_prompt(reader):
     kwargs = {"prior": reader, "objective": "prompt_match", "num_steps": 2, "max_depth": 2, "objective_scale": 1.0}
     env = gym.make(SEARCH, prompt=PROMPTS[0], **kwargs)
@@ -203,5 +217,9 @@ def test_search_refuses_what_it_cannot_follow(reader, prior):
         gym.make(SEARCH, prior=prior, prompt=PROMPTS[0])
     with pytest.raises(InvalidInputError, match="strengthens a prompt"):
         gym.make(SEARCH, prior=reader, guidance=1.0)
+    with pytest.raises(InvalidInputError, match=r"claim_guidance=2 moves objects .* prompt=None has none"):
+        gym.make(SEARCH, prior=reader, claim_guidance=2.0)
+    with pytest.raises(InvalidInputError, match="claim_guidance=-1 must be a finite number from 0 on"):
+        gym.make(SEARCH, prior=reader, prompt=PROMPTS[0], claim_guidance=-1)
     with pytest.raises(InvalidInputError, match="one text"):
         gym.make(SEARCH, prior=reader, prompt=PROMPTS)

@@ -1,0 +1,86 @@
+"""Prompts on relations that samples follow, with and without claim guidance, as a table.
+
+python benchmarks/claim_guidance.py [--priors dimsum_table,living_room_shelf_feasible] [--count 128] [--strength 2]
+
+The prompts describe the relations of scenes of the grammar. Both rows of a prior have the same prompts and the same
+noise. With ``--picture PATH`` the scenes of the first prior are drawn: without guidance above, with guidance below.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+
+from agents import ScenePrior
+from rewards import RewardContext, make_reward
+from scene_envs import SceneBatch, get_grammar
+from scene_envs.datasets import describe, parse_prompt, scene_facts
+from scene_envs.datasets.prompts.claims import SideClaim
+from scene_envs.render import gallery, picture_camera, render
+
+CLASSES = ("PlaceCount", "SupportCount", "PairCount", "side", "next")
+_SHOWN = 4
+
+
+def main() -> None:
+    """Sample, print the table and draw the picture."""
+    arguments = _arguments()
+    print("| prior | claim guidance | relations followed | at places | on or in one thing | on things of a name | sides |"
+          " next to | feasible share | scenes per second |")  # fmt: skip
+    print("|---" * 10 + "|")
+    for number, name in enumerate(arguments.priors.split(",")):
+        prior = ScenePrior.load(name)
+        scenes = get_grammar(prior.scene_type.name).sample(np.random.default_rng(7), arguments.count)
+        prompts = describe(scenes, np.random.default_rng(7), kinds=["relations"])
+        drawn = []
+        for strength in (0.0, arguments.strength):
+            started = time.process_time()
+            batch = prior.sample(
+                arguments.count, prompt=prompts, guidance=arguments.guidance, claim_guidance=strength, seed=3
+            )
+            print(f"| `{name}` | {strength:g} | {_row(batch, prompts, time.process_time() - started)} |", flush=True)
+            drawn.append(batch[:_SHOWN])
+        if number == 0 and arguments.picture is not None:
+            print("\n".join(prompts[:_SHOWN]))
+            _draw(drawn, arguments.picture)
+
+
+def _row(batch: SceneBatch, prompts: list[str], seconds: float) -> str:
+    held: dict[str, list[bool]] = defaultdict(list)
+    followed = []
+    for prompt, facts in zip(prompts, scene_facts(batch), strict=True):
+        checks = parse_prompt(prompt, batch.scene_type).check(facts)
+        followed.append(all(check.holds for check in checks))
+        for check in checks:
+            claim = check.claim
+            side = isinstance(claim, SideClaim)
+            kind = ("next" if claim.side == "next" else "side") if side else type(claim).__name__
+            held[kind].append(check.holds)
+    parts = [f"{np.mean(held[kind]):.0%} of {len(held[kind])}" if held[kind] else "" for kind in CLASSES]
+    output = make_reward("feasible_share")(batch, RewardContext())
+    share = float(output.value.mean())
+    return " | ".join([f"{np.mean(followed):.0%}", *parts, f"{share:.1%}", f"{len(batch) / seconds:.1f}"])
+
+
+def _draw(drawn: list[SceneBatch], path: Path) -> None:
+    scenes = SceneBatch.concatenate([batch[index : index + 1] for batch in drawn for index in range(len(batch))])
+    camera = picture_camera(scenes.scene_type.name, 400, 300)
+    gallery(render(scenes, camera=camera, width=400, height=300), columns=_SHOWN).save(path)
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--priors", default="dimsum_table", help="names or folders of priors, joined by commas")
+    parser.add_argument("--count", type=int, default=128, help="prompts of each prior")
+    parser.add_argument("--strength", type=float, default=2.0, help="claim_guidance of the second row")
+    parser.add_argument("--guidance", type=float, default=0.5, help="weight of classifier-free guidance")
+    parser.add_argument("--picture", type=Path, default=None, help="picture of the first prior's scenes")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()
