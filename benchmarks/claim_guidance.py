@@ -22,6 +22,10 @@ from scene_envs.datasets import describe, parse_prompt, scene_facts
 from scene_envs.datasets.prompts.claims import SideClaim
 from scene_envs.render import gallery, picture_camera, render
 
+_COLUMNS = (
+    "prior", "claim guidance", "relations followed", "at places", "on or in one thing", "on things of a name", "sides",
+    "next to", "feasible share", "scenes per second",
+)  # fmt: skip
 CLASSES = ("PlaceCount", "SupportCount", "PairCount", "side", "next")
 _SHOWN = 4
 
@@ -29,9 +33,8 @@ _SHOWN = 4
 def main() -> None:
     """Sample, print the table and draw the picture."""
     arguments = _arguments()
-    print("| prior | claim guidance | relations followed | at places | on or in one thing | on things of a name | sides |"
-          " next to | feasible share | scenes per second |")  # fmt: skip
-    print("|---" * 10 + "|")
+    print("| " + " | ".join(_COLUMNS) + " |")
+    print("|---" * len(_COLUMNS) + "|")
     for number, name in enumerate(arguments.priors.split(",")):
         prior = ScenePrior.load(name)
         scenes = get_grammar(prior.scene_type.name).sample(np.random.default_rng(7), arguments.count)

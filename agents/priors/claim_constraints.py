@@ -96,31 +96,36 @@ def constraints(claims: Sequence[Claim], scene: SceneFacts, surfaces: Surfaces, 
     found: list[Constraint] = []
     for claim in claims:
         if isinstance(claim, SideClaim):
-            found += _side(claim, scene)
+            found += _side(claim, scene, surfaces)
         elif isinstance(claim, PairCount | SupportCount):
             found += _support(claim, scene, surfaces, error)
         elif isinstance(claim, PlaceCount):
-            found += _place(claim, scene, surfaces.tiers)
+            found += _place(claim, scene, surfaces)
     return found
 
 
 # -- references -------------------------------------------------------------------------------------
 
 
-def _refer(reference: Reference, scene: SceneFacts, taken: int = -1) -> tuple[int, list[Constraint]]:
-    """The object that a reference means, or is to mean, and the constraints that keep it in its order; -1 for none.
+def _refer(
+    reference: Reference, scene: SceneFacts, surfaces: Surfaces, taken: int = -1
+) -> tuple[int, list[Constraint]]:
+    """The object that a reference means, -1 for none, and the constraints under which it means this one.
 
-    ``taken`` is the other thing of the claim. Where both references mean the same object, the neighbour in the order
-    takes its place.
+    Things that are counted at a place come there as far as the reference needs them. ``taken`` is the other thing of
+    the claim. Where both references mean the same object, its neighbour in the order takes its place.
     """
-    members = scene.named(reference.name)
+    members, found = scene.named(reference.name), []
     if reference.place is not None:
         here = members[reference.place.holds(scene)[members]]
-        members = here if len(here) else members
+        needed = max(2, reference.ordinal) if reference.ordinal else 1
+        if len(here) < needed or (len(here) > 1 and not reference.ordinal):
+            found = _place(PlaceCount(reference.name, needed, reference.place), scene, surfaces)
+        members = here
     if not reference.ordinal:
-        return (int(members[0]), []) if len(members) == 1 else (-1, [])
+        return (int(members[0]) if len(members) == 1 else -1), found
     if not 2 <= len(members) >= reference.ordinal:
-        return -1, []
+        return -1, found
     along = scene.along(reference.edge)
     ranked = [int(index) for index in members[np.argsort(-along[members], kind="stable")]]
     rank = reference.ordinal - 1
@@ -130,10 +135,11 @@ def _refer(reference: Reference, scene: SceneFacts, taken: int = -1) -> tuple[in
         chosen = min(neighbours, key=lambda other: abs(along[other] - along[taken]))
     rest = [index for index in ranked if index != chosen]
     axis = _direction(reference.edge)
-    order = [Constraint(rest[rank - 1], chosen, axis, _ORDER)] if rank else []
+    if rank:
+        found.append(Constraint(rest[rank - 1], chosen, axis, _ORDER))
     if rank < len(rest):
-        order.append(Constraint(chosen, rest[rank], axis, _ORDER))
-    return chosen, order
+        found.append(Constraint(chosen, rest[rank], axis, _ORDER))
+    return chosen, found
 
 
 def _direction(side: str) -> Array:
@@ -145,19 +151,19 @@ def _direction(side: str) -> Array:
 # -- claims -----------------------------------------------------------------------------------------
 
 
-def _side(claim: SideClaim, scene: SceneFacts) -> list[Constraint]:
-    first, order = _refer(claim.subject, scene)
-    second, more = _refer(claim.landmark, scene, first)
+def _side(claim: SideClaim, scene: SceneFacts, surfaces: Surfaces) -> list[Constraint]:
+    first, found = _refer(claim.subject, scene, surfaces)
+    second, more = _refer(claim.landmark, scene, surfaces, first)
+    found += more
     if first < 0 or second < 0 or first == second:
-        return []
-    order += more
+        return found
     if claim.side == "next":
         reach = (_sizes(scene)[first] + _sizes(scene)[second]) / 2 + _BESIDE
-        return order + [Constraint(first, second, _AXES[axis], -reach[axis], reach[axis]) for axis in (0, 1)]
+        return found + [Constraint(first, second, _AXES[axis], -reach[axis], reach[axis]) for axis in (0, 1)]
     ahead = _direction(claim.side)
     across = np.cross(_AXES[2], ahead)
     cone = [(ahead + sign * _CONE * across) / np.hypot(1.0, _CONE) for sign in (-1.0, 1.0)]
-    return [*order, Constraint(first, second, ahead, _OFFSET), *(Constraint(first, second, a, 0.0) for a in cone)]
+    return [*found, Constraint(first, second, ahead, _OFFSET), *(Constraint(first, second, a, 0.0) for a in cone)]
 
 
 def _support(claim: PairCount | SupportCount, scene: SceneFacts, surfaces: Surfaces, error: Array) -> list[Constraint]:
@@ -165,7 +171,7 @@ def _support(claim: PairCount | SupportCount, scene: SceneFacts, surfaces: Surfa
         found: list[Constraint] = []
         holding = scene.named(claim.under)
     else:
-        landmark, found = _refer(claim.landmark, scene)
+        landmark, found = _refer(claim.landmark, scene, surfaces)
         holding = np.array([landmark] if landmark >= 0 else [], dtype=np.int64)
     members = scene.named(claim.name)
     if not len(holding) or not len(members):
@@ -188,12 +194,12 @@ def _support(claim: PairCount | SupportCount, scene: SceneFacts, surfaces: Surfa
     return found
 
 
-def _place(claim: PlaceCount, scene: SceneFacts, tiers: Array) -> list[Constraint]:
-    unit, found = _refer(claim.place.unit, scene)
+def _place(claim: PlaceCount, scene: SceneFacts, surfaces: Surfaces) -> list[Constraint]:
+    unit, found = _refer(claim.place.unit, scene, surfaces)
     members = scene.named(claim.name)
     if unit < 0 or not len(members):
         return []
-    levels = tiers[unit][np.isfinite(tiers[unit])]
+    levels = surfaces.tiers[unit][np.isfinite(surfaces.tiers[unit])]
     tier = None if claim.place.tier is None else claim.place.tier % max(len(levels), 1)
     if claim.place.tier is not None and not len(levels):
         return []
