@@ -1,12 +1,21 @@
-"""Linear constraints on pairs of objects that the claims of a prompt put on the positions of a scene."""
+"""Constraints that the claims of a prompt put on the positions of a scene."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 
+from agents.priors.pair_constraints import (
+    AXES,
+    Constraint,
+    Surfaces,
+    distance_across,
+    sizes,
+    stands_at,
+    stands_beside,
+    stands_on,
+)
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.datasets.prompts.claims import (
     Claim,
@@ -19,67 +28,18 @@ from scene_envs.datasets.prompts.claims import (
 )
 from scene_envs.datasets.prompts.facts import SceneFacts
 
-_AXES = np.eye(3)
 _OFFSET, _CONE = 0.035, 1.3
 """Least offset (m) to a side, and its ratio to the offset across: the claim holds from 0.02 m and 1 on."""
 _BESIDE = 0.02
 """Distance (m) of things that are next to each other; the claim holds up to 0.05 m."""
 _ORDER = 0.02
 """Least distance (m) between neighbours in an order."""
-_UPON = 0.15
-"""Share of a thing's width within which the centre of what stands on it lies, to each side of its own centre."""
-_WITHIN = 0.25
-"""The same for things in a container."""
-_LEVEL = 0.004
-"""Heights of two things in contact differ by at most this (m)."""
-_FLOOR, _FILL = 0.01, 0.03
-"""Thickness (m) of the bottom of a container; height (m) above it that the lowest things lie within."""
-_REST = 0.01
-"""Height (m) above a tier that things on it stand within."""
 _NEAR = 0.35
 """A thing whose centre is within this share of the width of another may stand on it, given the error of positions."""
 _SHARP = 0.1
 """Error (m) of positions below which single supports can be told apart."""
 _STOREY = 0.2
 """Difference of the heights (m) of two things that may stand on each other."""
-_CLEAR = 1.1
-"""Things that no longer stand on each other are apart by this times their mean width."""
-_SPOT = 0.03
-"""They come within this distance (m) of the chosen place."""
-_OFF = 10.0
-"""A place outside the furniture counts as less roomy by this times its distance."""
-
-
-@dataclass(frozen=True)
-class Constraint:
-    """``low <= axis . (position of first - position of second) <= high``, in the frame of :class:`SceneFacts`.
-
-    Attributes:
-        first, second: indices of the two objects.
-        axis: (3,) unit vector.
-        low, high: bounds in m; infinite for none.
-        second_stays: whether the first object alone may be moved.
-    """
-
-    first: int
-    second: int
-    axis: Array
-    low: float
-    high: float = np.inf
-    second_stays: bool = False
-
-
-@dataclass(frozen=True)
-class Surfaces:
-    """Heights of the surfaces of n objects that carry others, relative to the positions of :class:`SceneFacts`, m.
-
-    Attributes:
-        top: (n,) of the upper side at the middle; of the rim of a hollow thing.
-        tiers: (n, L) of the tiers, from the top; NaN for none.
-    """
-
-    top: Array
-    tiers: Array
 
 
 def constraints(claims: Sequence[Claim], scene: SceneFacts, surfaces: Surfaces, error: Array) -> list[Constraint]:
@@ -145,7 +105,7 @@ def _refer(
 def _direction(side: str) -> Array:
     """(3,) unit vector of a side: of right, front and up, as positions."""
     axis, sign = {"left": (0, -1.0), "right": (0, 1.0), "front": (1, 1.0), "back": (1, -1.0)}[side]
-    return sign * _AXES[axis]
+    return sign * AXES[axis]
 
 
 # -- claims -----------------------------------------------------------------------------------------
@@ -158,10 +118,10 @@ def _side(claim: SideClaim, scene: SceneFacts, surfaces: Surfaces) -> list[Const
     if first < 0 or second < 0 or first == second:
         return found
     if claim.side == "next":
-        reach = (_sizes(scene)[first] + _sizes(scene)[second]) / 2 + _BESIDE
-        return found + [Constraint(first, second, _AXES[axis], -reach[axis], reach[axis]) for axis in (0, 1)]
+        reach = (sizes(scene)[first] + sizes(scene)[second]) / 2 + _BESIDE
+        return found + [Constraint(first, second, AXES[axis], -reach[axis], reach[axis]) for axis in (0, 1)]
     ahead = _direction(claim.side)
-    across = np.cross(_AXES[2], ahead)
+    across = np.cross(AXES[2], ahead)
     cone = [(ahead + sign * _CONE * across) / np.hypot(1.0, _CONE) for sign in (-1.0, 1.0)]
     return [*found, Constraint(first, second, ahead, _OFFSET), *(Constraint(first, second, a, 0.0) for a in cone)]
 
@@ -175,22 +135,22 @@ def _support(claim: PairCount | SupportCount, scene: SceneFacts, surfaces: Surfa
         holding = np.array([landmark] if landmark >= 0 else [], dtype=np.int64)
     members = scene.named(claim.name)
     if not len(holding) or not len(members):
-        return []
+        return found
     holder = _likely_holders(claim, scene, members, holding, error)
     held = np.isin(holder[members], holding)
     missing = claim.number - int(held.sum())
     stays, leaves = list(members[held]), []
     if missing > 0:
         for upper, lower in _closest_pairs(claim, scene, members[~held], holding, holder)[:missing]:
-            found += _on(upper, lower, claim.inside, scene, surfaces)
+            found += stands_on(upper, lower, claim.inside, scene, surfaces)
     elif missing < 0 and error[:2].max() < _SHARP:
         bears = set(holder.tolist()) | set(scene.held.support.tolist())
-        stays.sort(key=lambda index: (index in bears, -_across(scene, index, holder[index])))
+        stays.sort(key=lambda index: (index in bears, -distance_across(scene, index, holder[index])))
         leaves, stays = stays[:-missing], stays[-missing:]
     for index in stays if missing >= 0 or leaves else []:
-        found += _on(int(index), int(holder[index]), claim.inside, scene, surfaces)
+        found += stands_on(int(index), int(holder[index]), claim.inside, scene, surfaces)
     for index in leaves:
-        found += _beside(int(index), int(holder[index]), scene)
+        found += stands_beside(int(index), int(holder[index]), scene)
     return found
 
 
@@ -207,84 +167,19 @@ def _place(claim: PlaceCount, scene: SceneFacts, surfaces: Surfaces) -> list[Con
     missing = claim.number - int(here.sum())
     height = scene.boxes[:, 0, 2] - scene.positions[unit, 2]
     if missing > 0:
-        distance = np.abs(height - levels[tier]) if tier is not None else _across(scene, np.arange(scene.count), unit)
+        distance = (
+            np.abs(height - levels[tier]) if tier is not None else distance_across(scene, np.arange(scene.count), unit)
+        )
         for index in sorted(members[~here], key=lambda index: distance[index])[:missing]:
-            found += _at(int(index), unit, scene, None if tier is None else levels[tier])
+            found += stands_at(int(index), unit, scene, None if tier is None else levels[tier])
     elif missing < 0 and tier is not None and len(levels) > 1:
         others = np.delete(levels, tier)
         for index in sorted(members[here], key=lambda index: np.abs(height[index] - others).min())[:-missing]:
-            found += _at(int(index), unit, scene, others[np.abs(height[index] - others).argmin()])
+            found += stands_at(int(index), unit, scene, others[np.abs(height[index] - others).argmin()])
     return found
 
 
-# -- geometry ---------------------------------------------------------------------------------------
-
-
-def _sizes(scene: SceneFacts) -> Array:
-    """(n, 3) extent of each object, m."""
-    return np.asarray(scene.boxes[:, 1] - scene.boxes[:, 0])
-
-
-def _across(scene: SceneFacts, first: int | Index, second: int | Index) -> Array:
-    """Horizontal distances of two sets of objects, m."""
-    offset = scene.positions[first] - scene.positions[second]
-    return np.asarray(np.hypot(offset[..., 0], offset[..., 1]))
-
-
-def _below(scene: SceneFacts, index: int) -> float:
-    """Height of an object's position above its lowest point, m."""
-    return float(scene.positions[index, 2] - scene.boxes[index, 0, 2])
-
-
-def _on(upper: int, lower: int, inside: bool, scene: SceneFacts, surfaces: Surfaces) -> Iterator[Constraint]:
-    """One thing stands on another, or lies in it."""
-    share = _WITHIN if inside else _UPON
-    for axis in (0, 1):
-        reach = share * _sizes(scene)[lower, axis]
-        yield Constraint(upper, lower, _AXES[axis], -reach, reach)
-    surface = _FLOOR - _below(scene, lower) if inside else surfaces.top[lower]
-    height = surface + _below(scene, upper)
-    yield Constraint(upper, lower, _AXES[2], height - _LEVEL, height + _LEVEL + (_FILL if inside else 0.0))
-
-
-def _beside(upper: int, lower: int, scene: SceneFacts) -> Iterator[Constraint]:
-    """What stands on a thing comes to stand beside it, where most room is."""
-    base = lower
-    while (below := int(scene.held.support[base])) >= 0 and not scene.fixed[below]:
-        base = below
-    target = _roomiest(upper, lower, scene) - scene.positions[lower, :2]
-    for axis in (0, 1):
-        yield Constraint(upper, lower, _AXES[axis], target[axis] - _SPOT, target[axis] + _SPOT, second_stays=True)
-    height = scene.boxes[base, 0, 2] + _below(scene, upper) - scene.positions[lower, 2]
-    yield Constraint(upper, lower, _AXES[2], height - _LEVEL, height + _LEVEL, second_stays=True)
-
-
-def _roomiest(upper: int, lower: int, scene: SceneFacts) -> Array:
-    """(2,) place around ``lower``, on the same furniture, that is farthest from all other things."""
-    clear = _CLEAR * float(_sizes(scene)[[upper, lower], :2].mean())
-    angles = np.arange(16) * np.pi / 8
-    places = scene.positions[lower, :2] + clear * np.stack([np.cos(angles), np.sin(angles)], axis=1)  # (16, 2)
-    others = ~scene.fixed & (np.arange(scene.count) != upper) & (np.arange(scene.count) != lower)
-    offsets = places[:, None] - scene.positions[None, others, :2]
-    room = np.hypot(offsets[..., 0], offsets[..., 1]).min(axis=1, initial=clear)
-    unit = int(scene.held.place[lower])
-    if unit >= 0:
-        low, high = scene.boxes[unit, 0, :2], scene.boxes[unit, 1, :2]
-        room -= np.maximum(low - places, places - high).max(axis=1).clip(min=0.0) * _OFF
-    return np.asarray(places[room.argmax()])
-
-
-def _at(index: int, unit: int, scene: SceneFacts, level: float | None) -> Iterator[Constraint]:
-    """A thing is within the outline of a piece of furniture, and at the height ``level`` above its position."""
-    low, high = scene.boxes[unit] - scene.positions[unit]
-    margin = _sizes(scene)[index] / 2
-    for axis in (0, 1):
-        least, most = low[axis] + margin[axis], high[axis] - margin[axis]
-        if least < most:
-            yield Constraint(index, unit, _AXES[axis], least, most, second_stays=True)
-    if level is not None:
-        height = level + _below(scene, index)
-        yield Constraint(index, unit, _AXES[2], height - _LEVEL, height + _REST, second_stays=True)
+# -- supports ---------------------------------------------------------------------------------------
 
 
 def _likely_holders(
@@ -297,11 +192,13 @@ def _likely_holders(
     holder = holders(scene, claim.inside).copy()
     if claim.inside or error[:2].max() >= _SHARP:
         return holder
-    reach = _NEAR * _sizes(scene)[:, :2].max(axis=1)
+    reach = _NEAR * sizes(scene)[:, :2].max(axis=1)
     height = scene.boxes[:, 0, 2]
     for index in members[~np.isin(holder[members], holding)]:
         above = height[index] - height
-        below: Mask = (_across(scene, index, np.arange(scene.count)) < reach) & (above > 0.0) & (above < _STOREY)
+        below: Mask = (
+            (distance_across(scene, index, np.arange(scene.count)) < reach) & (above > 0.0) & (above < _STOREY)
+        )
         below[index] = False
         if below.any():
             nearest = int(np.where(below, above, np.inf).argmin())
@@ -319,7 +216,7 @@ def _closest_pairs(
     one_each = isinstance(claim, PairCount) and not claim.inside
     occupied = set(holder.tolist()) | set(scene.held.support[~scene.held.contained].tolist()) if one_each else set()
     ranked = sorted(
-        (float(_across(scene, upper, lower)), int(upper), int(lower))
+        (float(distance_across(scene, upper, lower)), int(upper), int(lower))
         for upper in free
         for lower in holding
         if upper != lower and lower not in occupied and holder[lower] != upper and not scene.carries(upper, lower)

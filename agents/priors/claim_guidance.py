@@ -10,7 +10,8 @@ import torch
 from scipy.special import log_ndtr, ndtr
 from torch import Tensor
 
-from agents.priors.claim_constraints import Constraint, Surfaces, constraints
+from agents.priors.claim_constraints import constraints
+from agents.priors.pair_constraints import Constraint, Surfaces
 from scene_envs.arrays import Array, Mask
 from scene_envs.assets.support_shapes import library_shapes
 from scene_envs.datasets.prompts import Tolerances, parse_prompt, scene_facts
