@@ -20,7 +20,7 @@ class PostTrainingTables:
     """A table of post-training: its runs, their samples and those of the base priors.
 
     Attributes:
-        table: stability, placement, counts, prompts, realism or frontier.
+        table: stability, placement, equal_scenes, counts, prompts, realism or frontier.
         rows: patterns of the names of rows to run and show, such as [dimsum_table-nft-*]; empty for all.
         iterations: iterations of every run; null takes the number of the table.
         count: number of measured samples of each prior.
@@ -41,7 +41,7 @@ class PostTrainingTables:
 def run(settings: PostTrainingTables, run: Run) -> None:
     """Train and measure what is missing, and write the table after every row."""
     from benchmarks.post_training.rows import TABLES, Row
-    from benchmarks.post_training.runs import kept_loss, measure, train, training_figures
+    from benchmarks.post_training.runs import guard_figures, kept_loss, measure, train, training_figures
     from benchmarks.post_training.tables import markdown
     from scene_envs.files import write_text
 
@@ -63,7 +63,7 @@ def run(settings: PostTrainingTables, run: Run) -> None:
             train(row, run.directory, iterations, settings.keys)
         if not (folder / "log.csv").exists():
             return {}
-        figures = training_figures(folder)
+        figures = training_figures(folder) | guard_figures(folder)
         figures["seconds_per_iteration"] = figures["seconds"] / figures["iterations"]
         if table.measures and (folder / "metrics.json").exists():
             prior = str(folder)

@@ -78,6 +78,17 @@ def _placement() -> tuple[Row, ...]:
     )
 
 
+def _equal_scenes() -> tuple[Row, ...]:
+    """960 sampled scenes for each algorithm and scene type; the guard samples the base prior and the trained one."""
+    guard = ("guard.scenes=128", "guard.samples=128", "guard.every=20", "guard.samples_every=20")
+    return tuple(
+        Row(f"{prior}-{name}-{seed}", prior, (*_keys(name, "feasible_share", seed), "batch_size=24", *guard), 40)
+        for prior in TYPES
+        for name in (FORWARD, CHAIN, BASELINE)
+        for seed in range(3 if prior == "dimsum_table" else 1)
+    )
+
+
 def _counts() -> tuple[Row, ...]:
     """The paper's figure: the number of objects on Living Room Shelf with 20 extra slots, and on Dimsum."""
     hold = "hold=guard:1.05"
@@ -143,6 +154,9 @@ TABLES: dict[str, Table] = {
     "stability": Table("300 iterations at the defaults", _stability(), (), ("first", "best", "last", "fall")),
     "placement": Table("Feasible share, equal sampled scenes", _placement(), _WITH_PROMPTS,
                        (*_LAYOUT, "prompt_counts", "prompt_names", "prompt_relations")),
+    "equal_scenes": Table("Feasible share after 960 scenes", _equal_scenes(), (),
+                          ("base_reward", "guard_reward", "kept", "loss", "guard_counts", "base_classifier",
+                           "guard_classifier")),
     "counts": Table("Object counts past the data", _counts(), ("layout", "physics"),
                     ("free", "feasible", "share", "loss", "count_wasserstein", "category_kl")),
     "prompts": Table("Following prompts", _prompts(), _WITH_PROMPTS,

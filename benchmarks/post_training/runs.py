@@ -87,6 +87,26 @@ def kept_loss(folder: Path) -> dict[str, float]:
     return {"loss": float(guard["ratio"])} if guard.get("ratio") is not None else {}
 
 
+def guard_figures(folder: Path) -> dict[str, float]:
+    """Figures of the guard's samples at the base prior (``base_…``) and at the last check, and the iteration ``kept``.
+
+    Empty without a guard that samples, or before the run ended.
+    """
+    path = folder / "metrics.json"
+    guard = json.loads(path.read_text(encoding="utf-8")).get("guard") if path.exists() else None
+    if not guard or not guard["checks"] or not guard["checks"][-1].get("samples"):
+        return {}
+    base, last = guard["base_samples"], guard["checks"][-1]["samples"]
+    return {
+        "base_reward": base["sample_reward"],
+        "guard_reward": last["sample_reward"],
+        "kept": float(guard["best_iteration"]),
+        "guard_counts": last["count_distance"],
+        "base_classifier": base["classifier_accuracy"],
+        "guard_classifier": last["classifier_accuracy"],
+    }
+
+
 def _numbers(metrics: Mapping[str, object]) -> dict[str, float]:
     return {name: float(value) for name, value in metrics.items() if isinstance(value, int | float)}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from agents.cli.keys import compose
 from agents.post_training.config import PostTrainConfig
 from benchmarks.post_training.__main__ import main
 from benchmarks.post_training.rows import TABLES
-from benchmarks.post_training.runs import training_figures
+from benchmarks.post_training.runs import guard_figures, training_figures
 from rewards.registry import resolve_reward
 
 
@@ -36,6 +37,23 @@ def test_the_largest_fall_is_measured_from_the_best_mean_before_it(tmp_path: Pat
     assert figures["fall"] == pytest.approx(0.1)
     assert (figures["first"], figures["best"], figures["last"]) == pytest.approx((0.7, 0.95, 0.94))
     assert figures["loss"] == 1.05
+
+
+def test_the_figures_of_the_guard_are_those_of_its_last_check(tmp_path: Path) -> None:
+    assert guard_figures(tmp_path) == {}
+    sampled = [
+        {"sample_reward": reward, "count_distance": 1.0 + reward, "classifier_accuracy": 0.9 - reward}
+        for reward in (0.5, 0.6, 0.7)
+    ]
+    checks = [{"iteration": 20 * i, "samples": figures} for i, figures in enumerate(sampled[1:], start=1)]
+    guard = {"best_iteration": 20, "base_samples": sampled[0], "checks": checks}
+    (tmp_path / "metrics.json").write_text(json.dumps({"guard": guard}))
+    figures = guard_figures(tmp_path)
+    assert (figures["base_reward"], figures["guard_reward"], figures["kept"]) == (0.5, 0.7, 20.0)
+    assert figures["guard_counts"] == 1.7
+    assert figures["base_classifier"] - figures["guard_classifier"] == pytest.approx(0.2)
+    (tmp_path / "metrics.json").write_text(json.dumps({"guard": None}))
+    assert guard_figures(tmp_path) == {}
 
 
 @pytest.mark.parametrize("word", ["table=placements", "rows=[dimsum-*]"])
