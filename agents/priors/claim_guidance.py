@@ -12,7 +12,8 @@ from torch import Tensor
 
 from agents.priors.claim_constraints import constraints
 from agents.priors.pair_constraints import Constraint, Surfaces
-from scene_envs.arrays import Array, Mask
+from scene_envs.arrays import Array, Index, Mask
+from scene_envs.assets import AssetLibrary
 from scene_envs.assets.support_shapes import library_shapes
 from scene_envs.datasets.prompts import Tolerances, parse_prompt, scene_facts
 from scene_envs.datasets.prompts.claims import Claim
@@ -86,48 +87,46 @@ class ClaimGuidance:
         return free if self._movable is None else free & self._movable[row, scene.slots]
 
     def _moves(self, wanted: Sequence[Constraint], scene: SceneFacts, error: Array, free: Mask) -> Array:
-        """(n, 3) m, in the frame of ``scene``."""
-        moves = np.zeros((scene.count, 3))
+        """(n, 3) m, in the frame of ``scene``: the sum of the moves for M constraints."""
+        if not wanted:
+            return np.zeros((scene.count, 3))
+        first, second = (np.array([getattr(c, name) for c in wanted]) for name in ("first", "second"))
+        low, high = (np.array([getattr(c, name) for c in wanted]) for name in ("low", "high"))
+        stays = np.array([c.second_stays for c in wanted])
+        axis = np.stack([c.axis for c in wanted])  # (M, 3)
         carried = _carried(scene)
-        for constraint in wanted:
-            first = _without(carried, constraint.first, constraint.second)
-            second = _without(carried, constraint.second, constraint.first)
-            sides = [(who & free, sign) for who, sign in ((first, 1.0), (second, -1.0)) if (who & free).any()]
-            uncertain = len(sides)
-            sides = [side for side in sides if side[1] > 0] if constraint.second_stays else sides
-            if not sides:
-                continue
-            offset = scene.positions[constraint.first] - scene.positions[constraint.second]
-            spread = np.sqrt(uncertain) * float(np.linalg.norm(constraint.axis * error))
-            slope = probability_slope(float(constraint.axis @ offset), constraint.low, constraint.high, spread)
-            step = uncertain / len(sides) * self.strength * slope * error**2 * constraint.axis
-            for who, sign in sides:
-                moves[who] += sign * step
-        return moves
+        movers = [_without(carried, first, second) & free, _without(carried, second, first) & free]  # (M, n) each
+        moved = np.stack([who.any(axis=1) for who in movers])  # (2, M)
+        uncertain = moved.sum(axis=0)
+        moved[1] &= ~stays
+        sides = moved.sum(axis=0)
+        spread = np.sqrt(uncertain.clip(min=1)) * np.linalg.norm(axis * error, axis=1)
+        offset = (axis * (scene.positions[first] - scene.positions[second])).sum(axis=1)
+        size = self.strength * uncertain / sides.clip(min=1) * probability_slope(offset, low, high, spread)
+        steps = size[:, None] * error**2 * axis
+        moves = (movers[0] & moved[0][:, None]).T @ steps - (movers[1] & moved[1][:, None]).T @ steps
+        return np.asarray(moves)
 
 
-def probability_slope(value: float, low: float, high: float, spread: float) -> float:
-    """d ln P(low <= x <= high) / d value, 1/m, of a normal x with mean ``value`` and standard deviation ``spread``, m.
+def probability_slope(value: Array, low: Array, high: Array, spread: Array) -> Array:
+    """d ln P(low <= x <= high) / d value, 1/m, of normal x with means ``value`` and standard deviations ``spread``, m.
 
-    The mean of x given that it lies in the interval is ``value + spread² * slope``.
+    The mean of x given that it lies in the interval is ``value + spread² * slope``. All arrays have one shape.
 
-    >>> round(probability_slope(0.0, 0.0, np.inf, 1.0), 6)  # sqrt(2 / pi): the mean of a half-normal
+    >>> half_normal, far = probability_slope(np.array([0.0, -50.0]), np.zeros(2), np.array([np.inf, 0.5]), np.ones(2))
+    >>> round(float(half_normal), 6)  # sqrt(2 / pi)
     0.797885
-    >>> probability_slope(-50.0, 0.0, 0.5, 1.0) > 50.0      # far outside: to the nearest bound and a little beyond
+    >>> bool(far > 50.0)              # far outside: to the nearest bound and a little beyond
     True
     """
     below, above = (low - value) / spread, (high - value) / spread
-    if below > 0:  # the same by symmetry; keeps the digits of a small probability
-        return -probability_slope(-value, -high, -low, spread)
-    if above < 0:
+    mirrored = below > 0  # by symmetry the same; keeps the digits of small probabilities
+    below, above = np.where(mirrored, -above, below), np.where(mirrored, -below, above)
+    with np.errstate(all="ignore"):  # both forms are computed everywhere, each is used where it is exact
         upper, lower = log_ndtr(above), log_ndtr(below)
-        log_mass = upper + np.log1p(-np.exp(lower - upper))
-    else:
-        log_mass = np.log(ndtr(above) - ndtr(below))
-    densities = [
-        0.0 if np.isinf(z) else np.exp(-0.5 * z * z - 0.5 * np.log(2 * np.pi) - log_mass) for z in (below, above)
-    ]
-    return float((densities[0] - densities[1]) / spread)
+        log_mass = np.where(above < 0, upper + np.log1p(-np.exp(lower - upper)), np.log(ndtr(above) - ndtr(below)))
+    densities = [np.exp(-0.5 * z * z - 0.5 * np.log(2 * np.pi) - log_mass) for z in (below, above)]
+    return np.asarray(np.where(mirrored, -1.0, 1.0) * (densities[0] - densities[1]) / spread)
 
 
 def _carried(scene: SceneFacts) -> Mask:
@@ -141,9 +140,9 @@ def _carried(scene: SceneFacts) -> Mask:
     return carried
 
 
-def _without(carried: Mask, who: int, other: int) -> Mask:
-    """(n,) bool: what moves with object ``who``, without ``other`` and what is on it."""
-    moving: Mask = carried[who] & ~carried[other] if carried[who, other] else carried[who]
+def _without(carried: Mask, who: Index, other: Index) -> Mask:
+    """(M, n) bool: what moves with the objects ``who`` (M,), without ``other`` (M,) and what is on it."""
+    moving: Mask = carried[who] & ~(carried[other] & carried[who, other][:, None])
     return moving
 
 
@@ -153,11 +152,19 @@ def _surfaces(batch: SceneBatch, row: int, scene: SceneFacts) -> Surfaces:
     categories = batch.categories[row].numpy()[scene.slots]
     origin = batch.translations[row, :, 2].double().numpy()[scene.slots] - scene.positions[:, 2]
     upright = batch.rotations[row, :, 2, 2].numpy()[scene.slots] > _UPRIGHT
-    middle = shapes.top[shapes.cells(categories, np.zeros((len(categories), 3)))]
+    middle = _middles(batch.scene_type.library)[categories]
     highest = scene.boxes[:, 1, 2] - scene.positions[:, 2]
     flat = upright & (middle + origin > highest - _SHALLOW)  # not so of a hollow thing, whose rim carries others
     top = np.where(flat, middle + origin, highest)
     return Surfaces(top, shapes.tiers[categories] + origin[:, None])
+
+
+@lru_cache(maxsize=32)
+def _middles(library: AssetLibrary) -> Array:
+    """(C,) height of the upper side of each asset at its middle, asset frame, m; -inf where nothing is."""
+    shapes = library_shapes(library)
+    every = np.arange(len(shapes.top))
+    return np.asarray(shapes.top[shapes.cells(every, np.zeros((len(every), 3)))])
 
 
 @lru_cache(maxsize=4096)
