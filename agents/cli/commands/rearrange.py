@@ -22,7 +22,7 @@ def run(settings: InpaintingConfig, run: Run) -> None:
         claim_guidance=settings.claim_guidance,
         num_steps=settings.num_steps,
         seed=settings.seed,
-    )  # fmt: skip.to("cpu")
+    ).to("cpu")
     distance = (moved.translations - batch.translations).norm(dim=-1)[batch.is_free]
     figures = {"mean_distance_m": float(distance.double().mean()) if len(distance) else 0.0}
     run.say(f"{len(batch)} scenes, objects moved by {figures['mean_distance_m']:.3f} m on average")
