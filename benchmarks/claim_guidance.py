@@ -1,9 +1,10 @@
-"""Prompts on relations that samples follow, with and without claim guidance, as a table.
+"""Prompts that samples follow, with and without claim guidance, as a table.
 
-python benchmarks/claim_guidance.py [--priors dimsum_table,living_room_shelf_feasible] [--count 128] [--strength 2]
+python benchmarks/claim_guidance.py [--priors dimsum_table,living_room_shelf_feasible] [--kinds relations,count,names]
+    [--count 128] [--strength 2] [--picture PATH]
 
-The prompts describe the relations of scenes of the grammar. Both rows of a prior have the same prompts and the same
-noise. With ``--picture PATH`` the scenes of the first prior are drawn: without guidance above, with guidance below.
+The prompts describe scenes of the grammar. Both rows of a prior and a kind have the same prompts and the same noise.
+``--picture`` draws the scenes of the first prior and kind: without guidance above, with guidance below.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from scene_envs.datasets.prompts.claims import SideClaim
 from scene_envs.render import gallery, picture_camera, render
 
 _COLUMNS = (
-    "prior", "claim guidance", "relations followed", "at places", "on or in one thing", "on things of a name", "sides",
+    "prior", "prompts", "claim guidance", "followed", "at places", "on or in one thing", "on things of a name", "sides",
     "next to", "feasible share", "scenes per second",
 )  # fmt: skip
 CLASSES = ("PlaceCount", "SupportCount", "PairCount", "side", "next")
@@ -35,21 +36,24 @@ def main() -> None:
     arguments = _arguments()
     print("| " + " | ".join(_COLUMNS) + " |")
     print("|---" * len(_COLUMNS) + "|")
-    for number, name in enumerate(arguments.priors.split(",")):
+    for name in arguments.priors.split(","):
         prior = ScenePrior.load(name)
         scenes = get_grammar(prior.scene_type.name).sample(np.random.default_rng(7), arguments.count)
-        prompts = describe(scenes, np.random.default_rng(7), kinds=["relations"])
-        drawn = []
-        for strength in (0.0, arguments.strength):
-            started = time.process_time()
-            batch = prior.sample(
-                arguments.count, prompt=prompts, guidance=arguments.guidance, claim_guidance=strength, seed=3
-            )
-            print(f"| `{name}` | {strength:g} | {_row(batch, prompts, time.process_time() - started)} |", flush=True)
-            drawn.append(batch[:_SHOWN])
-        if number == 0 and arguments.picture is not None:
-            print("\n".join(prompts[:_SHOWN]))
-            _draw(drawn, arguments.picture)
+        for kind in arguments.kinds.split(","):
+            prompts = describe(scenes, np.random.default_rng(7), kinds=[kind])
+            drawn = []
+            for strength in (0.0, arguments.strength):
+                started = time.process_time()
+                batch = prior.sample(
+                    arguments.count, prompt=prompts, guidance=arguments.guidance, claim_guidance=strength, seed=3
+                )
+                row = _row(batch, prompts, time.process_time() - started)
+                print(f"| `{name}` | {kind} | {strength:g} | {row} |", flush=True)
+                drawn.append(batch[:_SHOWN])
+            if arguments.picture is not None:
+                print("\n".join(prompts[:_SHOWN]))
+                _draw(drawn, arguments.picture)
+                return
 
 
 def _row(batch: SceneBatch, prompts: list[str], seconds: float) -> str:
@@ -78,10 +82,13 @@ def _draw(drawn: list[SceneBatch], path: Path) -> None:
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--priors", default="dimsum_table", help="names or folders of priors, joined by commas")
-    parser.add_argument("--count", type=int, default=128, help="prompts of each prior")
+    parser.add_argument("--kinds", default="relations", help="kinds of prompts: relations, count, names")
+    parser.add_argument("--count", type=int, default=128, help="prompts of each prior and kind")
     parser.add_argument("--strength", type=float, default=2.0, help="claim_guidance of the second row")
     parser.add_argument("--guidance", type=float, default=0.5, help="weight of classifier-free guidance")
-    parser.add_argument("--picture", type=Path, default=None, help="picture of the first prior's scenes")
+    parser.add_argument(
+        "--picture", type=Path, default=None, help="picture of the first scenes; nothing else is sampled"
+    )
     return parser.parse_args()
 
 

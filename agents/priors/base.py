@@ -24,6 +24,7 @@ from agents.priors.forward import Trainable
 from agents.priors.hooks import Hook, make_hook
 from agents.priors.inpainting import Inpainting
 from agents.priors.loading import Loadable
+from agents.priors.number_guidance import NumberGuidance
 from agents.priors.prompt_validation import check_prompts, no_text
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
@@ -251,7 +252,8 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
         moved = torch.ones(len(prompts), slots, 1, dtype=torch.bool)
         moved[:, : len(self.scene_type.fixed)] = False
         guides = [ClaimGuidance(prompts, self.scene_type, strength)]
-        return make_hook(self, self.step_table(num_steps), self.decode, moved, guides=guides)
+        numbers = NumberGuidance(prompts, self.scene_type)
+        return make_hook(self, self.step_table(num_steps), self.decode, moved, guides=guides, draw=numbers)
 
     def decode(self, x: Tensor) -> SceneBatch:
         """Scenes from normalised x_0 (B, N, D); known entries take their exact values."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from agents.priors.pair_constraints import (
     stands_on,
 )
 from scene_envs.arrays import Array, Index, Mask
+from scene_envs.datasets.prompts import parse_prompt
 from scene_envs.datasets.prompts.claims import (
     Claim,
     PairCount,
@@ -27,6 +29,8 @@ from scene_envs.datasets.prompts.claims import (
     holders,
 )
 from scene_envs.datasets.prompts.facts import SceneFacts
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene_types import SceneType
 
 _OFFSET, _CONE = 0.035, 1.3
 """Least offset (m) to a side, and its ratio to the offset across: the claim holds from 0.02 m and 1 on."""
@@ -42,10 +46,20 @@ _STOREY = 0.2
 """Difference of the heights (m) of two things that may stand on each other."""
 
 
+@lru_cache(maxsize=4096)
+def claims_of(prompt: str, scene_type: str | SceneType) -> tuple[Claim, ...]:
+    """The claims of a prompt; none where it cannot be read."""
+    try:
+        return parse_prompt(prompt, scene_type).claims if prompt.strip() else ()
+    except InvalidInputError:
+        return ()
+
+
 def constraints(claims: Sequence[Claim], scene: SceneFacts, surfaces: Surfaces, error: Array) -> list[Constraint]:
     """Constraints under which ``claims`` hold, with as few changes of supports and orders as possible.
 
-    Claims on numbers of objects have none. Nor do claims whose things are not in the scene (yet).
+    Claims on numbers of objects have none (:mod:`agents.priors.number_guidance`). Nor do claims whose things are not in
+    the scene (yet).
 
     Args:
         claims: of one prompt.
@@ -54,9 +68,10 @@ def constraints(claims: Sequence[Claim], scene: SceneFacts, surfaces: Surfaces, 
         error: (3,) standard deviation of the positions, m.
     """
     found: list[Constraint] = []
+    placed = {claim.name for claim in claims if isinstance(claim, PlaceCount)}
     for claim in claims:
         if isinstance(claim, SideClaim):
-            found += _side(claim, scene, surfaces)
+            found += _side(claim, scene, surfaces, placed)
         elif isinstance(claim, PairCount | SupportCount):
             found += _support(claim, scene, surfaces, error)
         elif isinstance(claim, PlaceCount):
@@ -111,12 +126,15 @@ def _direction(side: str) -> Array:
 # -- claims -----------------------------------------------------------------------------------------
 
 
-def _side(claim: SideClaim, scene: SceneFacts, surfaces: Surfaces) -> list[Constraint]:
+def _side(claim: SideClaim, scene: SceneFacts, surfaces: Surfaces, placed: Collection[str]) -> list[Constraint]:
     first, found = _refer(claim.subject, scene, surfaces)
     second, more = _refer(claim.landmark, scene, surfaces, first)
     found += more
     if first < 0 or second < 0 or first == second:
         return found
+    stays_first, stays_second = (ref.place is not None or ref.name in placed for ref in (claim.subject, claim.landmark))
+    pair = (second, first) if stays_first and not stays_second else (first, second)
+    found += _come_together(*pair, scene, surfaces)
     if claim.side == "next":
         reach = (sizes(scene)[first] + sizes(scene)[second]) / 2 + _BESIDE
         return found + [Constraint(first, second, AXES[axis], -reach[axis], reach[axis]) for axis in (0, 1)]
@@ -124,6 +142,18 @@ def _side(claim: SideClaim, scene: SceneFacts, surfaces: Surfaces) -> list[Const
     across = np.cross(AXES[2], ahead)
     cone = [(ahead + sign * _CONE * across) / np.hypot(1.0, _CONE) for sign in (-1.0, 1.0)]
     return [*found, Constraint(first, second, ahead, _OFFSET), *(Constraint(first, second, a, 0.0) for a in cone)]
+
+
+def _come_together(comes: int, stays: int, scene: SceneFacts, surfaces: Surfaces) -> list[Constraint]:
+    """One thing comes to the furniture and the tier of another; the other way where the other is on no furniture."""
+    place, tier = scene.held.place, scene.held.tier
+    if place[comes] == place[stays] and tier[comes] == tier[stays]:
+        return []
+    comes, stays = (comes, stays) if place[stays] >= 0 else (stays, comes)
+    unit, levels = int(place[stays]), surfaces.tiers[place[stays]]
+    if comes == unit or scene.fixed[comes]:
+        return []
+    return list(stands_at(comes, unit, scene, float(levels[tier[stays]]) if scene.tiers[unit] > 1 else None))
 
 
 def _support(claim: PairCount | SupportCount, scene: SceneFacts, surfaces: Surfaces, error: Array) -> list[Constraint]:
@@ -176,6 +206,11 @@ def _place(claim: PlaceCount, scene: SceneFacts, surfaces: Surfaces) -> list[Con
         others = np.delete(levels, tier)
         for index in sorted(members[here], key=lambda index: np.abs(height[index] - others).min())[:-missing]:
             found += stands_at(int(index), unit, scene, others[np.abs(height[index] - others).argmin()])
+    elif missing < 0 and tier is None and len(units := np.setdiff1d(scene.named(claim.place.unit.name), [unit])):
+        away = np.stack([distance_across(scene, np.arange(scene.count), other) for other in units])  # (U, n)
+        bears = set(scene.held.support.tolist())
+        for index in sorted(members[here], key=lambda index: (index in bears, away[:, index].min()))[:-missing]:
+            found += stands_at(int(index), int(units[away[:, index].argmin()]), scene, None)
     return found
 
 

@@ -10,15 +10,13 @@ import torch
 from scipy.special import log_ndtr, ndtr
 from torch import Tensor
 
-from agents.priors.claim_constraints import constraints
+from agents.priors.claim_constraints import claims_of, constraints
 from agents.priors.pair_constraints import Constraint, Surfaces
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.assets import AssetLibrary
 from scene_envs.assets.support_shapes import library_shapes
-from scene_envs.datasets.prompts import Tolerances, parse_prompt, scene_facts
-from scene_envs.datasets.prompts.claims import Claim
+from scene_envs.datasets.prompts import Tolerances, scene_facts
 from scene_envs.datasets.prompts.facts import SceneFacts, viewer_axes
-from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
 from scene_envs.supports import CONTACT, LARGEST_CONTACT
@@ -57,7 +55,7 @@ class ClaimGuidance:
         self, prompts: Sequence[str], scene_type: str | SceneType, strength: float, movable: Tensor | None = None
     ) -> None:
         self.strength = strength
-        self._claims = [_claims(prompt, scene_type) for prompt in prompts]
+        self._claims = [claims_of(prompt, scene_type) for prompt in prompts]
         self._axes = viewer_axes(scene_type)
         self._movable = None if movable is None else movable.cpu().numpy()
 
@@ -165,12 +163,3 @@ def _middles(library: AssetLibrary) -> Array:
     shapes = library_shapes(library)
     every = np.arange(len(shapes.top))
     return np.asarray(shapes.top[shapes.cells(every, np.zeros((len(every), 3)))])
-
-
-@lru_cache(maxsize=4096)
-def _claims(prompt: str, scene_type: str | SceneType) -> tuple[Claim, ...]:
-    """The claims of a prompt; none where it cannot be read."""
-    try:
-        return parse_prompt(prompt, scene_type).claims if prompt.strip() else ()
-    except InvalidInputError:
-        return ()

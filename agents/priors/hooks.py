@@ -25,6 +25,8 @@ Guide = Callable[[int, int, Callable[[], SceneBatch], Tensor], Tensor | None]
 ``denoised`` is as for :data:`Watch`; ``std`` (3,) is the standard deviation of the denoised translations, m. If the
 shift is None, the step is not changed.
 """
+Draw = Callable[[Tensor, ReverseStep], ReverseStep]
+"""``(x_t, reverse) -> reverse``: changes how the categories of masked slots are drawn."""
 Watch = Callable[[int, int, Callable[[], SceneBatch]], Tensor | None]
 """``(step, steps, denoised) -> rows``: called at the steps of the denoising; chooses the scenes that continue.
 
@@ -53,6 +55,7 @@ def make_hook(
     *,
     watch: Watch | None = None,
     guides: Sequence[Guide] = (),
+    draw: Draw | None = None,
 ) -> Hook | None:
     """The hook of one chain; None if nothing watches or guides it.
 
@@ -61,7 +64,7 @@ def make_hook(
         table: the chain.
         scenes: the B scenes of normalised x_0 (B, N, D), as watch and guides see them.
         moved: (B, N, 1) bool, slots whose poses guides may move.
-        watch, guides: called in this order: ``watch.see``, guides, ``watch``.
+        watch, guides, draw: called in this order: ``watch.see``, ``draw``, guides, ``watch``.
     """
     see = getattr(watch, "see", None)
 
@@ -69,20 +72,23 @@ def make_hook(
         estimate = reverse.denoised
         if see is not None:
             see(step, len(table), x)
+        if draw is not None:
+            reverse = draw(x, reverse)
         if estimate is None:
             return reverse
 
         def denoised() -> SceneBatch:
             return scenes(estimate)
 
-        for guide in guides:
+        if guides:
             weight, std = prior.estimate(step, table)
             scale = prior.normalizer.scale[TRANSLATION].to(std)
             metres = torch.where(scale == 0, torch.zeros_like(scale), std / scale)
+        for guide in guides:
             shift = guide(step, len(table), denoised, metres)
             if shift is not None:
                 reverse = reverse.shifted(weight * scale * shift.to(std) * moved.to(std))
         rows = None if watch is None else watch(step, len(table), denoised)
         return reverse if rows is None else reverse.take(rows.to(x.device))
 
-    return None if watch is None and not guides else hook
+    return None if watch is None and draw is None and not guides else hook

@@ -13,6 +13,7 @@ from agents.diffusion.step_tables import StepTable
 from agents.networks.text import Text
 from agents.priors.claim_guidance import ClaimGuidance
 from agents.priors.hooks import Guide, Hook, Start, Watch, make_hook
+from agents.priors.number_guidance import NumberGuidance
 from agents.priors.observed_scenes import Noise, ObservedScenes, check_mask, merge
 from agents.priors.prompt_validation import check_prompts
 from scene_envs.errors import InvalidInputError
@@ -190,14 +191,15 @@ class Inpainting(ABC):
             generators = [Generator().manual_seed(seed + i) for i in range(len(batch))]
         device, table = self.device, self.step_table(num_steps)
         moved = both[..., :1]
-        guides = [guide] if guide is not None else []
+        guides, numbers = ([] if guide is None else [guide]), None
         if prompts is not None and claim_guidance:
             guides.append(ClaimGuidance(prompts, self.scene_type, claim_guidance, moved.squeeze(-1)))
+            numbers = NumberGuidance(prompts, self.scene_type)
 
         def scenes(x: Tensor) -> SceneBatch:
             return merge(batch, self.decode(x).to(batch.tensor.device), both)
 
-        hook = make_hook(self, table, scenes, moved, watch=watch, guides=guides)
+        hook = make_hook(self, table, scenes, moved, watch=watch, guides=guides, draw=numbers)
         begins = getattr(watch, "start", None)
         start = None if begins is None else begins(len(table))
         x = self.regenerate(

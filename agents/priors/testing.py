@@ -26,6 +26,7 @@ def tiny_prior(
     slots: int | None = None,
     process: str = "continuous",
     text: bool = False,
+    kernel: str = MixedPriorConfig.kernel,
 ) -> ScenePrior:
     """An untrained prior with a very small network and random weights, for tests and examples.
 
@@ -35,6 +36,7 @@ def tiny_prior(
         slots: slots per scene; the scene type's when None.
         process: ``"continuous"`` or ``"mixed"``.
         text: whether it reads prompts, with the vocabulary of prompts about scenes of this type; mixed only.
+        kernel: categorical kernel; mixed only.
     """
     scene_type = get_scene_type(scene_type)
     if process not in PROCESSES:
@@ -44,7 +46,7 @@ def tiny_prior(
     slots = scene_type.slots if slots is None else slots
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        prior = _mixed(scene_type, slots, text) if process == "mixed" else _continuous(scene_type, slots)
+        prior = _mixed(scene_type, slots, text, kernel) if process == "mixed" else _continuous(scene_type, slots)
         for parameter in prior.parameters():
             if not bool(parameter.any()):
                 nn.init.normal_(parameter, std=0.02)
@@ -58,7 +60,7 @@ def _continuous(scene_type: SceneType, slots: int) -> ScenePrior:
     return ContinuousPrior(config, _workspace_normalizer(scene_type), moments)
 
 
-def _mixed(scene_type: SceneType, slots: int, text: bool) -> ScenePrior:
+def _mixed(scene_type: SceneType, slots: int, text: bool, kernel: str) -> ScenePrior:
     reader = TextConfig(prompt_words(scene_type), width=16, depth=1, heads=2, latents=4) if text else None
     network = MixedFluxConfig(
         scene_type.num_assets + 1,
@@ -72,7 +74,7 @@ def _mixed(scene_type: SceneType, slots: int, text: bool) -> ScenePrior:
         time_input="log_noise",
         modules=(ObservedFlagsConfig(), FourierFeaturesConfig()),
     )
-    config = MixedPriorConfig(scene_type.name, slots, network, text=reader)
+    config = MixedPriorConfig(scene_type.name, slots, network, text=reader, kernel=kernel)
     moments = Preconditioning(torch.zeros(POSE_FEATURES), torch.full((POSE_FEATURES,), 0.5))
     return MixedPrior(config, _workspace_normalizer(scene_type), moments)
 

@@ -151,6 +151,36 @@ def test_things_on_or_in_one_certain_thing(claim: str) -> None:
     assert holds(followed(scene, prompt), prompt)
 
 
+@pytest.mark.parametrize("landmark", ["speaker", "book"])
+def test_two_things_on_different_tiers_come_together(landmark: str) -> None:
+    things = [("soda_can", (0.0, -0.2, BOTTOM)), ("book", (0.0, 0.0, BOTTOM)), ("speaker", (0.0, 0.2, TOP))]
+    scene = build("living_room_shelf", things)
+    prompt = f"A scene where the coke can is to the right of the {landmark}."
+    assert not holds(scene, prompt)
+    assert holds(followed(scene, prompt), prompt)
+
+
+def test_the_thing_that_a_claim_places_stays_and_the_other_comes() -> None:
+    things = [("soda_can", (0.0, 0.2, BOTTOM)), ("book", (0.0, -0.2, TOP))]
+    prompt = "A scene where the coke can is to the right of the book and a coke can is on the bottom shelf."
+    scene = build("living_room_shelf", things)
+    assert not holds(scene, prompt)
+    after = followed(scene, prompt)
+    assert holds(after, prompt)
+    assert float(after.translations[0, 2, 2]) < BOTTOM + 0.1
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_things_that_are_too_many_on_a_table_go_to_another_table(number: int) -> None:
+    tables = [("cafe_table", (0.0, -1.0, 0.0)), ("cafe_table", (0.0, 1.0, 0.0))]
+    plates = [("dinner_plate", (0.0, -1.0 + 0.25 * (i - 1), 0.0)) for i in range(3)]
+    scene = build("restaurant_low_clutter", [*tables, *plates])
+    words = {1: "a plate is", 2: "two plates are"}
+    prompt = f"A scene where {words[number]} on the first table from the left."
+    assert holds(scene, "A scene where three plates are on the first table from the left.")
+    assert holds(followed(scene, prompt), prompt)
+
+
 def test_what_a_thing_carries_goes_with_it() -> None:
     scene = build(
         "dimsum_table",
