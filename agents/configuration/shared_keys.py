@@ -12,6 +12,8 @@ class SamplingKeys:
     Attributes:
         prompt: text that the scenes should match, for priors that read prompts; null for no prompt.
         guidance: weight of classifier-free guidance, 0 for none; needs a prompt.
+        claim_guidance: strength with which scenes are guided to the numbers and places that the prompt gives, 0 for
+            none; 2 is a good choice; needs a prompt.
         num_steps: denoising steps per scene.
         slots: slots per scene, which may exceed the number in training; null takes the number in training.
         seed: seed of the noise.
@@ -19,6 +21,7 @@ class SamplingKeys:
 
     prompt: str | None = None
     guidance: float = 0.0
+    claim_guidance: float = 0.0
     num_steps: int = 50
     slots: int | None = None
     seed: int = 0

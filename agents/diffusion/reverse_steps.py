@@ -282,15 +282,22 @@ def concatenate_steps(parts: Sequence[ReverseStep]) -> ReverseStep:
         return first
     if isinstance(first, GaussianStep):
         normal = [part for part in parts if isinstance(part, GaussianStep)]
-        return GaussianStep(torch.cat([part.mean for part in normal]), _joined([part.std for part in normal], 3))
+        mean, std = torch.cat([part.mean for part in normal]), _joined([part.std for part in normal], 3)
+        return GaussianStep(mean, std, _all_estimates(parts))
     if isinstance(first, MixedStep):
         mixed = [part for part in parts if isinstance(part, MixedStep)]
         mean, probs = (torch.cat([getattr(part, name) for part in mixed]) for name in ("mean", "probs"))
         masked = None if first.masked is None else torch.cat([part.masked for part in mixed if part.masked is not None])
         pose_std, random = _joined([part.pose_std for part in mixed], 3), _joined([part.random for part in mixed], 2)
         groups = None if first.groups is None else torch.cat([part.groups for part in mixed if part.groups is not None])
-        return MixedStep(mean, pose_std, probs, random, masked, groups=groups)
+        return MixedStep(mean, pose_std, probs, random, masked, _all_estimates(parts), groups)
     raise TypeError(f"cannot concatenate steps of type {type(first).__name__}")
+
+
+def _all_estimates(parts: Sequence[ReverseStep]) -> Tensor | None:
+    """The denoised scenes of all parts; None if any part has none."""
+    known = [part.denoised for part in parts if part.denoised is not None]
+    return torch.cat(known) if len(known) == len(parts) else None
 
 
 def _joined(parts: Sequence[Tensor], dims: int) -> Tensor:

@@ -56,8 +56,6 @@ class SearchConfig(BudgetKeys, SamplingKeys):
         workers: physics worker processes; 0 computes physics in this process.
         prompt: text that all scenes should match, for priors that read prompts; the objective gets it too. null for no
             prompt.
-        claim_guidance: strength of the moves of objects toward what the prompt says of their places, 0 for none; 2 is a
-            good choice; needs a prompt.
         num_steps: denoiser evaluations per scene.
         slots: slots per scene; null takes the number of the scene type.
         seed: seed of the search tree; the baseline starts with the same first scenes, unless the planner steers the
@@ -76,7 +74,6 @@ class SearchConfig(BudgetKeys, SamplingKeys):
     masks: list[Any] | None = None
     objective_scale: float | None = None
     workers: int = 0
-    claim_guidance: float = 0.0
     planner: PlannerSettings = nested(
         GradientPlanner, folder="planner", option="gradient", kinds=planner_settings, registered=list_planners
     )

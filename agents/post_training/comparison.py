@@ -57,6 +57,7 @@ def measure_prior(
     pool: PhysicsPool | None = None,
     prompts: Sequence[str] | None = None,
     guidance: float = 0.0,
+    claim_guidance: float = 0.0,
     slots: int | None = None,
     reward: Any = None,
 ) -> Measured:
@@ -70,13 +71,17 @@ def measure_prior(
         pool: physics workers.
         prompts: one per scene, which the samples are then compared with; None for none.
         guidance: weight of classifier-free guidance.
+        claim_guidance: strength of claim guidance.
         slots: per sample; None means as trained.
         reward: reward that the run trains with, as :func:`rewards.isolation.run_reward` gives it; None measures none.
     """
     from agents.post_training.guard import realism
     from scene_envs.physics import feasibility, make_ready
 
-    raw = prior.sample(count, prompt=prompts, guidance=guidance, num_steps=num_steps, slots=slots, seed=seed)
+    raw = prior.sample(
+        count, prompt=prompts, guidance=guidance, claim_guidance=claim_guidance, num_steps=num_steps, slots=slots,
+        seed=seed,
+    )  # fmt: skip
     feasible = feasibility(raw, pool=pool)
     ready = make_ready(raw, pool=pool)
     counts = raw.counts.double()

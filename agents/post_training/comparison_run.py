@@ -68,7 +68,7 @@ def post_train_and_compare(
         def measure(prior: ScenePrior) -> Measured:
             return measure_prior(
                 prior, scenes, num_steps=num_steps, seed=seed, pool=pool, prompts=prompts, guidance=config.guidance,
-                slots=config.slots, reward=reward,
+                claim_guidance=config.claim_guidance, slots=config.slots, reward=reward,
             )  # fmt: skip
 
         say_stage(config, f"measuring {scenes} samples of the base prior")

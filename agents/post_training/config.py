@@ -17,7 +17,7 @@ from agents.configuration.tree import plain_tree
 from agents.post_training.algorithms import AlgorithmSettings, DDPOSFSettings, algorithm_settings, list_algorithms
 from agents.post_training.inpaint_settings import InpaintSettings
 from agents.post_training.regularisation_settings import AdapterSettings, RegularisationSettings
-from scene_envs.envs.settings import PROMPT_SOURCES
+from scene_envs.envs.settings import PROMPT_SOURCES, check_claim_guidance
 from scene_envs.errors import InvalidInputError
 
 RESUMABLE = ("recipe", "iterations", "output", "workers", "logger", "reward_timeout", "reward_memory")
@@ -167,6 +167,8 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
             with two cups.", "A scene with 9 objects."]', ``data`` for the prompts of the real scenes, or ``grammar``
             for descriptions of grammar scenes; null for no prompt.
         guidance: weight of classifier-free guidance in the policy, 0 for none; needs a prompt.
+        claim_guidance: strength with which sampled scenes are guided to the numbers and places that their prompts
+            give, 0 for none; 2 is a good choice; needs a prompt, and an algorithm that learns from finished samples.
         seed: seed of the initial noise, the chain's noise, the choice of steps and the real scenes.
         algorithm: the post-training algorithm.
         optimizer: the optimiser of the weights.
@@ -216,6 +218,18 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
             )
         self.prompt = list(self.prompt) if isinstance(self.prompt, tuple) else self.prompt
         check_prompt(self.prompt, self.guidance)
+        check_claim_guidance(self.prompt, self.claim_guidance)
+        if self.claim_guidance and isinstance(self.algorithm, DDPOSFSettings):
+            raise InvalidInputError(
+                f"claim_guidance={self.claim_guidance:g} changes how scenes are drawn, and "
+                f"algorithm={self.algorithm.name} learns from the probability of its own draws; take algorithm=nft or "
+                "awm, or leave claim_guidance=0"
+            )
+        if self.claim_guidance and self.inpaint.mask is not None:
+            raise InvalidInputError(
+                f"claim_guidance={self.claim_guidance:g} guides whole scenes, and inpaint.mask={self.inpaint.mask} "
+                "regenerates parts; leave one of them out"
+            )
         if self.optimizer.lr is None:
             factor = _ADAPTER_RATE if self.adapter.rank else 1.0
             self.optimizer = replace(self.optimizer, lr=factor * self.algorithm.learning_rate)

@@ -34,6 +34,7 @@ def make_guard(config: PostTrainConfig, learner: Learner, scenes: SceneBank) -> 
             learner.slots,
             asked[:count] if asked is not None and config.prompt is not None else None,
             config.guidance,
+            config.claim_guidance,
         )
     limits = config.guard.limits(config.algorithm.sample_limits)
     held = config.regularisation.target

@@ -71,8 +71,9 @@ class Learner:
             attach_adapter(self.prior, config.prior, rank=adapter.rank, scale=adapter.scale, seed=config.seed)
         self.slots = self.prior.config.slots if config.slots is None else config.slots
         self.policy = DenoisingPolicy(
-            self.prior, config.num_steps, chunk=config.optimizer.chunk, guidance=config.guidance
-        )
+            self.prior, config.num_steps, chunk=config.optimizer.chunk, guidance=config.guidance,
+            claim_guidance=config.claim_guidance,
+        )  # fmt: skip
         self.stds = self.policy.stds(self.slots).cpu()
         self.algorithm: Algorithm[Any] = make_algorithm(config.algorithm, self.policy, self.stds)
         self.reward = run_reward(

@@ -43,8 +43,9 @@ class OwnSampleAlgorithm(Algorithm[TensorDict]):
         self.sampler = deepcopy(self.prior).eval().requires_grad_(False)
         self.draws = draws
         self._sampling_policy = DenoisingPolicy(
-            self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance, independent=False
-        )  # it needs no log-probabilities
+            self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance,
+            claim_guidance=policy.claim_guidance, independent=False,
+        )  # fmt: skip  # it needs no log-probabilities
         self._average = WeightAverage(self.prior, sampler_decay)
 
     @property

@@ -167,6 +167,9 @@ def collect(
     rngs = [seeding.np_random(start + (first_row + row) // together)[0] for row in range(env.core.num_envs)]
     generator = Generator(device).manual_seed(stream_seed(seed, "noise", iteration))
     entries = None if observed is None else observed.entries.to(device)
+    slots = env.core.slots
+    hook = policy.claim_hook(prompts, slots)
+    shared_hook = policy.claim_hook(None if prompts is None else prompts[::together], slots)
     log_probs: list[Tensor] = []
     texts: list[Text] = []
 
@@ -181,10 +184,10 @@ def collect(
         if together > 1 and step < branching.steps:
             first = None if text is None else (text[0][::together], text[1][::together])
             x_t, flags = x_t[::together], None if entries is None else entries[::together]
-            drawn = policy.draw(x_t, step, text=first, noise=noise(x_t), observed=flags)
+            drawn = policy.draw(x_t, step, text=first, noise=noise(x_t), observed=flags, hook=shared_hook)
             action, log_prob = (part.repeat_interleave(together, dim=0) for part in drawn)
         else:
-            action, log_prob = policy.draw(x_t, step, text=text, noise=noise(x_t), observed=entries)
+            action, log_prob = policy.draw(x_t, step, text=text, noise=noise(x_t), observed=entries, hook=hook)
         if not bool(torch.isfinite(log_prob).all()):
             raise TrainingError(
                 f"the prior gave values that are not finite at step {step} of iteration {iteration + 1}; "

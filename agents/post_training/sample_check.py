@@ -33,6 +33,7 @@ class SampleCheck:
         slots: per sample.
         prompts: one per sample; None without prompts.
         guidance: weight of classifier-free guidance.
+        claim_guidance: strength of claim guidance.
 
     >>> from agents.priors.testing import tiny_prior
     >>> scorer = RewardScorer("object_count")
@@ -50,6 +51,7 @@ class SampleCheck:
     slots: int | None = None
     prompts: Sequence[str] | None = None
     guidance: float = 0.0
+    claim_guidance: float = 0.0
 
     @torch.no_grad()
     def sample(self, prior: ScenePrior) -> SceneBatch:
@@ -68,6 +70,7 @@ class SampleCheck:
             count,
             prompt=prompts,
             guidance=self.guidance if prompts else 0.0,
+            claim_guidance=self.claim_guidance if prompts else 0.0,
             num_steps=self.num_steps,
             slots=self.slots,
             seed=derived_seed(self.seed, start),

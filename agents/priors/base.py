@@ -240,13 +240,20 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
             size = min(batch_size, count - start)
             x0 = self.sample_tensor(
                 size, prompts=texts, guidance=guidance, num_steps=num_steps, slots=slots, generator=generator, eta=eta,
-                hook=self._claim_hook(texts, claim_guidance, num_steps, wide),
+                hook=self.claim_hook(texts, claim_guidance, num_steps, wide),
             )  # fmt: skip
             chunks.append(x0)
         return self.decode(torch.cat(chunks))
 
-    def _claim_hook(self, prompts: Sequence[str] | None, strength: float, num_steps: int, slots: int) -> Hook | None:
-        """Hook of a chain that samples whole scenes, moved toward the claims of ``prompts``."""
+    def claim_hook(self, prompts: Sequence[str] | None, strength: float, num_steps: int, slots: int) -> Hook | None:
+        """Hook of a chain that samples whole scenes, guided to the claims of ``prompts``; None without guidance.
+
+        Args:
+            prompts: one per scene.
+            strength: ``claim_guidance`` of :meth:`sample`.
+            num_steps: steps of the chain.
+            slots: slots per scene.
+        """
         if prompts is None or not strength:
             return None
         moved = torch.ones(len(prompts), slots, 1, dtype=torch.bool)

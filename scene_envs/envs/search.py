@@ -261,12 +261,12 @@ class SearchProblem:
         how: dict[str, Any] = {"num_steps": self.num_steps, "generators": noises}
         if watch is not None:
             role = getattr(watch, "role", "watch")
-            _check_takes(self.prior, role)
+            _check_takes(self.prior, role, "choose a planner that does not steer the denoising, such as evolution")
             how[role] = watch
         if reader is None or self.prompt is None:
             return self.prior.inpaint(batch, masks, **how).to("cpu")
         if self.claim_guidance:
-            _check_takes(self.prior, "claim_guidance")
+            _check_takes(self.prior, "claim_guidance", "leave claim_guidance=0")
             how["claim_guidance"] = self.claim_guidance
         return reader.inpaint(batch, masks, prompt=self.prompt, guidance=guidance, **how).to("cpu")
 
@@ -328,11 +328,8 @@ class SearchProblem:
         self.scorer.close()
 
 
-def _check_takes(prior: Any, role: str) -> None:
-    """Refuse to steer the inpaintings of a prior that cannot be steered."""
+def _check_takes(prior: Any, role: str, remedy: str) -> None:
+    """Refuse to steer or guide the inpaintings of a prior that does not take ``role``."""
     keys = inspect.signature(prior.inpaint).parameters.values()
     if not any(key.name == role or key.kind is inspect.Parameter.VAR_KEYWORD for key in keys):
-        raise InvalidInputError(
-            f"the planner steers the denoising, and inpaint of {type(prior).__name__} takes no {role}=; "
-            "choose another planner, such as evolution"
-        )
+        raise InvalidInputError(f"inpaint of {type(prior).__name__} takes no {role}=; {remedy}")

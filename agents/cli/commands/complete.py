@@ -29,16 +29,7 @@ class CompleteConfig(InpaintingConfig):
 def run(settings: CompleteConfig, run: Run) -> None:
     """Fill the empty slots."""
     prior, batch = load_prior_and_scenes("complete", settings)
-    filled = prior.complete(
-        batch,
-        prompt=settings.prompt,
-        guidance=settings.guidance,
-        claim_guidance=settings.claim_guidance,
-        slots=settings.slots,
-        fill=settings.fill,
-        num_steps=settings.num_steps,
-        seed=settings.seed,
-    )
+    filled = prior.complete(batch, slots=settings.slots, fill=settings.fill, **settings.sampling())
     added = float((filled.counts - batch.counts).double().mean())
     run.say(f"{len(batch)} scenes, {added:.1f} objects added on average")
     save_scenes(batch, filled.to("cpu"), settings.pictures, run, {"added": added})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from agents.cli.commands.scenes import draw_scenes
 from scene_envs.errors import InvalidInputError
@@ -31,8 +31,8 @@ class InpaintingConfig:
         count: number of scenes, from the first; null for all, or for 12 fresh samples.
         prompt: text that the whole scenes should match, for priors that read prompts; null for no prompt.
         guidance: weight of classifier-free guidance, 0 for none; needs a prompt.
-        claim_guidance: strength of the moves of objects toward what the prompt says of their places, 0 for none; 2 is a
-            good choice; needs a prompt.
+        claim_guidance: strength with which scenes are guided to the numbers and places that the prompt gives, 0 for
+            none; 2 is a good choice; needs a prompt.
         num_steps: denoising steps per scene.
         seed: seed of the noise.
         pictures: number of scenes in the galleries; 0 draws none.
@@ -51,6 +51,16 @@ class InpaintingConfig:
     pictures: int = 12
     device: str = "cpu"
     output: str = ""
+
+    def sampling(self) -> dict[str, Any]:
+        """Arguments of the methods of priors that these keys give."""
+        return {
+            "prompt": self.prompt,
+            "guidance": self.guidance,
+            "claim_guidance": self.claim_guidance,
+            "num_steps": self.num_steps,
+            "seed": self.seed,
+        }
 
 
 def check(settings: InpaintingConfig) -> None:

@@ -15,14 +15,7 @@ __all__ = ["check", "run"]
 def run(settings: InpaintingConfig, run: Run) -> None:
     """Give the free objects new poses; welded objects stay."""
     prior, batch = load_prior_and_scenes("rearrange", settings)
-    moved = prior.rearrange(
-        batch,
-        prompt=settings.prompt,
-        guidance=settings.guidance,
-        claim_guidance=settings.claim_guidance,
-        num_steps=settings.num_steps,
-        seed=settings.seed,
-    ).to("cpu")
+    moved = prior.rearrange(batch, **settings.sampling()).to("cpu")
     distance = (moved.translations - batch.translations).norm(dim=-1)[batch.is_free]
     figures = {"mean_distance_m": float(distance.double().mean()) if len(distance) else 0.0}
     run.say(f"{len(batch)} scenes, objects moved by {figures['mean_distance_m']:.3f} m on average")

@@ -25,8 +25,6 @@ class SampleConfig(SamplingKeys, OutputKeys):
     Attributes:
         prior: a shipped name, or the folder of a prior or a run.
         count: number of scenes to draw.
-        claim_guidance: strength of the moves of objects toward what the prompt says of their places, 0 for none; 2 is a
-            good choice; needs a prompt.
         eta: scale of the noise of the Gaussian steps: 1 for the ancestral chain, 0 for a deterministic chain (DDIM).
         union: objects in a scene of a prior of several scene types: one_type (only objects of one type) or any.
         reward: reward that scores the samples for metrics.json; null for none.
@@ -40,7 +38,6 @@ class SampleConfig(SamplingKeys, OutputKeys):
 
     prior: str = "dimsum_table"
     count: int = 16
-    claim_guidance: float = 0.0
     eta: float = 1.0
     union: str = "one_type"
     reward: Any = named("feasible_objects", "reward")
