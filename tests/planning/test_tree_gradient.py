@@ -183,7 +183,7 @@ def test_planners_that_steer_are_not_guided(name: str) -> None:
 def test_a_prior_that_cannot_be_guided_is_told() -> None:
     env = SearchEnv(prior=ToyPrior(), objective=near_middle, branching=10, num_steps=2, slots=SLOTS)
     env.reset(seed=0)
-    with pytest.raises(InvalidInputError, match="inpaint of ToyPrior takes no guide=; choose another planner"):
+    with pytest.raises(InvalidInputError, match="inpaint of ToyPrior takes no guide=; choose a planner that does not"):
         GradientPlanner(children=2).plan(env, 4)
 
 
