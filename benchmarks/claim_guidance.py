@@ -3,6 +3,8 @@
 python benchmarks/claim_guidance.py [--priors dimsum_table,living_room_shelf_feasible] [--kinds relations,count,names]
     [--count 128] [--strength 2] [--picture PATH]
 
+*Both* is the mean over scenes of the feasible share, 0 where the prompt is not followed.
+
 The prompts describe scenes of the grammar. Both rows of a prior and a kind have the same prompts and the same noise.
 ``--picture`` draws the scenes of the first prior and kind: without guidance above, with guidance below.
 """
@@ -25,7 +27,7 @@ from scene_envs.render import gallery, picture_camera, render
 
 _COLUMNS = (
     "prior", "prompts", "claim guidance", "followed", "at places", "on or in one thing", "on things of a name", "sides",
-    "next to", "feasible share", "scenes per second",
+    "next to", "feasible share", "both", "scenes per second",
 )  # fmt: skip
 CLASSES = ("PlaceCount", "SupportCount", "PairCount", "side", "next")
 _SHOWN = 4
@@ -69,8 +71,11 @@ def _row(batch: SceneBatch, prompts: list[str], seconds: float) -> str:
             held[kind].append(check.holds)
     parts = [f"{np.mean(held[kind]):.0%} of {len(held[kind])}" if held[kind] else "" for kind in CLASSES]
     output = make_reward("feasible_share")(batch, RewardContext())
-    share = float(output.value.mean())
-    return " | ".join([f"{np.mean(followed):.0%}", *parts, f"{share:.1%}", f"{len(batch) / seconds:.1f}"])
+    share = output.value.numpy()
+    both = float(np.mean(share * np.array(followed)))
+    return " | ".join(
+        [f"{np.mean(followed):.0%}", *parts, f"{share.mean():.1%}", f"{both:.1%}", f"{len(batch) / seconds:.1f}"]
+    )
 
 
 def _draw(drawn: list[SceneBatch], path: Path) -> None:

@@ -217,8 +217,9 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
             prompt: what the scenes should hold, one text for all or one per scene; None for anything.
             guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional (Ho and Salimans 2022); it
                 needs a prompt.
-            claim_guidance: strength of the moves toward the claims of the prompt, see
-                :class:`~agents.priors.claim_guidance.ClaimGuidance`; 2 is a good choice. It needs a prompt.
+            claim_guidance: strength of guidance to the claims of the prompt, see
+                :class:`~agents.priors.claim_guidance.ClaimGuidance` and
+                :class:`~agents.priors.number_guidance.NumberGuidance`; 2 is a good choice. It needs a prompt.
             num_steps: denoiser evaluations per scene, 1..T.
             slots: slots per scene; more than trained is allowed.
             seed: of the torch generator; the same seed and batch size give the same scenes.

@@ -161,8 +161,9 @@ class Inpainting(ABC):
                 category of each slot. Fixed welded slots are never regenerated.
             prompt: what the whole scenes should hold in the end, one text for all or one per scene; None for anything.
             guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional; it needs a prompt.
-            claim_guidance: strength of the moves toward the claims of the prompt, see
-                :class:`~agents.priors.claim_guidance.ClaimGuidance`; it needs a prompt.
+            claim_guidance: strength of guidance to the claims of the prompt, see
+                :class:`~agents.priors.claim_guidance.ClaimGuidance` and
+                :class:`~agents.priors.number_guidance.NumberGuidance`; it needs a prompt.
             num_steps: denoiser evaluations of one pass, 1..T.
             generators: one per scene, so that a scene's result does not depend on its neighbours' noise.
             seed: used to make the generators when none are given.

@@ -97,7 +97,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     | `render_mode` | `None` | `"rgb_array"`: pictures, masked objects in red; `"human"`: a page in the browser |
     | `prompt` | `None` | text that all scenes should satisfy, for priors that read prompts; the objective gets it too |
     | `guidance` | `0.0` | weight of classifier-free guidance, which doubles the NFE; needs a prompt |
-    | `claim_guidance` | `0.0` | strength of the moves toward what the prompt says of places; needs a prompt |
+    | `claim_guidance` | `0.0` | strength of guidance to the numbers and places that the prompt gives; needs a prompt |
 
     ## Vectorized environment
 

@@ -106,7 +106,7 @@ class TreeSettings(EnvSettings):
         objective_scale: objective at which Φ is 1; None means the largest value that it declares, or else the number
             of free slots.
         max_nfe: denoiser evaluations per episode; None for any number.
-        claim_guidance: strength of the moves of objects toward what the prompt says of their places; needs a prompt.
+        claim_guidance: strength of guidance to the numbers and places that the prompt gives; needs a prompt.
 
     Raises:
         InvalidInputError: a value is outside what is accepted.
@@ -169,10 +169,12 @@ def check_claim_guidance(prompt: Any, strength: Any) -> None:
         InvalidInputError: names the value and the remedy.
     """
     if not _is_finite(strength) or strength < 0:
-        raise InvalidInputError(f"claim_guidance={_shown(strength)} must be a finite number from 0 on; 0 moves nothing")
+        raise InvalidInputError(
+            f"claim_guidance={_shown(strength)} must be a finite number from 0 on; 0 guides nothing"
+        )
     if strength and not prompt:
         raise InvalidInputError(
-            f"claim_guidance={strength:g} moves objects toward the claims of a prompt, and prompt={prompt!r} has none; "
+            f"claim_guidance={strength:g} guides scenes to the claims of a prompt, and prompt={prompt!r} has none; "
             "give prompt=, or leave claim_guidance=0"
         )
 

@@ -59,7 +59,7 @@ LINES = {
     "sample eta=nan": "eta=nan must be at least 0",
     "sample reward_timeout=0": "reward_timeout=0.0 must be more than 0",
     "sample guidance=2": "guidance=2 strengthens a prompt",
-    "sample claim_guidance=2": "claim_guidance=2 moves objects toward the claims of a prompt",
+    "sample claim_guidance=2": "claim_guidance=2 guides scenes to the claims of a prompt",
     "search claim_guidance=2": "give prompt=, or leave claim_guidance=0",
     "rearrange prior=dimsum_table claim_guidance=-1": "claim_guidance=-1.0 must be a finite number",
     "evaluate claim_guidance=nan": "claim_guidance=nan must be a finite number",

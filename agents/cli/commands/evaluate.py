@@ -53,7 +53,8 @@ class EvaluateConfig(RealSceneKeys, OutputKeys):
         prompt_count: number of samples with prompts of held-out scenes, at most count; null takes count.
         num_steps: denoising steps per sample.
         guidance: weight of classifier-free guidance for the samples with prompts, 0 for none.
-        claim_guidance: strength of the moves of objects toward what their prompts say of their places, 0 for none.
+        claim_guidance: strength with which samples are guided to the numbers and places that their prompts give, 0 for
+            none.
         seed: seed of the samples, the real scenes and the classifiers.
         measures: all, or some of layout, physics, ready, fsd, novelty, prompts, classifier, renders, fid, written as
             layout or [layout, physics].
