@@ -1,6 +1,6 @@
 """Cost of the environment adapters over a bare sampling loop with the same prior.
 
-    python benchmarks/env_overhead.py [--prior dimsum_table] [--batch 128] [--steps 10] [--rounds 3]
+    python benchmarks/env_overhead.py [--prior dimsum_table_continuous] [--batch 128] [--steps 10] [--rounds 3]
 
 Every adapter runs the same chain as the bare loop: the prior's posterior, one normal draw a step, and the decoding and
 counting of the finished scenes. Times are CPU seconds of one thread, which a busy machine disturbs little. The bare

@@ -2,11 +2,11 @@
 
     python benchmarks/feasibility.py [--count 48] [--seed 0]
 
-The 20-object scenes are Dimsum Tables of 18 to 22 objects; the 60-object scenes are three such tables side by side,
-welded in one scene. *At rest* is how they are generated. *Precise* and *rough* add Gaussian noise to every free
-object, as samples of a good and of a poor prior: 0.4 mm in height and 2 mm sideways, 2 mm and 10 mm. Rates are per
-CPU second of one thread, which a busy machine disturbs little; geometry and bodies are built before the clock
-starts. Projection is timed scene by scene on the rough scenes, settling (1.5 s) on what comes out of it.
+The 20-object scenes are Dimsum Tables of 18 to 22 objects. The 60-object scenes are three such tables side by side,
+welded in one scene. *At rest* scenes are as generated. *Precise* and *rough* scenes have Gaussian noise on every free
+object, as samples of a good and of a poor prior have: 0.4 mm in height and 2 mm sideways, or 2 mm and 10 mm. Rates
+are per CPU second of one thread, which a busy machine changes little. Geometry and bodies are built before the clock
+starts. Projection is timed scene by scene on the rough scenes. Settling (1.5 s) is timed on the projected scenes.
 """
 
 from __future__ import annotations

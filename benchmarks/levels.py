@@ -2,9 +2,10 @@
 
     python benchmarks/levels.py [--scenes 1000] [--seed 0] [--types ...]
 
-Scenes of all types, a third each as generated and with *precise* and *rough* noise (2 mm sideways and 0.4 mm in height,
-10 mm and 2 mm), judged three times: as ``feasibility`` does; with every hollow object simulated with its fine parts;
-and with nothing at rest, so that every object is simulated, with fine parts. Counts objects whose verdict differs.
+A third of the scenes of each type is as generated, a third has *precise* noise (2 mm sideways, 0.4 mm in height), and
+a third has *rough* noise (10 mm and 2 mm). Each scene is judged three times: as ``feasibility`` does it; with fine
+parts of every hollow object; and with every object simulated, with fine parts. The table counts the objects whose
+verdict differs.
 """
 
 from __future__ import annotations

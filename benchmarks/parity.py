@@ -1,27 +1,33 @@
-"""Verdicts of feasibility here and in Drake, by the same definition on the same convex parts.
+"""Verdicts of feasibility of this package and of Drake, by the same definition on the same convex parts.
 
     python benchmarks/parity.py [TYPE ...] [--scenes 10] [--kinds raw "2 mm" "10 mm" prior] [--seed 0]
                                 [--friction 0.6] [--contact hydroelastic]
 
-Scenes, so many of each type and kind: as generated; with Gaussian noise on every free object of 2 mm sideways and
-0.4 mm in height, and of 10 mm and 2 mm; and samples of the shipped prior in 50 steps.
+``--scenes`` is the number of scenes of each type and kind. The kinds are:
 
-Drake's verdict. All fine convex parts of an asset become convex geometries of one body; welded objects belong to the
-world. The depth of two parts is that of `QueryObject.ComputePointPairPenetration`, and where this exceeds 1 mm the
-smaller of it and `ComputeSignedDistancePairClosestPoints`: both iterate, and may stop at a way out that is not the
-shortest. The depth of an object pair is its deepest part pair, and an object in a pair deeper than 1 mm is
-infeasible. Such objects are put out of reach, and the others move for 0.1 s under gravity in the discrete
-`MultibodyPlant`: 1 ms steps, SAP's solver with Drake's default approximation of contact ("lagged"), one friction
-everywhere. An object that is then more than 1 mm (object frame) or 0.01 rad from its pose is infeasible. Every object
-is simulated, with all its parts at their true size.
+- raw: scenes as generated,
+- 2 mm: with Gaussian noise on every free object, 2 mm sideways and 0.4 mm in height,
+- 10 mm: with noise of 10 mm sideways and 2 mm in height,
+- prior: samples of the shipped prior in 50 steps.
 
-Contact is hydroelastic by default, over a patch: welded objects rigid, others compliant with 1e8 Pa, so that objects at
-rest sink by micrometres. `--contact point` has one point per part pair, on which a box rocks. Hunt-Crossley dissipation
-of 20 s/m lets overlaps within the limit open at 50 mm/s at most, as objects that open faster would hop.
+Drake's verdict. Each fine convex part of an asset is a convex geometry, and all parts of an asset are one body.
+Welded objects belong to the world. The depth of two parts is that of `QueryObject.ComputePointPairPenetration`. If
+this depth is above 1 mm, the smaller of it and of `ComputeSignedDistancePairClosestPoints` is taken, because both
+iterate and may stop at a direction that is not the shortest. The depth of two objects is that of their deepest two
+parts. An object in a pair deeper than 1 mm is infeasible. Such objects are put out of reach, and the others move for
+0.1 s under gravity in the discrete `MultibodyPlant`, with 1 ms steps, the SAP solver, Drake's default approximation
+of contact ("lagged") and one friction for all. An object that is then more than 1 mm (object frame) or 0.01 rad from
+its pose is infeasible. Every object is simulated, with all its parts at their true size.
 
-Printed are objects, verdicts that differ in all, on penetration (deeper than 1 mm in one only) and on motion (all
-other differences), the largest difference in depth among objects that neither finds deep, seconds in Drake, and a
-line for each object whose verdict differs. Scenes that one of the two could not simulate are named and left out.
+Contact is hydroelastic by default and acts over a patch. Welded objects are rigid. Others are compliant with 1e8 Pa,
+so objects at rest sink by micrometres. With `--contact point` each part pair has one contact point, and a box rocks
+on it. Hunt-Crossley dissipation of 20 s/m lets overlaps within the limit open at 50 mm/s at most. Objects that open
+faster would hop.
+
+The table gives, for each type and kind, the number of objects, the number of verdicts that differ, those of them that
+differ on penetration (deeper than 1 mm in one only) and on motion (all others), the largest difference in depth among
+objects that neither finds deep, and the seconds in Drake. A line follows for each object whose verdict differs.
+Scenes that one of the two could not simulate are named and left out.
 """
 
 from __future__ import annotations

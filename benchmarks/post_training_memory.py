@@ -1,11 +1,11 @@
 """Peak memory of one policy gradient against the number of denoising steps.
 
-    python benchmarks/post_training_memory.py [--prior dimsum_table] [--batch-size 32]
+    python benchmarks/post_training_memory.py [--prior dimsum_table_continuous] [--batch-size 8] [--steps 10 25 50 100]
 
-Compares the score-function gradient, accumulated step by step (`DDPOSFLoss`), with a gradient propagated through
-the whole chain. Counts the tensors autograd keeps for the backward pass, by hooks, so the figure is exact, the same
-on every machine and free of the allocator; on a GPU the allocator's peak is printed too. Every step is in the
-gradient. The chain's own states, kept for the score function, are listed apart: kilobytes a scene.
+Compares the score-function gradient, accumulated step by step (`DDPOSFLoss`), with a gradient that is propagated
+through the whole chain. Every step is in the gradient. Hooks count the tensors that autograd keeps for the backward
+pass, so the figure is exact and the same on every machine. On a GPU the allocator's peak is printed too. The states
+of the chain, which the score function needs, have a column of their own: kilobytes a scene.
 """
 
 from __future__ import annotations

@@ -3,17 +3,20 @@
     python benchmarks/projection.py [--count 40] [--small 20] [--starts 6] [--seed 0] [--types ...] [--heaps]
 
 *Each type*: generated scenes whose free objects were moved by Gaussian noise of 1 and 2 cm along every axis. Times
-are CPU time of one thread, scene by scene. *Small scenes*: 2 to 8 free objects that overlap, cut out of the jittered
-scenes, solved by projection and by scipy's SLSQP: least sum of squared translations, the signed distance of every near
-pair of convex parts at least the clearance that projection asks for, the workspace as bounds. SLSQP solves both
-the fine parts and the coarse hulls, from the given poses and from random ones 1 cm around them, and the fine parts
-once more from what projection found; its best solution that is free of overlap counts. The ratio is between the
-square roots of what both minimise. *Alone* counts the scenes that SLSQP solves without the start from ours.
+are CPU time of one thread, scene by scene.
 
-``--heaps`` measures degenerate scenes alone, at the largest count of each type: all free objects at one point of the
-workspace or 10 m outside it, at one place in pairs, in a tower 10 mm apart, in a cube of 5 cm, or in what is welded;
-of random assets, and all of the asset with most convex parts. *Left* is the deepest overlap
-that is left, the largest over the scenes.
+*Small scenes*: 2 to 8 free objects that overlap, cut out of the jittered scenes. Projection and scipy's SLSQP solve
+the same problem: the least sum of squared translations, with the signed distance of every near pair of convex parts
+at least the clearance that projection asks for, and the workspace as bounds. SLSQP solves it with the fine parts and
+with the coarse hulls, from the given poses and from random poses 1 cm around them. It also solves it with the fine
+parts from the result of projection. The best of its solutions that are free of overlap counts. The ratio is between
+the square roots of the minimised sums. *Alone* is the number of scenes that SLSQP solves without the start from the
+result of projection.
+
+``--heaps`` measures degenerate scenes alone, at the largest count of each type. All free objects are at one point of
+the workspace or 10 m outside it, at one place in pairs, in a tower 10 mm apart, in a cube of 5 cm, or inside a welded
+object. Their assets are random, or all the one with most convex parts. *Left* is the deepest overlap that is left,
+the largest over the scenes.
 """
 
 from __future__ import annotations

@@ -3,15 +3,16 @@
     python benchmarks/ready.py [TYPE ...] [--count 30] [--seed 0] [--noise 0 0.004 0.015] [--simulator MuJoCo]
                                [--duration 2] [--others drop] [--scenes FILE | --ready FILE] [--save FOLDER] [--details]
 
-Scenes come from the grammar of each type. The noise levels take turns over them: Gaussian, so many metres sideways
-and a fifth of that in height, on every free object. `make_ready` projects and settles them, the export as it is goes
-into the simulator, which runs for the duration. Counted are the objects that `make_ready` marks ready: how many are
-then more than 1 mm (object frame) from where they were exported, and the largest distance; how many are in an overlap
-deeper than 0.1 mm by `penetration`, and the deepest. Objects not ready carry no promise: they are left out of the
-exported scene, or with `--others keep` stay in it and are not counted.
+Scenes come from the grammar of each type. Every free object gets Gaussian noise; ``--noise`` lists its standard
+deviations sideways in m, and its height has a fifth of that. The first scene has the first level, the second scene
+the second, and so on in turn. `make_ready` projects and settles the scenes, and their export is simulated for
+``--duration`` seconds. The table counts the objects that `make_ready` marks ready, those of them that are then more
+than 1 mm (object frame) from where they were exported, the largest distance, the ready objects in an overlap deeper
+than 0.1 mm by `penetration`, and the deepest overlap. Objects that are not ready are left out of the exported scene.
+With `--others keep` they stay in it and are not counted.
 
 `--details` lists objects that moved: their pose, their distance after 0.1 s and at the end, and what they overlap.
-`--save` writes the ready objects of each type to FOLDER/TYPE.safetensors; `--ready FILE` simulates such a file again.
+`--save` writes the ready objects of each type to FOLDER/TYPE.safetensors. `--ready FILE` simulates such a file again.
 """
 
 from __future__ import annotations

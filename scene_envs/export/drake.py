@@ -8,9 +8,11 @@ from typing import Any
 
 import yaml
 
+from scene_envs.errors import InvalidInputError
 from scene_envs.export.asset_files import AssetFiles
 from scene_envs.export.placed import PlacedObject, PlacedScene, angle_axis, number
 from scene_envs.export.urdf import asset_urdf, relative
+from scene_envs.files import write_text
 
 
 class _AngleAxis(dict[str, Any]):
@@ -40,15 +42,24 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
 
 
 def write_package(files: AssetFiles) -> str:
-    """Write ``package.xml`` into the export folder unless it is there already; returns the name in it."""
+    """Write ``package.xml`` into the export folder unless it is there already; returns the name in it.
+
+    Raises:
+        InvalidInputError: a file of this name is there and names no package.
+    """
     path = files.root.parent / "package.xml"
-    if path.exists():
-        found = re.search(r"<name>\s*([^<\s]+)\s*</name>", path.read_text())
-        if found:
-            return found[1]
-    path.write_text(
+    if path.exists() and (text := path.read_text().strip()):
+        found = re.search(r"<name>\s*([^<\s]+)\s*</name>", text)
+        if not found:
+            raise InvalidInputError(
+                f"{path} has no <name>, so that Drake cannot find the assets beside it; name the package there, or "
+                "export into another folder"
+            )
+        return found[1]
+    write_text(
+        path,
         f'<?xml version="1.0"?>\n<package format="2">\n  <name>{files.package}</name>\n  <version>1.0.0</version>\n'
-        "  <description>Scenes and their assets.</description>\n</package>\n"
+        "  <description>Scenes and their assets.</description>\n</package>\n",
     )
     return files.package
 

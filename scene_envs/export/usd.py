@@ -12,6 +12,7 @@ from scene_envs.assets.base import Asset
 from scene_envs.export.asset_files import AssetFiles, face_colors, visual_mesh
 from scene_envs.export.placed import PlacedScene, quaternion
 from scene_envs.export.urdf import relative
+from scene_envs.physics.constants import GRAVITY
 from scene_envs.physics.rigid import principal_inertia
 
 
@@ -25,7 +26,7 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     stage.SetDefaultPrim(world.GetPrim())
     physics = UsdPhysics.Scene.Define(stage, "/World/physics_scene")
     physics.CreateGravityDirectionAttr(Gf.Vec3f(0, 0, -1))
-    physics.CreateGravityMagnitudeAttr(9.81)
+    physics.CreateGravityMagnitudeAttr(GRAVITY)
     for thing in scene.objects:
         prim = UsdGeom.Xform.Define(stage, f"/World/{thing.name}")
         prim.GetPrim().GetReferences().AddReference(Sdf.Reference(relative(asset_usd(thing.asset, files), folder)))

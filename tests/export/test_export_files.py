@@ -55,6 +55,17 @@ def test_no_file_names_a_place_outside_the_folder(folder):
             assert not target.startswith(b"/"), name
 
 
+def test_a_package_of_the_user_keeps_its_name_and_one_without_a_name_is_refused(tmp_path, batch):
+    package = tmp_path / "package.xml"
+    package.write_text("<package><name>kitchen</name></package>")
+    export(batch[:1], tmp_path, formats=["drake"])
+    assert "package://kitchen/" in (tmp_path / "scene_000" / "scene.dmd.yaml").read_text()
+    package.write_text("<package/>")
+    with pytest.raises(InvalidInputError, match=r"package.xml has no <name>.*name the package there"):
+        export(batch[:1], tmp_path, formats=["drake"])
+    assert package.read_text() == "<package/>"
+
+
 def test_duplicates_have_names_of_their_own(scenes):
     names = [thing.name for thing in scenes[0].objects]
     assert len(set(names)) == len(names)
