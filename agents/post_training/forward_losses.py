@@ -75,7 +75,8 @@ class AWMLoss(ForwardProcessLoss):
 
     With a = clip(A / c, -1, 1), the loss of a continuous entry is a |o - target|^2 + beta |o - o_old|^2. This loss is
     bounded below for beta > 1. The loss of a category is a times its cross-entropy plus beta KL(p_old || p). For a bad
-    sample it is bounded below if beta times p_old of the category exceeds -a. At o = o_old the gradient is that of :class:`NFTLoss` divided by the beta of :class:`NFTLoss`.
+    sample it is bounded below if beta times p_old of the category exceeds -a. At o = o_old the gradient is that of
+    :class:`NFTLoss` divided by the beta of :class:`NFTLoss`.
 
     Args:
         prior, sampler, expectation, generator: as in :class:`ForwardProcessLoss`.

@@ -102,18 +102,16 @@ def _counts() -> tuple[Row, ...]:
 
 
 def _prompts() -> tuple[Row, ...]:
-    """Prompts as reward, alone and gated with feasibility."""
-    gated = "reward={name: product, rewards: [prompt_match, feasible_share]}"
-    rows = []
-    for prior in ("dimsum_table", "restaurant_low_clutter"):
-        for label, reward in (
-            ("match", "reward=prompt_match"),
-            ("gated", gated),
-            ("feasible", "reward=feasible_share"),
-        ):
-            keys = (f"algorithm={FORWARD}", reward, "prompt=grammar", "seed=0")
-            rows.append(Row(f"{prior}-{label}-0", prior, keys, 100))
-    return tuple(rows)
+    """Prompts as reward, feasibility, and feasibility where the prompt is followed; with and without claim guidance."""
+    gated = "reward={name: gate, reward: feasible_share, condition: prompt_match, threshold: 1}"
+    rewards = {"match": "reward=prompt_match", "feasible": "reward=feasible_share", "gate": gated}
+    return tuple(
+        Row(f"{prior}-{how}{label}-0", prior,
+            (f"algorithm={FORWARD}", reward, "prompt=grammar", "seed=0", f"claim_guidance={strength}"), 60)
+        for prior in ("dimsum_table", "restaurant_low_clutter")
+        for how, strength in (("", 0), ("guided_", 2))
+        for label, reward in rewards.items()
+    )  # fmt: skip
 
 
 def _realism() -> tuple[Row, ...]:
