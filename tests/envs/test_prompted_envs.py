@@ -217,7 +217,7 @@ def test_search_refuses_what_it_cannot_follow(reader, prior):
         gym.make(SEARCH, prior=prior, prompt=PROMPTS[0])
     with pytest.raises(InvalidInputError, match="strengthens a prompt"):
         gym.make(SEARCH, prior=reader, guidance=1.0)
-    with pytest.raises(InvalidInputError, match=r"claim_guidance=2 moves objects .* prompt=None has none"):
+    with pytest.raises(InvalidInputError, match=r"claim_guidance=2 guides scenes .* prompt=None has none"):
         gym.make(SEARCH, prior=reader, claim_guidance=2.0)
     with pytest.raises(InvalidInputError, match="claim_guidance=-1 must be a finite number from 0 on"):
         gym.make(SEARCH, prior=reader, prompt=PROMPTS[0], claim_guidance=-1)
