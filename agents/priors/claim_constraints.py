@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -250,14 +250,24 @@ def _closest_pairs(
     """
     one_each = isinstance(claim, PairCount) and not claim.inside
     occupied = set(holder.tolist()) | set(scene.held.support[~scene.held.contained].tolist()) if one_each else set()
-    ranked = sorted(
-        (float(distance_across(scene, upper, lower)), int(upper), int(lower))
+    width = sizes(scene)[:, :2].max(axis=1)
+    ranked = sorted(  # of two orders of a pair, the wider thing below
+        (float(distance_across(scene, upper, lower)), float(width[upper] - width[lower]), int(upper), int(lower))
         for upper in free
         for lower in holding
         if upper != lower and lower not in occupied and holder[lower] != upper and not scene.carries(upper, lower)
     )
-    pairs: list[tuple[int, int]] = []
-    for _, upper, lower in ranked:
-        if all(upper != other and not (one_each and lower == under) for other, under in pairs):
-            pairs.append((upper, lower))
-    return pairs
+    under: dict[int, int] = {}
+    for _, _, upper, lower in ranked:
+        taken = upper in under or (one_each and lower in under.values())
+        if not taken and not _stands_over(under, lower, upper):
+            under[upper] = lower
+    return list(under.items())
+
+
+def _stands_over(under: Mapping[int, int], upper: int, lower: int) -> bool:
+    """Whether the chain of things under ``upper`` leads to ``lower``."""
+    while (upper := under.get(upper, -1)) >= 0:
+        if upper == lower:
+            return True
+    return False

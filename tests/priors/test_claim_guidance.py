@@ -137,6 +137,15 @@ def test_things_on_other_things(on: int, number: int) -> None:
     assert holds(followed(scene, prompt), prompt)
 
 
+@pytest.mark.parametrize("number", [1, 2])
+def test_a_stack_of_things_of_one_name(number: int) -> None:
+    scene = build("dimsum_table", [("steamer_bottom", (0.0, 0.3 * i - 0.3, 0.0)) for i in range(3)])
+    words = {1: "a steamer bottom is", 2: "two steamer bottoms are each"}
+    prompt = f"A scene where {words[number]} on top of a steamer bottom."
+    assert not holds(scene, prompt)
+    assert holds(followed(scene, prompt), prompt)
+
+
 @pytest.mark.parametrize("claim", ["two coke cans are on top of the plate", "an apple is in the bowl"])
 def test_things_on_or_in_one_certain_thing(claim: str) -> None:
     cans = [("soda_can", (0.1, 0.2 * i - 0.2, BOTTOM)) for i in range(2)]
