@@ -68,7 +68,7 @@ class NumberGuidance:
 
     def __call__(self, x: Tensor, reverse: ReverseStep) -> ReverseStep:
         """The step at x_t (B, N, D) with other probabilities of the masked slots' categories."""
-        if not isinstance(reverse, MixedStep) or reverse.masked is None:
+        if not isinstance(reverse, MixedStep) or reverse.masked is None or not bool(reverse.masked.any()):
             return reverse
         masked, kinds, states = reverse.masked, self._kinds.to(x.device), state_of(x[..., POSE_FEATURES:])
         probs, chance = reverse.probs[..., :-1], 1 - reverse.probs[..., -1:]
