@@ -90,7 +90,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--kinds", default="relations", help="kinds of prompts: relations, count, names")
     parser.add_argument("--count", type=int, default=128, help="prompts of each prior and kind")
     parser.add_argument("--strength", type=float, default=2.0, help="claim_guidance of the second row")
-    parser.add_argument("--guidance", type=float, default=0.5, help="weight of classifier-free guidance")
+    parser.add_argument("--guidance", type=float, default=0.0, help="weight of classifier-free guidance")
     parser.add_argument(
         "--picture", type=Path, default=None, help="picture of the first scenes; nothing else is sampled"
     )
