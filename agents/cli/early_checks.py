@@ -81,7 +81,7 @@ def check_early(settings: Any, config_dir: str = "", module: ModuleType | None =
         find_scenes(Path(replay), "regularisation.replay")
     for key in set(_DATASETS) - set(kept) - set(getattr(settings, "NO_PATHS", ())):
         _check_dataset(key, _dotted(settings, key))
-    _check_prompt(settings)
+    _check_guidance(settings)
 
 
 def known_rewards(config_dir: str = "") -> list[str]:
@@ -165,7 +165,7 @@ def _check_dataset(key: str, value: Any) -> None:
             )
 
 
-def _check_prompt(settings: Any) -> None:
+def _check_guidance(settings: Any) -> None:
     prompt, guidance = getattr(settings, "prompt", None), getattr(settings, "guidance", 0.0)
     if not math.isfinite(guidance):
         raise InvalidInputError(f"guidance={guidance} must be a finite number; 0 follows the prompt as it is")
@@ -177,6 +177,10 @@ def _check_prompt(settings: Any) -> None:
         from scene_envs.envs.settings import check_claim_guidance
 
         check_claim_guidance(prompt if hasattr(settings, "prompt") else "those of real scenes", strength)
+    if strength := getattr(settings, "physics_guidance", 0.0):
+        from scene_envs.envs.settings import check_physics_guidance
+
+        check_physics_guidance(strength)
 
 
 def _dotted(settings: Any, key: str) -> Any:

@@ -57,6 +57,8 @@ class SearchConfig(BudgetKeys, SamplingKeys):
         prompt: text that all scenes should match, for priors that read prompts; the objective gets it too. null for no
             prompt.
         num_steps: denoiser evaluations per scene.
+        physics_guidance: strength with which regenerated objects are moved out of overlaps and onto supports at the
+            last steps, 0 to 1; 1 is a good choice.
         slots: slots per scene; null takes the number of the scene type.
         seed: seed of the search tree; the baseline starts with the same first scenes, unless the planner steers the
             denoising.
@@ -73,6 +75,7 @@ class SearchConfig(BudgetKeys, SamplingKeys):
     mask: Any = named("blamed_or_empty", "mask")
     masks: list[Any] | None = None
     objective_scale: float | None = None
+    physics_guidance: float = 0.0
     workers: int = 0
     planner: PlannerSettings = nested(
         GradientPlanner, folder="planner", option="gradient", kinds=planner_settings, registered=list_planners

@@ -239,6 +239,7 @@ class _Run:
             prompt=config.prompt,
             guidance=config.guidance,
             claim_guidance=config.claim_guidance,
+            physics_guidance=config.physics_guidance,
         )
         journal = None
         if self.folder is not None:

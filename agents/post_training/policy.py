@@ -96,7 +96,9 @@ class DenoisingPolicy(TensorDictModuleBase):
         """Hook of :meth:`draw` that guides scenes to the claims of their ``prompts``; None without guidance."""
         if prompts is None or not self.claim_guidance:
             return None
-        return cast(ScenePrior, self.prior).claim_hook(prompts, self.claim_guidance, len(self), slots)
+        return cast(ScenePrior, self.prior).sampling_hook(
+            len(prompts), slots, len(self), prompts=prompts, claim_guidance=self.claim_guidance
+        )
 
     def distribution(
         self, x_t: Tensor, step: int, text: Text | None = None, observed: Tensor | None = None

@@ -19,13 +19,13 @@ from agents.diffusion import (
 from agents.networks.count_conditioning import CountConditioning
 from agents.networks.text import Text
 from agents.priors.adapters import AdapterFacts
-from agents.priors.claim_guidance import ClaimGuidance
 from agents.priors.forward import Trainable
-from agents.priors.hooks import Hook, make_hook
+from agents.priors.guidance import guidance_hook
+from agents.priors.hooks import Hook
 from agents.priors.inpainting import Inpainting
 from agents.priors.loading import Loadable
-from agents.priors.number_guidance import NumberGuidance
 from agents.priors.prompt_validation import check_prompts, no_text
+from scene_envs.envs.settings import check_physics_guidance
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
@@ -204,6 +204,7 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
         prompt: str | Sequence[str] | None = None,
         guidance: float = 0.0,
         claim_guidance: float = 0.0,
+        physics_guidance: float = 0.0,
         num_steps: int = 50,
         slots: int | None = None,
         seed: int = 0,
@@ -220,6 +221,8 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
             claim_guidance: strength of guidance to the claims of the prompt, see
                 :class:`~agents.priors.claim_guidance.ClaimGuidance` and
                 :class:`~agents.priors.number_guidance.NumberGuidance`; 2 is a good choice. It needs a prompt.
+            physics_guidance: strength with which objects are moved out of overlaps and onto supports at the last steps,
+                0 to 1, see :class:`~agents.priors.physics_guidance.PhysicsGuidance`; 1 is a good choice.
             num_steps: denoiser evaluations per scene, 1..T.
             slots: slots per scene; more than trained is allowed.
             seed: of the torch generator; the same seed and batch size give the same scenes.
@@ -234,6 +237,7 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
             prompt, guidance, count, scene_type=self.scene_type, slots=wide, conditional=self.conditional,
             claim_guidance=claim_guidance,
         )  # fmt: skip
+        check_physics_guidance(physics_guidance, self.scene_type)
         generator = Generator(str(self._fixed.device)).manual_seed(seed)
         chunks = []
         for start in range(0, count, batch_size):
@@ -241,27 +245,39 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
             size = min(batch_size, count - start)
             x0 = self.sample_tensor(
                 size, prompts=texts, guidance=guidance, num_steps=num_steps, slots=slots, generator=generator, eta=eta,
-                hook=self.claim_hook(texts, claim_guidance, num_steps, wide),
+                hook=self.sampling_hook(
+                    size, wide, num_steps, prompts=texts, claim_guidance=claim_guidance,
+                    physics_guidance=physics_guidance,
+                ),
             )  # fmt: skip
             chunks.append(x0)
         return self.decode(torch.cat(chunks))
 
-    def claim_hook(self, prompts: Sequence[str] | None, strength: float, num_steps: int, slots: int) -> Hook | None:
-        """Hook of a chain that samples whole scenes, guided to the claims of ``prompts``; None without guidance.
+    def sampling_hook(
+        self,
+        count: int,
+        slots: int,
+        num_steps: int,
+        *,
+        prompts: Sequence[str] | None = None,
+        claim_guidance: float = 0.0,
+        physics_guidance: float = 0.0,
+    ) -> Hook | None:
+        """Hook of a chain that samples whole scenes under guidance; None where nothing guides them.
 
         Args:
-            prompts: one per scene.
-            strength: ``claim_guidance`` of :meth:`sample`.
-            num_steps: steps of the chain.
+            count: scenes.
             slots: slots per scene.
+            num_steps: steps of the chain.
+            prompts: one per scene; without prompts there is no claim guidance.
+            claim_guidance, physics_guidance: as in :meth:`sample`.
         """
-        if prompts is None or not strength:
-            return None
-        moved = torch.ones(len(prompts), slots, 1, dtype=torch.bool)
+        moved = torch.ones(count, slots, 1, dtype=torch.bool)
         moved[:, : len(self.scene_type.fixed)] = False
-        guides = [ClaimGuidance(prompts, self.scene_type, strength)]
-        numbers = NumberGuidance(prompts, self.scene_type)
-        return make_hook(self, self.step_table(num_steps), self.decode, moved, guides=guides, draw=numbers)
+        return guidance_hook(
+            self, self.scene_type, self.step_table(num_steps), self.decode, moved,
+            prompts=prompts, claim_guidance=claim_guidance, physics_guidance=physics_guidance,
+        )  # fmt: skip
 
     def decode(self, x: Tensor) -> SceneBatch:
         """Scenes from normalised x_0 (B, N, D); known entries take their exact values."""

@@ -11,11 +11,11 @@ from torch import Generator, Tensor
 from agents.diffusion.reverse_steps import ReverseStep
 from agents.diffusion.step_tables import StepTable
 from agents.networks.text import Text
-from agents.priors.claim_guidance import ClaimGuidance
-from agents.priors.hooks import Guide, Hook, Start, Watch, make_hook
-from agents.priors.number_guidance import NumberGuidance
+from agents.priors.guidance import guidance_hook
+from agents.priors.hooks import Guide, Hook, Start, Watch
 from agents.priors.observed_scenes import Noise, ObservedScenes, check_mask, merge
 from agents.priors.prompt_validation import check_prompts
+from scene_envs.envs.settings import check_physics_guidance
 from scene_envs.errors import InvalidInputError
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
@@ -143,6 +143,7 @@ class Inpainting(ABC):
         prompt: str | Sequence[str] | None = None,
         guidance: float = 0.0,
         claim_guidance: float = 0.0,
+        physics_guidance: float = 0.0,
         num_steps: int = 50,
         generators: Sequence[Generator] | None = None,
         seed: int = 0,
@@ -164,6 +165,8 @@ class Inpainting(ABC):
             claim_guidance: strength of guidance to the claims of the prompt, see
                 :class:`~agents.priors.claim_guidance.ClaimGuidance` and
                 :class:`~agents.priors.number_guidance.NumberGuidance`; it needs a prompt.
+            physics_guidance: strength with which regenerated objects are moved out of overlaps and onto supports at the
+                last steps, 0 to 1, see :class:`~agents.priors.physics_guidance.PhysicsGuidance`.
             num_steps: denoiser evaluations of one pass, 1..T.
             generators: one per scene, so that a scene's result does not depend on its neighbours' noise.
             seed: used to make the generators when none are given.
@@ -179,7 +182,8 @@ class Inpainting(ABC):
 
         Raises:
             InvalidInputError: a mask of the wrong shape or type, not one generator per scene, ``resample`` below 1, a
-                prompt for a prior that reads none, guidance without a prompt, or ``claim_guidance`` below 0.
+                prompt for a prior that reads none, guidance without a prompt, ``claim_guidance`` below 0, or
+                ``physics_guidance`` outside 0 to 1.
         """
         both = check_mask(batch, mask, generators, resample).to(batch.tensor.device)
         both[:, : len(self.scene_type.fixed)] = False
@@ -188,19 +192,19 @@ class Inpainting(ABC):
             prompt, guidance, len(batch), scene_type=self.scene_type, slots=slots, conditional=self.conditional,
             claim_guidance=claim_guidance,
         )  # fmt: skip
+        check_physics_guidance(physics_guidance, self.scene_type)
         if generators is None:
             generators = [Generator().manual_seed(seed + i) for i in range(len(batch))]
         device, table = self.device, self.step_table(num_steps)
         moved = both[..., :1]
-        guides, numbers = ([] if guide is None else [guide]), None
-        if prompts is not None and claim_guidance:
-            guides.append(ClaimGuidance(prompts, self.scene_type, claim_guidance, moved.squeeze(-1)))
-            numbers = NumberGuidance(prompts, self.scene_type)
 
         def scenes(x: Tensor) -> SceneBatch:
             return merge(batch, self.decode(x).to(batch.tensor.device), both)
 
-        hook = make_hook(self, table, scenes, moved, watch=watch, guides=guides, draw=numbers)
+        hook = guidance_hook(
+            self, self.scene_type, table, scenes, moved, prompts=prompts, claim_guidance=claim_guidance,
+            physics_guidance=physics_guidance, guide=guide, watch=watch,
+        )  # fmt: skip
         begins = getattr(watch, "start", None)
         start = None if begins is None else begins(len(table))
         x = self.regenerate(
@@ -215,6 +219,7 @@ class Inpainting(ABC):
         prompt: str | Sequence[str] | None = None,
         guidance: float = 0.0,
         claim_guidance: float = 0.0,
+        physics_guidance: float = 0.0,
         slots: int | None = None,
         fill: int | None = None,
         num_steps: int = 50,
@@ -227,7 +232,7 @@ class Inpainting(ABC):
         Args:
             batch: scenes.
             prompt: what the completed scenes should hold, one text for all or one per scene; None for anything.
-            guidance, claim_guidance: as in :meth:`inpaint`.
+            guidance, claim_guidance, physics_guidance: as in :meth:`inpaint`.
             slots: slots of the result, at least those of ``batch``; None keeps them.
             fill: most objects to add to a scene; None for as many as there are empty slots.
             num_steps: denoiser evaluations per scene.
@@ -238,8 +243,8 @@ class Inpainting(ABC):
             raise InvalidInputError(f"fill={fill}: give the most objects to add, at least 0, or None")
         open_slots = wide.is_empty if fill is None else wide.is_empty & (wide.is_empty.cumsum(dim=1) <= fill)
         return self.inpaint(
-            wide, open_slots, prompt=prompt, guidance=guidance, claim_guidance=claim_guidance, num_steps=num_steps,
-            seed=seed,
+            wide, open_slots, prompt=prompt, guidance=guidance, claim_guidance=claim_guidance,
+            physics_guidance=physics_guidance, num_steps=num_steps, seed=seed,
         )  # fmt: skip
 
     def rearrange(
@@ -249,6 +254,7 @@ class Inpainting(ABC):
         prompt: str | Sequence[str] | None = None,
         guidance: float = 0.0,
         claim_guidance: float = 0.0,
+        physics_guidance: float = 0.0,
         num_steps: int = 50,
         seed: int = 0,
     ) -> SceneBatch:
@@ -259,8 +265,9 @@ class Inpainting(ABC):
         free = batch.is_free
         mask = torch.stack([free, torch.zeros_like(free)], dim=-1)
         return self.inpaint(
-            batch, mask, prompt=prompt, guidance=guidance, claim_guidance=claim_guidance, num_steps=num_steps, seed=seed
-        )
+            batch, mask, prompt=prompt, guidance=guidance, claim_guidance=claim_guidance,
+            physics_guidance=physics_guidance, num_steps=num_steps, seed=seed,
+        )  # fmt: skip
 
 
 def draw_noise(like: Tensor, generators: Sequence[Generator] | Generator | None) -> Tensor:

@@ -16,7 +16,7 @@ from torch import Tensor
 from scene_envs.envs.masks import MaskGenerator, mask_for_prompt, masked_slots, resolve_mask
 from scene_envs.envs.prompts import EnvPrompts
 from scene_envs.envs.scoring import RewardScorer, Score
-from scene_envs.envs.settings import SearchSettings, TreeSettings, takes
+from scene_envs.envs.settings import SearchSettings, TreeSettings, check_physics_guidance, takes
 from scene_envs.envs.spaces import check_slots, prior_device, resolve_scene_and_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
@@ -142,7 +142,8 @@ class SearchProblem:
         self.device = prior_device(self.prior)
         self.branching, self.max_depth, self.num_steps = chosen.branching, chosen.max_depth, chosen.num_steps
         self.num_actions, self.max_nfe = chosen.branching, chosen.max_nfe
-        self.claim_guidance = chosen.claim_guidance
+        self.claim_guidance, self.physics_guidance = chosen.claim_guidance, chosen.physics_guidance
+        check_physics_guidance(self.physics_guidance, self.scene_type)
         self.prior.step_table(self.num_steps)  # raises now, not later, if the prior has fewer steps
         self.prompting = EnvPrompts(self.prior, chosen.prompt, chosen.guidance, self.slots)
         self.prompt = self.prompting.draw(np.random.default_rng(0)) if self.prompting.given else None
@@ -263,6 +264,9 @@ class SearchProblem:
             role = getattr(watch, "role", "watch")
             _check_takes(self.prior, role, "choose a planner that does not steer the denoising, such as evolution")
             how[role] = watch
+        if self.physics_guidance:
+            _check_takes(self.prior, "physics_guidance", "leave physics_guidance=0")
+            how["physics_guidance"] = self.physics_guidance
         if reader is None or self.prompt is None:
             return self.prior.inpaint(batch, masks, **how).to("cpu")
         if self.claim_guidance:

@@ -107,6 +107,7 @@ class TreeSettings(EnvSettings):
             of free slots.
         max_nfe: denoiser evaluations per episode; None for any number.
         claim_guidance: strength of guidance to the numbers and places that the prompt gives; needs a prompt.
+        physics_guidance: strength with which objects are moved out of overlaps and onto supports, 0 to 1.
 
     Raises:
         InvalidInputError: a value is outside what is accepted.
@@ -118,6 +119,7 @@ class TreeSettings(EnvSettings):
     objective_scale: float | None = None
     max_nfe: int | None = None
     claim_guidance: float = 0.0
+    physics_guidance: float = 0.0
 
     def __post_init__(self) -> None:
         self._check_at_least_one("branching")
@@ -126,6 +128,7 @@ class TreeSettings(EnvSettings):
             self._check_at_least_one("max_nfe")
         super().__post_init__()
         check_claim_guidance(self.prompt, self.claim_guidance)
+        check_physics_guidance(self.physics_guidance)
         if self.objective_scale is not None:
             self._check_positive("objective_scale")
         if self.prompt is not None and not isinstance(self.prompt, str):
@@ -176,6 +179,24 @@ def check_claim_guidance(prompt: Any, strength: Any) -> None:
         raise InvalidInputError(
             f"claim_guidance={strength:g} guides scenes to the claims of a prompt, and prompt={prompt!r} has none; "
             "give prompt=, or leave claim_guidance=0"
+        )
+
+
+def check_physics_guidance(strength: Any, scene_type: SceneType | None = None) -> None:
+    """Refuse physics guidance that is not a number from 0 to 1, or of scenes whose assets have no geometry.
+
+    Raises:
+        InvalidInputError: names the value and the remedy.
+    """
+    if not _is_finite(strength) or not 0 <= strength <= 1:
+        raise InvalidInputError(
+            f"physics_guidance={_shown(strength)} must be a number from 0 to 1; 0 guides nothing, and 1 moves objects "
+            "until they neither overlap nor float"
+        )
+    if strength and scene_type is not None and not scene_type.has_geometry:
+        raise InvalidInputError(
+            f"physics_guidance={strength:g} needs the geometry of the assets, which scene type {scene_type.name!r} "
+            "does not have; leave physics_guidance=0"
         )
 
 

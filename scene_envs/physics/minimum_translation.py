@@ -46,6 +46,7 @@ def minimum_translations(
     bounds: tuple[Array, Array],
     tried: Tried,
     budget: Budget,
+    cost: Array | None = None,
 ) -> Array:
     """(P, 3) m: translations that free overlapping object pairs when they are added to the offsets of the pairs.
 
@@ -57,6 +58,7 @@ def minimum_translations(
         bounds: lowest and highest translations (n, 3), (n, 3) m.
         tried: directions that did not help; the directions of the returned translations are added to them.
         budget: charged with one unit per pair of parts.
+        cost: (3,) of a metre along each axis of the world; None for 1.
     """
     placed = place(collider.library, objects, "fine")
     pair, a, b = part_pairs(placed, first, second)
@@ -69,6 +71,8 @@ def minimum_translations(
     directions = _directions(len(first), pair, groups, offset, walk)
     lengths = _lengths(len(first), pair, groups, directions)
     costs = lengths * _weights(collider, objects, first, second, directions, lengths, bounds)
+    if cost is not None:
+        costs *= np.linalg.norm(directions * cost, axis=-1)
     for row, key in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
         for old in tried.get(key, ()):
             costs[row, directions[row] @ old > _SAME_DIRECTION] *= _REPEATED

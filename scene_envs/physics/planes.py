@@ -129,11 +129,17 @@ def _planes_at(
     return _PartPlanes(pair, first[pair], second[pair], direction, bound), best >= -_APART
 
 
-def nearest(objects: Objects, home: Array, planes: Planes, budget: Budget) -> Array:
+def nearest(objects: Objects, home: Array, planes: Planes, budget: Budget, cost: Array | None = None) -> Array:
     """Translations (n, 3) nearest to ``home`` that satisfy the planes as well as possible.
 
     Groups of objects that no plane connects are solved separately. ``budget`` is charged with the rows solved.
+    ``cost`` (3,) is that of a metre along each axis of the world; None means 1.
     """
+    if cost is not None:
+        direction = planes.direction / cost
+        size = np.linalg.norm(direction, axis=1)
+        scaled = Planes(planes.first, planes.second, direction / size[:, None], planes.bound / size)
+        return nearest(objects, home * cost, scaled, budget) / cost
     result = home.copy()
     free = ~objects.fixed
     mobile = lambda rows: (rows >= 0) & free[rows]  # noqa: E731

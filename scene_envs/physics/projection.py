@@ -99,6 +99,31 @@ def project_objects(collider: Collider, objects: Objects, workspace: Corners) ->
     return best
 
 
+def separated(
+    collider: Collider, objects: Objects, first: Index, second: Index, workspace: Corners, cost: Array
+) -> Array:
+    """Translations (n, 3) after one round of projection: approximately free of overlap.
+
+    A heap of objects, which would take too much work, is left as it is.
+
+    Args:
+        collider: geometry of the assets.
+        objects: of one scene; fixed ones do not move.
+        first, second: (P,) object rows of the pairs that overlap.
+        workspace: lowest and highest corner (m) for the translations.
+        cost: (3,) of a metre along each axis of the world; among several ways out of an overlap, the cheapest is taken.
+    """
+    if not len(first) or corner_tests(collider.library, objects, first, second).sum() > _OVERLAPPING:
+        return objects.translation
+    bounds = _bounds(objects.translation, objects, workspace)
+    home, walls, budget = objects.translation, _walls(bounds), Budget(WORK)
+    near_first, near_second = near_pairs(collider, objects)
+    overlapping = np.concatenate([first, second])
+    kept = np.isin(near_first, overlapping) | np.isin(near_second, overlapping)
+    near = near_first[kept], near_second[kept]
+    return _round(collider, objects, home, first, second, near, bounds, walls, {}, budget, cost)
+
+
 def _search(collider: Collider, objects: Objects, bounds: tuple[Array, Array]) -> Projection:
     """The nearest translations without overlap that a bounded number of rounds finds."""
     home, walls, budget = objects.translation, _walls(bounds), Budget(WORK)
@@ -126,7 +151,8 @@ def _search(collider: Collider, objects: Objects, bounds: tuple[Array, Array]) -
             break  # a refinement led to another overlap: the last result without overlap is kept
         if budget.is_spent or corner_tests(collider.library, current, first, second).sum() > _OVERLAPPING:
             break
-        translation = _round(collider, current, home, first, second, bounds, walls, tried, budget)
+        near = near_pairs(collider, current)
+        translation = _round(collider, current, home, first, second, near, bounds, walls, tried, budget)
         current = replace(current, translation=translation)
     assert best is not None
     inside = _inside(best.translation, bounds)
@@ -139,21 +165,23 @@ def _round(
     home: Array,
     first: Index,
     second: Index,
+    near: tuple[Index, Index],
     bounds: tuple[Array, Array],
     walls: Planes,
     tried: Tried,
     budget: Budget,
+    cost: Array | None = None,
 ) -> Array:
-    """The next translations: overlapping pairs (``first``, ``second``) come free, all others are kept apart."""
-    near_first, near_second = near_pairs(collider, current)
+    """The next translations: overlapping pairs (``first``, ``second``) come free, other ``near`` pairs stay apart."""
+    near_first, near_second = near
     extra = np.zeros((len(near_first), 3))
     if len(first):
         count = len(current)
-        moves = minimum_translations(collider, current, first, second, bounds, tried, budget)
+        moves = minimum_translations(collider, current, first, second, bounds, tried, budget, cost)
         place_of = np.searchsorted(near_first * count + near_second, first * count + second)
         extra[place_of] = moves
     planes = separating_planes(collider, current, near_first, near_second, extra, home, budget)
-    return nearest(current, home, planes + walls, budget)
+    return nearest(current, home, planes + walls, budget, cost)
 
 
 def _measure(collider: Collider, objects: Objects, budget: Budget) -> tuple[Index, Index, Projection]:

@@ -55,6 +55,8 @@ class EvaluateConfig(RealSceneKeys, OutputKeys):
         guidance: weight of classifier-free guidance for the samples with prompts, 0 for none.
         claim_guidance: strength with which samples are guided to the numbers and places that their prompts give, 0 for
             none.
+        physics_guidance: strength with which objects of all samples are moved out of overlaps and onto supports at the
+            last steps, 0 to 1.
         seed: seed of the samples, the real scenes and the classifiers.
         measures: all, or some of layout, physics, ready, fsd, novelty, prompts, classifier, renders, fid, written as
             layout or [layout, physics].
@@ -71,6 +73,7 @@ class EvaluateConfig(RealSceneKeys, OutputKeys):
     num_steps: int = 50
     guidance: float = 0.0
     claim_guidance: float = 0.0
+    physics_guidance: float = 0.0
     seed: int = 0
     measures: Any = "all"
     project: bool = True
@@ -280,6 +283,7 @@ def _sample(prior: ScenePrior, settings: EvaluateConfig, prompts: list[str] | No
         prompt=prompts,
         guidance=0.0 if prompts is None else settings.guidance,
         claim_guidance=0.0 if prompts is None else settings.claim_guidance,
+        physics_guidance=settings.physics_guidance,
         num_steps=settings.num_steps,
         seed=settings.seed,
         batch_size=settings.batch_size,

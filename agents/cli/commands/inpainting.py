@@ -33,6 +33,8 @@ class InpaintingConfig:
         guidance: weight of classifier-free guidance, 0 for none; needs a prompt.
         claim_guidance: strength with which scenes are guided to the numbers and places that the prompt gives, 0 for
             none; 2 is a good choice; needs a prompt.
+        physics_guidance: strength with which objects are moved out of overlaps and onto supports at the last steps, 0
+            to 1; 1 is a good choice.
         num_steps: denoising steps per scene.
         seed: seed of the noise.
         pictures: number of scenes in the galleries; 0 draws none.
@@ -46,6 +48,7 @@ class InpaintingConfig:
     prompt: str | None = None
     guidance: float = 0.0
     claim_guidance: float = 0.0
+    physics_guidance: float = 0.0
     num_steps: int = 50
     seed: int = 0
     pictures: int = 12
@@ -58,6 +61,7 @@ class InpaintingConfig:
             "prompt": self.prompt,
             "guidance": self.guidance,
             "claim_guidance": self.claim_guidance,
+            "physics_guidance": self.physics_guidance,
             "num_steps": self.num_steps,
             "seed": self.seed,
         }
