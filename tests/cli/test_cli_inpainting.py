@@ -81,11 +81,23 @@ def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("command", ["complete", "rearrange"])
 def test_prompts_reach_the_prior(files: tuple[Path, Path], reader: Path, tmp_path: Path, command: str) -> None:
     words = [command, f"scenes={files[0]}", f"prior={reader}", "num_steps=2", "pictures=0", f"output={tmp_path}"]
-    assert main([*words, "prompt=A scene with two cups, a plate and a table.", "guidance=1.5", "claim_guidance=1"]) == 0
+    assert (
+        main(
+            [
+                *words,
+                "prompt=A scene with two cups, a plate and a table.",
+                "guidance=1.5",
+                "claim_guidance=1",
+                "physics_guidance=1",
+            ]
+        )
+        == 0
+    )
     prior, before = ScenePrior.load(reader), SceneBatch.load(files[0])
     expected = getattr(prior, command)(
-        before, prompt="A scene with two cups, a plate and a table.", guidance=1.5, claim_guidance=1.0, num_steps=2
-    )
+        before, prompt="A scene with two cups, a plate and a table.", guidance=1.5, claim_guidance=1.0,
+        physics_guidance=1.0, num_steps=2,
+    )  # fmt: skip
     assert torch.equal(SceneBatch.load(tmp_path / "scenes.safetensors").tensor, expected.tensor)
 
 
@@ -175,3 +187,5 @@ def test_an_imported_prior_without_geometry_is_sampled_without_physics(
     assert "reward" not in json.loads((output / "metrics.json").read_text())
     assert main([*words[:-1], f"output={tmp_path / 'ready'}", "project=true"]) == 2
     assert "have none here" in capsys.readouterr().err
+    assert main([*words[:-1], f"output={tmp_path / 'guided'}", "physics_guidance=1"]) == 2
+    assert "physics_guidance=1 needs the geometry of the assets" in capsys.readouterr().err

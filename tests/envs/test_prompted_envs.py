@@ -189,18 +189,20 @@ def test_search_inpaints_under_the_prompt(reader):
     assert (first.evaluations, guided.evaluations) == (6, 4)  # two roots and a child; one root with both branches
 
 
-def test_search_hands_on_claim_guidance(reader, monkeypatch):
+def test_search_hands_on_claim_and_physics_guidance(reader, monkeypatch):
     told, inpaint = [], reader.inpaint
 
-    def listening(*args, claim_guidance=0.0, **kwargs):
-        told.append(claim_guidance)
-        return inpaint(*args, claim_guidance=claim_guidance, **kwargs)
+    def listening(*args, claim_guidance=0.0, physics_guidance=0.0, **kwargs):
+        told.append((claim_guidance, physics_guidance))
+        return inpaint(*args, claim_guidance=claim_guidance, physics_guidance=physics_guidance, **kwargs)
 
     monkeypatch.setattr(reader, "inpaint", listening)
-    for strength in (0.0, 2.0):
-        settings = {"objective": "prompt_match", "num_steps": 2, "claim_guidance": strength}
-        assert SearchProblem(prior=reader, prompt=PROMPTS[0], **settings).root(seed=3).valid
-    assert told == [0.0, 2.0]
+    for claims, physics in ((0.0, 0.0), (2.0, 0.0), (2.0, 1.0)):
+        settings = {"num_steps": 2, "claim_guidance": claims, "physics_guidance": physics}
+        problem = SearchProblem(prior=reader, prompt=PROMPTS[0], objective="prompt_match", **settings)
+        assert problem.root(seed=3).valid
+    assert SearchProblem(prior=reader, objective="object_count", num_steps=2, physics_guidance=1.0).root(seed=3).valid
+    assert told == [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]
 
 
 def test_search_shows_its_prompt(reader):
@@ -221,5 +223,7 @@ def test_search_refuses_what_it_cannot_follow(reader, prior):
         gym.make(SEARCH, prior=reader, claim_guidance=2.0)
     with pytest.raises(InvalidInputError, match="claim_guidance=-1 must be a finite number from 0 on"):
         gym.make(SEARCH, prior=reader, prompt=PROMPTS[0], claim_guidance=-1)
+    with pytest.raises(InvalidInputError, match="physics_guidance=2 must be a number from 0 to 1"):
+        gym.make(SEARCH, prior=reader, physics_guidance=2)
     with pytest.raises(InvalidInputError, match="one text"):
         gym.make(SEARCH, prior=reader, prompt=PROMPTS)

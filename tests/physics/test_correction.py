@@ -1,0 +1,140 @@
+"""Corrections of denoised scenes: closed forms with boxes, and what they leave alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from scene_envs.grammars import get_grammar
+from scene_envs.physics import penetration
+from scene_envs.physics.correction import corrections
+from scene_envs.physics.falls import falls
+from scene_envs.physics.motion import physics_of
+from scene_envs.physics.placement import flatten
+from scene_envs.scene import SceneBatch
+from tests.helpers.simple_scenes import SIDE
+from tests.helpers.simple_scenes import scene as boxes
+
+EVEN, FLAT = np.array([0.01, 0.01, 0.01]), np.array([0.01, 0.01, 1e-4])
+"""Standard deviations, m: the same along all axes, and small along z."""
+CLEARANCE = 1e-4
+
+
+def after(scene: SceneBatch, spread: np.ndarray = EVEN, movable: np.ndarray | None = None) -> torch.Tensor:
+    """(N, 3) moves of the first scene, m."""
+    return corrections(scene, spread, movable)[0]
+
+
+def fallen(scene: SceneBatch, limit: float = 0.03) -> torch.Tensor:
+    """(N,) falls of the first scene, m."""
+    physics = physics_of(scene.scene_type)
+    categories = scene.categories.numpy()
+    welded = np.isin(categories, np.array(scene.scene_type.welded_categories))
+    poses = scene.translations.double().numpy(), scene.rotations.double().numpy()
+    objects = flatten(physics.library, *poses, categories, welded)
+    out = torch.zeros(scene.tensor.shape[1])
+    out[objects.slot] = torch.from_numpy(falls(physics.collider, objects, limit)).float()
+    return out
+
+
+# -- falls ------------------------------------------------------------------------------------------
+
+
+def test_objects_fall_by_their_height_and_follow_what_they_stand_on() -> None:
+    stack = boxes(("cube", 0.0, 0.0, 0.01), ("cube", 0.02, 0.0, SIDE + 0.01), ("cube", 0.5, 0.0, 0.0))
+    torch.testing.assert_close(fallen(stack)[1:4], torch.tensor([0.01, 0.01, 0.0]), atol=1e-6, rtol=0.0)
+    gap = boxes(("cube", 0.0, 0.0, 0.01), ("cube", 0.02, 0.0, SIDE + 0.015))
+    torch.testing.assert_close(fallen(gap)[1:3], torch.tensor([0.01, 0.015]), atol=1e-6, rtol=0.0)
+
+
+def test_objects_far_above_everything_stay() -> None:
+    assert not fallen(boxes(("cube", 0.0, 0.0, 0.031))).any()
+    assert float(fallen(boxes(("cube", 0.0, 0.0, 0.031)), limit=0.04)[1]) == pytest.approx(0.031, abs=1e-6)
+    assert not fallen(boxes(("cube", 3.0, 0.0, 0.01))).any()  # beside the floor
+
+
+def test_an_object_falls_into_a_bowl_and_past_a_wall() -> None:
+    in_bowl = boxes(("bowl", 0.0, 0.0, 0.0), ("post", 0.0, 0.0, 0.02))  # the bottom of the bowl is 1 cm thick
+    torch.testing.assert_close(fallen(in_bowl)[2], torch.tensor(0.01), atol=1e-6, rtol=0.0)
+    beside = boxes(("cube", 0.0, 0.0, 0.0), ("cube", SIDE - 1e-4, 0.0, 0.02))  # 0.1 mm in the other's side
+    torch.testing.assert_close(fallen(beside)[2], torch.tensor(0.02), atol=1e-6, rtol=0.0)
+
+
+# -- overlaps ---------------------------------------------------------------------------------------
+
+
+def test_two_objects_share_the_shortest_way_apart() -> None:
+    moves = after(boxes(("cube", 0.0, 0.0, 0.0), ("cube", SIDE - 0.01, 0.03, 0.0)))
+    expected = torch.tensor([[-0.005, 0.0, 0.0], [0.005, 0.0, 0.0]])
+    torch.testing.assert_close(moves[1:3], expected, atol=CLEARANCE, rtol=0.0)
+
+
+def test_a_fixed_object_leaves_the_whole_way_to_the_other() -> None:
+    scene = boxes(("cube", 0.0, 0.0, 0.0), ("cube", SIDE - 0.01, 0.03, 0.0))
+    movable = np.arange(scene.tensor.shape[1])[None] != 1
+    moves = after(scene, EVEN, movable)
+    assert not moves[1].any()
+    torch.testing.assert_close(moves[2], torch.tensor([0.01, 0.0, 0.0]), atol=CLEARANCE, rtol=0.0)
+    sunk = after(boxes(("cube", 0.0, 0.0, -0.002)))
+    torch.testing.assert_close(sunk[:2], torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.002]]), atol=CLEARANCE, rtol=0.0)
+
+
+def test_objects_move_along_the_axis_on_which_they_are_uncertain() -> None:
+    """3 mm deep and 20 mm wide: up where all axes are alike, aside where heights are certain, and down from there."""
+    scene = boxes(("cube", 0.0, 0.0, 0.0), ("cube", SIDE - 0.02, 0.0, SIDE - 0.003))
+    up = after(scene, EVEN)
+    assert float(up[2, 2] - up[1, 2]) == pytest.approx(0.003, abs=CLEARANCE)
+    assert float(up[1:3, :2].abs().max()) < CLEARANCE
+    aside = after(scene, FLAT)
+    assert float(aside[2, 0] - aside[1, 0]) == pytest.approx(0.02, abs=CLEARANCE)
+    assert float(aside[1:3, 2].abs().max()) < CLEARANCE  # the floor is further than 3 cm below
+
+
+def test_an_object_that_comes_off_another_comes_down() -> None:
+    scene = boxes(("cube", 0.0, 0.0, 0.0), ("cube", SIDE - 0.02, 0.0, 0.015))
+    moves = after(scene, FLAT)
+    assert float(moves[2, 0] - moves[1, 0]) == pytest.approx(0.02, abs=CLEARANCE)
+    assert float(moves[2, 2]) == pytest.approx(-0.015, abs=CLEARANCE)
+
+
+def test_real_scenes_stay_as_they_are() -> None:
+    for name in ("dimsum_table", "living_room_shelf", "restaurant_low_clutter"):
+        real = get_grammar(name).sample(np.random.default_rng(0), 6)
+        assert float(corrections(real, FLAT).abs().max()) < 1e-3
+
+
+def test_overlaps_of_noisy_scenes_shrink_and_welded_objects_stay() -> None:
+    real = get_grammar("dimsum_table").sample(np.random.default_rng(1), 6)
+    noise = 0.01 * torch.randn(real.translations.shape, generator=torch.Generator().manual_seed(0))
+    noisy = real.with_poses(real.translations + noise * real.is_free.unsqueeze(-1), real.rotations)
+    moves = corrections(noisy, EVEN)
+    assert not moves[~noisy.is_free].any()
+    moved = noisy.with_poses(noisy.translations + moves, noisy.rotations)
+    before, now = (penetration(batch).total_per_pair.sum() for batch in (noisy, moved))
+    assert float(now) < 0.1 * float(before)
+
+
+def test_the_moves_of_a_scene_do_not_depend_on_the_others() -> None:
+    real = get_grammar("dimsum_table").sample(np.random.default_rng(2), 20)
+    noise = 0.01 * torch.randn(real.translations.shape, generator=torch.Generator().manual_seed(0))
+    noisy = real.with_poses(real.translations + noise * real.is_free.unsqueeze(-1), real.rotations)
+    together = corrections(noisy, FLAT)
+    for row in (0, 7, 19):
+        assert torch.equal(corrections(noisy[row : row + 1], FLAT)[0], together[row])
+
+
+def test_only_the_ratios_of_the_deviations_matter() -> None:
+    scene = boxes(("cube", 0.0, 0.0, 0.0), ("cube", SIDE - 0.02, 0.0, SIDE - 0.003))
+    torch.testing.assert_close(after(scene, 100 * FLAT), after(scene, FLAT))
+    assert torch.isfinite(after(scene, np.zeros(3))).all()
+
+
+def test_a_heap_is_left_as_it_is_in_bounded_work() -> None:
+    batch = SceneBatch.empty("dimsum_table", 1)
+    categories = batch.categories.clone()
+    categories[0, 1:] = batch.scene_type.assets.index(
+        next(name for name in batch.scene_type.assets if "steamer" in name)
+    )
+    heap = SceneBatch.from_parts(batch.translations, torch.eye(3).expand(1, 34, 3, 3), categories, batch.scene_type)
+    assert torch.isfinite(corrections(heap, EVEN)).all()
