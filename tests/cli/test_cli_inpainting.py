@@ -81,18 +81,8 @@ def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("command", ["complete", "rearrange"])
 def test_prompts_reach_the_prior(files: tuple[Path, Path], reader: Path, tmp_path: Path, command: str) -> None:
     words = [command, f"scenes={files[0]}", f"prior={reader}", "num_steps=2", "pictures=0", f"output={tmp_path}"]
-    assert (
-        main(
-            [
-                *words,
-                "prompt=A scene with two cups, a plate and a table.",
-                "guidance=1.5",
-                "claim_guidance=1",
-                "physics_guidance=1",
-            ]
-        )
-        == 0
-    )
+    guided = ["guidance=1.5", "claim_guidance=1", "physics_guidance=1"]
+    assert main([*words, "prompt=A scene with two cups, a plate and a table.", *guided]) == 0
     prior, before = ScenePrior.load(reader), SceneBatch.load(files[0])
     expected = getattr(prior, command)(
         before, prompt="A scene with two cups, a plate and a table.", guidance=1.5, claim_guidance=1.0,
