@@ -1,7 +1,7 @@
 """Prompts that samples follow, with and without claim guidance, as a table.
 
 python benchmarks/claim_guidance.py [--priors dimsum_table,living_room_shelf_feasible] [--kinds relations,count,names]
-    [--count 128] [--strength 2] [--picture PATH]
+    [--count 128] [--strength 2] [--physics-guidance 1] [--picture PATH]
 
 *Both* is the mean over scenes of the feasible share, 0 where the prompt is not followed.
 
@@ -47,8 +47,9 @@ def main() -> None:
             for strength in (0.0, arguments.strength):
                 started = time.process_time()
                 batch = prior.sample(
-                    arguments.count, prompt=prompts, guidance=arguments.guidance, claim_guidance=strength, seed=3
-                )
+                    arguments.count, prompt=prompts, guidance=arguments.guidance, claim_guidance=strength,
+                    physics_guidance=arguments.physics_guidance, seed=3,
+                )  # fmt: skip
                 row = _row(batch, prompts, time.process_time() - started)
                 print(f"| `{name}` | {kind} | {strength:g} | {row} |", flush=True)
                 drawn.append(batch[:_SHOWN])
@@ -90,6 +91,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--kinds", default="relations", help="kinds of prompts: relations, count, names")
     parser.add_argument("--count", type=int, default=128, help="prompts of each prior and kind")
     parser.add_argument("--strength", type=float, default=2.0, help="claim_guidance of the second row")
+    parser.add_argument("--physics-guidance", type=float, default=0.0, help="physics_guidance of all rows")
     parser.add_argument("--guidance", type=float, default=0.0, help="weight of classifier-free guidance")
     parser.add_argument(
         "--picture", type=Path, default=None, help="picture of the first scenes; nothing else is sampled"
