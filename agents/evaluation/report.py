@@ -14,6 +14,7 @@ _NOT_SHOWN = frozenset({"category_kl"})
 
 READING: dict[str, str] = {
     "num_steps": "denoiser evaluations per sample",
+    "physics_guidance": "strength of physics guidance of all samples",
     "scenes": "samples measured",
     "objects_mean": "objects per scene, welded ones included",
     "objects_min": "in the emptiest scene",

@@ -12,6 +12,7 @@ import torch
 
 from agents.cli import main
 from agents.evaluation import grammar_scenes
+from agents.priors import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.datasets import SceneDataset
 from scene_envs.normalizer import Normalizer
@@ -117,6 +118,20 @@ def test_other_guidance_measures_the_prompts_alone_anew(tmp_path: Path, capsys: 
     assert log(tmp_path / "out").count("prompts measured in") == 2
     assert metrics(tmp_path / "out")["prompt_guidance"] == 2
     assert "| num_steps | 1 |" in (tmp_path / "out" / "metrics.md").read_text()
+
+
+def test_physics_guidance_guides_all_samples_and_needs_a_folder_of_its_own(
+    prior: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    words = ["evaluate", f"prior={prior}", *QUICK, "num_steps=4", "measures=layout", f"output={tmp_path / 'out'}"]
+    assert main([*words, "physics_guidance=1"]) == 0
+    saved = SceneBatch.load(tmp_path / "out" / "scenes.safetensors")
+    expected = ScenePrior.load(prior).sample(3, num_steps=4, physics_guidance=1.0)
+    assert torch.equal(saved.tensor, expected.tensor)
+    assert metrics(tmp_path / "out")["physics_guidance"] == 1
+    assert "| physics_guidance | 1 |" in (tmp_path / "out" / "metrics.md").read_text()
+    assert main(words) == 2
+    assert "physics_guidance was 1.0, is None" in capsys.readouterr().err
 
 
 def test_all_leaves_out_what_cannot_be_measured_and_says_why(

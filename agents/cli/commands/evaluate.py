@@ -194,7 +194,7 @@ class _Results:
     def __init__(self, run: Run, identity: dict[str, Any], groups: dict[str, dict[str, float]]) -> None:
         self.run_, self.identity, self.groups = run, identity, groups
         self.skipped: dict[str, str] = {}
-        self._steps = {"num_steps": float(identity["num_steps"])}
+        self._sampling = {key: float(identity[key]) for key in ("num_steps", "physics_guidance") if key in identity}
 
     @classmethod
     def of(cls, run: Run, identity: dict[str, Any]) -> _Results:
@@ -254,7 +254,7 @@ class _Results:
         """``metrics.json``: all figures by name, then the same by group."""
         flat = {name: value for figures in self.groups.values() for name, value in figures.items()}
         evaluation = {"identity": self.identity, "groups": self.groups, "skipped": self.skipped}
-        self.run_.write_metrics({**self._steps, **flat, "evaluation": {**evaluation, "sha256": _digest(evaluation)}})
+        self.run_.write_metrics({**self._sampling, **flat, "evaluation": {**evaluation, "sha256": _digest(evaluation)}})
 
     def report(self, groups: list[str]) -> str:
         """The figures of ``groups`` as Markdown, and the groups that were not measured."""
@@ -262,7 +262,7 @@ class _Results:
 
         self.write()
         measured = {k: v for name in groups for k, v in self.groups.get(name, {}).items() if v is not None}
-        figures = {**self._steps, **measured}
+        figures = {**self._sampling, **measured}
         notes = [f"- {name} not measured: {reason}" for name, reason in self.skipped.items()]
         return "\n".join([figure_table(figures), *(["", *notes] if notes else [])])
 
@@ -274,6 +274,8 @@ def _identity(settings: EvaluateConfig, prior: ScenePrior) -> dict[str, Any]:
         digest.update(name.encode())
         digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
     keys = {key: value for key, value in vars(settings).items() if key not in _NOT_PART}
+    if not settings.physics_guidance:
+        del keys["physics_guidance"]  # folders of earlier versions have no such key
     return {**keys, "digest": digest.hexdigest()[:16]}
 
 
