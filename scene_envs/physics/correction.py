@@ -11,7 +11,7 @@ from torch import Tensor
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.falls import falls
 from scene_envs.physics.motion import Physics, physics_of
-from scene_envs.physics.placement import Objects, flatten
+from scene_envs.physics.placement import Objects, flatten, object_boxes, place
 from scene_envs.physics.projection import Corners, separated
 from scene_envs.scene import SceneBatch
 
@@ -23,6 +23,8 @@ _FALL = 0.03
 """An object higher than this (m) above everything is left as it is."""
 _LEAST = 0.02
 """Least standard deviation along an axis, as a share of the largest one."""
+_LEVEL = np.array([1.0, 1.0, 50.0])
+"""Cost of a metre along each axis where furniture moves: it stays at its height."""
 _CHUNK = 16
 """Scenes whose overlaps are found together."""
 
@@ -30,40 +32,43 @@ _CHUNK = 16
 def corrections(batch: SceneBatch, spread: Array, movable: Mask | None = None) -> Tensor:
     """Moves (B, N, 3), m, after which objects overlap and float less: one round for each scene.
 
-    Overlapping objects come apart by a least-distance problem, as in :func:`~scene_envs.physics.project`. Distances are
-    measured in standard deviations of the positions, so objects move along the axes on which they are uncertain rather
-    than along the others. Then each object comes straight down onto what is less than 3 cm below it. Rotations and
-    welded objects stay.
+    First, generated furniture that overlaps other furniture comes apart along the floor, and takes along what is on it.
+    Then overlapping objects come apart by a least-distance problem, as in :func:`~scene_envs.physics.project`.
+    Distances are measured in standard deviations of the positions, so objects move along the axes on which they are
+    uncertain rather than along the others. At last each object comes straight down onto what is less than 3 cm below
+    it. Rotations and the fixed objects of the scene type stay.
 
     Args:
         batch: B scenes of N slots, on the CPU, with finite poses.
         spread: (3,) standard deviation of the positions along the axes of the world; only its ratios matter.
-        movable: (B, N) bool, slots whose objects may move; None for all. Welded objects never move.
+        movable: (B, N) bool, slots whose objects may move; None for all.
 
     >>> corrections(SceneBatch.empty("dimsum_table", 1), np.ones(3)).abs().max()
     tensor(0.)
     """
     physics, moves = physics_of(batch.scene_type), np.zeros((*batch.tensor.shape[:2], 3))
+    movable = np.ones(batch.tensor.shape[:2], dtype=bool) if movable is None else movable
     cost = 1.0 / np.maximum(spread / max(float(spread.max()), 1e-12), _LEAST)
+    workspace = batch.scene_type.workspace
     for start in range(0, len(batch), _CHUNK):
-        rows = slice(start, start + _CHUNK)
-        objects = _objects(physics, batch[rows], None if movable is None else movable[rows])
-        if len(objects):
-            after = _apart(physics, objects, batch.scene_type.workspace, cost)
-            down = falls(physics.collider, replace(objects, translation=after), _FALL)
-            after[:, 2] -= np.where(down > _FLOATING, down, 0.0)
-            moves[start + objects.scene, objects.slot] = after - objects.translation
+        some, free = batch[start : start + _CHUNK], movable[start : start + _CHUNK]
+        objects = _objects(physics, some, free)
+        if not len(objects):
+            continue
+        before, furniture = objects.translation, some.is_furniture.numpy() & free
+        if furniture.any():
+            objects = _furniture_apart(physics, objects, furniture[objects.scene, objects.slot], workspace)
+        objects = replace(objects, translation=_apart(physics, objects, workspace, cost))
+        down = falls(physics.collider, objects, _FALL)
+        moves[start + objects.scene, objects.slot] = objects.translation - before
+        moves[start + objects.scene, objects.slot, 2] -= np.where(down > _FLOATING, down, 0.0)
     return torch.as_tensor(moves, dtype=batch.tensor.dtype)
 
 
-def _objects(physics: Physics, batch: SceneBatch, movable: Mask | None) -> Objects:
-    """The objects of scenes; those that may not move are fixed."""
-    categories = batch.categories.numpy()
-    welded = np.isin(categories, np.array(batch.scene_type.welded_categories, dtype=np.int64))
-    fixed = welded if movable is None else welded | ~movable
-    return flatten(
-        physics.library, batch.translations.double().numpy(), batch.rotations.double().numpy(), categories, fixed
-    )
+def _objects(physics: Physics, batch: SceneBatch, movable: Mask) -> Objects:
+    """The objects of scenes; welded ones, and those that may not move, are fixed."""
+    poses = batch.translations.double().numpy(), batch.rotations.double().numpy()
+    return flatten(physics.library, *poses, batch.categories.numpy(), batch.is_welded.numpy() | ~movable)
 
 
 def _apart(physics: Physics, objects: Objects, workspace: Corners, cost: Array) -> Array:
@@ -76,3 +81,22 @@ def _apart(physics: Physics, objects: Objects, workspace: Corners, cost: Array) 
         deep = own.depth > _DEEP
         after[rows] = separated(physics.collider, objects[rows], own.first[deep], own.second[deep], workspace, cost)
     return after
+
+
+def _furniture_apart(physics: Physics, objects: Objects, furniture: Mask, workspace: Corners) -> Objects:
+    """The objects after ``furniture`` (n,) came apart, with what is on each piece of it."""
+    pieces = np.flatnonzero(furniture | physics.library.static[objects.category])
+    free = replace(objects[pieces], fixed=~furniture[pieces])
+    moves = _apart(physics, free, workspace, _LEVEL) - free.translation
+    moved = np.flatnonzero(furniture[pieces] & (np.abs(moves) > 0.0).any(axis=1))
+    if not len(moved):
+        return objects
+    low, high = object_boxes(place(physics.library, free, "coarse"))
+    at, scene = objects.translation, objects.scene
+    on = (at[:, None] >= low) & (at[:, None] <= np.concatenate([high[:, :2], np.full((len(high), 1), np.inf)], axis=1))
+    held = on.all(axis=2) & (scene[:, None] == free.scene) & furniture[pieces] & ~objects.fixed[:, None]
+    distance = np.where(held, np.abs(at[:, None, :2] - free.translation[:, :2]).max(axis=2), np.inf)
+    holder = np.where(held.any(axis=1), distance.argmin(axis=1), -1)
+    holder[pieces] = np.arange(len(pieces))
+    shift = np.where((holder >= 0)[:, None], moves[holder], 0.0)
+    return replace(objects, translation=at + shift)

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from scene_envs.grammars import get_grammar
-from scene_envs.physics import penetration
+from scene_envs.physics import furniture_overlap, penetration
 from scene_envs.physics.correction import corrections
 from scene_envs.physics.falls import falls
 from scene_envs.physics.motion import physics_of
 from scene_envs.physics.placement import flatten
 from scene_envs.scene import SceneBatch
-from tests.helpers.simple_scenes import SIDE
+from tests.helpers.simple_scenes import SIDE, TYPE
 from tests.helpers.simple_scenes import scene as boxes
 
 EVEN, FLAT = np.array([0.01, 0.01, 0.01]), np.array([0.01, 0.01, 1e-4])
@@ -104,7 +106,7 @@ def test_real_scenes_stay_as_they_are() -> None:
         assert float(corrections(real, FLAT).abs().max()) < 1e-3
 
 
-def test_overlaps_of_noisy_scenes_shrink_and_welded_objects_stay() -> None:
+def test_overlaps_of_noisy_scenes_shrink_and_fixed_objects_stay() -> None:
     real = get_grammar("dimsum_table").sample(np.random.default_rng(1), 6)
     noise = 0.01 * torch.randn(real.translations.shape, generator=torch.Generator().manual_seed(0))
     noisy = real.with_poses(real.translations + noise * real.is_free.unsqueeze(-1), real.rotations)
@@ -113,6 +115,25 @@ def test_overlaps_of_noisy_scenes_shrink_and_welded_objects_stay() -> None:
     moved = noisy.with_poses(noisy.translations + moves, noisy.rotations)
     before, now = (penetration(batch).total_per_pair.sum() for batch in (noisy, moved))
     assert float(now) < 0.1 * float(before)
+
+
+def test_furniture_comes_apart_and_takes_along_what_is_on_it() -> None:
+    """Two welded boxes that overlap by 3 cm, with a post on each of them and one on the floor beside them."""
+    room = replace(TYPE, name="room_of_welded_boxes", welded=("floor", "cube"))
+    room.__dict__["library"] = TYPE.library
+    overlap = 0.03
+    objects = [("cube", 0.0, 0.0, 0.0), ("cube", SIDE - overlap, 0.04, 0.0), ("post", -0.03, 0.0, SIDE)]
+    objects += [("post", SIDE - overlap + 0.03, 0.04, SIDE), ("post", 0.0, 0.5, 0.0)]
+    batch = SceneBatch(boxes(*objects).tensor, room)
+    moves = after(batch, FLAT)
+    half = torch.tensor([overlap / 2, 0.0, 0.0])
+    expected = torch.stack([-half, half, -half, half, 0 * half])
+    torch.testing.assert_close(moves[1:6], expected, atol=CLEARANCE, rtol=0.0)
+    assert not furniture_overlap(batch.with_poses(batch.translations + moves, batch.rotations)).any()
+    kept = after(batch, FLAT, np.arange(batch.tensor.shape[1])[None] != 1)  # observed furniture stays, with its post
+    assert not kept[1].any()
+    assert not kept[3].any()
+    torch.testing.assert_close(kept[2], 2 * half, atol=2 * CLEARANCE, rtol=0.0)
 
 
 def test_the_moves_of_a_scene_do_not_depend_on_the_others() -> None:
