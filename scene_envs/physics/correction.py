@@ -55,9 +55,10 @@ def corrections(batch: SceneBatch, spread: Array, movable: Mask | None = None) -
         objects = _objects(physics, some, free)
         if not len(objects):
             continue
-        before, furniture = objects.translation, some.is_furniture.numpy() & free
+        before, at = objects.translation, (objects.scene, objects.slot)
+        furniture = some.is_furniture.numpy() & free
         if furniture.any():
-            objects = _furniture_apart(physics, objects, furniture[objects.scene, objects.slot], workspace)
+            objects = _furniture_apart(physics, objects, some.is_welded.numpy()[at], furniture[at], workspace)
         objects = replace(objects, translation=_apart(physics, objects, workspace, cost))
         down = falls(physics.collider, objects, _FALL)
         moves[start + objects.scene, objects.slot] = objects.translation - before
@@ -83,20 +84,24 @@ def _apart(physics: Physics, objects: Objects, workspace: Corners, cost: Array) 
     return after
 
 
-def _furniture_apart(physics: Physics, objects: Objects, furniture: Mask, workspace: Corners) -> Objects:
-    """The objects after ``furniture`` (n,) came apart, with what is on each piece of it."""
-    pieces = np.flatnonzero(furniture | physics.library.static[objects.category])
-    free = replace(objects[pieces], fixed=~furniture[pieces])
-    moves = _apart(physics, free, workspace, _LEVEL) - free.translation
-    moved = np.flatnonzero(furniture[pieces] & (np.abs(moves) > 0.0).any(axis=1))
-    if not len(moved):
+def _furniture_apart(physics: Physics, objects: Objects, welded: Mask, movable: Mask, workspace: Corners) -> Objects:
+    """The objects (n,) after the ``welded`` ones that are ``movable`` came apart, with what is on each of them."""
+    pieces = np.flatnonzero(welded)
+    furniture = replace(objects[pieces], fixed=~movable[pieces])
+    moves = _apart(physics, furniture, workspace, _LEVEL) - furniture.translation
+    if not moves.any():
         return objects
-    low, high = object_boxes(place(physics.library, free, "coarse"))
-    at, scene = objects.translation, objects.scene
-    on = (at[:, None] >= low) & (at[:, None] <= np.concatenate([high[:, :2], np.full((len(high), 1), np.inf)], axis=1))
-    held = on.all(axis=2) & (scene[:, None] == free.scene) & furniture[pieces] & ~objects.fixed[:, None]
-    distance = np.where(held, np.abs(at[:, None, :2] - free.translation[:, :2]).max(axis=2), np.inf)
-    holder = np.where(held.any(axis=1), distance.argmin(axis=1), -1)
+    holder = _holders(physics, objects, furniture)
     holder[pieces] = np.arange(len(pieces))
     shift = np.where((holder >= 0)[:, None], moves[holder], 0.0)
-    return replace(objects, translation=at + shift)
+    return replace(objects, translation=objects.translation + shift)
+
+
+def _holders(physics: Physics, objects: Objects, furniture: Objects) -> Index:
+    """(n,) row of the ``furniture`` (m,) that each free object is on or in; -1 for none."""
+    low, high = object_boxes(place(physics.library, furniture, "coarse"))
+    at, middle = objects.translation[:, None], furniture.translation
+    over = ((at[..., :2] >= low[:, :2]) & (at[..., :2] <= high[:, :2])).all(axis=2) & (at[..., 2] >= low[:, 2])
+    over &= (objects.scene[:, None] == furniture.scene) & ~objects.fixed[:, None] & ~furniture.fixed
+    distance = np.where(over, np.abs(at[..., :2] - middle[:, :2]).max(axis=2), np.inf)
+    return np.where(over.any(axis=1), distance.argmin(axis=1), -1)
