@@ -102,7 +102,7 @@ def project_objects(collider: Collider, objects: Objects, workspace: Corners) ->
 def separated(
     collider: Collider, objects: Objects, first: Index, second: Index, workspace: Corners, cost: Array
 ) -> Array:
-    """Translations (n, 3) after one round of projection: approximately free of overlap.
+    """Translations (n, 3) after one round of projection of overlapping objects and their neighbours.
 
     A heap of objects, which would take too much work, is left as it is.
 
@@ -115,13 +115,18 @@ def separated(
     """
     if not len(first) or corner_tests(collider.library, objects, first, second).sum() > _OVERLAPPING:
         return objects.translation
-    bounds = _bounds(objects.translation, objects, workspace)
-    home, walls, budget = objects.translation, _walls(bounds), Budget(WORK)
     near_first, near_second = near_pairs(collider, objects)
     overlapping = np.concatenate([first, second])
     kept = np.isin(near_first, overlapping) | np.isin(near_second, overlapping)
-    near = near_first[kept], near_second[kept]
-    return _round(collider, objects, home, first, second, near, bounds, walls, {}, budget, cost)
+    rows = np.unique(np.concatenate([near_first[kept], near_second[kept], np.flatnonzero(objects.fixed)]))
+    some = objects[rows]
+    one, other = np.searchsorted(rows, first), np.searchsorted(rows, second)
+    near = np.searchsorted(rows, near_first[kept]), np.searchsorted(rows, near_second[kept])
+    bounds = _bounds(some.translation, some, workspace)
+    home, walls, budget = some.translation, _walls(bounds), Budget(WORK)
+    result = objects.translation.copy()
+    result[rows] = _round(collider, some, home, one, other, near, bounds, walls, {}, budget, cost)
+    return result
 
 
 def _search(collider: Collider, objects: Objects, bounds: tuple[Array, Array]) -> Projection:
