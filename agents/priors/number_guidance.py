@@ -65,6 +65,8 @@ class NumberGuidance:
         self._kinds = torch.tensor([*of_asset, len(kinds)])  # (K,); *empty* is a kind of its own, the last
         self._bounds = [number_bounds(claims_of(prompt, scene_type)) for prompt in prompts]
         self._names = [*kinds, ""]
+        self._member = F.one_hot(self._kinds, len(self._names)).double()  # (K, R)
+        self._limits: dict[int, tuple[Tensor, Tensor]] = {}
 
     def __call__(self, x: Tensor, reverse: ReverseStep) -> ReverseStep:
         """The step at x_t (B, N, D) with other probabilities of the masked slots' categories."""
@@ -72,10 +74,10 @@ class NumberGuidance:
             return reverse
         masked, kinds, states = reverse.masked, self._kinds.to(x.device), state_of(x[..., POSE_FEATURES:])
         probs, chance = reverse.probs[..., :-1], 1 - reverse.probs[..., -1:]
-        member = F.one_hot(kinds, len(self._names)).double()  # (K, R)
+        member = self._member.to(x.device)
         drawn = torch.where(masked[..., None], probs.double(), 0.0) @ member / chance.clamp(min=_TINY).double()
         visible = F.one_hot(states, len(kinds) + 1)[..., :-1].sum(dim=1).double() @ member
-        low, high = (bound - visible for bound in self._limits(visible, x.shape[1]))
+        low, high = (bound.to(visible) - visible for bound in self._limits_of(x.shape[1]))
         weights = kind_weights(drawn, low.clamp(min=0.0), high.clamp(min=0.0))  # (B, R)
         tilted = probs * weights[:, kinds].unsqueeze(1).to(probs)
         tilted = tilted * (chance / tilted.sum(dim=-1, keepdim=True).clamp(min=_TINY))
@@ -86,16 +88,19 @@ class NumberGuidance:
         groups = torch.where(together, kinds + 2 * len(kinds), others.to(x.device))
         return reverse._replace(probs=torch.cat([tilted, reverse.probs[..., -1:]], dim=-1), groups=groups)
 
-    def _limits(self, like: Tensor, slots: int) -> tuple[Tensor, Tensor]:
+    def _limits_of(self, slots: int) -> tuple[Tensor, Tensor]:
         """(B, R) least and largest number of each kind, in scenes of ``slots``."""
-        low, high = torch.zeros_like(like), torch.full_like(like, torch.inf)
-        for row, bounds in enumerate(self._bounds):
-            for name, (least, most) in bounds.items():
-                if not name:
-                    least, most = slots - most, slots - least
-                kind = self._names.index(name)
-                low[row, kind], high[row, kind] = max(least, 0.0), max(most, 0.0)
-        return low, high
+        if slots not in self._limits:
+            low = torch.zeros(len(self._bounds), len(self._names), dtype=torch.float64)
+            high = torch.full_like(low, torch.inf)
+            for row, bounds in enumerate(self._bounds):
+                for name, (least, most) in bounds.items():
+                    if not name:
+                        least, most = slots - most, slots - least
+                    kind = self._names.index(name)
+                    low[row, kind], high[row, kind] = max(least, 0.0), max(most, 0.0)
+            self._limits[slots] = low, high
+        return self._limits[slots]
 
 
 def kind_weights(probs: Tensor, low: Tensor, high: Tensor) -> Tensor:
