@@ -194,7 +194,8 @@ class _Results:
     def __init__(self, run: Run, identity: dict[str, Any], groups: dict[str, dict[str, float]]) -> None:
         self.run_, self.identity, self.groups = run, identity, groups
         self.skipped: dict[str, str] = {}
-        self._sampling = {key: float(identity[key]) for key in ("num_steps", "physics_guidance") if key in identity}
+        keys: tuple[str, ...] = ("num_steps", "physics_guidance")
+        self._sampling = {key: float(identity[key]) for key in keys if key in identity}
 
     @classmethod
     def of(cls, run: Run, identity: dict[str, Any]) -> _Results:
