@@ -118,6 +118,7 @@ def separated(
     near_first, near_second = near_pairs(collider, objects)
     overlapping = np.concatenate([first, second])
     kept = np.isin(near_first, overlapping) | np.isin(near_second, overlapping)
+    # Fixed objects are always among them: boards above limit how far an object can be lifted.
     rows = np.unique(np.concatenate([near_first[kept], near_second[kept], np.flatnonzero(objects.fixed)]))
     some = objects[rows]
     one, other = np.searchsorted(rows, first), np.searchsorted(rows, second)
