@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from agents.post_training.forward_process import ForwardProcess
     from agents.post_training.forward_process_loss import ForwardProcessLoss
     from agents.post_training.guard import Guard
+    from agents.post_training.guidance_distillation import GuidanceDistillation, GuidanceDistillationLoss
     from agents.post_training.losses import DDPOSFLoss
     from agents.post_training.neon import Neon, SelfTrainingLoss
     from agents.post_training.policy import DenoisingPolicy
@@ -38,6 +39,8 @@ __all__ = [
     "ForwardProcess",
     "ForwardProcessLoss",
     "Guard",
+    "GuidanceDistillation",
+    "GuidanceDistillationLoss",
     "NFTLoss",
     "Neon",
     "PostTrainConfig",

@@ -8,6 +8,7 @@ from importlib import import_module
 from typing import Any, ClassVar, TypeVar
 
 from agents.configuration.checks import at_least, one_of, positive
+from scene_envs.envs.settings import check_physics_guidance
 from scene_envs.errors import InvalidInputError
 from scene_envs.registry import Registry
 
@@ -243,6 +244,38 @@ class NeonSettings(AlgorithmSettings):
         positive(self, "w")
 
 
+@dataclass
+class GuidanceDistillationSettings(AlgorithmSettings):
+    """Guidance distillation: the prior learns to place objects as physics guidance does; the reward is reported only.
+
+    Attributes:
+        updates: optimiser steps per batch.
+        draws: number of steps of the chain of every scene per optimiser step.
+        strength: strength of the physics guidance that is learned, 0 to 1.
+        clip: largest move of an object that is learned at a step, in standard deviations of its denoised position.
+        sampler_decay: final decay of the averaged weights that sample, per iteration; it rises from 0.
+    """
+
+    learning_rate: ClassVar[float] = 2e-4
+    regularisation_weight: ClassVar[float] = 0.01
+    sample_limits: ClassVar[Mapping[str, float]] = ForwardProcessSettings.sample_limits
+
+    name: str = "guidance_distillation"
+    updates: int = 4
+    draws: int = 2
+    strength: float = 1.0
+    clip: float = 1.0
+    sampler_decay: float = 0.9
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, 1, "updates", "draws")
+        positive(self, "strength", "clip")
+        check_physics_guidance(self.strength)
+        if not 0 <= self.sampler_decay < 1:
+            raise InvalidInputError(f"sampler_decay={self.sampler_decay} must lie in [0, 1)")
+
+
 @dataclass(frozen=True)
 class _Entry:
     settings: type[AlgorithmSettings]
@@ -257,6 +290,9 @@ _ALGORITHMS = Registry(
     {
         "ddpo_sf": _Entry(DDPOSFSettings, "agents.post_training.ddpo:DDPO"),
         "ddpo_is": _Entry(DDPOISSettings, "agents.post_training.ddpo:DDPO"),
+        "guidance_distillation": _Entry(
+            GuidanceDistillationSettings, "agents.post_training.guidance_distillation:GuidanceDistillation"
+        ),
         "nft": _Entry(NFTSettings, _FORWARD),
         "awm": _Entry(AWMSettings, _FORWARD),
         "neon": _Entry(NeonSettings, "agents.post_training.neon:Neon"),

@@ -19,9 +19,7 @@ from agents.post_training.gradients import BatchGradient, credited_reward, judge
 from agents.post_training.own_samples import OwnSampleAlgorithm
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import Branching, Rollout, rollout_groups
-from agents.priors.base import ScenePrior
 from agents.utils.process_group import ProcessGroup
-from agents.utils.weight_average import WeightAverage
 
 
 class ForwardProcess(OwnSampleAlgorithm):
@@ -108,24 +106,12 @@ class ForwardProcess(OwnSampleAlgorithm):
         gradient = super().accumulate(rollout, advantage, generator)
         return replace(gradient, columns={**gradient.columns, "distance": gradient.columns["distance"] ** 0.5})
 
-    def end_iteration(self) -> None:
-        """Move the sampling policy towards the prior in training."""
-        self._average.update(self.prior)
-        self._average.copy_to(self.sampler)
-
-    def return_to(self, prior: ScenePrior) -> None:
-        """Sample with the weights of ``prior``, and begin their average anew."""
-        self._average = WeightAverage(prior, self.settings.sampler_decay)
-        self._average.copy_to(self.sampler)
-
     def state(self) -> dict[str, Any]:
-        """The weights of the sampling policy, and the state of the expectation."""
-        expectation = None if self.copy is None else self.copy.state()
-        return {"sampler": self._average.tensors, "updates": self._average.updates, "expectation": expectation}
+        """The state of the sampling policy, and that of the expectation."""
+        return {**super().state(), "expectation": None if self.copy is None else self.copy.state()}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Inverse of :meth:`state`."""
-        self._average.tensors, self._average.updates = state["sampler"], state["updates"]
-        self._average.copy_to(self.sampler)
+        super().restore(state)
         if self.copy is not None:
             self.copy.restore(state["expectation"])

@@ -4,25 +4,22 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections import defaultdict
-from copy import deepcopy
 from typing import Any
 
 from tensordict import TensorDict
 from torch import Generator
 
-from agents.post_training.base import Algorithm
+from agents.post_training.averaged_sampler import AveragedSampler
 from agents.post_training.expectation import TrainedCopy
 from agents.post_training.gradients import BatchGradient, GradientSum
 from agents.post_training.own_sample_loss import OwnSampleLoss
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import Rollout
-from agents.priors.base import ScenePrior
 from agents.utils.process_group import ProcessGroup, gather_rows
-from agents.utils.weight_average import WeightAverage
 
 
-class OwnSampleAlgorithm(Algorithm[TensorDict]):
-    """An algorithm that samples with a separate copy of the prior, whose weights are also evaluated and saved.
+class OwnSampleAlgorithm(AveragedSampler):
+    """An algorithm that trains on the finished scenes of an averaged sampler.
 
     Args:
         policy: policy that is optimised.
@@ -30,7 +27,6 @@ class OwnSampleAlgorithm(Algorithm[TensorDict]):
         sampler_decay: decay, per :meth:`WeightAverage.update`, of the weight average that samples.
 
     Attributes:
-        sampler: the prior that samples.
         copy: a copy of the denoiser that is trained on the samples, with ``loss_expectation``; None for none.
     """
 
@@ -38,25 +34,8 @@ class OwnSampleAlgorithm(Algorithm[TensorDict]):
     copy: TrainedCopy | None
 
     def __init__(self, policy: DenoisingPolicy, *, draws: int, sampler_decay: float) -> None:
-        self.policy = policy
-        self.prior: ScenePrior = policy.prior  # type: ignore[assignment]
-        self.sampler = deepcopy(self.prior).eval().requires_grad_(False)
+        super().__init__(policy, sampler_decay=sampler_decay)
         self.draws = draws
-        self._sampling_policy = DenoisingPolicy(
-            self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance,
-            claim_guidance=policy.claim_guidance, independent=False,
-        )  # fmt: skip  # it needs no log-probabilities
-        self._average = WeightAverage(self.prior, sampler_decay)
-
-    @property
-    def sampling_policy(self) -> DenoisingPolicy:
-        """The reverse chain of the copy that samples."""
-        return self._sampling_policy
-
-    @property
-    def average(self) -> WeightAverage:
-        """The weights of the copy that samples."""
-        return self._average
 
     @abstractmethod
     def advantage(self, rollout: Rollout) -> TensorDict:

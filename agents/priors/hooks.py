@@ -83,7 +83,7 @@ def make_hook(
         if guides:
             weight, std = prior.estimate(step, table)
             scale = prior.normalizer.scale[TRANSLATION].to(std)
-            metres = torch.where(scale == 0, torch.zeros_like(scale), std / scale)
+            metres = position_std(prior, step, table)
         for guide in guides:
             shift = guide(step, len(table), denoised, metres)
             if shift is not None:
@@ -92,3 +92,10 @@ def make_hook(
         return reverse if rows is None else reverse.take(rows.to(x.device))
 
     return None if watch is None and draw is None and not guides else hook
+
+
+def position_std(prior: Estimating, step: int, table: StepTable) -> Tensor:
+    """(3,) standard deviation of the denoised positions at a step of a chain, m; 0 on axes without extent."""
+    _, std = prior.estimate(step, table)
+    scale = prior.normalizer.scale[TRANSLATION].to(std)
+    return torch.where(scale == 0, torch.zeros_like(scale), std / scale)

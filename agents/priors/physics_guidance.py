@@ -43,7 +43,12 @@ class PhysicsGuidance:
             denoised: gives the B scenes that the network expects.
             std: (3,) standard deviation of their positions along the axes of the world, m.
         """
-        error = std.cpu().double().numpy()
-        if error[:2].max() > _FINE:
+        if not self.acts(std):
             return None
+        error = std.cpu().double().numpy()
         return (self.strength * corrections(denoised().to("cpu"), error, self._movable)).to(std.device)
+
+    @staticmethod
+    def acts(std: Tensor) -> bool:
+        """Whether objects are moved at steps whose denoised positions have the standard deviation ``std`` (3,), m."""
+        return float(std[:2].max()) <= _FINE

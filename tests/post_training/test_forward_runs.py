@@ -35,7 +35,14 @@ def forward_config(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("algorithm", "process"), [("nft", "mixed"), ("awm", "continuous"), ("reward_weighted", "mixed"), ("neon", "mixed")]
+    ("algorithm", "process"),
+    [
+        ("nft", "mixed"),
+        ("awm", "continuous"),
+        ("reward_weighted", "mixed"),
+        ("neon", "mixed"),
+        ("guidance_distillation", "continuous"),
+    ],
 )
 def test_stopped_and_resumed_run_equals_the_uninterrupted_one(tmp_path: Path, algorithm: str, process: str) -> None:
     whole = post_train(forward_config(tmp_path / "whole", algorithm, iterations=3), prior=tiny_prior(process=process))

@@ -42,6 +42,7 @@ CASES: dict[str, tuple[str, torch.dtype, dict[str, Any]]] = {
         torch.float32,
         {"guard": {"action": "rollback", "limit": 0.5, "scenes": 20, "samples": 20}, "iterations": 3, "bank_size": 30},
     ),
+    "guidance_distillation": ("mixed", torch.float64, {"prompt": TWO}),
     "neon": ("mixed", torch.float64, {"algorithm": {"updates": 2, "period": 2}}),
     "reward_weighted": ("mixed", torch.float32, {"reward": "diversity"}),
 }
