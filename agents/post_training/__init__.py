@@ -6,12 +6,8 @@ from scene_envs.lazy import lazy_names
 
 if TYPE_CHECKING:
     from agents.post_training.advantages import compute_advantages
-    from agents.post_training.algorithms import (
-        AlgorithmSettings,
-        DDPOSFSettings,
-        list_algorithms,
-        register_algorithm,
-    )
+    from agents.post_training.algorithm_settings import AlgorithmSettings, DDPOSFSettings
+    from agents.post_training.algorithms import list_algorithms, register_algorithm
     from agents.post_training.base import Algorithm
     from agents.post_training.comparison_run import post_train_and_compare
     from agents.post_training.config import PostTrainConfig

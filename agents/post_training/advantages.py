@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from agents.post_training.algorithms import BASELINES
+from agents.post_training.algorithm_settings import BASELINES
 from agents.utils.process_group import gather_rows
 from scene_envs.errors import InvalidInputError
 

@@ -14,7 +14,8 @@ from agents.configuration.prior_names import split_name
 from agents.configuration.settings import LoggerSettings, OptimizerSettings
 from agents.configuration.shared_keys import RewardLimits, SamplingKeys, TrainingKeys
 from agents.configuration.tree import plain_tree
-from agents.post_training.algorithms import AlgorithmSettings, DDPOSFSettings, algorithm_settings, list_algorithms
+from agents.post_training.algorithm_settings import AlgorithmSettings, DDPOSFSettings
+from agents.post_training.algorithms import algorithm_settings, list_algorithms
 from agents.post_training.inpaint_settings import InpaintSettings
 from agents.post_training.regularisation_settings import AdapterSettings, RegularisationSettings
 from scene_envs.envs.settings import PROMPT_SOURCES, check_claim_guidance

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from torch import Generator, Tensor
 
 from agents.post_training.advantages import compute_advantages
-from agents.post_training.algorithms import DDPOISSettings, DDPOSFSettings
+from agents.post_training.algorithm_settings import DDPOISSettings, DDPOSFSettings
 from agents.post_training.base import Algorithm
 from agents.post_training.base_kl import chain_kl
 from agents.post_training.gradients import BatchGradient, accumulate_policy_gradient, credited_reward, draw_steps

@@ -11,7 +11,12 @@ from tensordict import TensorDict
 from torch import Generator, Tensor
 
 from agents.post_training.advantages import compute_advantages, sibling_advantages
-from agents.post_training.algorithms import AWMSettings, ForwardProcessSettings, NFTSettings, RewardWeightedSettings
+from agents.post_training.algorithm_settings import (
+    AWMSettings,
+    ForwardProcessSettings,
+    NFTSettings,
+    RewardWeightedSettings,
+)
 from agents.post_training.expectation import Expectation
 from agents.post_training.forward_losses import AWMLoss, NFTLoss, RewardWeightedLoss
 from agents.post_training.forward_process_loss import ForwardProcessLoss

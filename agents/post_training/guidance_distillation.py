@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Generator, Tensor
 
-from agents.post_training.algorithms import GuidanceDistillationSettings
+from agents.post_training.algorithm_settings import GuidanceDistillationSettings
 from agents.post_training.averaged_sampler import AveragedSampler
 from agents.post_training.gradients import BatchGradient, GradientSum
 from agents.post_training.own_sample_loss import PlainLoss

@@ -9,7 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 
 from agents.networks.text import Text
-from agents.post_training.algorithms import NeonSettings
+from agents.post_training.algorithm_settings import NeonSettings
 from agents.post_training.expectation import TrainedCopy
 from agents.post_training.own_sample_loss import OwnSampleLoss
 from agents.post_training.own_samples import OwnSampleAlgorithm

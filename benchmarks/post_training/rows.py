@@ -12,6 +12,7 @@ TYPES = (
     "restaurant_low_clutter", "restaurant_high_clutter",
 )  # fmt: skip
 FORWARD, CHAIN, BASELINE, NEON = "nft", "ddpo_sf", "reward_weighted", "neon"
+DISTILLATION = "guidance_distillation"
 LENGTH = 300
 """Iterations of a row, but for Neon, which needs fewer."""
 
@@ -58,7 +59,7 @@ def _stability() -> tuple[Row, ...]:
     """300 iterations: each algorithm on Dimsum with three seeds, and the forward process on two more scene types."""
     dimsum = [
         Row(f"dimsum_table-{name}-{seed}", "dimsum_table", _keys(name, "feasible_share", seed), 300)
-        for name in (FORWARD, "awm", CHAIN)
+        for name in (FORWARD, "awm", CHAIN, DISTILLATION)
         for seed in range(3)
     ]
     others = [
@@ -84,7 +85,7 @@ def _equal_scenes() -> tuple[Row, ...]:
     return tuple(
         Row(f"{prior}-{name}-{seed}", prior, (*_keys(name, "feasible_share", seed), "batch_size=24", *guard), 40)
         for prior in TYPES
-        for name in (FORWARD, CHAIN, BASELINE)
+        for name in (FORWARD, CHAIN, BASELINE, DISTILLATION)
         for seed in range(3 if prior == "dimsum_table" else 1)
     )
 

@@ -126,7 +126,7 @@ def test_words_of_groups_are_those_of_the_parts_they_are_for():
     from agents.evaluation.measures import MEASURES
     from agents.networks.mixed_denoiser import EMPTY_SLOTS
     from agents.networks.mixed_flux_config import TEXT_REACHES
-    from agents.post_training.algorithms import LOG_PROB_REDUCTIONS
+    from agents.post_training.algorithm_settings import LOG_PROB_REDUCTIONS
     from agents.post_training.losses import REDUCTIONS
     from agents.pretraining.initial_prior import MOMENTS
     from agents.pretraining.settings import LossSettings, NetworkSettings, ProcessSettings

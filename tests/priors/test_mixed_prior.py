@@ -13,7 +13,8 @@ from agents.diffusion import MixedStep
 from agents.diffusion.reverse_steps import state_of
 from agents.networks.mixed_denoiser import Observed
 from agents.post_training import DDPOSFLoss, DenoisingPolicy
-from agents.post_training.algorithms import DDPOSFSettings, NFTSettings, make_algorithm
+from agents.post_training.algorithm_settings import DDPOSFSettings, NFTSettings
+from agents.post_training.algorithms import make_algorithm
 from agents.post_training.rollouts import collect
 from agents.priors.base import ScenePrior
 from agents.priors.mixed import MixedPrior

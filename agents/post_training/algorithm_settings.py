@@ -1,0 +1,270 @@
+"""Settings of the post-training algorithms; imports no torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+from agents.configuration.checks import at_least, one_of, positive
+from scene_envs.envs.settings import check_physics_guidance
+from scene_envs.errors import InvalidInputError
+
+CREDITS = ("auto", "scene", "object")
+CATEGORY_CREDITS = ("auto", "scene", "none")
+BASELINES = ("leave_one_out", "mean")
+STEP_WEIGHTINGS = ("uniform", "std", "variance")
+LOG_PROB_REDUCTIONS = ("mean", "sum")
+
+
+@dataclass
+class AlgorithmSettings:
+    """Settings that all algorithms share.
+
+    Attributes:
+        name: name of a registered algorithm.
+        scenes_per_prompt: number of scenes of a batch that share a prompt, or the observed part in inpainting;
+            advantages are computed within such a group.
+    """
+
+    learning_rate: ClassVar[float] = 5e-5
+    """Learning rate unless ``optimizer.lr`` names another."""
+    regularisation_weight: ClassVar[float] = 0.5
+    """Coefficient of the pretraining loss unless ``regularisation.weight`` names another."""
+    sample_limits: ClassVar[Mapping[str, float]] = {}
+    """Limits of the guard's sample figures unless ``guard`` names others; a reward may ask for other object counts."""
+
+    name: str = ""
+    scenes_per_prompt: int = 8
+
+    def __post_init__(self) -> None:
+        at_least(self, 2, "scenes_per_prompt")
+
+    @property
+    def optimiser_steps(self) -> int:
+        """Optimiser steps per batch: the key ``updates`` of algorithms that have it."""
+        return getattr(self, "updates", 1)
+
+
+@dataclass
+class DDPOSFSettings(AlgorithmSettings):
+    """DDPO-SF: the score-function policy gradient (Black et al. 2024, Eq. 3).
+
+    Attributes:
+        gradient_steps: number of denoising steps per iteration that contribute to the gradient, drawn from the eligible
+            steps.
+        min_std: smallest sigma of an eligible step, in normalised units; steps with less noise are excluded from the
+            gradient.
+        skip_first: first fraction of the chain, with the most noise, that is excluded from the gradient.
+        step_weighting: weight of a step: ``uniform``, or proportional to its ``std`` or ``variance``.
+        log_prob_reduction: reduction of log p over the random entries of a scene: ``mean`` or ``sum``.
+        credit: ``scene`` gives every slot the advantage of the scene, ``object`` gives it its own (for rewards with
+            ``per_object``), ``auto`` uses ``object`` if the reward allows it.
+        baseline: baseline of the advantages: ``leave_one_out`` or ``mean``.
+        advantage_clip: largest absolute value of an advantage.
+    """
+
+    name: str = "ddpo_sf"
+    gradient_steps: int = 8
+    min_std: float = 0.03
+    skip_first: float = 0.0
+    step_weighting: str = "uniform"
+    log_prob_reduction: str = "mean"
+    credit: str = "auto"
+    baseline: str = "leave_one_out"
+    advantage_clip: float = 5.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, 1, "gradient_steps")
+        positive(self, "advantage_clip", "min_std")
+        if not 0 <= self.skip_first < 1:
+            raise InvalidInputError(f"skip_first={self.skip_first} must lie in [0, 1)")
+        one_of(self, "credit", CREDITS)
+        one_of(self, "baseline", BASELINES)
+        one_of(self, "step_weighting", STEP_WEIGHTINGS)
+        one_of(self, "log_prob_reduction", LOG_PROB_REDUCTIONS)
+
+
+@dataclass
+class DDPOISSettings(DDPOSFSettings):
+    """DDPO-IS: DDPO with clipped importance weights, for several updates per batch (Eq. 4).
+
+    Attributes:
+        clip_epsilon: half-width of the clip of the probability ratio.
+        updates: optimiser steps per batch.
+    """
+
+    name: str = "ddpo_is"
+    clip_epsilon: float = 1e-4
+    updates: int = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, 1, "updates")
+        if not 0 < self.clip_epsilon < 1:
+            raise InvalidInputError(f"clip_epsilon={self.clip_epsilon} must lie between 0 and 1")
+
+
+@dataclass
+class ForwardProcessSettings(AlgorithmSettings):
+    """Settings that the forward-process algorithms share.
+
+    Attributes:
+        updates: optimiser steps per batch.
+        draws: number of timesteps and noises of every scene per optimiser step.
+        credit: credit of poses: ``scene`` gives every slot the advantage of the scene, ``object`` gives it its own (for
+            rewards with ``per_object``), ``auto`` uses ``object`` if the reward allows it.
+        category_credit: credit of categories: ``scene`` uses the advantage of the scene, ``none`` keeps the categories
+            as they are, ``auto`` is ``none`` if poses have credit per object, else ``scene``.
+        sampler_decay: final decay of the averaged weights that sample, per iteration; it rises from 0.
+        siblings: number of neighbouring scenes that share the first steps of their chain and are compared with each
+            other; with 1 scenes share nothing and are compared with the whole batch.
+        shared_steps: share of the chain that siblings have in common; all categories should be drawn at its end.
+    """
+
+    learning_rate: ClassVar[float] = 2e-4
+    regularisation_weight: ClassVar[float] = 0.2
+    sample_limits: ClassVar[Mapping[str, float]] = {
+        "count_distance": 1.0,
+        "category_kl": 0.05,
+        "classifier_accuracy": 0.1,
+    }
+
+    updates: int = 2
+    draws: int = 2
+    credit: str = "auto"
+    category_credit: str = "auto"
+    sampler_decay: float = 0.9
+    siblings: int = 1
+    shared_steps: float = 0.5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, 1, "updates", "draws", "siblings")
+        if not 0 <= self.shared_steps < 1:
+            raise InvalidInputError(f"shared_steps={self.shared_steps} must lie in [0, 1)")
+        one_of(self, "credit", CREDITS)
+        one_of(self, "category_credit", CATEGORY_CREDITS)
+        if not 0 <= self.sampler_decay < 1:
+            raise InvalidInputError(f"sampler_decay={self.sampler_decay} must lie in [0, 1)")
+
+
+@dataclass
+class NFTSettings(ForwardProcessSettings):
+    """NFT: good samples pull, bad samples push, both within bounds (Zheng et al. 2025).
+
+    Attributes:
+        beta: strength; smaller ones step further from the sampling policy.
+        advantage_clip: advantage, in standard deviations, at which a sample is fully good or bad.
+        expectation_lr: learning rate of the copy of the denoiser that learns the mean of own samples; 0 takes the
+            sampling policy for it.
+    """
+
+    name: str = "nft"
+    beta: float = 0.5
+    advantage_clip: float = 2.0
+    expectation_lr: float = 3e-4
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        positive(self, "beta", "advantage_clip")
+        at_least(self, 0, "expectation_lr")
+
+
+@dataclass
+class AWMSettings(ForwardProcessSettings):
+    """AWM: the pretraining loss of own samples times their advantage (Xue et al. 2025).
+
+    Attributes:
+        beta: strength of the pull to the sampling policy, above 1.
+        advantage_clip: largest advantage, in standard deviations.
+        expectation_lr: as for ``nft``.
+    """
+
+    name: str = "awm"
+    beta: float = 2.0
+    advantage_clip: float = 2.0
+    expectation_lr: float = 3e-4
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        positive(self, "advantage_clip")
+        at_least(self, 0, "expectation_lr")
+        if not self.beta > 1:
+            raise InvalidInputError(f"beta={self.beta} must be above 1: below, a bad sample pushes without bound")
+
+
+@dataclass
+class RewardWeightedSettings(ForwardProcessSettings):
+    """Reward-weighted fine-tuning: good samples pull, none pushes; the baseline of the other algorithms.
+
+    Attributes:
+        temperature: temperature of the weights exp(A / temperature), in standard deviations of the reward.
+    """
+
+    name: str = "reward_weighted"
+    temperature: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        positive(self, "temperature")
+
+
+@dataclass
+class NeonSettings(AlgorithmSettings):
+    """Neon: negative extrapolation from self-training (Alemohammad et al. 2025); the reward is reported only.
+
+    Attributes:
+        updates: optimiser steps per batch.
+        draws: number of timesteps and noises of every own sample per optimiser step.
+        w: length of the step away from the copy that is trained on own samples.
+        period: number of iterations of a round; a round ends with an extrapolation.
+    """
+
+    learning_rate: ClassVar[float] = 1e-4
+    regularisation_weight: ClassVar[float] = 1.0
+    sample_limits: ClassVar[Mapping[str, float]] = ForwardProcessSettings.sample_limits
+
+    name: str = "neon"
+    updates: int = 8
+    draws: int = 1
+    w: float = 1.0
+    period: int = 20
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, 1, "updates", "draws", "period")
+        positive(self, "w")
+
+
+@dataclass
+class GuidanceDistillationSettings(AlgorithmSettings):
+    """Guidance distillation: the prior learns to place objects as physics guidance does; the reward is reported only.
+
+    Attributes:
+        updates: optimiser steps per batch.
+        draws: number of steps of the chain of every scene per optimiser step.
+        strength: strength of the physics guidance that is learned, 0 to 1.
+        clip: largest move of an object that is learned at a step, in standard deviations of its denoised position.
+        sampler_decay: final decay of the averaged weights that sample, per iteration; it rises from 0.
+    """
+
+    learning_rate: ClassVar[float] = 2e-4
+    regularisation_weight: ClassVar[float] = 0.01
+    sample_limits: ClassVar[Mapping[str, float]] = ForwardProcessSettings.sample_limits
+
+    name: str = "guidance_distillation"
+    updates: int = 4
+    draws: int = 2
+    strength: float = 1.0
+    clip: float = 1.0
+    sampler_decay: float = 0.9
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, 1, "updates", "draws")
+        positive(self, "strength", "clip")
+        check_physics_guidance(self.strength)
+        if not 0 <= self.sampler_decay < 1:
+            raise InvalidInputError(f"sampler_decay={self.sampler_decay} must lie in [0, 1)")
