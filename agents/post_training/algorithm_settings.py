@@ -247,7 +247,7 @@ class GuidanceDistillationSettings(AlgorithmSettings):
         draws: number of steps of the chain of every scene per optimiser step.
         strength: strength of the physics guidance that is learned, 0 to 1.
         clip: largest move of an object that is learned at a step, in standard deviations of its denoised position.
-        sampler_decay: final decay of the averaged weights that sample, per iteration; it rises from 0.
+        sampler_decay: decay of the averaged weights that sample, per iteration.
     """
 
     learning_rate: ClassVar[float] = 2e-4

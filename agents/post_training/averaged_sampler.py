@@ -21,13 +21,14 @@ class AveragedSampler(Algorithm[TensorDict]):
     Args:
         policy: policy that is optimised.
         sampler_decay: final decay, per batch, of the weight average that samples.
+        warm_up: of the decay, see :class:`~agents.utils.weight_average.WeightAverage`.
 
     Attributes:
         prior: the prior in training.
         sampler: the prior that samples.
     """
 
-    def __init__(self, policy: DenoisingPolicy, *, sampler_decay: float) -> None:
+    def __init__(self, policy: DenoisingPolicy, *, sampler_decay: float, warm_up: float = 10.0) -> None:
         self.policy = policy
         self.prior: ScenePrior = policy.prior  # type: ignore[assignment]
         self.sampler = deepcopy(self.prior).eval().requires_grad_(False)
@@ -35,7 +36,7 @@ class AveragedSampler(Algorithm[TensorDict]):
             self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance,
             claim_guidance=policy.claim_guidance, independent=False,
         )  # fmt: skip  # it needs no log-probabilities
-        self._average = WeightAverage(self.prior, sampler_decay)
+        self._average = WeightAverage(self.prior, sampler_decay, warm_up)
 
     @property
     def sampling_policy(self) -> DenoisingPolicy:
@@ -54,7 +55,7 @@ class AveragedSampler(Algorithm[TensorDict]):
 
     def return_to(self, prior: ScenePrior) -> None:
         """Sample with the weights of ``prior``, and begin their average anew."""
-        self._average = WeightAverage(prior, self._average.decay)
+        self._average = WeightAverage(prior, self._average.decay, self._average.warm_up)
         self._average.copy_to(self.sampler)
 
     def state(self) -> dict[str, Any]:

@@ -136,7 +136,7 @@ class GuidanceDistillation(AveragedSampler):
     loss: GuidanceDistillationLoss
 
     def __init__(self, settings: GuidanceDistillationSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
-        super().__init__(policy, sampler_decay=settings.sampler_decay)
+        super().__init__(policy, sampler_decay=settings.sampler_decay, warm_up=0.0)
         check_physics_guidance(settings.strength, self.prior.scene_type)
         self.settings = settings
         self.loss = GuidanceDistillationLoss(self.prior)

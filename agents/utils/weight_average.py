@@ -12,7 +12,13 @@ Module = TypeVar("Module", bound=nn.Module)
 
 
 class WeightAverage:
-    """Exponential moving average of a module's parameters, with a warm-up of the decay.
+    """Exponential moving average of a module's parameters.
+
+    Args:
+        module: whose parameters are averaged.
+        decay: final decay.
+        warm_up: updates after which the decay is one half, if the final decay is not reached before; 0 for the final
+            decay from the first update on.
 
     >>> layer = nn.Linear(1, 1)
     >>> average = WeightAverage(layer, decay=0.5)
@@ -21,8 +27,9 @@ class WeightAverage:
     True
     """
 
-    def __init__(self, module: nn.Module, decay: float) -> None:
+    def __init__(self, module: nn.Module, decay: float, warm_up: float = 10.0) -> None:
         self.decay = decay
+        self.warm_up = warm_up
         self.updates = 0
         self.tensors = {name: p.detach().clone() for name, p in module.named_parameters()}
 
@@ -30,7 +37,7 @@ class WeightAverage:
     def update(self, module: nn.Module) -> float:
         """Move towards ``module``; returns the decay that was used."""
         self.updates += 1
-        decay = min(self.decay, self.updates / (self.updates + 10.0))
+        decay = min(self.decay, self.updates / (self.updates + self.warm_up))
         named = dict(module.named_parameters())
         get_ema_multi_avg_fn(decay)([self.tensors[name] for name in named], list(named.values()), self.updates)
         return decay
