@@ -184,22 +184,23 @@ class GuidanceDistillation(AveragedSampler):
 
     @torch.no_grad()
     def corrected(self, rollout: Rollout, steps: Tensor) -> TensorDict:
-        """The states (B,) of scenes at ``steps`` (B,) of their chains, as the loss reads them.
+        """The states (B,) of scenes at ``steps`` (B,) of their chains, all in :attr:`steps`, as the loss reads them.
 
         ``moved`` (B, N) is how far the guidance moves each object, m.
         """
         x0 = self.sampler.encode(rollout.batch.to(self.sampler.device))
-        parts = [self._corrected_at(int(step), rollout, x0, torch.nonzero(steps == step)[:, 0]) for step in self.steps]
-        order = torch.cat([torch.nonzero(steps == step)[:, 0] for step in self.steps]).argsort()
-        return torch.cat([part for part in parts if len(part)])[order]
+        rows = [torch.nonzero(steps == step)[:, 0] for step in self.steps]
+        parts = [
+            self._corrected_at(step, rollout, x0, at.to(x0.device))
+            for step, at in zip(self.steps, rows, strict=True)
+            if len(at)
+        ]
+        return torch.cat(parts)[torch.cat(rows).argsort()]
 
     def _corrected_at(self, step: int, rollout: Rollout, x0: Tensor, rows: Tensor) -> TensorDict:
         """The states of scenes ``rows`` (R,) at one step of their chains; ``x0`` (B, N, D) are the finished scenes."""
-        rows = rows.to(x0.device)
-        x, text = rollout.scenes[step][rows], rollout.text
-        if not len(rows):
-            return TensorDict({}, [0])
-        text = None if text is None else (text[0][rows], text[1][rows])
+        x = rollout.scenes[step][rows]
+        text = None if rollout.text is None else (rollout.text[0][rows], rollout.text[1][rows])
         observed = None if rollout.observed is None else rollout.observed[rows]
         denoised = self._teacher.distribution(x, step, text, observed).denoised
         assert denoised is not None
@@ -207,9 +208,9 @@ class GuidanceDistillation(AveragedSampler):
         movable[:, : len(self.sampler.scene_type.fixed)] = False
         if observed is not None:
             movable &= ~observed[..., 0]
-            whole = torch.cat([observed[..., :1].expand(-1, -1, POSE_FEATURES), observed[..., 1:].expand(
-                -1, -1, x.shape[-1] - POSE_FEATURES)], dim=-1)  # fmt: skip
-            denoised = torch.where(whole, x0[rows], denoised)
+            is_pose = torch.arange(x.shape[-1], device=x.device) < POSE_FEATURES
+            known = torch.where(is_pose, observed[..., :1], observed[..., 1:])
+            denoised = torch.where(known, x0[rows], denoised)
         scenes = self.sampler.decode(denoised)
         guidance, std = PhysicsGuidance(self.settings.strength, movable), self._stds[step]
         moves = guidance(step, len(self.policy), lambda: scenes, std)
