@@ -259,7 +259,7 @@ class GuidanceDistillationSettings(AlgorithmSettings):
     draws: int = 2
     strength: float = 1.0
     clip: float = 1.0
-    sampler_decay: float = 0.95
+    sampler_decay: float = 0.9
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -94,10 +94,11 @@ class GuidanceDistillationLoss(PlainLoss):
         text = None if tokens is None or mask is None else (tokens.detach(), mask)
         weight = self.prior.loss_weight(x.shape[1]).to(x)[:, :POSE_FEATURES].expand(len(x), -1, -1)
         weight = weight if trained is None else weight * trained[..., None]
+        observed = self.prior.observed_by_mask(x, flat.get(keys.observed, None))
         noised = NoisedScenes(
             x_t=x, t=t, target=teacher, weight=weight, scale=x.new_ones(len(x)),
             category=x[..., POSE_FEATURES:].argmax(dim=-1),
-            observed=self.prior.observed_by_mask(x, flat.get(keys.observed, None)),
+            observed=self.prior.observed_entries(x, observed),
         )  # fmt: skip
         found = self.prior.denoised(noised, self.prior.output(noised, text))[..., :POSE_FEATURES]
         entries = ((found - teacher) / self._std(t, x)).square() * weight

@@ -44,6 +44,16 @@ def algorithm(trainer: PostTrainer) -> GuidanceDistillation:
     return found
 
 
+@pytest.mark.parametrize("name", ["dimsum_table", "dimsum_table_continuous", "living_room_shelf"])
+def test_a_prior_that_denoises_as_the_teacher_has_no_loss(name: str) -> None:
+    prior = ScenePrior.load(name)
+    x, table = prior.initial(2, 23, Generator().manual_seed(0)), prior.step_table(10)
+    with torch.no_grad():
+        own: Any = prior.transition(x, 4, table)
+        states = {"scene": x, "timestep": table.timesteps[4].expand(2), "denoised": own.denoised[..., :POSE_FEATURES]}
+        assert float(GuidanceDistillationLoss(prior)(TensorDict(states, [2]))["loss_objective"]) < 1e-6
+
+
 @pytest.mark.parametrize("process", ["mixed", "continuous"])
 def test_the_loss_is_the_squared_difference_in_units_of_the_denoiser_error(process: str) -> None:
     prior = tiny_prior(process=process)
