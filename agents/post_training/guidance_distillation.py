@@ -120,7 +120,8 @@ class GuidanceDistillation(AveragedSampler):
     of these chains, :class:`~agents.priors.physics_guidance.PhysicsGuidance` corrects the scenes that the copy
     denoises, and the prior is trained to denoise the same x_t to the corrected poses. The states come from the policy
     itself, as in DAgger (Ross et al. 2011), so the prior learns to correct the errors that it makes. The gradient ends
-    where the guidance has nothing left to correct. Categories are not trained by it. The reward is reported only.
+    where the guidance has nothing left to correct. Rotations are held at what the copy denoises, and categories get no
+    gradient. The reward is reported only.
 
     Args:
         settings: settings of the algorithm.
