@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from agents.configuration.checks import at_least, one_of, positive
-from scene_envs.envs.settings import check_physics_guidance
 from scene_envs.errors import InvalidInputError
 
 CREDITS = ("auto", "scene", "object")
@@ -251,7 +250,7 @@ class GuidanceDistillationSettings(AlgorithmSettings):
     """
 
     learning_rate: ClassVar[float] = 2e-4
-    regularisation_weight: ClassVar[float] = 0.01
+    regularisation_weight: ClassVar[float] = 0.03
     sample_limits: ClassVar[Mapping[str, float]] = ForwardProcessSettings.sample_limits
 
     name: str = "guidance_distillation"
@@ -265,6 +264,7 @@ class GuidanceDistillationSettings(AlgorithmSettings):
         super().__post_init__()
         at_least(self, 1, "updates", "draws")
         positive(self, "strength", "clip")
-        check_physics_guidance(self.strength)
+        if self.strength > 1:
+            raise InvalidInputError(f"strength={self.strength:g} must lie in (0, 1]; 1 learns the whole moves")
         if not 0 <= self.sampler_decay < 1:
             raise InvalidInputError(f"sampler_decay={self.sampler_decay} must lie in [0, 1)")

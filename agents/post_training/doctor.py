@@ -187,13 +187,13 @@ def _advice(report: DoctorReport, config: PostTrainConfig) -> list[str]:
     if weight > 0 and report.policy_gradient_norm > 0:
         if report.gradient_ratio < QUIET:
             advice.append(
-                f"Regularisation drowns the reward (ratio {report.gradient_ratio:.2g}): "
+                f"Regularisation drowns the policy gradient (ratio {report.gradient_ratio:.2g}): "
                 f"lower regularisation.weight from {weight:g}, or change "
                 "algorithm.log_prob_reduction."
             )
         if report.gradient_ratio > LOUD:
             advice.append(
-                f"The reward drowns the regularisation (ratio {report.gradient_ratio:.2g}): "
+                f"The policy gradient drowns the regularisation (ratio {report.gradient_ratio:.2g}): "
                 f"raise regularisation.weight from {weight:g}, or expect the guard to stop you."
             )
     if not report.steps:

@@ -22,7 +22,6 @@ from agents.priors.forward import NoisedScenes
 from agents.priors.hooks import position_std
 from agents.priors.physics_guidance import PhysicsGuidance
 from agents.utils.process_group import ProcessGroup
-from scene_envs.envs.settings import check_physics_guidance
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import POSE_FEATURES, TRANSLATION
 
@@ -139,7 +138,11 @@ class GuidanceDistillation(AveragedSampler):
 
     def __init__(self, settings: GuidanceDistillationSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
         super().__init__(policy, sampler_decay=settings.sampler_decay, warm_up=0.0)
-        check_physics_guidance(settings.strength, self.prior.scene_type)
+        if not self.prior.scene_type.has_geometry:
+            raise InvalidInputError(
+                f"algorithm={settings.name} needs the geometry of the assets, which scene type "
+                f"{self.prior.scene_type.name!r} does not have; take another algorithm, such as nft"
+            )
         self.settings = settings
         self.loss = GuidanceDistillationLoss(self.prior)
         self._teacher = DenoisingPolicy(self.sampler, len(policy), chunk=policy.chunk, independent=False)
