@@ -283,7 +283,8 @@ def config(output: Path, **keys: Any) -> PostTrainConfig:
 
 
 def algorithm(name: str) -> dict[str, Any]:
-    return {"name": name, "scenes_per_prompt": 3, **({"gradient_steps": 2} if name.startswith("ddpo") else {})}
+    few = {"guidance_distillation": {"updates": 1, "draws": 1}}.get(name, {})
+    return {"name": name, "scenes_per_prompt": 3, **few, **({"gradient_steps": 2} if name.startswith("ddpo") else {})}
 
 
 @pytest.mark.slow

@@ -42,7 +42,11 @@ CASES: dict[str, tuple[str, torch.dtype, dict[str, Any]]] = {
         torch.float32,
         {"guard": {"action": "rollback", "limit": 0.5, "scenes": 20, "samples": 20}, "iterations": 3, "bank_size": 30},
     ),
-    "guidance_distillation": ("mixed", torch.float64, {"prompt": TWO}),
+    "guidance_distillation": (
+        "mixed",
+        torch.float64,
+        {"algorithm": {"updates": 1, "draws": 1}, "prompt": TWO, "iterations": 1, "slots": 12},
+    ),
     "neon": ("mixed", torch.float64, {"algorithm": {"updates": 2, "period": 2}}),
     "reward_weighted": ("mixed", torch.float32, {"reward": "diversity"}),
 }
