@@ -193,17 +193,16 @@ class GuidanceDistillation(AveragedSampler):
 
         ``moved`` (B, N) is how far the guidance moves each object, m.
         """
-        x0 = self.sampler.encode(rollout.batch.to(self.sampler.device))
         rows = [torch.nonzero(steps == step)[:, 0] for step in self.steps]
         parts = [
-            self._corrected_at(step, rollout, x0, at.to(x0.device))
+            self._corrected_at(step, rollout, at.to(rollout.scenes.device))
             for step, at in zip(self.steps, rows, strict=True)
             if len(at)
         ]
         return torch.cat(parts)[torch.cat(rows).argsort()]
 
-    def _corrected_at(self, step: int, rollout: Rollout, x0: Tensor, rows: Tensor) -> TensorDict:
-        """The states of scenes ``rows`` (R,) at one step of their chains; ``x0`` (B, N, D) are the finished scenes."""
+    def _corrected_at(self, step: int, rollout: Rollout, rows: Tensor) -> TensorDict:
+        """The states of scenes ``rows`` (R,) at one step of their chains."""
         x = rollout.scenes[step][rows]
         text = None if rollout.text is None else (rollout.text[0][rows], rollout.text[1][rows])
         observed = None if rollout.observed is None else rollout.observed[rows]
@@ -215,7 +214,8 @@ class GuidanceDistillation(AveragedSampler):
             movable &= ~observed[..., 0]
             is_pose = torch.arange(x.shape[-1], device=x.device) < POSE_FEATURES
             known = torch.where(is_pose, observed[..., :1], observed[..., 1:])
-            denoised = torch.where(known, x0[rows], denoised)
+            finished = self.sampler.encode(rollout.batch[rows.cpu()].to(x.device))
+            denoised = torch.where(known, finished, denoised)
         scenes = self.sampler.decode(denoised)
         guidance, std = PhysicsGuidance(self.settings.strength, movable), self._stds[step]
         moves = guidance(step, len(self.policy), lambda: scenes, std)

@@ -83,7 +83,7 @@ def make_hook(
         if guides:
             weight, std = prior.estimate(step, table)
             scale = prior.normalizer.scale[TRANSLATION].to(std)
-            metres = position_std(prior, step, table)
+            metres = _in_metres(std, scale)
         for guide in guides:
             shift = guide(step, len(table), denoised, metres)
             if shift is not None:
@@ -97,5 +97,9 @@ def make_hook(
 def position_std(prior: Estimating, step: int, table: StepTable) -> Tensor:
     """(3,) standard deviation of the denoised positions at a step of a chain, m; 0 on axes without extent."""
     _, std = prior.estimate(step, table)
-    scale = prior.normalizer.scale[TRANSLATION].to(std)
+    return _in_metres(std, prior.normalizer.scale[TRANSLATION].to(std))
+
+
+def _in_metres(std: Tensor, scale: Tensor) -> Tensor:
+    """(3,) deviations in metres of normalised ones; 0 where ``scale`` (3,) is 0."""
     return torch.where(scale == 0, torch.zeros_like(scale), std / scale)
