@@ -36,7 +36,7 @@ def main() -> None:
         real = get_grammar(prior.scene_type.name).sample(np.random.default_rng(0), arguments.count)
         real = real.with_slots(prior.config.slots)
         half = _half(real)
-        scenes = (real, half, prior.complete(half, num_steps=50, seed=0), prior.rearrange(real, num_steps=50, seed=0))
+        scenes = (real, half, prior.complete(half, physics_guidance=0.0), prior.rearrange(real, physics_guidance=0.0))
         for title, batch in zip(COLUMNS, scenes, strict=True):
             print(_row(name, title, batch))
         camera = picture_camera(prior.scene_type.name, 320, 240)

@@ -84,24 +84,26 @@ def log_figures(file: Path) -> Figures:
 def sampling(name: str) -> Figures:
     """Two scenes in ten steps, without a prompt, and with one and guidance where the prior reads prompts."""
     prior = ScenePrior.load(name)
-    batch = prior.sample(2, num_steps=10, seed=3)
+    batch = prior.sample(2, num_steps=10, seed=3, physics_guidance=0.0)
     figures = {"free": scene_figures(batch)}
     if prior.conditional:
         import numpy as np
 
         prompts = [texts[0] for texts in describe_all(batch, np.random.default_rng(0), count=1)]
-        figures["prompted"] = scene_figures(prior.sample(2, prompt=prompts, guidance=1.0, num_steps=10, seed=4))
+        figures["prompted"] = scene_figures(
+            prior.sample(2, prompt=prompts, guidance=1.0, physics_guidance=0.0, num_steps=10, seed=4)
+        )
     return figures
 
 
 def inpainting(name: str) -> Figures:
     """Completion with more slots, and rearrangement, of two samples."""
     prior = ScenePrior.load(name)
-    batch = prior.sample(2, num_steps=5, seed=3)
+    batch = prior.sample(2, num_steps=5, seed=3, physics_guidance=0.0)
     slots = batch.tensor.shape[1] + 4
     return {
-        "complete": scene_figures(prior.complete(batch, num_steps=5, seed=1, slots=slots)),
-        "rearrange": scene_figures(prior.rearrange(batch, num_steps=5, seed=2)),
+        "complete": scene_figures(prior.complete(batch, num_steps=5, seed=1, slots=slots, physics_guidance=0.0)),
+        "rearrange": scene_figures(prior.rearrange(batch, num_steps=5, seed=2, physics_guidance=0.0)),
     }
 
 

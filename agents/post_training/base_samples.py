@@ -45,6 +45,7 @@ def kept_base_samples(
             batch = base.sample(
                 count,
                 prompt=prompts,
+                physics_guidance=0.0,
                 num_steps=config.num_steps,
                 slots=bank.train.shape[1],
                 seed=stream_seed(config.seed, "base_samples"),

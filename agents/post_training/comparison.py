@@ -79,8 +79,8 @@ def measure_prior(
     from scene_envs.physics import feasibility, make_ready
 
     raw = prior.sample(
-        count, prompt=prompts, guidance=guidance, claim_guidance=claim_guidance, num_steps=num_steps, slots=slots,
-        seed=seed,
+        count, prompt=prompts, guidance=guidance, claim_guidance=claim_guidance, physics_guidance=0.0,
+        num_steps=num_steps, slots=slots, seed=seed,
     )  # fmt: skip
     feasible = feasibility(raw, pool=pool)
     ready = make_ready(raw, pool=pool)

@@ -164,8 +164,9 @@ def sampled_parts(prior: ScenePrior, num_steps: int, slots: int, guidance: float
     def draw(count: int, episode_prompts: Sequence[str] | None, seed: int) -> tuple[SceneBatch, Sequence[str] | None]:
         weight = 0.0 if episode_prompts is None else guidance
         batch = prior.sample(
-            count, prompt=episode_prompts, guidance=weight, num_steps=num_steps, slots=slots, seed=seed
-        )
+            count, prompt=episode_prompts, guidance=weight, physics_guidance=0.0, num_steps=num_steps, slots=slots,
+            seed=seed,
+        )  # fmt: skip
         return batch.to("cpu"), episode_prompts
 
     return draw

@@ -53,6 +53,7 @@ class LearnedRewards:
                 prompt=prompts,
                 guidance=self._config.guidance if prompts else 0.0,
                 claim_guidance=self._config.claim_guidance if prompts else 0.0,
+                physics_guidance=0.0,
                 num_steps=self._config.num_steps,
                 slots=slots,
                 seed=self._seed,

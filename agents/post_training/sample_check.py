@@ -71,6 +71,7 @@ class SampleCheck:
             prompt=prompts,
             guidance=self.guidance if prompts else 0.0,
             claim_guidance=self.claim_guidance if prompts else 0.0,
+            physics_guidance=0.0,
             num_steps=self.num_steps,
             slots=self.slots,
             seed=derived_seed(self.seed, start),

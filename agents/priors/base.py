@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import torch
@@ -20,7 +21,7 @@ from agents.networks.count_conditioning import CountConditioning
 from agents.networks.text import Text
 from agents.priors.adapters import AdapterFacts
 from agents.priors.forward import Trainable
-from agents.priors.guidance import guidance_hook
+from agents.priors.guidance import guidance_hook, physics_strength
 from agents.priors.hooks import Hook
 from agents.priors.inpainting import Inpainting
 from agents.priors.loading import Loadable
@@ -69,6 +70,7 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
         """Store the parts that priors of every process have."""
         self.config = config
         self.scene_type: SceneType = get_scene_type(config.scene_type)
+        check_physics_guidance(config.physics_guidance, self.scene_type)
         self.normalizer = normalizer
         self.preconditioning = preconditioning
         self.card = card or {}
@@ -145,6 +147,16 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
             raise unknown_name("union", union, UNIONS)
         return self
 
+    def with_physics_guidance(self: Prior, strength: float) -> Prior:
+        """This prior; its samples have physics guidance of ``strength`` (0 to 1) where a caller gives none.
+
+        Raises:
+            InvalidInputError: not from 0 to 1, or the assets have no geometry.
+        """
+        strength = physics_strength(strength, self.config, self.scene_type)
+        self.config = replace(self.config, physics_guidance=strength)
+        return self
+
     def with_open_empty(self: Prior, share: float) -> Prior:
         """This prior; in its training, ``share`` of the masks of whole slots include every empty slot.
 
@@ -204,7 +216,7 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
         prompt: str | Sequence[str] | None = None,
         guidance: float = 0.0,
         claim_guidance: float = 0.0,
-        physics_guidance: float = 0.0,
+        physics_guidance: float | None = None,
         num_steps: int = 50,
         slots: int | None = None,
         seed: int = 0,
@@ -222,7 +234,9 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
                 :class:`~agents.priors.claim_guidance.ClaimGuidance` and
                 :class:`~agents.priors.number_guidance.NumberGuidance`; 2 is a good choice. It needs a prompt.
             physics_guidance: strength with which objects are moved out of overlaps and onto supports at the last steps,
-                0 to 1, see :class:`~agents.priors.physics_guidance.PhysicsGuidance`; 1 is a good choice.
+                0 to 1, see :class:`~agents.priors.physics_guidance.PhysicsGuidance`. None takes the strength that the
+                prior was published with (``config.physics_guidance``): 1 for shipped priors whose names end in
+                ``_feasible``, otherwise 0.
             num_steps: denoiser evaluations per scene, 1..T.
             slots: slots per scene; more than trained is allowed.
             seed: of the torch generator; the same seed and batch size give the same scenes.
@@ -237,7 +251,7 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
             prompt, guidance, count, scene_type=self.scene_type, slots=wide, conditional=self.conditional,
             claim_guidance=claim_guidance,
         )  # fmt: skip
-        check_physics_guidance(physics_guidance, self.scene_type)
+        strength = physics_strength(physics_guidance, self.config, self.scene_type)
         generator = Generator(str(self._fixed.device)).manual_seed(seed)
         chunks = []
         for start in range(0, count, batch_size):
@@ -247,7 +261,7 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
                 size, prompts=texts, guidance=guidance, num_steps=num_steps, slots=slots, generator=generator, eta=eta,
                 hook=self.sampling_hook(
                     size, wide, num_steps, prompts=texts, claim_guidance=claim_guidance,
-                    physics_guidance=physics_guidance,
+                    physics_guidance=strength,
                 ),
             )  # fmt: skip
             chunks.append(x0)
@@ -270,7 +284,8 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
             slots: slots per scene.
             num_steps: steps of the chain.
             prompts: one per scene; without prompts there is no claim guidance.
-            claim_guidance, physics_guidance: as in :meth:`sample`.
+            claim_guidance: as in :meth:`sample`.
+            physics_guidance: strength, 0 for none.
         """
         moved = torch.ones(count, slots, 1, dtype=torch.bool)
         moved[:, : len(self.scene_type.fixed)] = False

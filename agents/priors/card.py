@@ -39,6 +39,7 @@ def package_prior(
     license: str = "",
     machine: str = "",
     limits: str = "",
+    physics_guidance: float | None = None,
 ) -> Path:
     """Write a prior as a folder to publish: ``config.json``, ``model.safetensors`` and the model card ``README.md``.
 
@@ -52,10 +53,12 @@ def package_prior(
         license: of the data; empty for that of this package, unless the prior was imported.
         machine: the hardware of the training, as in ``"one NVIDIA H200"``.
         limits: weaknesses of the prior, in sentences.
+        physics_guidance: strength of physics guidance of samples of the package where a caller gives none; None keeps
+            that of the source.
 
     Raises:
-        InvalidInputError: no such evaluation, a weight that half precision cannot hold, or a folder that holds
-            anything but a packaged prior.
+        InvalidInputError: no such evaluation, ``physics_guidance`` outside 0 to 1, a weight that half precision cannot
+            hold, or a folder that holds anything but a packaged prior.
         CorruptFileError: the evaluation is not a JSON mapping, as the command writes it.
     """
     from agents.priors.base import ScenePrior
@@ -64,6 +67,9 @@ def package_prior(
 
     measures = {} if evaluation is None else read_measures(evaluation)
     prior = ScenePrior.load(source)
+    config = prior.config
+    if physics_guidance is not None:
+        prior.with_physics_guidance(physics_guidance)
     told = {"data": data, "license": license or _license(prior.card), "machine": machine, "limits": limits}
     kept = prior.card
     # the settings of a post-training run describe the post-training; the card has those of the pretraining
@@ -79,7 +85,7 @@ def package_prior(
             write_config(folder, _without_folders(read_config(folder)))
             write_text(folder / README, card_page(folder.name, prior, PriorFacts.of(folder)))
     finally:
-        prior.card = kept
+        prior.card, prior.config = kept, config
     return folder
 
 
@@ -133,6 +139,7 @@ def card_page(name: str, prior: ScenePrior, facts: PriorFacts) -> str:
         "data": _data(card),
         "training": _training(card),
         "post-training": _post_training(card),
+        "sampling": _sampling(prior),
         "licence of the data": str(card.get("license") or "not stated"),
     }
     table = "\n".join(["| | |", "|---|---|", *(f"| {key} | {text} |" for key, text in rows.items() if text)])
@@ -159,8 +166,12 @@ def _measured(card: Mapping[str, Any], measures: Mapping[str, float]) -> str:
     if not measures:
         return "Not measured."
     steps = f" at {measures['num_steps']:.0f} steps" if "num_steps" in measures else ""
-    intro = f"{measures['scenes']:.0f} raw samples{steps}, none selected. *Real* is the same figure of real scenes: "
-    return intro + "what a perfect sampler would score.\n\n" + figure_table(measures)
+    strength = measures.get("physics_guidance", 0.0)
+    guided = f", with physics guidance of strength {strength:g}" if strength else ""
+    intro = f"{measures['scenes']:.0f} raw samples{steps}{guided}, none selected."
+    return f"{intro} *Real* is the same figure of real scenes: what a perfect sampler would score.\n\n" + figure_table(
+        measures
+    )
 
 
 def _network(prior: ScenePrior, facts: PriorFacts) -> str:
@@ -183,6 +194,11 @@ def _process(prior: ScenePrior, facts: PriorFacts) -> str:
     text = f"{facts.process}, T = {config.num_timesteps}, schedule {config.schedule}, prediction {config.prediction}"
     kernel = getattr(config, "kernel", "")
     return f"{text}, categories {kernel}" if kernel else text
+
+
+def _sampling(prior: ScenePrior) -> str:
+    strength = prior.config.physics_guidance
+    return f"with physics guidance of strength {strength:g}; `physics_guidance=0` turns it off" if strength else ""
 
 
 def _data(card: Mapping[str, Any]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from agents.diffusion.gaussian import current_prediction
@@ -22,11 +22,13 @@ class DenoiserConfig:
         scene_type: name of its scene type.
         slots: slots per scene that it was trained on.
         network: kind and size of its denoiser.
+        physics_guidance: strength of physics guidance where a caller gives none, 0 to 1.
     """
 
     scene_type: str
     slots: int
     network: NetworkConfig
+    physics_guidance: float = field(default=0.0, kw_only=True)
 
 
 @dataclass(frozen=True)

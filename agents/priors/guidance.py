@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from torch import Tensor
 
@@ -11,8 +12,25 @@ from agents.priors.claim_guidance import ClaimGuidance
 from agents.priors.hooks import Estimating, Guide, Hook, Watch, make_hook
 from agents.priors.number_guidance import NumberGuidance
 from agents.priors.physics_guidance import PhysicsGuidance
+from scene_envs.envs.settings import check_physics_guidance
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
+
+
+def physics_strength(given: float | None, config: Any, scene_type: SceneType) -> float:
+    """Strength of physics guidance of a chain.
+
+    Args:
+        given: by the caller; None takes that of the prior.
+        config: of the prior.
+        scene_type: of the scenes.
+
+    Raises:
+        InvalidInputError: not from 0 to 1, or the assets have no geometry.
+    """
+    strength = config.physics_guidance if given is None else given
+    check_physics_guidance(strength, scene_type)
+    return float(strength)
 
 
 def guidance_hook(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Generator, Tensor
@@ -11,11 +12,10 @@ from torch import Generator, Tensor
 from agents.diffusion.reverse_steps import ReverseStep
 from agents.diffusion.step_tables import StepTable
 from agents.networks.text import Text
-from agents.priors.guidance import guidance_hook
+from agents.priors.guidance import guidance_hook, physics_strength
 from agents.priors.hooks import Guide, Hook, Start, Watch
 from agents.priors.observed_scenes import Noise, ObservedScenes, check_mask, merge
 from agents.priors.prompt_validation import check_prompts
-from scene_envs.envs.settings import check_physics_guidance
 from scene_envs.errors import InvalidInputError
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
@@ -32,6 +32,7 @@ class Inpainting(ABC):
 
     scene_type: SceneType
     normalizer: Normalizer
+    config: Any
 
     @property
     def conditional(self) -> bool:
@@ -143,7 +144,7 @@ class Inpainting(ABC):
         prompt: str | Sequence[str] | None = None,
         guidance: float = 0.0,
         claim_guidance: float = 0.0,
-        physics_guidance: float = 0.0,
+        physics_guidance: float | None = None,
         num_steps: int = 50,
         generators: Sequence[Generator] | None = None,
         seed: int = 0,
@@ -166,7 +167,8 @@ class Inpainting(ABC):
                 :class:`~agents.priors.claim_guidance.ClaimGuidance` and
                 :class:`~agents.priors.number_guidance.NumberGuidance`; it needs a prompt.
             physics_guidance: strength with which regenerated objects are moved out of overlaps and onto supports at the
-                last steps, 0 to 1, see :class:`~agents.priors.physics_guidance.PhysicsGuidance`.
+                last steps, 0 to 1, see :class:`~agents.priors.physics_guidance.PhysicsGuidance`. None takes the
+                strength of the prior, as :meth:`ScenePrior.sample` does.
             num_steps: denoiser evaluations of one pass, 1..T.
             generators: one per scene, so that a scene's result does not depend on its neighbours' noise.
             seed: used to make the generators when none are given.
@@ -192,7 +194,7 @@ class Inpainting(ABC):
             prompt, guidance, len(batch), scene_type=self.scene_type, slots=slots, conditional=self.conditional,
             claim_guidance=claim_guidance,
         )  # fmt: skip
-        check_physics_guidance(physics_guidance, self.scene_type)
+        strength = physics_strength(physics_guidance, self.config, self.scene_type)
         if generators is None:
             generators = [Generator().manual_seed(seed + i) for i in range(len(batch))]
         device, table = self.device, self.step_table(num_steps)
@@ -203,7 +205,7 @@ class Inpainting(ABC):
 
         hook = guidance_hook(
             self, self.scene_type, table, scenes, moved, prompts=prompts, claim_guidance=claim_guidance,
-            physics_guidance=physics_guidance, guide=guide, watch=watch,
+            physics_guidance=strength, guide=guide, watch=watch,
         )  # fmt: skip
         begins = getattr(watch, "start", None)
         start = None if begins is None else begins(len(table))
@@ -219,7 +221,7 @@ class Inpainting(ABC):
         prompt: str | Sequence[str] | None = None,
         guidance: float = 0.0,
         claim_guidance: float = 0.0,
-        physics_guidance: float = 0.0,
+        physics_guidance: float | None = None,
         slots: int | None = None,
         fill: int | None = None,
         num_steps: int = 50,
@@ -254,7 +256,7 @@ class Inpainting(ABC):
         prompt: str | Sequence[str] | None = None,
         guidance: float = 0.0,
         claim_guidance: float = 0.0,
-        physics_guidance: float = 0.0,
+        physics_guidance: float | None = None,
         num_steps: int = 50,
         seed: int = 0,
     ) -> SceneBatch:

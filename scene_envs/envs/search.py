@@ -143,7 +143,8 @@ class SearchProblem:
         self.branching, self.max_depth, self.num_steps = chosen.branching, chosen.max_depth, chosen.num_steps
         self.num_actions, self.max_nfe = chosen.branching, chosen.max_nfe
         self.claim_guidance, self.physics_guidance = chosen.claim_guidance, chosen.physics_guidance
-        check_physics_guidance(self.physics_guidance, self.scene_type)
+        if self.physics_guidance is not None:
+            check_physics_guidance(self.physics_guidance, self.scene_type)
         self.prior.step_table(self.num_steps)  # raises now, not later, if the prior has fewer steps
         self.prompting = EnvPrompts(self.prior, chosen.prompt, chosen.guidance, self.slots)
         self.prompt = self.prompting.draw(np.random.default_rng(0)) if self.prompting.given else None
@@ -266,6 +267,7 @@ class SearchProblem:
             how[role] = watch
         if self.physics_guidance:
             _check_takes(self.prior, "physics_guidance", "leave physics_guidance=0")
+        if self.physics_guidance is not None and _takes(self.prior, "physics_guidance"):
             how["physics_guidance"] = self.physics_guidance
         if reader is None or self.prompt is None:
             return self.prior.inpaint(batch, masks, **how).to("cpu")
@@ -332,8 +334,13 @@ class SearchProblem:
         self.scorer.close()
 
 
+def _takes(prior: Any, role: str) -> bool:
+    """Whether ``inpaint`` of a prior takes a key ``role``."""
+    keys = inspect.signature(prior.inpaint).parameters.values()
+    return any(key.name == role or key.kind is inspect.Parameter.VAR_KEYWORD for key in keys)
+
+
 def _check_takes(prior: Any, role: str, remedy: str) -> None:
     """Refuse to steer or guide the inpaintings of a prior that does not take ``role``."""
-    keys = inspect.signature(prior.inpaint).parameters.values()
-    if not any(key.name == role or key.kind is inspect.Parameter.VAR_KEYWORD for key in keys):
+    if not _takes(prior, role):
         raise InvalidInputError(f"inpaint of {type(prior).__name__} takes no {role}=; {remedy}")

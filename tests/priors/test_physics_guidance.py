@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
 
 from agents import ScenePrior
+from agents.configuration.prior_names import list_priors
+from agents.priors.card import package_prior
+from agents.priors.files import read_config
 from agents.priors.physics_guidance import PhysicsGuidance
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError
@@ -71,6 +75,27 @@ def test_without_guidance_no_bit_changes_and_with_it_welded_objects_stay() -> No
     welded = plain.scene_type.welded_categories
     fixed = torch.isin(guided.categories, torch.tensor(list(welded)))
     assert torch.equal(guided.translations[fixed], plain.translations[fixed])
+
+
+def test_a_prior_may_name_the_strength_of_callers_that_give_none(tmp_path: Path) -> None:
+    prior = tiny_prior("dimsum_table", process="mixed")
+    scenes = {strength: prior.sample(3, num_steps=6, physics_guidance=strength) for strength in (0.0, 1.0)}
+    moved = {strength: prior.rearrange(scenes[0.0], num_steps=6, physics_guidance=strength) for strength in (0.0, 1.0)}
+    assert not torch.equal(scenes[0.0].tensor, scenes[1.0].tensor)
+    guided = ScenePrior.load(package_prior(prior, tmp_path / "guided", precision="float32", physics_guidance=1.0))
+    assert prior.config.physics_guidance == 0
+    assert guided.config.physics_guidance == 1
+    for strength, expected in ((None, 1.0), (0.0, 0.0)):
+        assert torch.equal(guided.sample(3, num_steps=6, physics_guidance=strength).tensor, scenes[expected].tensor)
+        again = guided.rearrange(scenes[0.0], num_steps=6, physics_guidance=strength)
+        assert torch.equal(again.tensor, moved[expected].tensor)
+    with pytest.raises(InvalidInputError, match="physics_guidance=2 must be a number from 0 to 1"):
+        guided.with_physics_guidance(2)
+
+
+def test_shipped_priors_that_were_trained_to_be_feasible_are_guided() -> None:
+    strengths = {name: read_config(name)["prior"].get("physics_guidance", 0.0) for name in list_priors()}
+    assert strengths == {name: float(name.endswith("_feasible")) for name in strengths}
 
 
 def test_completions_keep_what_is_observed_bit_for_bit() -> None:

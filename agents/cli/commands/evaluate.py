@@ -56,7 +56,8 @@ class EvaluateConfig(RealSceneKeys, OutputKeys):
         claim_guidance: strength with which samples are guided to the numbers and places that their prompts give, 0 for
             none.
         physics_guidance: strength with which objects of all samples are moved out of overlaps and onto supports at the
-            last steps, 0 to 1.
+            last steps, 0 to 1; null takes that of the prior, 1 for shipped priors whose names end in _feasible and 0
+            for the others.
         seed: seed of the samples, the real scenes and the classifiers.
         measures: all, or some of layout, physics, ready, fsd, novelty, prompts, classifier, renders, fid, written as
             layout or [layout, physics].
@@ -73,7 +74,7 @@ class EvaluateConfig(RealSceneKeys, OutputKeys):
     num_steps: int = 50
     guidance: float = 0.0
     claim_guidance: float = 0.0
-    physics_guidance: float = 0.0
+    physics_guidance: float | None = None
     seed: int = 0
     measures: Any = "all"
     project: bool = True
@@ -270,12 +271,16 @@ class _Results:
 
 def _identity(settings: EvaluateConfig, prior: ScenePrior) -> dict[str, Any]:
     """The keys that figures depend on, and a digest of the configuration and the weights of the prior."""
-    digest = hashlib.sha256(json.dumps(prior.config_state(), sort_keys=True).encode())
+    from agents.priors.guidance import physics_strength
+
+    state = {key: value for key, value in prior.config_state().items() if key != "physics_guidance"}
+    digest = hashlib.sha256(json.dumps(state, sort_keys=True).encode())
     for name, tensor in sorted(prior.weights().items()):
         digest.update(name.encode())
         digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
     keys = {key: value for key, value in vars(settings).items() if key not in _NOT_PART}
-    if not settings.physics_guidance:
+    keys["physics_guidance"] = physics_strength(settings.physics_guidance, prior.config, prior.scene_type)
+    if not keys["physics_guidance"]:
         del keys["physics_guidance"]  # folders of earlier versions have no such key
     return {**keys, "digest": digest.hexdigest()[:16]}
 

@@ -34,7 +34,7 @@ class InpaintingConfig:
         claim_guidance: strength with which scenes are guided to the numbers and places that the prompt gives, 0 for
             none; 2 is a good choice; needs a prompt.
         physics_guidance: strength with which objects are moved out of overlaps and onto supports at the last steps, 0
-            to 1; 1 is a good choice.
+            to 1; null takes that of the prior, 1 for shipped priors whose names end in _feasible and 0 for the others.
         num_steps: denoising steps per scene.
         seed: seed of the noise.
         pictures: number of scenes in the galleries; 0 draws none.
@@ -48,7 +48,7 @@ class InpaintingConfig:
     prompt: str | None = None
     guidance: float = 0.0
     claim_guidance: float = 0.0
-    physics_guidance: float = 0.0
+    physics_guidance: float | None = None
     num_steps: int = 50
     seed: int = 0
     pictures: int = 12

@@ -24,6 +24,8 @@ class PackagePriorConfig:
         license: licence of the data, for the card; empty takes that of this package, unless the prior was imported.
         machine: sentence of the card about the machine of the training.
         limits: sentence of the card about the limits of the prior.
+        physics_guidance: strength of physics guidance of samples of the new prior where a command gives none, 0 to 1;
+            null keeps that of the prior.
     """
 
     NO_PATHS: ClassVar[Sequence[str]] = ("data",)
@@ -37,6 +39,7 @@ class PackagePriorConfig:
     license: str = ""
     machine: str = ""
     limits: str = ""
+    physics_guidance: float | None = None
 
 
 def check(settings: PackagePriorConfig) -> None:

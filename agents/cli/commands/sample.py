@@ -27,7 +27,7 @@ class SampleConfig(SamplingKeys, OutputKeys):
         count: number of scenes to draw.
         eta: scale of the noise of the Gaussian steps: 1 for the ancestral chain, 0 for a deterministic chain (DDIM).
         physics_guidance: strength with which objects are moved out of overlaps and onto supports at the last steps, 0
-            to 1; 1 is a good choice.
+            to 1; null takes that of the prior, 1 for shipped priors whose names end in _feasible and 0 for the others.
         union: objects in a scene of a prior of several scene types: one_type (only objects of one type) or any.
         reward: reward that scores the samples for metrics.json; null for none.
         reward_timeout: most seconds that a reward from outside this package may take; it runs in its own process.
@@ -41,7 +41,7 @@ class SampleConfig(SamplingKeys, OutputKeys):
     prior: str = "dimsum_table"
     count: int = 16
     eta: float = 1.0
-    physics_guidance: float = 0.0
+    physics_guidance: float | None = None
     union: str = "one_type"
     reward: Any = named("feasible_objects", "reward")
     reward_timeout: float = 60.0
