@@ -58,8 +58,7 @@ class SearchConfig(BudgetKeys, SamplingKeys):
             prompt.
         num_steps: denoiser evaluations per scene.
         physics_guidance: strength with which regenerated objects are moved out of overlaps and onto supports at the
-            last steps, 0 to 1; null takes that of the prior, 1 for shipped priors whose names end in _feasible and 0
-            for the others.
+            last steps, 0 to 1. A search starts without, also from priors that are sampled with it.
         slots: slots per scene; null takes the number of the scene type.
         seed: seed of the search tree; the baseline starts with the same first scenes, unless the planner steers the
             denoising.
@@ -76,7 +75,7 @@ class SearchConfig(BudgetKeys, SamplingKeys):
     mask: Any = named("blamed_or_empty", "mask")
     masks: list[Any] | None = None
     objective_scale: float | None = None
-    physics_guidance: float | None = None
+    physics_guidance: float = 0.0
     workers: int = 0
     planner: PlannerSettings = nested(
         GradientPlanner, folder="planner", option="gradient", kinds=planner_settings, registered=list_planners

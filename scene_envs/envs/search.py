@@ -143,8 +143,7 @@ class SearchProblem:
         self.branching, self.max_depth, self.num_steps = chosen.branching, chosen.max_depth, chosen.num_steps
         self.num_actions, self.max_nfe = chosen.branching, chosen.max_nfe
         self.claim_guidance, self.physics_guidance = chosen.claim_guidance, chosen.physics_guidance
-        if self.physics_guidance is not None:
-            check_physics_guidance(self.physics_guidance, self.scene_type)
+        check_physics_guidance(self.physics_guidance, self.scene_type)
         self.prior.step_table(self.num_steps)  # raises now, not later, if the prior has fewer steps
         self.prompting = EnvPrompts(self.prior, chosen.prompt, chosen.guidance, self.slots)
         self.prompt = self.prompting.draw(np.random.default_rng(0)) if self.prompting.given else None
@@ -267,7 +266,7 @@ class SearchProblem:
             how[role] = watch
         if self.physics_guidance:
             _check_takes(self.prior, "physics_guidance", "leave physics_guidance=0")
-        if self.physics_guidance is not None and _takes(self.prior, "physics_guidance"):
+        if _takes(self.prior, "physics_guidance"):  # 0 as well: some priors are guided where no strength is given
             how["physics_guidance"] = self.physics_guidance
         if reader is None or self.prompt is None:
             return self.prior.inpaint(batch, masks, **how).to("cpu")

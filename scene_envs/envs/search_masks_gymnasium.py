@@ -95,7 +95,7 @@ class SearchMaskEnv(SearchEnv):
     | `prompt` | `None` | text that all scenes should satisfy, for priors that read prompts; the objective gets it too |
     | `guidance` | `0.0` | weight of classifier-free guidance, which doubles the NFE; needs a prompt |
     | `claim_guidance` | `0.0` | strength of guidance to the numbers and places that the prompt gives; needs a prompt |
-    | `physics_guidance` | `None` | how far objects move out of overlaps and onto supports, 0 to 1; None: as the prior |
+    | `physics_guidance` | `0.0` | strength with which objects are moved out of overlaps and onto supports, 0 to 1 |
 
     ## Vectorized environment
 

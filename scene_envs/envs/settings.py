@@ -107,8 +107,7 @@ class TreeSettings(EnvSettings):
             of free slots.
         max_nfe: denoiser evaluations per episode; None for any number.
         claim_guidance: strength of guidance to the numbers and places that the prompt gives; needs a prompt.
-        physics_guidance: strength with which objects are moved out of overlaps and onto supports, 0 to 1; None takes
-            that of the prior.
+        physics_guidance: strength with which objects are moved out of overlaps and onto supports, 0 to 1.
 
     Raises:
         InvalidInputError: a value is outside what is accepted.
@@ -120,7 +119,7 @@ class TreeSettings(EnvSettings):
     objective_scale: float | None = None
     max_nfe: int | None = None
     claim_guidance: float = 0.0
-    physics_guidance: float | None = None
+    physics_guidance: float = 0.0
 
     def __post_init__(self) -> None:
         self._check_at_least_one("branching")
@@ -129,8 +128,7 @@ class TreeSettings(EnvSettings):
             self._check_at_least_one("max_nfe")
         super().__post_init__()
         check_claim_guidance(self.prompt, self.claim_guidance)
-        if self.physics_guidance is not None:
-            check_physics_guidance(self.physics_guidance)
+        check_physics_guidance(self.physics_guidance)
         if self.objective_scale is not None:
             self._check_positive("objective_scale")
         if self.prompt is not None and not isinstance(self.prompt, str):
