@@ -61,6 +61,7 @@ def check(settings: SampleConfig) -> None:
 def run(settings: SampleConfig, run: Run) -> None:
     """Draw, score, save and picture the scenes."""
     from agents.priors.base import ScenePrior
+    from agents.priors.guidance import physics_strength
     from rewards.isolation import close_reward, run_reward
     from scene_envs.export.formats import resolve_formats
     from scene_envs.physics import PhysicsPool
@@ -90,13 +91,18 @@ def run(settings: SampleConfig, run: Run) -> None:
         batch_size=settings.batch_size,
     ).to("cpu")
     seconds = time.perf_counter() - started
-    run.say(f"{len(batch)} scenes in {seconds:.1f} s, {batch.counts.double().mean():.1f} objects each on average")
+    strength = physics_strength(settings.physics_guidance, prior.config, prior.scene_type)
+    guided = f", with physics_guidance={strength:g}" if strength else ""
+    run.say(
+        f"{len(batch)} scenes in {seconds:.1f} s{guided}, {batch.counts.double().mean():.1f} objects each on average"
+    )
     batch.save(run.directory / "scenes.safetensors")
     counts = batch.counts
     metrics: dict[str, Any] = {
         "scenes": len(batch),
         "objects": {"mean": float(counts.double().mean()), "min": int(counts.min()), "max": int(counts.max())},
         "sampling_seconds": round(seconds, 3),
+        "physics_guidance": strength,
     }
     with PhysicsPool(workers=settings.workers) as pool:
         if reward is not None:
