@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from agents import ScenePrior
 from agents.cli import main
 from agents.priors.testing import tiny_prior
 from scene_envs import SceneBatch
@@ -50,6 +51,18 @@ def test_the_same_seed_draws_the_same_scenes(prior, tmp_path):
         assert main(["sample", *words, f"output={tmp_path / name}"]) == 0
     first, again, other = ((tmp_path / name / "scenes.safetensors").read_bytes() for name in "abc")
     assert first == again != other
+
+
+@pytest.mark.slow
+def test_samples_are_guided_as_the_prior_says_unless_the_command_says_otherwise(prior, tmp_path, capsys):
+    guided, scenes = ScenePrior.load(prior).with_physics_guidance(1.0).save(tmp_path / "guided"), {}
+    for name, words in {"usual": [], "on": ["physics_guidance=1"], "off": ["physics_guidance=0"]}.items():
+        words += [f"prior={guided}", "count=2", "num_steps=4", "reward=null", "pictures=0", "workers=0"]
+        assert main(["sample", *words, f"output={tmp_path / name}"]) == 0
+        assert metrics(tmp_path / name)["physics_guidance"] == (name != "off")
+        assert ("physics_guidance=1" in capsys.readouterr().out) == (name != "off")
+        scenes[name] = (tmp_path / name / "scenes.safetensors").read_bytes()
+    assert scenes["usual"] == scenes["on"] != scenes["off"]
 
 
 @pytest.mark.slow

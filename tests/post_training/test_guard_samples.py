@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 
 import pytest
@@ -48,6 +49,21 @@ def test_the_base_prior_measures_as_itself(tmp_path: Path) -> None:
     assert guard.last_samples is not None
     assert guard.samples is not None
     assert reading.samples["count_distance"] == count_wasserstein(guard.last_samples, guard.samples.real)
+
+
+@pytest.mark.slow
+def test_samples_of_a_run_have_no_physics_guidance_and_its_prior_keeps_the_strength(tmp_path: Path) -> None:
+    logs = []
+    for strength in (0.0, 1.0):
+        folder = tmp_path / f"{strength:g}"
+        config = small_config(folder, iterations=1, algorithm={"name": "nft"}, **SAMPLES)
+        post_train(config, prior=tiny_prior(process="mixed").with_physics_guidance(strength))
+        assert ScenePrior.load(folder).config.physics_guidance == strength
+        with (folder / "log.csv").open() as file:
+            logs.append(
+                [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)]
+            )
+    assert logs[0] == logs[1] != []
 
 
 @pytest.mark.slow
