@@ -55,7 +55,7 @@ def measure(
         names = ",".join(measures)
         _call(
             "evaluate", f"prior={prior}", f"measures=[{names}]", f"count={count}", f"guidance={guidance}",
-            "workers=0", f"output={directory}",
+            "physics_guidance=0", "workers=0", f"output={directory}",
         )  # fmt: skip
     return _numbers(json.loads((directory / "metrics.json").read_text(encoding="utf-8")))
 

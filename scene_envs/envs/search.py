@@ -266,8 +266,8 @@ class SearchProblem:
             how[role] = watch
         if self.physics_guidance:
             _check_takes(self.prior, "physics_guidance", "leave physics_guidance=0")
-        if _takes(self.prior, "physics_guidance"):  # 0 as well: some priors are guided where no strength is given
-            how["physics_guidance"] = self.physics_guidance
+        if self.physics_guidance or "physics_guidance" in inspect.signature(self.prior.inpaint).parameters:
+            how["physics_guidance"] = self.physics_guidance  # 0 as well: some priors are guided where none is given
         if reader is None or self.prompt is None:
             return self.prior.inpaint(batch, masks, **how).to("cpu")
         if self.claim_guidance:
@@ -333,13 +333,8 @@ class SearchProblem:
         self.scorer.close()
 
 
-def _takes(prior: Any, role: str) -> bool:
-    """Whether ``inpaint`` of a prior takes a key ``role``."""
-    keys = inspect.signature(prior.inpaint).parameters.values()
-    return any(key.name == role or key.kind is inspect.Parameter.VAR_KEYWORD for key in keys)
-
-
 def _check_takes(prior: Any, role: str, remedy: str) -> None:
     """Refuse to steer or guide the inpaintings of a prior that does not take ``role``."""
-    if not _takes(prior, role):
+    keys = inspect.signature(prior.inpaint).parameters.values()
+    if not any(key.name == role or key.kind is inspect.Parameter.VAR_KEYWORD for key in keys):
         raise InvalidInputError(f"inpaint of {type(prior).__name__} takes no {role}=; {remedy}")
