@@ -148,7 +148,7 @@ def card_page(name: str, prior: ScenePrior, facts: PriorFacts) -> str:
         f"{kind} {facts.process} diffusion prior over scenes of type `{facts.scene_type}`.",
         table,
         "## How good it is",
-        _measured(card, facts.measures),
+        _measured(prior, facts.measures),
         "## What it is not good at",
         str(card.get("limits") or "Not stated."),
         "## Use",
@@ -160,7 +160,7 @@ def card_page(name: str, prior: ScenePrior, facts: PriorFacts) -> str:
 _PROMPT = " prompt='A scene with 12 objects.'"
 
 
-def _measured(card: Mapping[str, Any], measures: Mapping[str, float]) -> str:
+def _measured(prior: ScenePrior, measures: Mapping[str, float]) -> str:
     from agents.evaluation import figure_table
 
     if not measures:
@@ -168,6 +168,8 @@ def _measured(card: Mapping[str, Any], measures: Mapping[str, float]) -> str:
     steps = f" at {measures['num_steps']:.0f} steps" if "num_steps" in measures else ""
     strength = measures.get("physics_guidance", 0.0)
     guided = f", with physics guidance of strength {strength:g}" if strength else ""
+    if prior.config.physics_guidance and not strength:
+        guided = ", without physics guidance"
     intro = f"{measures['scenes']:.0f} raw samples{steps}{guided}, none selected."
     return f"{intro} *Real* is the same figure of real scenes: what a perfect sampler would score.\n\n" + figure_table(
         measures
