@@ -144,6 +144,7 @@ class SearchProblem:
         self.num_actions, self.max_nfe = chosen.branching, chosen.max_nfe
         self.claim_guidance, self.physics_guidance = chosen.claim_guidance, chosen.physics_guidance
         check_physics_guidance(self.physics_guidance, self.scene_type)
+        self._may_be_guided = "physics_guidance" in inspect.signature(self.prior.inpaint).parameters
         self.prior.step_table(self.num_steps)  # raises now, not later, if the prior has fewer steps
         self.prompting = EnvPrompts(self.prior, chosen.prompt, chosen.guidance, self.slots)
         self.prompt = self.prompting.draw(np.random.default_rng(0)) if self.prompting.given else None
@@ -266,7 +267,7 @@ class SearchProblem:
             how[role] = watch
         if self.physics_guidance:
             _check_takes(self.prior, "physics_guidance", "leave physics_guidance=0")
-        if self.physics_guidance or "physics_guidance" in inspect.signature(self.prior.inpaint).parameters:
+        if self.physics_guidance or self._may_be_guided:
             how["physics_guidance"] = self.physics_guidance  # 0 as well: some priors are guided where none is given
         if reader is None or self.prompt is None:
             return self.prior.inpaint(batch, masks, **how).to("cpu")

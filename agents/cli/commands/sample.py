@@ -77,13 +77,14 @@ def run(settings: SampleConfig, run: Run) -> None:
     if not prior.scene_type.has_geometry:
         settings = _without_geometry(settings, prior.scene_type, run)
         reward = None if settings.reward is None else reward
+    strength = physics_strength(settings.physics_guidance, prior.config, prior.scene_type)
     started = time.perf_counter()
     batch = prior.sample(
         settings.count,
         prompt=settings.prompt,
         guidance=settings.guidance,
         claim_guidance=settings.claim_guidance,
-        physics_guidance=settings.physics_guidance,
+        physics_guidance=strength,
         num_steps=settings.num_steps,
         eta=settings.eta,
         slots=settings.slots,
@@ -91,7 +92,6 @@ def run(settings: SampleConfig, run: Run) -> None:
         batch_size=settings.batch_size,
     ).to("cpu")
     seconds = time.perf_counter() - started
-    strength = physics_strength(settings.physics_guidance, prior.config, prior.scene_type)
     guided = f", with physics_guidance={strength:g}" if strength else ""
     run.say(
         f"{len(batch)} scenes in {seconds:.1f} s{guided}, {batch.counts.double().mean():.1f} objects each on average"
