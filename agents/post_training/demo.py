@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,8 @@ from agents.post_training.comparison_run import PHYSICS_TIMEOUT, SAMPLE_SEED, sa
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.report import Page, Picture, Section, Tile, write_report
 from agents.post_training.run_files import write_metrics
-from agents.post_training.trainer import PostTrainResult, post_train
+from agents.post_training.side_by_side import post_train_side_by_side
+from agents.post_training.trainer import PostTrainResult
 from agents.priors.base import ScenePrior
 from rewards import reward_label
 
@@ -31,7 +33,7 @@ def run_demo(
     recipes: Mapping[str, PostTrainConfig] | None = None,
     prior: ScenePrior | None = None,
 ) -> dict[str, Any]:
-    """Post-train a prior in two ways, measure all three priors on fresh samples, and write the report.
+    """Post-train a prior in two ways side by side, measure all three priors on fresh samples, and write the report.
 
     All priors start from the same noise, and every sample is measured. Physics decides which objects are
     simulation-ready.
@@ -40,7 +42,7 @@ def run_demo(
         output: folder for ``report.html``, ``metrics.json``, the pictures, and one folder per run, ``clutter`` and
             ``feasible``, which ``prior=`` loads. An interrupted demonstration is resumed.
         seed: seed of training, from which the seed of the measured samples is derived.
-        workers: physics worker processes.
+        workers: physics worker processes, of both runs together while they train.
         scenes: fresh samples measured of each prior.
         num_steps: denoiser evaluations per measured sample.
         recipes: the runs by name, in place of ``configs/recipe/demo_clutter.yaml`` and ``demo_feasible.yaml``.
@@ -48,48 +50,40 @@ def run_demo(
 
     Returns:
         The numbers of ``metrics.json``: those of ``measure_prior`` for ``base`` and each run, ``runs`` (the metrics of
-        each run), and ``stage_seconds``.
+        each run), and ``seconds``.
     """
+    from scene_envs.physics import make_pool
+
     directory, started = Path(output), time.perf_counter()
     recipes = recipes or {name: PostTrainConfig(recipe=f"demo_{name}") for name in RUNS}
+    each = -(-workers // len(recipes))
     configs = {
-        name: replace(recipe, output=str(directory / name), seed=seed, workers=workers)
-        for name, recipe in recipes.items()
+        name: replace(recipe, output=str(directory / name), seed=seed, workers=each) for name, recipe in recipes.items()
     }
     base = ScenePrior.load(next(iter(configs.values())).prior if prior is None else prior)
-    results = {}
     for name, config in configs.items():
-        say_stage(config, f"post-training toward {_goal(config)} with {_algorithm(config)}")
-        results[name] = post_train(config, prior=base)
-    trained = time.perf_counter()
-    measured = _measure(results, base, scenes, num_steps)
-    seconds = {"training": round(trained - started, 1), "measuring": round(time.perf_counter() - trained, 1)}
+        say_stage(config, f"{name}: post-training toward {_goal(config)} with {_algorithm(config)}")
+    measured: dict[str, Measured] = {}
+    results: dict[str, PostTrainResult] = {}
+    with make_pool(workers, PHYSICS_TIMEOUT) as pool, closing(post_train_side_by_side(configs, base)) as runs:
+        for name, results[name] in runs:  # the other run goes on while samples are measured
+            for label, tested in {"base": base, name: results[name].prior}.items():
+                if label not in measured:
+                    say_stage(configs[name], f"measuring {scenes} samples of the prior {label!r}")
+                    measured[label] = measure_prior(
+                        tested, scenes, num_steps=num_steps, seed=seed + SAMPLE_SEED, pool=pool
+                    )
+    measured = {name: measured[name] for name in ("base", *recipes)}
+    results = {name: results[name] for name in recipes}
     metrics = {
         **{name: part.figures for name, part in measured.items()},
         "runs": {name: result.metrics for name, result in results.items()},
-        "stage_seconds": seconds,
+        "seconds": round(time.perf_counter() - started, 1),
         "num_steps": num_steps,
     }
     write_report(directory / "report.html", _page(directory, base, results, measured))
     write_metrics(directory, metrics)
     return metrics
-
-
-def _measure(
-    results: Mapping[str, PostTrainResult], base: ScenePrior, scenes: int, num_steps: int
-) -> dict[str, Measured]:
-    """Fresh samples of the base prior and of each result, all from the same noise."""
-    from scene_envs.physics import make_pool
-
-    config = next(iter(results.values())).config
-    measured = {}
-    with make_pool(config.workers, PHYSICS_TIMEOUT) as pool:
-        for name, prior in {"base": base, **{name: result.prior for name, result in results.items()}}.items():
-            say_stage(config, f"measuring {scenes} samples of the prior {name!r}")
-            measured[name] = measure_prior(
-                prior, scenes, num_steps=num_steps, seed=config.seed + SAMPLE_SEED, pool=pool
-            )
-    return measured
 
 
 def _page(

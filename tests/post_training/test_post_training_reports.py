@@ -98,8 +98,9 @@ def test_report_and_metrics_have_the_trained_reward_before_and_after(tmp_path: P
 
 
 @pytest.mark.slow
-def test_demonstration_end_to_end(tmp_path: Path) -> None:
+def test_demonstration_end_to_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("scene_envs.physics")
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0})  # one core: no processes; test_side_by_side has them
     recipes = {
         "clutter": small_config(tmp_path, iterations=2),
         "feasible": small_config(tmp_path, iterations=1, algorithm="nft", reward="feasible_share"),
