@@ -6,6 +6,7 @@ import shutil
 import tempfile
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +33,22 @@ def _registries() -> list[dict[str, Any]]:
     from scene_envs.grammars.grammar import GRAMMARS
     from scene_envs.scene_types.registry import _SCENE_TYPES
 
+    _load_shipped()
+    return [_SCENE_TYPES, GRAMMARS, _MASKS, _FORMATS, _REWARDS, _ENTRIES, _PLANNERS, _ALGORITHMS]
+
+
+@cache
+def _load_shipped() -> None:
+    """Import what modules of this project register; a module that is imported already would not register it again.
+
+    Once per process: names of installed packages are read from all their metadata, which takes 0.1 s.
+    """
+    from agents.planning.registry import _PLANNERS
+    from scene_envs.grammars.grammar import GRAMMARS
+
     for registry in (GRAMMARS, _PLANNERS):
         for name in registry.names():
-            registry[name]  # what modules of this project register comes once per process
-    return [_SCENE_TYPES, GRAMMARS, _MASKS, _FORMATS, _REWARDS, _ENTRIES, _PLANNERS, _ALGORITHMS]
+            registry[name]
 
 
 @contextmanager
