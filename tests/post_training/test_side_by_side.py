@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -57,7 +58,7 @@ def test_closing_ends_the_processes_that_still_run(tmp_path: Path, monkeypatch: 
         if pids.exists() and len(pids.read_text().split()) == 2:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(f"{MODULE}.time.sleep", interrupt)
+    monkeypatch.setattr(f"{MODULE}.time", SimpleNamespace(sleep=interrupt))
     with pytest.raises(KeyboardInterrupt):
         list(post_train_side_by_side(configs, tiny_prior(), cores=2))
     for pid in map(int, pids.read_text().split()):
