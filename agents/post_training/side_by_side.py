@@ -32,8 +32,8 @@ def post_train_side_by_side(
     Args:
         configs: the runs by name; each has an output folder of its own.
         prior: the prior to start from; it is not changed.
-        cores: processor cores to use; None for those that this process may run on. With fewer cores than runs, the runs
-            follow one another in this process.
+        cores: processor cores to use; None for those that this process may run on. With fewer cores than runs, or where
+            a run cannot be pickled (its reward is a lambda), the runs follow one another in this process.
 
     Yields:
         The name and the result of each run as soon as it is finished. Runs that are not finished when the iterator is
@@ -43,26 +43,35 @@ def post_train_side_by_side(
         SceneEnvsError: as :func:`~agents.post_training.post_train`. The other runs are finished or can be resumed.
     """
     cores = len(os.sched_getaffinity(0)) if cores is None else cores
-    if not 1 < len(configs) <= cores:
+    runs = _pickled(configs, prior) if 1 < len(configs) <= cores else {}
+    if not runs:
         yield from ((name, post_train(config, prior=prior)) for name, config in configs.items())
         return
-    with contextlib.closing(_run_processes(configs, prior, cores // len(configs))) as ended:
+    with contextlib.closing(_run_processes(runs, cores // len(runs))) as ended:
         for name in ended:
             yield name, post_train(configs[name], prior=prior)
 
 
-def _run_processes(configs: Mapping[str, PostTrainConfig], prior: ScenePrior, threads: int) -> Generator[str]:
+def _pickled(configs: Mapping[str, PostTrainConfig], prior: ScenePrior) -> dict[str, bytes]:
+    """What the process of each run reads; nothing where a run cannot be pickled."""
+    try:
+        return {name: pickle.dumps((config, prior)) for name, config in configs.items()}
+    except (pickle.PicklingError, AttributeError, TypeError):
+        return {}
+
+
+def _run_processes(runs: Mapping[str, bytes], threads: int) -> Generator[str]:
     """Start a process for each run, and yield the name of each run whose process ended."""
     environment = module_environment() | {"OMP_NUM_THREADS": str(threads), "MKL_NUM_THREADS": str(threads)}
     processes: dict[str, subprocess.Popen[bytes]] = {}
     try:
-        for name, config in configs.items():
-            with tempfile.TemporaryFile() as run:
-                pickle.dump((config, prior), run)
-                run.seek(0)
+        for name, run in runs.items():
+            with tempfile.TemporaryFile() as file:
+                file.write(run)
+                file.seek(0)
                 processes[name] = subprocess.Popen(
                     module_command(__name__),
-                    stdin=run,
+                    stdin=file,
                     stderr=subprocess.PIPE,
                     env=environment,
                     start_new_session=True,  # Ctrl-C reaches this process alone, which then tells the others

@@ -48,6 +48,17 @@ def test_what_a_lost_process_did_not_do_is_done_here(
     assert capfd.readouterr().err.count(": no memory\n") == (2 if cores == 2 else 0)
 
 
+@pytest.mark.usefixtures("blank_curves")
+def test_runs_that_cannot_be_pickled_follow_one_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def started(*_: str) -> list[str]:
+        raise AssertionError("a process was started")
+
+    monkeypatch.setattr(f"{MODULE}.module_command", started)
+    reward = lambda batch: batch.counts.float()  # noqa: E731
+    configs = {name: small_config(tmp_path / name, reward=reward, iterations=1) for name in ("one", "two")}
+    assert [name for name, _ in post_train_side_by_side(configs, tiny_prior(), cores=2)] == ["one", "two"]
+
+
 def test_closing_ends_the_processes_that_still_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     waits = "import os, sys, time; open(sys.argv[1], 'a').write(f'{os.getpid()} '); sys.stderr.close(); time.sleep(600)"
     pids = tmp_path / "pids"
