@@ -120,7 +120,7 @@ def _realism() -> tuple[Row, ...]:
     gated = "reward={name: gate, reward: discriminator, condition: feasible_share, threshold: 0.7}"
     return tuple(
         Row(f"{prior}-{label}-0", prior, (f"algorithm={FORWARD}", reward, "seed=0"), 100)
-        for prior in ("breakfast_table_high_clutter", "restaurant_low_clutter")
+        for prior in ("breakfast_table_high_clutter", "restaurant_low_clutter", "restaurant_high_clutter")
         for label, reward in (
             ("discriminator", "reward=discriminator"),
             ("gated", gated),
