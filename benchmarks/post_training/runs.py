@@ -42,7 +42,7 @@ def train(row: Row, directory: Path, iterations: int, extra: Sequence[str]) -> P
 def measure(
     prior: str, directory: Path, measures: Sequence[str], count: int, guidance: float = 0.0
 ) -> dict[str, float]:
-    """Figures of ``evaluate`` for a prior, computed once for each folder.
+    """Figures of ``evaluate`` for a prior, computed once for each folder; an interrupted evaluation goes on.
 
     Args:
         prior: a shipped name, or the folder of a run.
@@ -51,7 +51,7 @@ def measure(
         count: samples.
         guidance: weight of guidance of the samples with prompts.
     """
-    if not (directory / "metrics.json").exists():
+    if not _measured(directory / "metrics.json", measures):
         names = ",".join(measures)
         _call(
             "evaluate", f"prior={prior}", f"measures=[{names}]", f"count={count}", f"guidance={guidance}",
@@ -105,6 +105,14 @@ def guard_figures(folder: Path) -> dict[str, float]:
         "base_classifier": base["classifier_accuracy"],
         "guard_classifier": last["classifier_accuracy"],
     }
+
+
+def _measured(path: Path, measures: Sequence[str]) -> bool:
+    """Whether ``evaluate`` has written all of these groups of figures, or why a group is missing."""
+    if not path.exists():
+        return False
+    evaluation = json.loads(path.read_text(encoding="utf-8")).get("evaluation", {})
+    return set(measures) <= {*evaluation.get("groups", {}), *evaluation.get("skipped", {})}
 
 
 def _numbers(metrics: Mapping[str, object]) -> dict[str, float]:

@@ -11,7 +11,7 @@ from agents.cli.keys import compose
 from agents.post_training.config import PostTrainConfig
 from benchmarks.post_training.__main__ import main
 from benchmarks.post_training.rows import TABLES
-from benchmarks.post_training.runs import guard_figures, training_figures
+from benchmarks.post_training.runs import guard_figures, measure, training_figures
 from rewards.registry import resolve_reward
 
 
@@ -54,6 +54,26 @@ def test_the_figures_of_the_guard_are_those_of_its_last_check(tmp_path: Path) ->
     assert figures["base_classifier"] - figures["guard_classifier"] == pytest.approx(0.2)
     (tmp_path / "metrics.json").write_text(json.dumps({"guard": None}))
     assert guard_figures(tmp_path) == {}
+
+
+def test_an_interrupted_evaluation_goes_on_and_a_finished_one_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, calls = tmp_path / "metrics.json", []
+
+    def evaluate(words: tuple[str, ...]) -> int:
+        calls.append(words)
+        groups = {"layout": {"free_objects_mean": 17.0}}
+        path.write_text(
+            json.dumps({"free_objects_mean": 17.0, "evaluation": {"groups": groups, "skipped": {"physics": ""}}})
+        )
+        return 0
+
+    monkeypatch.setattr("benchmarks.post_training.runs.scene_envs", evaluate)
+    path.write_text(json.dumps({"num_steps": 50.0, "evaluation": {"groups": {}, "skipped": {}}}))
+    for _ in range(2):
+        assert measure("dimsum_table", tmp_path, ("layout", "physics"), 8) == {"free_objects_mean": 17.0}
+    assert len(calls) == 1
 
 
 @pytest.mark.parametrize("word", ["table=placements", "rows=[dimsum-*]"])
