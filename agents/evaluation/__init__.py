@@ -9,6 +9,7 @@ from agents.evaluation.physics_figures import physics_figures, stable_fraction
 from agents.evaluation.prompt_following import own_prompts, prompt_following
 from agents.evaluation.render_classifier import render_classifier_accuracy
 from agents.evaluation.report import figure_table
+from agents.evaluation.spacing import spacing_wasserstein
 from agents.evaluation.two_sample_test import Accuracy, ClassifierConfig
 
 __all__ = [
@@ -27,5 +28,6 @@ __all__ = [
     "physics_figures",
     "prompt_following",
     "render_classifier_accuracy",
+    "spacing_wasserstein",
     "stable_fraction",
 ]

@@ -15,6 +15,7 @@ from agents.evaluation.metrics import (
 )
 from agents.evaluation.novelty import duplicates
 from agents.evaluation.physics_figures import physics_figures, ready_figures
+from agents.evaluation.spacing import spacing_wasserstein
 from scene_envs.envs.resolvers import resolve_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
@@ -124,7 +125,7 @@ def grammar_scenes(scene_type: str | SceneType, count: int, seed: int = 0) -> Sc
 
 
 def layout_figures(batch: SceneBatch, reference: SceneBatch) -> dict[str, float]:
-    """Figures that need no simulator: counts, categories, heights, workspace and duplicates.
+    """Figures that need no simulator: counts, categories, spacing, heights, workspace and duplicates.
 
     Raises:
         InvalidInputError: the scenes are of another type than the reference.
@@ -144,6 +145,9 @@ def layout_figures(batch: SceneBatch, reference: SceneBatch) -> dict[str, float]
         "out_of_workspace_rate": out_of_workspace_rate(batch),
         "duplicates": duplicates(batch),
     }
+    spacing = spacing_wasserstein(batch, reference)
+    if spacing is not None:
+        figures["spacing_wasserstein_mm"] = 1e3 * spacing
     for kind, errors in height_errors(batch).items():
         if len(errors):
             figures[f"height_error_{kind}_mm"] = 1e3 * float(errors.quantile(0.5))

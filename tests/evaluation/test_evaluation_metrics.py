@@ -12,21 +12,7 @@ from agents.evaluation.metrics import KL_EPS, category_kl, count_wasserstein, he
 from agents.evaluation.supports import SUPPORTS, Support
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import get_scene_type
-
-DIMSUM = get_scene_type("dimsum_table")
-
-
-def build(*scenes: list[tuple[str, float, float, float]]) -> SceneBatch:
-    """Dimsum scenes from (asset, x, y, z) lists; the table comes first."""
-    batch = SceneBatch.empty(DIMSUM, len(scenes))
-    translations, rotations, categories = batch.translations.clone(), batch.rotations.clone(), batch.categories
-    for row, objects in enumerate(scenes):
-        for slot, (name, *position) in enumerate(objects, start=1):
-            translations[row, slot] = torch.tensor(position)
-            rotations[row, slot] = torch.eye(3)
-            categories[row, slot] = DIMSUM.assets.index(name)
-    return SceneBatch.from_parts(translations, rotations, categories, DIMSUM)
+from tests.helpers.built_scenes import DIMSUM, build
 
 
 def raised(batch: SceneBatch, by: float, *, only: tuple[str, ...] | None = None) -> SceneBatch:
