@@ -94,18 +94,6 @@ def test_own_supports_can_be_given() -> None:
     assert errors["shelf"].tolist() == pytest.approx([0.25])
 
 
-def place(scene_type: str, *objects: tuple[str, float, float, float]) -> SceneBatch:
-    """One scene of any type: its fixed objects, and these."""
-    batch = SceneBatch.empty(scene_type, 1)
-    kind, first = batch.scene_type, len(batch.scene_type.fixed)
-    translations, rotations, categories = batch.translations.clone(), batch.rotations.clone(), batch.categories
-    for slot, (name, *position) in enumerate(objects, start=first):
-        translations[0, slot] = torch.tensor(position)
-        rotations[0, slot] = torch.eye(3)
-        categories[0, slot] = kind.assets.index(name)
-    return SceneBatch.from_parts(translations, rotations, categories, kind)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("scene_type", sorted(SUPPORTS))
 def test_real_scenes_of_every_type_rest_where_supports_say(scene_type: str) -> None:
@@ -125,7 +113,7 @@ def test_a_scene_lifted_by_a_millimetre_is_that_far_off_every_fixed_surface() ->
 
 
 def test_food_is_measured_from_its_plate_even_when_the_table_is_nearer() -> None:
-    scene = place("breakfast_table_low_clutter", ("plate", 0, 0, 0), ("apple_gala", 0, 0, 0.002))
+    scene = build([("plate", 0, 0, 0), ("apple_gala", 0, 0, 0.002)], scene_type="breakfast_table_low_clutter")
     errors = height_errors(scene)
     assert errors["plate"].tolist() == pytest.approx([0.004], abs=1e-6)
     assert errors["table"].tolist() == pytest.approx([0.0], abs=1e-6)
@@ -133,14 +121,14 @@ def test_food_is_measured_from_its_plate_even_when_the_table_is_nearer() -> None
 
 def test_what_lies_in_a_container_has_no_height_error() -> None:
     bowl = ("fruit_bowl", 0.0, 0.0, 0.4075)
-    inside = height_errors(place("pantry_shelf", bowl, ("apple_gala", 0.02, 0, 0.44)))
-    beside = height_errors(place("pantry_shelf", bowl, ("apple_gala", 0.0, 0.2, 0.41)))
+    inside = height_errors(build([bowl, ("apple_gala", 0.02, 0, 0.44)], scene_type="pantry_shelf"))
+    beside = height_errors(build([bowl, ("apple_gala", 0.0, 0.2, 0.41)], scene_type="pantry_shelf"))
     assert inside["tier"].tolist() == pytest.approx([0.0], abs=1e-6)
     assert beside["tier"].tolist() == pytest.approx([0.0, 0.0025], abs=1e-6)
 
 
 def test_tables_of_a_room_are_measured_and_carry_their_dishes_along() -> None:
-    room = place("restaurant_low_clutter", ("cafe_table", 1.0, 1.0, 0.003), ("teacup", 1.2, 1.0, 0.004))
+    room = build([("cafe_table", 1.0, 1.0, 0.003), ("teacup", 1.2, 1.0, 0.004)], scene_type="restaurant_low_clutter")
     errors = height_errors(room)
     assert errors["furniture"].tolist() == pytest.approx([0.003], abs=1e-6)
     assert errors["table"].tolist() == pytest.approx([0.001], abs=1e-6)

@@ -13,6 +13,7 @@ from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.physics import feasibility
 from scene_envs.scene import SceneBatch
+from tests.helpers.built_scenes import build
 
 
 @pytest.fixture(scope="module")
@@ -28,12 +29,7 @@ def lifted(batch: SceneBatch, by: float) -> SceneBatch:
 
 
 def one_object(name: str, z: float) -> SceneBatch:
-    batch = SceneBatch.empty("dimsum_table", 1)
-    translations, rotations, categories = batch.translations.clone(), batch.rotations.clone(), batch.categories
-    translations[0, 1] = torch.tensor([0.1, 0.1, z])
-    rotations[0, 1] = torch.eye(3)
-    categories[0, 1] = batch.scene_type.assets.index(name)
-    return SceneBatch.from_parts(translations, rotations, categories, batch.scene_type)
+    return build([(name, 0.1, 0.1, z)])
 
 
 def test_real_scenes_score_as_real(real: SceneBatch) -> None:
