@@ -10,6 +10,7 @@ from agents.evaluation.prompt_following import own_prompts, prompt_following
 from agents.evaluation.render_classifier import render_classifier_accuracy
 from agents.evaluation.report import figure_table
 from agents.evaluation.spacing import spacing_wasserstein
+from agents.evaluation.stacks import stack_wasserstein, tallest_stacks
 from agents.evaluation.two_sample_test import Accuracy, ClassifierConfig
 
 __all__ = [
@@ -30,4 +31,6 @@ __all__ = [
     "render_classifier_accuracy",
     "spacing_wasserstein",
     "stable_fraction",
+    "stack_wasserstein",
+    "tallest_stacks",
 ]

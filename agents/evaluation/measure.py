@@ -16,6 +16,7 @@ from agents.evaluation.metrics import (
 from agents.evaluation.novelty import duplicates
 from agents.evaluation.physics_figures import physics_figures, ready_figures
 from agents.evaluation.spacing import spacing_wasserstein
+from agents.evaluation.stacks import stack_wasserstein, tallest_stacks
 from scene_envs.envs.resolvers import resolve_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
@@ -125,7 +126,7 @@ def grammar_scenes(scene_type: str | SceneType, count: int, seed: int = 0) -> Sc
 
 
 def layout_figures(batch: SceneBatch, reference: SceneBatch) -> dict[str, float]:
-    """Figures that need no simulator: counts, categories, spacing, heights, workspace and duplicates.
+    """Figures that need no simulator: counts, categories, spacing, stacks, heights, workspace and duplicates.
 
     Raises:
         InvalidInputError: the scenes are of another type than the reference.
@@ -148,6 +149,9 @@ def layout_figures(batch: SceneBatch, reference: SceneBatch) -> dict[str, float]
     spacing = spacing_wasserstein(batch, reference)
     if spacing is not None:
         figures["spacing_wasserstein_mm"] = 1e3 * spacing
+    if batch.scene_type.has_geometry:
+        figures["tallest_stack_mean"] = float(tallest_stacks(batch).double().mean())
+        figures["stack_wasserstein"] = stack_wasserstein(batch, reference)
     for kind, errors in height_errors(batch).items():
         if len(errors):
             figures[f"height_error_{kind}_mm"] = 1e3 * float(errors.quantile(0.5))

@@ -23,6 +23,8 @@ READING: dict[str, str] = {
     "category_kl_e4": "KL(real ‖ samples) of the shares of assets, in 10⁻⁴ nats; lower is better",
     "count_wasserstein": "distance of the distributions of objects per scene, in objects; lower is better",
     "spacing_wasserstein_mm": "distance of the distributions of distances between neighbours; lower is better",
+    "tallest_stack_mean": "objects in the tallest stack of a scene",
+    "stack_wasserstein": "distance of the distributions of the tallest stack, in objects; lower is better",
     "workspace_fraction": "objects in the workspace; higher is better",
     "out_of_workspace_rate": "free objects outside the workspace; lower is better",
     "duplicates": "samples that repeat another within 1 cm; lower is better",

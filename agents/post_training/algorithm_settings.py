@@ -126,6 +126,7 @@ class ForwardProcessSettings(AlgorithmSettings):
     regularisation_weight: ClassVar[float] = 0.2
     sample_limits: ClassVar[Mapping[str, float]] = {
         "count_distance": 1.0,
+        "stack_distance": 0.5,
         "category_kl": 0.05,
         "classifier_accuracy": 0.1,
     }

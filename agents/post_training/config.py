@@ -64,6 +64,7 @@ class GuardSettings:
         samples_every: iterations between checks that sample.
         count_limit: limit of the Wasserstein-1 distance between object counts of samples and of real scenes: the number
             of objects by which it may exceed the base prior's distance; null takes the default of the algorithm.
+        stack_limit: the same limit for the distance between the heights of the tallest stacks, in objects.
         category_limit: the same limit for the KL divergence of the categories, in nats.
         classifier_limit: the same limit for the accuracy of a classifier that tells samples from real scenes.
         max_invalid: number of consecutive batches without a valid reward after which the run stops.
@@ -76,6 +77,7 @@ class GuardSettings:
     samples: int = 128
     samples_every: int = 20
     count_limit: float | None = None
+    stack_limit: float | None = None
     category_limit: float | None = None
     classifier_limit: float | None = None
     max_invalid: int = 3
@@ -84,7 +86,7 @@ class GuardSettings:
         at_least(self, 1, "every", "scenes", "max_invalid", "samples_every")
         positive(self, "limit")
         one_of(self, "action", ("report", "stop", "rollback"))
-        at_least(self, 0, "samples", "count_limit", "category_limit", "classifier_limit")
+        at_least(self, 0, "samples", "count_limit", "stack_limit", "category_limit", "classifier_limit")
 
     @property
     def sampled(self) -> int:
@@ -96,6 +98,7 @@ class GuardSettings:
         """Limits of figures of samples by name; ``defaults`` are the algorithm's."""
         own = {
             "count_distance": self.count_limit,
+            "stack_distance": self.stack_limit,
             "category_kl": self.category_limit,
             "classifier_accuracy": self.classifier_limit,
         }

@@ -12,6 +12,7 @@ _LABELS = {
     "loss": "held-out loss",
     "sample_reward": "mean reward",
     "count_distance": "distance of object counts (Wasserstein-1)",
+    "stack_distance": "distance of the tallest stacks (Wasserstein-1)",
     "category_kl": "KL divergence of categories (nats)",
     "classifier_accuracy": "accuracy of a classifier, samples against real scenes",
 }

@@ -40,7 +40,7 @@ class SampleCheck:
     >>> prior = tiny_prior()
     >>> check = SampleCheck(prior.sample(20, num_steps=2, seed=1), scorer, 20, num_steps=2, seed=0)
     >>> sorted(check.figures(check.sample(prior)))
-    ['category_kl', 'classifier_accuracy', 'count_distance', 'sample_reward']
+    ['category_kl', 'classifier_accuracy', 'count_distance', 'sample_reward', 'stack_distance']
     """
 
     real: SceneBatch
@@ -81,12 +81,13 @@ class SampleCheck:
     def figures(self, batch: SceneBatch) -> dict[str, float]:
         """Mean reward of ``batch``, and figures of its difference from the real scenes.
 
-        The difference is measured by the distance of object counts (objects), by the KL divergence of categories
-        (nats), and by the accuracy of a classifier (share of scenes). A figure that has no meaning, such as the
-        categories of empty scenes, is NaN.
+        The difference is measured by the distances of object counts and of tallest stacks (objects), by the KL
+        divergence of categories (nats), and by the accuracy of a classifier (share of scenes). A figure that has no
+        meaning, such as the categories of empty scenes, is NaN. Assets without geometry have no stacks.
         """
         from agents.evaluation.classifier import classifier_accuracy
         from agents.evaluation.metrics import category_kl, count_wasserstein
+        from agents.evaluation.stacks import stack_wasserstein
 
         batch = batch.to("cpu")
         score = self.scorer(batch, self.prompts)
@@ -95,6 +96,7 @@ class SampleCheck:
         return {
             "sample_reward": float(score.value.cpu()[valid].mean()) if bool(valid.any()) else float("nan"),
             "count_distance": count_wasserstein(batch, self.real),
+            **({"stack_distance": stack_wasserstein(batch, self.real)} if batch.scene_type.has_geometry else {}),
             "category_kl": float("nan") if empty else category_kl(batch, self.real),
             "classifier_accuracy": classifier_accuracy(self.real, batch, seeds=_CLASSIFIERS, seed=self.seed).mean,
         }
@@ -103,7 +105,10 @@ class SampleCheck:
 def beyond(figures: Mapping[str, float], base: Mapping[str, float], limits: Mapping[str, float]) -> list[str]:
     """Names of the figures that exceed the base prior's by more than their limit; figures without a limit never do.
 
-    >>> beyond({"category_kl": 0.3}, {"category_kl": 0.1}, {"category_kl": 0.1})
+    A limit of a figure that was not measured is ignored.
+
+    >>> beyond({"category_kl": 0.3}, {"category_kl": 0.1}, {"category_kl": 0.1, "stack_distance": 0.5})
     ['category_kl']
     """
-    return [name for name, most in limits.items() if not figures[name] <= base[name] + most]
+    measured = [name for name in limits if name in figures and name in base]
+    return [name for name in measured if not figures[name] <= base[name] + limits[name]]
