@@ -9,7 +9,7 @@ from agents.post_training.config import PostTrainConfig
 from agents.post_training.gradients import no_credit_per_object
 from agents.post_training.learner import Learner
 from agents.post_training.prompts import PromptSets
-from scene_envs.errors import TrainingError
+from scene_envs.errors import InvalidInputError, TrainingError
 from scene_envs.scene import SceneBatch
 
 _PROBED = 2
@@ -32,10 +32,15 @@ def check_it_can_learn(learner: Learner, real: SceneBatch, prompts: PromptSets |
 
     Raises:
         InvalidInputError: credit per object is asked of a reward that gives none, or the mask cannot be made, or leaves
-            nothing to regenerate in any scene.
+            nothing to regenerate in any scene, or the guard has a limit of stacks for assets without geometry.
         TrainingError: the reward scores none of the real scenes.
     """
-    config = learner.config
+    config, scene_type = learner.config, learner.prior.scene_type
+    if config.guard.stack_limit is not None and not scene_type.has_geometry:
+        raise InvalidInputError(
+            f"guard.stack_limit={config.guard.stack_limit} needs the geometry of the assets, and those of "
+            f"{scene_type.name!r} have none here; leave it out"
+        )
     scenes, texts = _tried(learner, real, prompts)
     score = learner.scorer(scenes, texts)
     valid = bool(score.valid.any())

@@ -16,7 +16,6 @@ from agents.post_training.scene_bank import SceneBank
 from agents.priors.adapters import save_adapter, with_adapter_of
 from agents.priors.base import ScenePrior
 from agents.utils.process_group import ProcessGroup
-from scene_envs.errors import InvalidInputError
 
 _PICTURED = 6
 """Samples of the guard that are kept for the report."""
@@ -25,12 +24,6 @@ _PICTURED = 6
 def make_guard(config: PostTrainConfig, learner: Learner, scenes: SceneBank) -> Guard:
     """The guard of a run; it samples if the configuration says so."""
     asked, count, check = scenes.heldout_prompts(), config.guard.sampled, None
-    scene_type = learner.prior.scene_type
-    if config.guard.stack_limit is not None and not scene_type.has_geometry:
-        raise InvalidInputError(
-            f"guard.stack_limit={config.guard.stack_limit} needs the geometry of the assets, and those of "
-            f"{scene_type.name!r} have none here; leave it out"
-        )
     if count:
         check = SampleCheck(
             learner.prior.decode(scenes.heldout[:count]).to("cpu"),

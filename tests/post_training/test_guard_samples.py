@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from agents.evaluation import tallest_stacks
 from agents.evaluation.metrics import count_wasserstein
 from agents.post_training import post_train
 from agents.post_training.config import GuardSettings
@@ -19,6 +20,7 @@ from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
+from scene_envs.scene_types import SceneType
 from tests.helpers.small_runs import small_config
 
 SAMPLES = {"guard.scenes": 20, "guard.samples": 20, "guard.samples_every": 2, "bank_size": 40}
@@ -169,3 +171,23 @@ def test_a_reward_that_learns_is_judged_by_the_classifier(monkeypatch: pytest.Mo
         guard.start(tiny_prior())
         kept[learns] = [guard.check(tiny_prior(), iteration, reward=0.0).kept for iteration in (1, 2)]
     assert kept == {True: [False, True], False: [True, False]}
+
+
+def test_a_check_compares_stacks_with_those_of_real_scenes(tmp_path: Path) -> None:
+    """Real scenes have their own stacks, and scenes of single objects lower ones."""
+    check = trainer(tmp_path).guard.samples
+    assert check is not None
+    assert check.figures(check.real)["stack_distance"] == 0.0
+    table = SceneBatch.empty("dimsum_table", len(check.real))
+    assert check.figures(table)["stack_distance"] == pytest.approx(float(tallest_stacks(check.real).double().mean()))
+
+
+def test_a_limit_on_stacks_needs_geometry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SceneType, "has_geometry", property(lambda self: False))
+    with pytest.raises(InvalidInputError, match=r"guard\.stack_limit=0\.5 needs the geometry"):
+        trainer(tmp_path, **{"guard.stack_limit": 0.5})
+
+
+def test_a_figure_that_the_base_prior_lacks_is_within_its_limit() -> None:
+    """A run of an earlier version continues, although its start did not measure stacks."""
+    assert beyond({"stack_distance": 3.0}, {}, {"stack_distance": 0.5}) == []
