@@ -64,24 +64,3 @@ def check_types(kind: type, values: Mapping[str, Any]) -> None:
         if not fits or (isinstance(value, float) and not math.isfinite(value)):
             told = " or ".join(sorted("null" if one is NoneType else one.__name__ for one in plain))
             raise InvalidInputError(f"{name}={str(value)[:100]!r} must be of type {told}")
-
-
-_UPPER_HALF_KERNELS = ("early_absorbing", "squared_absorbing")
-"""Kernels that mask categories in the upper half of the chain only."""
-
-
-def check_category_steps(share: float | None, kernel: str) -> None:
-    """Refuse a share of steps for the categories that is outside (0, 1), or that the kernel cannot have.
-
-    Raises:
-        InvalidInputError: as said; None is always fine.
-    """
-    if share is None:
-        return
-    if not 0 < share < 1:
-        raise InvalidInputError(f"category_steps={share} must lie between 0 and 1; null spaces the steps evenly")
-    if kernel not in _UPPER_HALF_KERNELS:
-        raise InvalidInputError(
-            f"category_steps={share} needs a kernel that masks in the upper half of the chain only, "
-            f"{' or '.join(_UPPER_HALF_KERNELS)}, not kernel={kernel!r}"
-        )

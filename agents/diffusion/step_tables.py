@@ -11,9 +11,6 @@ from torch import Tensor
 
 from scene_envs.errors import InvalidInputError
 
-_MASKED = 1e-3
-"""A smaller share of masked slots counts as none."""
-
 
 @dataclass(frozen=True)
 class StepTable:
@@ -93,38 +90,6 @@ class StepTable:
             return even
         later = torch.linspace(int(first[-1]), 1, rest + 1, dtype=torch.float64).round().long()[1:]
         return cls.from_timesteps([*first.tolist(), *later.tolist()], num_timesteps)
-
-    @classmethod
-    def two_part(cls, masked: Tensor, num_steps: int, share: float) -> StepTable:
-        """``num_steps`` steps, of which a ``share`` lies at the timesteps at which categories are masked.
-
-        Both parts are evenly spaced. A kernel that masks categories in the upper half of the chain only decides all of
-        them in the first part, and the second part places the objects. A part has no more steps than timesteps. If a
-        part would have none, all steps are evenly spaced.
-
-        Args:
-            masked: (T + 1,) share of masked slots at each timestep, non-decreasing; 0.001 counts as none.
-            num_steps: S, from 1 to T.
-            share: of the steps, above 0 and below 1.
-
-        Raises:
-            InvalidInputError: ``share`` is outside (0, 1), or ``num_steps`` is not a whole number in 1..T.
-
-        >>> masked = torch.linspace(-1, 1, 1001).clamp(min=0)
-        >>> StepTable.two_part(masked, 9, 1 / 3).timesteps.tolist()
-        [1000, 833, 667, 500, 400, 300, 201, 101, 1]
-        """
-        if not 0 < share < 1:
-            raise InvalidInputError(f"share={share} of the steps must lie between 0 and 1")
-        num_timesteps = len(masked) - 1
-        even = cls.spaced(num_timesteps, num_steps)
-        unmasked = int((masked.double().cpu() <= _MASKED).sum()) - 1  # the last timestep without masked categories
-        upper = min(max(round(share * num_steps), num_steps - unmasked), num_timesteps - unmasked)
-        if upper < 1 or num_steps - upper < 2:
-            return even
-        first = torch.linspace(num_timesteps, unmasked, upper + 1, dtype=torch.float64)[:-1]
-        later = torch.linspace(unmasked, 1, num_steps - upper, dtype=torch.float64)
-        return cls.from_timesteps(torch.cat([first, later]).round().long().tolist(), num_timesteps)
 
     @classmethod
     def from_timesteps(cls, timesteps: Sequence[int], num_timesteps: int | None = None) -> StepTable:

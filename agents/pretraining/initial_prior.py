@@ -140,7 +140,6 @@ def _mixed(config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts:
         text=text,
         empty_slots=process.empty_slots,
         unmasking=process.unmasking,
-        category_steps=process.category_steps,
         **_chain(config),
     )
     torch.manual_seed(config.seed)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-from agents.configuration.checks import at_least, check_category_steps, finite, one_of, positive, shares
+from agents.configuration.checks import at_least, finite, one_of, positive, shares
 from agents.configuration.fields import nested
 from agents.configuration.settings import LoggerSettings, OptimizerSettings
 from scene_envs.errors import InvalidInputError
@@ -108,8 +108,6 @@ class ProcessSettings:
         unmasking: choice of the slots that a sampling step of an absorbing kernel unmasks. ``even`` unmasks the
             expected number, rounded, so that a step decides few categories at once; with ``systematic`` the slots also
             share out the kinds of objects whose number a prompt gives; ``independent`` draws each slot on its own.
-        category_steps: share of the sampling steps at which a mixed prior decides categories, if its kernel masks them
-            in the upper half of the chain only; null spaces the steps evenly. With a third, two thirds place objects.
         denoised_clip: bound on denoised scenes during sampling, in normalised units; 0 for no bound.
     """
 
@@ -123,7 +121,6 @@ class ProcessSettings:
     kernel: str = "early_absorbing"
     empty_slots: str = "dropped"
     unmasking: str = "systematic"
-    category_steps: float | None = None
     denoised_clip: float = 0.0
 
     def __post_init__(self) -> None:
@@ -138,7 +135,6 @@ class ProcessSettings:
         one_of(self, "kernel", kernels, "categorical kernel")
         one_of(self, "empty_slots", ("attended", "dropped"), "treatment of empty slots")
         one_of(self, "unmasking", ("systematic", "even", "independent"))
-        check_category_steps(self.category_steps, self.kernel)
         positive(self, "noise_floor", "noise_ceiling")
         at_least(self, 0, "denoised_clip")
         if not self.noise_floor < self.noise_ceiling:

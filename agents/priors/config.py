@@ -100,8 +100,6 @@ class MixedPriorConfig(PoseDiffusionConfig, DenoiserConfig):
         unmasking: which masked slots a step of an absorbing kernel unmasks: ``"even"``, as near to the expected number
             as can be; ``"systematic"``, the same, and kinds of objects whose number a prompt gives are near their
             expected numbers, too; or ``"independent"``, each by its own chance. Other kernels draw independently.
-        category_steps: share of a chain's steps that lie at the timesteps at which categories are masked; None spaces
-            all steps evenly over the timesteps. A smaller share than the even one leaves more steps for poses.
         union: what a scene of a union of scene types may hold: ``"one_type"``, the assets of one member, which is
             settled by the first objects of the scene, or ``"any"`` assets. Needs an absorbing kernel; other scene
             types have one member.
@@ -118,7 +116,6 @@ class MixedPriorConfig(PoseDiffusionConfig, DenoiserConfig):
     text: AnyTextConfig | None = None
     empty_slots: str = "attended"
     unmasking: str = "even"
-    category_steps: float | None = None
     union: str = "one_type"
 
 

@@ -13,7 +13,7 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.nn import functional as F
 
-from agents.configuration.checks import check_category_steps, check_types
+from agents.configuration.checks import check_types
 from agents.diffusion import (
     CategoricalProcess,
     GaussianProcess,
@@ -87,7 +87,6 @@ class MixedPrior(TrainableMixedPrior):
             raise unknown_name("category loss", config.category_loss, CATEGORY_LOSSES)
         if config.unmasking not in UNMASKINGS:
             raise unknown_name("unmasking", config.unmasking, UNMASKINGS)
-        check_category_steps(config.category_steps, config.kernel)
         if config.union not in UNIONS:
             raise unknown_name("union", config.union, UNIONS)
         check_weighting(config.loss_weighting, config.prediction)

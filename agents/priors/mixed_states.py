@@ -114,12 +114,9 @@ class MixedStates(PromptReader, ScenePrior):
         """The reverse steps of a chain of ``num_steps``, any number in 1..T.
 
         If a scene holds the assets of one member of a union only, each of the first steps unmasks about one slot.
-        Otherwise ``config.category_steps`` says how many of the steps decide categories.
         """
         if self._separates_members:
             return StepTable.gradual(self.categories.schedule.mask, self.config.slots, num_steps)
-        if self.config.category_steps is not None:
-            return StepTable.two_part(self.categories.schedule.mask, num_steps, self.config.category_steps)
         return super().step_table(num_steps)
 
     @property

@@ -142,31 +142,3 @@ def test_training_timesteps_follow_the_lognormal_distribution() -> None:
     assert float(weights[0]) == 0.0
     assert mean == pytest.approx(-1.2, abs=0.01)
     assert std == pytest.approx(1.0, abs=0.01)
-
-
-@pytest.mark.parametrize("num_steps", [1, 2, 3, 25, 50, 150, 1000])
-def test_a_share_of_the_steps_decides_categories(num_steps: int) -> None:
-    masked = torch.linspace(-1.0, 1.0, 1001).clamp(min=0.0)  # masks above t = 500
-    table = StepTable.two_part(masked, num_steps, 0.3)
-    assert len(table) == num_steps
-    assert int(table.timesteps[0]) == 1000
-    assert int(table.previous[-1]) == 0
-    if num_steps > 1:
-        assert int(table.timesteps[-1]) == 1
-    if 25 <= num_steps <= 150:
-        assert int((table.timesteps > 500).sum()) == round(0.3 * num_steps)
-        strides = table.timesteps[:-1] - table.timesteps[1:]
-        upper = strides[table.timesteps[:-1] > 500]
-        assert int(upper.max() - upper.min()) <= 1
-        lower = strides[table.timesteps[:-1] <= 500]
-        assert int(lower.max() - lower.min()) <= 1
-
-
-def test_a_share_of_the_steps_lies_between_0_and_1() -> None:
-    with pytest.raises(InvalidInputError, match=r"share=1\.0"):
-        StepTable.two_part(torch.linspace(-1.0, 1.0, 1001).clamp(min=0.0), 50, 1.0)
-
-
-def test_a_chain_that_masks_everywhere_is_evenly_spaced() -> None:
-    table = StepTable.two_part(torch.linspace(0.0, 1.0, 1001), 50, 0.3)
-    assert torch.equal(table.timesteps, StepTable.spaced(1000, 50).timesteps)

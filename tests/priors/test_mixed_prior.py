@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -298,24 +297,3 @@ def test_a_policy_draws_independently_where_log_probabilities_are_read(systemati
     for settings, expected in ((DDPOSFSettings(), True), (NFTSettings(), False)):
         algorithm = make_algorithm(settings, DenoisingPolicy(systematic, 8), torch.ones(8))
         assert algorithm.sampling_policy.independent is expected
-
-
-def test_a_prior_may_decide_categories_in_a_share_of_its_steps(systematic: MixedPrior, tmp_path: Path) -> None:
-    config = replace(systematic.config, category_steps=0.3)
-    prior = MixedPrior(config, systematic.normalizer, systematic.process.preconditioning)
-    prior.load_state_dict(systematic.state_dict())
-    masked = prior.categories.schedule.mask[prior.step_table(50).timesteps] > 1e-3
-    assert (int(masked.sum()), len(prior.step_table(50))) == (15, 50)
-    masked = systematic.categories.schedule.mask[systematic.step_table(50).timesteps] > 1e-3
-    assert int(masked.sum()) == 24  # even spacing: timesteps from 515 on
-    prior.save(tmp_path / "prior")
-    loaded = ScenePrior.load(tmp_path / "prior")
-    assert torch.equal(loaded.step_table(50).timesteps, prior.step_table(50).timesteps)
-    assert torch.equal(loaded.sample(2, num_steps=8).tensor, prior.sample(2, num_steps=8).tensor)
-    assert not (loaded.sample(2, num_steps=8).tensor[..., -prior.num_categories :].sum(dim=-1) != 1).any()
-
-
-def test_a_share_of_the_steps_needs_a_kernel_that_masks_in_the_upper_half(systematic: MixedPrior) -> None:
-    for changes, said in (({"category_steps": 1.5}, "1.5"), ({"category_steps": 0.3, "kernel": "absorbing"}, "kernel")):
-        with pytest.raises(InvalidInputError, match=said):
-            MixedPrior(replace(systematic.config, **changes), systematic.normalizer, systematic.process.preconditioning)
