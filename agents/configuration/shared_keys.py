@@ -28,6 +28,21 @@ class SamplingKeys:
 
 
 @dataclass
+class DrawKeys:
+    """Sampling from a prior, with prior=.
+
+    Attributes:
+        num_steps: denoising steps per scene, with prior=.
+        physics_guidance: strength with which objects are moved out of overlaps and onto supports at the last steps, 0
+            to 1, with prior=; null takes that of the prior, 1 for shipped priors whose names end in _feasible and 0 for
+            the others.
+    """
+
+    num_steps: int = 50
+    physics_guidance: float | None = None
+
+
+@dataclass
 class RewardLimits:
     """Limits of a reward from outside this package; it runs in its own process.
 

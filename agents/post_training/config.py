@@ -14,7 +14,7 @@ from agents.configuration.prior_names import split_name
 from agents.configuration.settings import LoggerSettings, OptimizerSettings
 from agents.configuration.shared_keys import RewardLimits, SamplingKeys, TrainingKeys
 from agents.configuration.tree import plain_tree
-from agents.post_training.algorithm_settings import AlgorithmSettings, DDPOSFSettings
+from agents.post_training.algorithm_settings import AlgorithmSettings, DDPOSFSettings, NeonSettings
 from agents.post_training.algorithms import algorithm_settings, list_algorithms
 from agents.post_training.inpaint_settings import InpaintSettings
 from agents.post_training.regularisation_settings import AdapterSettings, RegularisationSettings
@@ -246,6 +246,11 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
                 "start from the folder of the run that made the first, whose prior holds its updates"
             )
         target = self.regularisation.target
+        if target is not None and isinstance(self.algorithm, NeonSettings):
+            raise InvalidInputError(
+                f"hold={self.regularisation.hold} adjusts regularisation.weight, and the size of this weight does not "
+                "change the steps of algorithm=neon; lower algorithm.w for a shorter step, or take another algorithm"
+            )
         if target is not None and target.figure == "guard" and target.value > self.guard.limit:
             raise InvalidInputError(
                 f"hold={self.regularisation.hold} lies beyond guard.limit={self.guard.limit:g}, past which no prior is "

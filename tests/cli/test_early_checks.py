@@ -67,6 +67,8 @@ LINES = {
     "search physics_guidance=-1": "physics_guidance=-1.0 must be a number from 0 to 1",
     "complete prior=dimsum_table physics_guidance=nan": "physics_guidance=nan must be a number from 0 to 1",
     "evaluate physics_guidance=1.1": "physics_guidance=1.1 must be a number from 0 to 1",
+    "export prior=dimsum_table physics_guidance=2": "physics_guidance=2.0 must be a number from 0 to 1",
+    "view prior=dimsum_table physics_guidance=-1": "physics_guidance=-1.0 must be a number from 0 to 1",
     "sample union=one": "did you mean 'one_type'",
     "sample export=drkae": "did you mean 'drake'",
     "complete": "name a scene file, run or dataset",

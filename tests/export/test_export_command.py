@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from agents.cli import main
+from agents.priors import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.datasets import SceneDataset
 from scene_envs.normalizer import Normalizer
@@ -68,6 +69,16 @@ def test_a_prior_is_sampled_and_made_ready(prior, tmp_path):
     assert len(SceneBatch.load(tmp_path / "ready.safetensors")) == 2
     assert (tmp_path / "scene_001" / "scene.xml").is_file()
     assert metrics(tmp_path)["ready"]["valid"] == 2
+
+
+@pytest.mark.slow
+def test_scenes_of_a_prior_are_guided_as_the_prior_says_unless_the_command_says_otherwise(prior, tmp_path):
+    guided, scenes = ScenePrior.load(prior).with_physics_guidance(1.0).save(tmp_path / "guided"), {}
+    for name, words in {"usual": [], "on": ["physics_guidance=1"], "off": ["physics_guidance=0"]}.items():
+        words += [f"prior={guided}", "count=2", "num_steps=4", "formats=npz", "workers=0"]
+        assert main(["export", *words, f"output={tmp_path / name}"]) == 0
+        scenes[name] = (tmp_path / name / "scenes.safetensors").read_bytes()
+    assert scenes["usual"] == scenes["on"] != scenes["off"]
 
 
 def test_sample_exports_what_it_made_ready(prior, tmp_path):

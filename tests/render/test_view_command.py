@@ -72,6 +72,11 @@ def test_a_prior_and_a_grammar(tmp_path):
     words = ("count=2", "num_steps=2")
     assert view(f"prior={tmp_path / 'prior'}", *words, f"output={tmp_path / 'a'}") == 0
     assert len(page(tmp_path / "a")[1]["scenes"]) == 2
+    guided, scenes = tiny_prior(slots=6).with_physics_guidance(1.0).save(tmp_path / "guided"), {}
+    for strength in ("null", "1", "0"):
+        assert view(f"prior={guided}", *words, f"physics_guidance={strength}", f"output={tmp_path / strength}") == 0
+        scenes[strength] = page(tmp_path / strength)[1]["scenes"]
+    assert scenes["null"] == scenes["1"] != scenes["0"]
     for name, seed in (("b", 0), ("c", 0), ("d", 1)):
         assert view("scene=dimsum_table", "count=2", f"seed={seed}", f"output={tmp_path / name}") == 0
     first, again, other = (page(tmp_path / name)[1] for name in "bcd")

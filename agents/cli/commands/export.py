@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.cli.commands.scenes import make_ready
+from agents.configuration.shared_keys import DrawKeys
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene_sources import load_scenes
 
@@ -22,7 +23,7 @@ _OVERLAP = 1e-3
 
 
 @dataclass
-class ExportConfig:
+class ExportConfig(DrawKeys):
     """Scenes for simulators and viewers.
 
     Attributes:
@@ -34,7 +35,6 @@ class ExportConfig:
         count: number of scenes; null for all of them, or 16 from a prior.
         project: make the scenes simulation-ready first (project out of penetration, then settle).
         friction: coefficient of friction of all surfaces.
-        num_steps: denoising steps per scene, with prior=.
         seed: seed of the noise, with prior=.
         workers: physics worker processes; 0 computes physics in this process.
         output: folder for assets/ and scene_000/, scene_001/, ...
@@ -46,7 +46,6 @@ class ExportConfig:
     count: int | None = None
     project: bool = False
     friction: float = 0.6
-    num_steps: int = 50
     seed: int = 0
     workers: int = 2
     output: str = ""
@@ -116,7 +115,9 @@ def _scenes(settings: ExportConfig, run: Run) -> SceneBatch:
 
         prior = ScenePrior.load(settings.prior)
         count = 16 if settings.count is None else settings.count
-        batch = prior.sample(count, num_steps=settings.num_steps, seed=settings.seed)
+        batch = prior.sample(
+            count, num_steps=settings.num_steps, physics_guidance=settings.physics_guidance, seed=settings.seed
+        )
         batch.save(run.directory / "scenes.safetensors")
         return batch
     return load_scenes(Path(settings.scenes), settings.count)

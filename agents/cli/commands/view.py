@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.configuration.fields import named
+from agents.configuration.shared_keys import DrawKeys
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene_sources import find_scenes, is_dataset, load_scenes
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class ViewConfig:
+class ViewConfig(DrawKeys):
     """Scenes in a browser.
 
     Attributes:
@@ -26,7 +27,6 @@ class ViewConfig:
         scene: scene type from whose grammar scenes are drawn; with scenes=, the type of a dataset that names none.
         count: number of scenes to show.
         first: the first scene of scenes= to show, counted from 0.
-        num_steps: denoising steps per scene, with prior=.
         seed: seed of the grammar or the prior.
         title: heading of the page; null for a heading that names the source of the scenes.
         pictures: number of scenes in gallery.png; 0 draws none.
@@ -40,7 +40,6 @@ class ViewConfig:
     scene: Any = named("", "scene")
     count: int = 16
     first: int = 0
-    num_steps: int = 50
     seed: int = 0
     title: str | None = None
     pictures: int = 12
@@ -90,7 +89,12 @@ def _gather(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str]:
         from agents.priors.base import ScenePrior
 
         prior = ScenePrior.load(settings.prior).to(settings.device)
-        batch = prior.sample(settings.count, num_steps=settings.num_steps, seed=settings.seed).to("cpu")
+        batch = prior.sample(
+            settings.count,
+            num_steps=settings.num_steps,
+            physics_guidance=settings.physics_guidance,
+            seed=settings.seed,
+        ).to("cpu")
         return batch, None, f"Samples of {Path(settings.prior).name}"
     import numpy as np
 
