@@ -35,7 +35,9 @@ from __future__ import annotations
 
 import argparse
 import csv
+import inspect
 import math
+import re
 import time
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -265,9 +267,11 @@ def main(args: Args) -> None:
 def parse_args() -> Args:
     """Every field of ``Args`` as an option."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    texts = dict(re.findall(r'(\w+): \w+ = .*\n    """(.*)"""', inspect.getsource(Args)))
     for field in fields(Args):
         kind = {"str": str, "int": int, "float": float}[str(field.type)]
-        parser.add_argument("--" + field.name.replace("_", "-"), type=kind, default=field.default)
+        text = f"{texts[field.name]} ({field.default})"
+        parser.add_argument("--" + field.name.replace("_", "-"), type=kind, default=field.default, help=text)
     return Args(**vars(parser.parse_args()))
 
 

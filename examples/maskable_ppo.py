@@ -24,6 +24,8 @@ of an episode, 11.6 ± 0.4 with random masks, 14.2 ± 0.2 with `culprits` alone,
 from __future__ import annotations
 
 import argparse
+import inspect
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -195,12 +197,13 @@ def main(args: Args) -> dict[str, dict[str, Any]]:
 def parse_args() -> Args:
     """The command line: one flag per field of :class:`Args`."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    texts = dict(re.findall(r'(\w+): \w+ = .*\n    """(.*)"""', inspect.getsource(Args)))
     for field in fields(Args):
-        flag = "--" + field.name.replace("_", "-")
+        flag, text = "--" + field.name.replace("_", "-"), f"{texts[field.name]} ({field.default})"
         if isinstance(field.default, bool):
-            parser.add_argument(flag, action="store_true")
+            parser.add_argument(flag, action="store_true", help=text)
         else:
-            parser.add_argument(flag, type=type(field.default), default=field.default)
+            parser.add_argument(flag, type=type(field.default), default=field.default, help=text)
     return Args(**vars(parser.parse_args()))
 
 

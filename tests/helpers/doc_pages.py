@@ -19,7 +19,7 @@ _INLINE = re.compile(r"`((?:scene-envs|python|make|bash) [^`]+)`")
 SMALLER: dict[str, dict[str, str]] = {
     "README.md": {"budget=32": "budget=2, branching=2, num_steps=20, slots=13"},
     "docs/algorithms/ddpo_sf.md": {
-        'iterations=40, output="runs/clutter"': (
+        'iterations=40, output="runs/more_objects"': (
             'iterations=1, batch_size=2, num_steps=3, **SMALL, output="runs/short"'
         ),
         "post_train_and_compare(config)": "post_train_and_compare(config, scenes=1, num_steps=20)",
@@ -149,7 +149,6 @@ NOT_RUN_PYTHON: dict[tuple[str, str], str] = {
 PREPARED: dict[str, tuple[str, ...]] = {
     "benchmarks/paper_tables/README.md": ("data/living_room_shelf",),
     "benchmarks/precision.md": ("data/dimsum_small", "data/dimsum_table"),
-    "docs/algorithms/ddpo_sf.md": ("runs/mixed",),
     "docs/commands.md": ("data/dimsum_table", "runs/clutter/config.yaml"),
     "docs/datasets.md": ("data/pantry_shelf",),
     "docs/evaluation.md": ("data/dimsum_table",),
@@ -157,11 +156,10 @@ PREPARED: dict[str, tuple[str, ...]] = {
     "docs/grammars.md": ("runs/tea_table",),
     "docs/networks.md": ("data/dimsum_table",),
     "docs/paper.md": ("data/dimsum_table",),
-    "docs/priors.md": ("runs/mixed", "runs/mine", "FILE.ckpt"),
+    "docs/priors.md": ("runs/mixed", "FILE.ckpt"),
     "docs/processes.md": ("data/dimsum_table",),
     "docs/prompted_sampling.md": ("data/dimsum_table",),
     "docs/render.md": ("runs/mine", "data/dimsum_table"),
-    "docs/rewards/prompt_match.md": ("runs/mixed",),
     "docs/search.md": ("runs/mine",),
     "docs/tables.md": ("data/dimsum_table",),
     "docs/user_assets.md": ("my_assets",),
