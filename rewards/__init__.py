@@ -4,7 +4,7 @@ A reward is any callable ``(SceneBatch, RewardContext) -> RewardOutput``. The sa
 reinforcement learning, search and evaluation.
 """
 
-from rewards.base import Reward, RewardContext, RewardOutput, averages_objects, depends_on_batch
+from rewards.base import Reward, RewardContext, RewardOutput, averages_objects, counts_objects, depends_on_batch
 from rewards.category_count import CategoryCount
 from rewards.clutter import Clutter
 from rewards.composite import Clip, Gate, Product, WeightedSum
@@ -66,6 +66,7 @@ __all__ = [
     "allow_reward_targets",
     "averages_objects",
     "check_reward",
+    "counts_objects",
     "depends_on_batch",
     "evaluate_reward",
     "learned_parts",

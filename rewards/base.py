@@ -66,6 +66,7 @@ class Reward(Protocol):
     ``depends_on_batch`` that is True (see :func:`depends_on_batch`). A reward may declare its largest value by an
     attribute ``maximum`` (see :func:`declared_maximum`), which searches take for their scale. A reward that is a mean
     over the objects and gives credit per object says so by ``averages_objects = True`` (see :func:`averages_objects`).
+    A reward that counts objects says so by ``counts_objects = True`` (see :func:`counts_objects`).
     """
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput: ...
@@ -90,6 +91,18 @@ def averages_objects(*rewards: object) -> bool:
     False
     """
     return all(bool(getattr(reward, "averages_objects", False)) for reward in rewards)
+
+
+def counts_objects(*rewards: object) -> bool:
+    """Whether one of ``rewards`` depends on which objects a scene has, wherever they are.
+
+    The credit of such objects does not depend on their poses. Algorithms with credit per object therefore give the
+    advantage of the scene to the categories.
+
+    >>> counts_objects(lambda batch: batch.counts)
+    False
+    """
+    return any(bool(getattr(reward, "counts_objects", False)) for reward in rewards)
 
 
 def declared_maximum(reward: object, slots: int, free_slots: int) -> float | None:

@@ -26,6 +26,7 @@ class CategoryCount:
     """
 
     name: ClassVar[str] = "category_count"
+    counts_objects: ClassVar[bool] = True
     assets: str | Sequence[str] = "edible"
 
     def __post_init__(self) -> None:

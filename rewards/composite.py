@@ -14,7 +14,15 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from rewards.base import Reward, RewardContext, RewardOutput, averages_objects, declared_maximum, depends_on_batch
+from rewards.base import (
+    Reward,
+    RewardContext,
+    RewardOutput,
+    averages_objects,
+    counts_objects,
+    declared_maximum,
+    depends_on_batch,
+)
 from rewards.evaluation import evaluate_reward
 from rewards.registry import register_reward, resolve_reward, reward_name
 from scene_envs.errors import InvalidInputError
@@ -25,8 +33,9 @@ from scene_envs.scene import SceneBatch
 class WeightedSum:
     """Sum of rewards, each times its weight.
 
-    ``per_object`` is the weighted sum of the parts' credits when all of them give one. A slot is judged where every
-    part judges it.
+    ``per_object`` is the weighted sum of the parts' credits when all of them give one. If some parts are means over the
+    objects and others are not, the credits of a mean are divided by its number of objects, so that the parts have the
+    same weights in the credits as in the value. A slot is judged where every part judges it.
 
     Args:
         rewards: the parts.
@@ -44,19 +53,33 @@ class WeightedSum:
         self.weights = tuple(1.0 for _ in self.rewards) if weights is None else tuple(float(w) for w in weights)
         if len(self.weights) != len(self.rewards):
             raise InvalidInputError(f"weighted_sum: {len(self.rewards)} rewards need as many weights, got {weights!r}")
-        self.depends_on_batch = depends_on_batch(*self.rewards)
         self.averages_objects = averages_objects(*self.rewards)
+        self.counts_objects = counts_objects(*self.rewards)
+
+    @property
+    def depends_on_batch(self) -> bool:
+        """Whether a part depends on the batch."""
+        return depends_on_batch(*self.rewards)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score every part and add up."""
         outputs = _score_parts(self.rewards, batch, context)
-        credits = [output.per_object for output in outputs.values() if output.per_object is not None]
+        pairs = zip(self.rewards, outputs.values(), strict=True)
+        credits = [self._credit(reward, output, batch) for reward, output in pairs if output.per_object is not None]
         per_object = self._add_up(credits) if len(credits) == len(outputs) else None
         total = _combine(self._add_up([output.value for output in outputs.values()]), outputs, per_object)
         if not any("judged" in output.object_flags for output in outputs.values()):
             return total
         judged = [output.object_flags.get("judged", batch.is_free) for output in outputs.values()]
         return replace(total, object_flags={**total.object_flags, "judged": torch.stack(judged).all(dim=0)})
+
+    def _credit(self, reward: Reward, output: RewardOutput, batch: SceneBatch) -> Tensor:
+        """(B, N) credits of a part; in a sum of means and other rewards, those of a mean are shares of its value."""
+        assert output.per_object is not None
+        if self.averages_objects or not averages_objects(reward):
+            return output.per_object
+        judged = output.object_flags.get("judged", batch.is_free)
+        return output.per_object / judged.sum(dim=1, keepdim=True).clamp(min=1)
 
     def _add_up(self, tensors: Sequence[Tensor]) -> Tensor:
         return torch.stack([weight * tensor for weight, tensor in zip(self.weights, tensors, strict=True)]).sum(dim=0)
@@ -80,7 +103,11 @@ class Product:
 
     def __init__(self, rewards: Sequence[Any]) -> None:
         self.rewards = _resolve_parts(self.name, rewards)
-        self.depends_on_batch = depends_on_batch(*self.rewards)
+
+    @property
+    def depends_on_batch(self) -> bool:
+        """Whether a part depends on the batch."""
+        return depends_on_batch(*self.rewards)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score every part and multiply."""
@@ -127,6 +154,11 @@ class Gate:
         """Whether ``reward`` is a mean over the objects."""
         return averages_objects(self.reward)
 
+    @property
+    def counts_objects(self) -> bool:
+        """Whether ``reward`` depends on which objects there are."""
+        return counts_objects(self.reward)
+
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score both; credit per object is that of ``reward`` where the gate is open, else 0."""
         outputs = _score_parts((self.reward, self.condition), batch, context)
@@ -172,6 +204,11 @@ class Clip:
     def averages_objects(self) -> bool:
         """Whether ``reward`` is a mean over the objects."""
         return averages_objects(self.reward)
+
+    @property
+    def counts_objects(self) -> bool:
+        """Whether ``reward`` depends on which objects there are."""
+        return counts_objects(self.reward)
 
     def maximum(self, slots: int, free_slots: int) -> float | None:
         """``high``, or the largest value of the reward where that is less."""

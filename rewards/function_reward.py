@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rewards.base import RewardContext, RewardOutput, averages_objects, depends_on_batch
+from rewards.base import RewardContext, RewardOutput, averages_objects, counts_objects, depends_on_batch
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
@@ -33,6 +33,7 @@ class FunctionReward:
         self.settings = settings
         self.maximum = getattr(function, "maximum", None)
         self.depends_on_batch, self.averages_objects = depends_on_batch(function), averages_objects(function)
+        self.counts_objects = counts_objects(function)
         self._takes_context = _accepts(function, 2, settings, self.name)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:

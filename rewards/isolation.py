@@ -7,7 +7,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from rewards.base import RewardContext, RewardOutput, averages_objects, declared_maximum, depends_on_batch
+from rewards.base import (
+    RewardContext,
+    RewardOutput,
+    averages_objects,
+    counts_objects,
+    declared_maximum,
+    depends_on_batch,
+)
 from rewards.local_files import allowed_files, is_local, names_in
 from rewards.registry import (
     RewardInfo,
@@ -55,7 +62,8 @@ class IsolatedReward:
             raise InvalidInputError(f"only a reward given by name or as a mapping can be isolated, got {reward!r}")
         check_limits(timeout, memory)
         self.name = self.__name__ = reward_name(reward)
-        self.depends_on_batch = self.averages_objects = False
+        self.depends_on_batch = self.averages_objects = self.counts_objects = self.has_open_statistics = False
+        self.statistics: Sequence[Any] | None = None
         self.seed = seed
         self.timeout, self.memory, self.workers = timeout, memory, workers
         self._reward = reward
@@ -74,18 +82,32 @@ class IsolatedReward:
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score in the worker; the batch may be on any device."""
+        with self._lock:
+            body = self._started().ask(("score", *self._scenes(batch, context)), self.timeout)
+        return unpacked(body, batch.tensor.device)
+
+    def _scenes(self, batch: SceneBatch, context: RewardContext) -> tuple[Any, ...]:
+        """A batch and its context, as the worker reads them."""
         scenes = batch.tensor.detach().cpu().contiguous().numpy()
         seed = self.seed if context.seed == 0 else context.seed
-        message = ("score", replace(batch.scene_type), scenes, (context.prompts, seed, current_draw()))
-        with self._lock:
-            body = self._started().ask(message, self.timeout)
-        return unpacked(body, batch.tensor.device)
+        return replace(batch.scene_type), scenes, (context.prompts, seed, current_draw())
 
     def maximum(self, slots: int, free_slots: int) -> float | None:
         """The largest value that the reward declares; see :func:`rewards.base.declared_maximum`."""
         with self._lock:
             found: float | None = self._started().ask(("maximum", slots, free_slots), self.timeout)
         return found
+
+    def fit_statistics(self, batch: SceneBatch, context: RewardContext) -> None:
+        """See :func:`rewards.statistics.fit_statistics`."""
+        with self._lock:
+            self.statistics = self._started().ask(("fit", *self._scenes(batch, context)), self.timeout)
+
+    def load_statistics(self, statistics: Sequence[Any] | None) -> None:
+        """See :func:`rewards.statistics.load_statistics`."""
+        with self._lock:
+            self._started().ask(("load", statistics), self.timeout)
+            self.statistics = statistics
 
     def close(self) -> None:
         """End the worker; the next call starts another."""
@@ -98,7 +120,10 @@ class IsolatedReward:
             self._worker = RewardProcess(self.name, self.timeout, self.memory)
             try:
                 message = ("make", self._reward, allowed_targets(), allowed_files(), self.workers, self.seed)
-                self.depends_on_batch, self.averages_objects = map(bool, self._worker.ask(message, self.timeout))
+                facts: tuple[bool, bool, bool, bool] = self._worker.ask(message, self.timeout)
+                self.depends_on_batch, self.averages_objects, self.counts_objects, self.has_open_statistics = facts
+                if self.statistics is not None:
+                    self._worker.ask(("load", self.statistics), self.timeout)
             except BaseException:
                 self.close()
                 raise
@@ -119,6 +144,7 @@ class SeededReward:
         self.name = reward_name(self.reward)
         self.depends_on_batch = depends_on_batch(self.reward)
         self.averages_objects = averages_objects(self.reward)
+        self.counts_objects = counts_objects(self.reward)
         self.seed = seed
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:

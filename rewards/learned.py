@@ -38,5 +38,10 @@ def learned_parts(reward: Any) -> list[LearnedReward]:
     """
     if isinstance(reward, LearnedReward):
         return [reward]
+    return [found for part in parts_of(reward) for found in learned_parts(part)]
+
+
+def parts_of(reward: Any) -> list[Any]:
+    """The parts of a composite, in a fixed order; none of any other reward."""
     parts = [getattr(reward, name) for name in ("reward", "condition") if hasattr(reward, name)]
-    return [found for part in (*parts, *getattr(reward, "rewards", ())) for found in learned_parts(part)]
+    return [*parts, *getattr(reward, "rewards", ())]

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import torch
 
-from rewards.base import RewardContext, RewardOutput, averages_objects, depends_on_batch
+from rewards.base import RewardContext, RewardOutput, averages_objects, counts_objects, depends_on_batch
 from rewards.evaluation import evaluate_reward
+from rewards.learned import parts_of
 from rewards.registry import register_reward, resolve_reward, reward_name
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
@@ -21,7 +23,8 @@ class Normalised:
 
     Mean and standard deviation are given, or are those of the valid scenes of the batch. They are not carried from
     batch to batch: a reward with a memory would score the same scene differently in training, in search and after a
-    run is resumed.
+    run is resumed. A post-training run fixes them once, at those of samples of its base prior (:meth:`fit`), so that
+    its guard and its report can compare values.
 
     Attributes:
         reward: what is scored.
@@ -37,21 +40,55 @@ class Normalised:
     reward: Any
     mean: float | None = None
     std: float | None = None
+    _given: tuple[float | None, float | None] = field(init=False, repr=False, compare=False, default=(None, None))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "reward", resolve_reward(self.reward))
+        object.__setattr__(self, "_given", (self.mean, self.std))
         if self.std is not None and not self.std > 0:
             raise InvalidInputError(f"normalised: std={self.std} must be positive")
 
     @property
     def depends_on_batch(self) -> bool:
         """True unless mean and std are both given and ``reward`` does not depend on the batch either."""
-        return self.mean is None or self.std is None or depends_on_batch(self.reward)
+        return self.is_open or depends_on_batch(self.reward)
 
     @property
     def averages_objects(self) -> bool:
         """Whether ``reward`` is a mean over the objects."""
         return averages_objects(self.reward)
+
+    @property
+    def counts_objects(self) -> bool:
+        """Whether ``reward`` depends on which objects there are."""
+        return counts_objects(self.reward)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether mean or std are those of the batch."""
+        return self.mean is None or self.std is None
+
+    def fit(self, batch: SceneBatch, context: RewardContext) -> None:
+        """Fix mean and std, where they are open, at those of the valid scenes of ``batch``; equal values give std 1."""
+        output = evaluate_reward(self.reward, batch, context, strict=True)
+        values = output.value[output.is_valid].double()
+        if len(values):
+            spread = float(values.std(correction=0))
+            self.load_statistics(
+                (
+                    float(values.mean()) if self.mean is None else self.mean,
+                    (spread if spread > 0 else 1.0) if self.std is None else self.std,
+                )
+            )
+
+    def statistics(self) -> tuple[float | None, float | None]:
+        """Mean and std; None for those of the batch."""
+        return self.mean, self.std
+
+    def load_statistics(self, statistics: Sequence[float | None] | None) -> None:
+        """Take mean and std; None takes the given ones again."""
+        for name, value in zip(("mean", "std"), self._given if statistics is None else statistics, strict=True):
+            object.__setattr__(self, name, value)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score and normalise. Terms: the value of ``reward``, under its name, and the terms of ``reward``.
@@ -68,3 +105,13 @@ class Normalised:
         credit = None if output.per_object is None else output.per_object * scale
         value = (output.value - mean.to(output.value)) * scale
         return replace(output, value=value, per_object=credit, terms=terms)
+
+
+def normalised_parts(reward: Any) -> list[Normalised]:
+    """The normalised rewards out of a reward and the parts of a composite, inner ones first.
+
+    >>> [part.name for part in normalised_parts(resolve_reward({"name": "normalised", "reward": "object_count"}))]
+    ['normalised']
+    """
+    found = [part for inner in parts_of(reward) for part in normalised_parts(inner)]
+    return [*found, reward] if isinstance(reward, Normalised) else found

@@ -24,6 +24,7 @@ class ObjectCount:
     """
 
     name: ClassVar[str] = "object_count"
+    counts_objects: ClassVar[bool] = True
 
     def maximum(self, slots: int, free_slots: int) -> float:
         """The largest value: every slot holds an object."""

@@ -6,7 +6,9 @@ A name may mention adapters, as ``dimsum_table with runs/a+0.5*runs/b``.
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.files import exists, is_file
@@ -35,6 +37,26 @@ def split_name(name: str | os.PathLike[str]) -> tuple[str | os.PathLike[str], st
     """
     prior, joint, adapter = str(name).partition(_JOINT)
     return (prior, adapter) if joint else (name, "")
+
+
+def joint_name(name: str | os.PathLike[str], adapters: Sequence[Any]) -> str:
+    """The name of a prior together with its adapters; inverse of :func:`split_name`.
+
+    >>> joint_name("dimsum_table", ["runs/a", ["0.5*runs/b"]])
+    'dimsum_table with runs/a+0.5*runs/b'
+    """
+    parts = [str(part) for spec in adapters for part in ([spec] if isinstance(spec, str | os.PathLike) else spec)]
+    return _JOINT.join([str(name), "+".join(parts)] if parts else [str(name)])
+
+
+def short_name(name: str | os.PathLike[str]) -> str:
+    """The last part of a prior's path, and its adapters as they are named.
+
+    >>> short_name("runs/first/prior"), short_name("priors/tea with runs/a")
+    ('prior', 'tea with runs/a')
+    """
+    prior, adapter = split_name(name)
+    return joint_name(Path(prior).name, [adapter] if adapter else [])
 
 
 def list_priors() -> list[str]:

@@ -68,7 +68,7 @@ def sibling_advantages(reward: Tensor, valid: Tensor, siblings: int) -> Tensor:
 
     Args:
         reward: (B, N) floats.
-        valid: (B, N) bool; False entries get 0 and have no part in their slot's mean.
+        valid: (B, N) bool; False entries, and rewards that are not finite, get 0 and have no part in their slot's mean.
         siblings: rows per group.
 
     Returns:
@@ -77,6 +77,7 @@ def sibling_advantages(reward: Tensor, valid: Tensor, siblings: int) -> Tensor:
     >>> sibling_advantages(torch.tensor([[1.0], [0.0], [1.0], [1.0]]), torch.ones(4, 1, dtype=torch.bool), 2)[:, 0]
     tensor([ 1.4142, -1.4142,  0.0000,  0.0000])
     """
+    valid = valid & torch.isfinite(reward)
     grouped = torch.where(valid, reward, torch.zeros_like(reward)).double().view(-1, siblings, reward.shape[1])
     present = valid.view_as(grouped)
     count = present.sum(dim=1, keepdim=True)

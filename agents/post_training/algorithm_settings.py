@@ -115,7 +115,8 @@ class ForwardProcessSettings(AlgorithmSettings):
         credit: credit of poses: ``scene`` gives every slot the advantage of the scene, ``object`` gives it its own (for
             rewards with ``per_object``), ``auto`` uses ``object`` if the reward allows it.
         category_credit: credit of categories: ``scene`` uses the advantage of the scene, ``none`` keeps the categories
-            as they are, ``auto`` is ``none`` if poses have credit per object, else ``scene``.
+            as they are, ``auto`` is ``none`` if poses have credit per object and the reward counts no objects, else
+            ``scene``.
         sampler_decay: final decay of the averaged weights that sample, per iteration; it rises from 0.
         siblings: number of neighbouring scenes that share the first steps of their chain and are compared with each
             other; with 1 scenes share nothing and are compared with the whole batch.

@@ -64,5 +64,5 @@ class AveragedSampler(Algorithm[TensorDict]):
 
     def restore(self, state: dict[str, Any]) -> None:
         """Inverse of :meth:`state`."""
-        self._average.tensors, self._average.updates = state["sampler"], state["updates"]
+        self._average.restore(state["sampler"], state["updates"])
         self._average.copy_to(self.sampler)

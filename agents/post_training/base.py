@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
 from typing import Any, Generic, TypeVar, cast
 
-from torch import Generator, Tensor
+from torch import Generator
 from torchrl.objectives import LossModule
 
-from agents.post_training.base_kl import forward_kl
+from agents.post_training.base_kl import Parts, forward_kl
 from agents.post_training.gradients import BatchGradient
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import Branching, Rollout
@@ -67,8 +66,8 @@ class Algorithm(ABC, Generic[Credit]):
         """
         return real
 
-    def kl(self, rollout: Rollout, base: ScenePrior, generator: Generator) -> Iterator[Tensor]:
-        """Terms () whose sum is the KL divergence of the prior in training from ``base``, nats per random variable."""
+    def kl(self, rollout: Rollout, base: ScenePrior, generator: Generator) -> Parts:
+        """Terms, in parts of the batch, whose sum is the KL divergence of the prior in training from ``base``, nats per random variable."""
         prior = cast(ScenePrior, self.policy.prior)
         return forward_kl(prior, base, rollout, generator, self.policy.chunk)
 

@@ -19,11 +19,12 @@ from agents.priors.base import ScenePrior
 from agents.priors.forward import NoisedScenes
 from agents.utils.process_group import ProcessGroup, gather_rows
 
+Parts = Iterator[Iterator[Tensor]]
+"""Parts of a batch, each a series of terms (); gradients of a part are complete before they are added to others."""
 
-def chain_kl(
-    policy: DenoisingPolicy, base: ScenePrior, rollout: Rollout, count: int, generator: Generator
-) -> Iterator[Tensor]:
-    """Terms () whose sum is the KL divergence of the chain that made a rollout from the base prior's (Fan et al. 2023).
+
+def chain_kl(policy: DenoisingPolicy, base: ScenePrior, rollout: Rollout, count: int, generator: Generator) -> Parts:
+    """Terms whose sum is the KL divergence of the chain that made a rollout from the base prior's (Fan et al. 2023).
 
     The estimate includes every random step, with as many scenes as the budget allows, because steps differ much more
     than scenes do.
@@ -33,14 +34,22 @@ def chain_kl(
         base: base prior, with which the policy is compared.
         rollout: B episodes of the policy.
         count: passes over the batch that the estimate may cost, at most one per step.
-        generator: draws the scenes of each step.
+        generator: draws the scenes of each step, from those of all processes.
     """
     first = DenoisingPolicy(base, len(policy), guidance=policy.guidance)
-    batch = rollout.scenes.shape[1]
+    own, processes = rollout.scenes.shape[1], ProcessGroup.current()
+    batch, begin = processes.size * own, processes.rank * own
+    size = policy.chunk or own
     steps = torch.nonzero(policy.table.previous > 0).flatten().tolist()  # the last step is deterministic
-    drawn = max(1, min(batch, round(batch * count / len(steps))))
-    for step in steps:
-        for rows in torch.randperm(batch, generator=generator)[:drawn].split(policy.chunk or drawn):
+    count = max(1, min(batch, round(batch * count / len(steps))))
+    drawn = count / processes.size  # the mean over the processes is then that over all drawn scenes
+    chosen = [torch.randperm(batch, generator=generator)[:count].sort().values - begin for _ in steps]
+
+    def part(start: int) -> Iterator[Tensor]:
+        for step, rows in zip(steps, chosen, strict=True):
+            rows = rows[(rows >= start) & (rows < min(start + size, own))]
+            if not len(rows):
+                continue
             x_t, text = rollout.scenes[step][rows], _rows(rollout.text, rows)
             observed = None if rollout.observed is None else rollout.observed[rows]
             with torch.no_grad():
@@ -52,11 +61,13 @@ def chain_kl(
             else:
                 yield step_kl(now, then).sum() / (drawn * entries)
 
+    return (part(start) for start in range(0, own, size))
+
 
 def forward_kl(
     prior: ScenePrior, base: ScenePrior, rollout: Rollout, generator: Generator, chunk: int | None = None
-) -> Iterator[Tensor]:
-    """Terms () whose sum estimates the same divergence from finished scenes, noised again, without their chains.
+) -> Parts:
+    """Terms whose sum estimates the same divergence from finished scenes, noised again, without their chains.
 
     The scenes of a batch take timesteps that are spread evenly over the chain of all timesteps. With several processes,
     each process draws timesteps and noise for the scenes of all processes, and takes those of its own scenes.
@@ -80,7 +91,7 @@ def forward_kl(
     size = chunk or count
     for start in range(0, count, size):
         rows = slice(start, start + size)
-        yield noised_kl(prior, base, noised.rows(rows), _rows(rollout.text, rows)).sum() * ((total - 1) / count)
+        yield iter([noised_kl(prior, base, noised.rows(rows), _rows(rollout.text, rows)).sum() * ((total - 1) / count)])
 
 
 def noised_kl(prior: ScenePrior, base: ScenePrior, noised: NoisedScenes, text: Text | None = None) -> Tensor:

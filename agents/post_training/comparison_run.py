@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import sys
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from torch import Generator
 
 from agents.post_training.comparison import Measured, measure_prior, write_comparison
 from agents.post_training.config import PostTrainConfig
+from agents.post_training.learned_rewards import LearnedRewards
 from agents.post_training.prompts import PromptDeck, prompts_beside
 from agents.post_training.rollouts import stream_seed
-from agents.post_training.run_files import SCENES_NAME
+from agents.post_training.run_files import CHECKPOINT_NAME, SCENES_NAME
 from agents.post_training.trainer import post_train
 from agents.priors.base import ScenePrior
+from agents.utils.checkpoints import load_checkpoint
 from agents.utils.process_group import ProcessGroup
 from rewards import reward_label
 from rewards.isolation import close_reward, run_reward
@@ -64,6 +67,7 @@ def post_train_and_compare(
     )
     with make_pool(config.workers, PHYSICS_TIMEOUT) as pool, ExitStack() as stack:
         stack.callback(close_reward, reward)
+        stack.enter_context(trained_reward(reward, config))
 
         def measure(prior: ScenePrior) -> Measured:
             return measure_prior(
@@ -80,6 +84,20 @@ def post_train_and_compare(
     title = f"Steering {base.scene_type.name.replace('_', ' ')} toward {reward_label(config.reward)}"
     extra = {"stage_seconds": seconds, "num_steps": num_steps}
     return write_comparison(result, before, after, title=title, extra=extra)
+
+
+@contextmanager
+def trained_reward(reward: Any, config: PostTrainConfig) -> Iterator[None]:
+    """Context in which the parts of ``reward`` that learn, or are normalised, are those of the end of a run."""
+    learned = LearnedRewards(reward, config)
+    if learned.needs_samples:
+        real = SceneBatch.load(config.directory / SCENES_NAME)
+        learned.begin(real[: len(real) - config.guard.scenes])
+        learned.restore(load_checkpoint(config.directory / CHECKPOINT_NAME)["learner"])
+    try:
+        yield
+    finally:
+        learned.end()
 
 
 def _measured_prompts(config: PostTrainConfig, prior: ScenePrior, count: int) -> list[str] | None:

@@ -17,7 +17,7 @@ from agents.configuration.tree import plain_tree
 from agents.post_training.algorithm_settings import AlgorithmSettings, DDPOSFSettings, NeonSettings
 from agents.post_training.algorithms import algorithm_settings, list_algorithms
 from agents.post_training.inpaint_settings import InpaintSettings
-from agents.post_training.regularisation_settings import AdapterSettings, RegularisationSettings
+from agents.post_training.regularisation_settings import REAL_SCENES, AdapterSettings, RegularisationSettings
 from scene_envs.envs.settings import PROMPT_SOURCES, check_claim_guidance
 from scene_envs.errors import InvalidInputError
 
@@ -214,6 +214,7 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
 
     def __post_init__(self) -> None:
         at_least(self, 1, "iterations", "num_steps", "slots")
+        at_least(self, 0, "seed")
         at_least(self, 2, "batch_size")
         positive(self, "reward_timeout", "reward_memory")
         if not (isinstance(self.workers, int) and self.workers >= 0) and self.workers != "ray":
@@ -239,6 +240,16 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
             self.optimizer = replace(self.optimizer, lr=factor * self.algorithm.learning_rate)
         if self.regularisation.weight is None:
             self.regularisation = replace(self.regularisation, weight=self.algorithm.regularisation_weight)
+        if self.regularisation.batch_size is None:
+            own = self.batch_size if isinstance(self.algorithm, NeonSettings) else REAL_SCENES
+            self.regularisation = replace(self.regularisation, batch_size=own)
+        compared = isinstance(self.algorithm, NeonSettings) and self.regularisation.pretraining_weight > 0
+        if compared and self.regularisation.batch_size != self.batch_size:
+            raise InvalidInputError(
+                f"regularisation.batch_size={self.regularisation.batch_size} with batch_size={self.batch_size}: "
+                "algorithm=neon trains one copy on real scenes and one on samples, as many of each, with the same "
+                "noise; leave regularisation.batch_size out"
+            )
         prior, adapter = split_name(self.prior)
         if self.adapter.rank and adapter:
             raise InvalidInputError(

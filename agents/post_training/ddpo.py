@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 from torch import Generator, Tensor
 
 from agents.post_training.advantages import compute_advantages
 from agents.post_training.algorithm_settings import DDPOISSettings, DDPOSFSettings
 from agents.post_training.base import Algorithm
-from agents.post_training.base_kl import chain_kl
+from agents.post_training.base_kl import Parts, chain_kl
 from agents.post_training.gradients import BatchGradient, accumulate_policy_gradient, credited_reward, draw_steps
 from agents.post_training.losses import DDPOSFLoss
 from agents.post_training.policy import DenoisingPolicy, gradient_weights
@@ -55,6 +53,6 @@ class DDPO(Algorithm[Tensor]):
         steps, scale = draw_steps(self.loss.step_weights.cpu(), self.settings.gradient_steps, generator)
         return accumulate_policy_gradient(self.loss, rollout, advantage, steps, scale=scale)
 
-    def kl(self, rollout: Rollout, base: ScenePrior, generator: Generator) -> Iterator[Tensor]:
+    def kl(self, rollout: Rollout, base: ScenePrior, generator: Generator) -> Parts:
         """Terms of the KL divergence of the chain, estimated at the cost of ``gradient_steps`` steps."""
         return chain_kl(self.policy, base, rollout, self.settings.gradient_steps, generator)

@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from agents.configuration.tree import changed
+from agents.post_training.algorithm_settings import GuidanceDistillationSettings, NeonSettings
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.gradients import accumulate_policy_gradient, gradient_norm
 from agents.post_training.learner import Learner
@@ -110,7 +111,7 @@ def diagnose(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> Doc
     """
     with TemporaryDirectory() as scratch:
         real = config.regularisation
-        bank = min(real.bank_size, config.guard.scenes + 4 * real.batch_size)
+        bank = min(real.bank_size, config.guard.scenes + 4 * real.real_scenes)
         small = changed(config, {"output": str(Path(scratch) / "run"), "regularisation.bank_size": bank})
         trainer = PostTrainer(small, prior=prior)
         try:
@@ -176,12 +177,16 @@ def _advice(report: DoctorReport, config: PostTrainConfig) -> list[str]:
         )
     if report.valid_fraction < 1:
         advice.append(f"{1 - report.valid_fraction:.0%} of the scenes have no valid reward; see the log for why.")
-    if report.valid_fraction > 0 and not report.reward_std > 0:
+    rewarded = not isinstance(config.algorithm, NeonSettings | GuidanceDistillationSettings)
+    if rewarded and report.valid_fraction > 0 and not report.reward_std > 0:
         advice.append("All rewards are equal: there is nothing to learn from. Use a graded reward or more scenes.")
-    if config.prompt is not None and report.reward_std > 0 and report.policy_gradient_norm == 0:
+    if rewarded and report.reward_std > 0 and report.policy_gradient_norm == 0:
+        together = config.algorithm.scenes_per_prompt
         advice.append(
-            "The rewards differ between prompts but not within any: there is nothing to learn. Raise scenes_per_prompt "
-            f"from {config.algorithm.scenes_per_prompt}, or use a reward that differs between scenes of one prompt."
+            "The rewards differ, but no advantage does: there is nothing to learn. Another algorithm.credit may help."
+            if config.prompt is None
+            else "The rewards differ between prompts but not within any: there is nothing to learn. Raise "
+            f"scenes_per_prompt from {together}, or use a reward that differs between scenes of one prompt."
         )
     weight = config.regularisation.pretraining_weight
     if weight > 0 and report.policy_gradient_norm > 0:

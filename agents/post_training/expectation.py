@@ -36,6 +36,11 @@ class TrainedCopy(nn.Module):
             self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
 
+    def return_to(self, prior: ScenePrior) -> None:
+        """Take the weights of ``prior``, and forget the optimiser's state."""
+        self.prior.load_state_dict(prior.state_dict())
+        self.optimizer.state.clear()
+
     def state(self) -> dict[str, Any]:
         """For a checkpoint."""
         return {"weights": self.prior.state_dict(), "optimizer": self.optimizer.state_dict()}

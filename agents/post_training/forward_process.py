@@ -24,6 +24,7 @@ from agents.post_training.gradients import BatchGradient, credited_reward, judge
 from agents.post_training.own_samples import OwnSampleAlgorithm
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import Branching, Rollout, rollout_groups
+from agents.priors.base import ScenePrior
 from agents.utils.process_group import ProcessGroup
 
 
@@ -73,7 +74,8 @@ class ForwardProcess(OwnSampleAlgorithm):
             poses = self._object_advantages(rollout, reward, valid)
         else:
             poses = self._scene_advantages(rollout)
-        if settings.category_credit == "none" or (settings.category_credit == "auto" and per_object):
+        poses_alone = per_object and not rollout.counts
+        if settings.category_credit == "none" or (settings.category_credit == "auto" and poses_alone):
             categories = torch.zeros_like(poses[:, :1])
         else:
             categories = self._scene_advantages(rollout)
@@ -110,6 +112,12 @@ class ForwardProcess(OwnSampleAlgorithm):
         """See :class:`OwnSampleAlgorithm`; ``distance`` is a root mean square."""
         gradient = super().accumulate(rollout, advantage, generator)
         return replace(gradient, columns={**gradient.columns, "distance": gradient.columns["distance"] ** 0.5})
+
+    def return_to(self, prior: ScenePrior) -> None:
+        """Sample with the weights of ``prior``; the expectation begins with them as well."""
+        super().return_to(prior)
+        if self.copy is not None:
+            self.copy.return_to(prior)
 
     def state(self) -> dict[str, Any]:
         """The state of the sampling policy, and that of the expectation."""

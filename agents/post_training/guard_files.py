@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
+from agents.configuration.prior_names import short_name
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.guard import Guard, GuardReading
 from agents.post_training.learner import Learner
@@ -32,7 +32,7 @@ def make_guard(config: PostTrainConfig, learner: Learner, scenes: SceneBank) -> 
             config.num_steps,
             stream_seed(config.seed, "samples"),
             learner.slots,
-            asked[:count] if asked is not None and config.prompt is not None else None,
+            None if config.prompt is None else scenes.heldout_prompts(count, learner.slots, learner.prior.scene_type),
             config.guidance,
             config.claim_guidance,
         )
@@ -48,21 +48,25 @@ class GuardFiles:
 
     Args:
         config: of the run.
+        base: name of the base prior; empty for a prior that was not loaded by name.
     """
 
-    def __init__(self, config: PostTrainConfig) -> None:
+    def __init__(self, config: PostTrainConfig, base: str) -> None:
         self.directory = config.directory
         self._facts: dict[str, Any] = {
             "algorithm": config.algorithm.name,
-            "base": Path(config.prior).name,
+            **({"base": short_name(base)} if base else {}),
             "reward": config.plain()["reward"],
         }
         self._processes = ProcessGroup.current()
 
     def keep(self, prior: ScenePrior, guard: Guard, iteration: int) -> None:
         """Write the evaluated weights to ``prior/``, with a card that says how they were made."""
+        unknown = (
+            ("measures", "limits") if iteration else ()
+        )  # those of the base prior are not those of the new weights
         prior.card = {
-            **prior.card,
+            **{key: value for key, value in prior.card.items() if key not in unknown},
             "post_training": {
                 **self._facts,
                 "iteration": iteration,

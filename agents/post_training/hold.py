@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from scene_envs.errors import InvalidInputError, unknown_name
 
@@ -79,7 +79,7 @@ class HoldState:
     Attributes:
         log_factor: logarithm of the factor on the weights of the regularisation.
         iteration: of the last measurement.
-        measured: the last value; None before the first.
+        measured: the last value; None before the first, and after a return to a checkpoint whose value is not known.
         slope: its change per iteration, averaged.
         beyond: measurements in a row that were above the target while the factor was at its upper bound.
         lost_at: iteration from which the target counts as not held; None while it counts as held.
@@ -96,6 +96,14 @@ class HoldState:
     def factor(self) -> float:
         """Factor on the weights."""
         return math.exp(self.log_factor)
+
+    def returned(self, measured: float | None) -> HoldState:
+        """The state after a return to an earlier checkpoint, which is no change of the figure by training.
+
+        Args:
+            measured: the figure of this checkpoint; None if it is not known.
+        """
+        return replace(self, measured=measured, slope=0.0)
 
 
 def adjust(state: HoldState, target: Target, measured: float, iteration: int) -> HoldState:
@@ -116,7 +124,8 @@ def adjust(state: HoldState, target: Target, measured: float, iteration: int) ->
     1.162
     """
     span = max(1, iteration - state.iteration)
-    before = BASE_VALUES[target.figure] if state.measured is None else state.measured
+    first = measured if state.iteration else BASE_VALUES[target.figure]
+    before = first if state.measured is None else state.measured
     slope = state.slope + (1.0 - math.exp(-span / SMOOTHING)) * ((measured - before) / span - state.slope)
     slope = slope if math.isfinite(slope) else 0.0
     error = target.error(measured + LOOK_AHEAD * slope)

@@ -30,7 +30,7 @@ from agents.priors.prompt_validation import no_text
 from agents.utils.checkpoints import check_tensors
 from agents.utils.process_group import ProcessGroup
 from agents.utils.weight_average import AveragedWeights, WeightAverage
-from rewards import averages_objects, depends_on_batch
+from rewards import averages_objects, counts_objects, depends_on_batch
 from rewards.isolation import close_reward, run_reward
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.envs.masks import resolve_mask
@@ -68,7 +68,7 @@ class Learner:
         self.regularisation = Regularisation(config.regularisation, self.prior)
         if config.adapter.rank:
             adapter = config.adapter
-            attach_adapter(self.prior, config.prior, rank=adapter.rank, scale=adapter.scale, seed=config.seed)
+            attach_adapter(self.prior, prior.loaded_as, rank=adapter.rank, scale=adapter.scale, seed=config.seed)
         self.slots = self.prior.config.slots if config.slots is None else config.slots
         self.policy = DenoisingPolicy(
             self.prior, config.num_steps, chunk=config.optimizer.chunk, guidance=config.guidance,
@@ -112,6 +112,7 @@ class Learner:
 
     def close(self) -> None:
         """Stop the workers of physics and of the reward, if any."""
+        self.learned.end()
         self.env.close()
         self.scorer.close()
         close_reward(self.reward)
@@ -179,17 +180,18 @@ class Learner:
             observed=observed,
             groups=groups,
         )
-        return replace(rollout, averages=averages_objects(self.reward))
+        return replace(rollout, averages=averages_objects(self.reward), counts=counts_objects(self.reward))
 
     def begin_rewards(self, real: SceneBatch, *, first: bool) -> None:
-        """Give real scenes to the rewards that learn; does nothing if no reward learns.
+        """Give real scenes to the rewards that learn; does nothing if no reward learns or is normalised.
 
         Args:
             real: real scenes that training may see.
-            first: also train them on samples of the base prior; False for a run whose state is restored.
+            first: also train them on samples of the base prior, and fix the statistics of normalised rewards; False for
+                a run whose state is restored.
         """
         self.learned.begin(real)
-        if self.learned and first:
+        if self.learned.needs_samples and first:
             prompts = None if self.deck is None else self.deck.deal(FIRST_SAMPLES, self._generator("discriminator", 0))
             self.learned.learn_from_prior(self.prior, self.slots, prompts)
 
@@ -216,7 +218,7 @@ class Learner:
         policy_norm = gradient_norm(self.parameters)
         held = self.regularisation.accumulate(self.algorithm, rollout, self._generator("kl", index))
         generator = self._generator("real", index)
-        count = config.regularisation.batch_size
+        count = config.regularisation.real_scenes
         real = scenes.batch(count, generator)
         samples = None if scenes.base is None else scenes.base.batch(count, self._generator("base", index))
         noise = self.algorithm.real_generator(self._generator("steps", index), generator)
@@ -269,7 +271,7 @@ class Learner:
             "average_updates": 0 if self.average is None else self.average.updates,
             "algorithm": self.algorithm.state(),
             "regularisation": self.regularisation.state_dict(),
-            "learned_rewards": self.learned.state(),
+            **self.learned.state(),
             "random": torch.get_rng_state(),
         }
 
@@ -284,10 +286,10 @@ class Learner:
         self.optimizer.load_state_dict(state["optimizer"])
         self.lr = state["learning_rate"]
         if self.average is not None:
-            self.average.tensors, self.average.updates = state["average"], state["average_updates"]
+            self.average.restore(state["average"], state["average_updates"])
         self.algorithm.restore(state["algorithm"])
         self.regularisation.load_state_dict(state.get("regularisation"))
-        self.learned.restore(state.get("learned_rewards", ()))
+        self.learned.restore(state)
         torch.set_rng_state(state["random"])
 
     def averaged(self) -> AveragedWeights[ScenePrior]:

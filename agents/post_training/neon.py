@@ -105,6 +105,7 @@ class Neon(OwnSampleAlgorithm):
     def return_to(self, prior: ScenePrior) -> None:
         """Begin a round with the weights of an earlier checkpoint."""
         self.iterations = 0
+        self.copy.optimizer.state.clear()
         self._begin({name: p.detach().clone() for name, p in prior.named_parameters()})
 
     def state(self) -> dict[str, Any]:
@@ -113,7 +114,7 @@ class Neon(OwnSampleAlgorithm):
 
     def restore(self, state: dict[str, Any]) -> None:
         """Inverse of :meth:`state`."""
-        self._average.tensors = state["sampler"]
+        self._average.restore(state["sampler"])
         self._average.copy_to(self.sampler)
         self.copy.restore(state["copy"])
         self.iterations = state["iterations"]

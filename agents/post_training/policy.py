@@ -68,6 +68,7 @@ class DenoisingPolicy(TensorDictModuleBase):
         if prior.conditional:
             self.in_keys = [*self.in_keys, "prompt"]
         self.table: StepTableLike = prior.step_table(num_steps)
+        self._first_steps: dict[int, ReverseStep] = {}
         self._step_of = {int(t): step for step, t in enumerate(self.table.timesteps.tolist())}
 
     def __len__(self) -> int:
@@ -169,12 +170,12 @@ class DenoisingPolicy(TensorDictModuleBase):
 
     def random_entries(self, slots: int) -> int:
         """Number of random variables that a step of the chain draws for a scene; the other entries are known."""
-        return int(self._steps(slots)[0].entries)
+        return int(self._first_step(slots).entries)
 
     @torch.no_grad()
     def unobserved_entries(self, observed: Tensor) -> Tensor:
         """(B,) number of random variables that a step draws for scenes, without the entries ``observed`` (B, N, 2)."""
-        first: Any = self._steps(observed.shape[1])[0]
+        first: Any = self._first_step(observed.shape[1])
         poses = first.std > 0  # (N, D); no categories for a mixed prior
         width = getattr(self.prior, "pose_width", POSE_FEATURES)
         count = (poses[:, :width] & ~observed[..., :1]).sum(dim=(1, 2))
@@ -189,6 +190,13 @@ class DenoisingPolicy(TensorDictModuleBase):
             for std in (step.std for step in self._steps(slots))
         ]
         return torch.stack(smallest)
+
+    @torch.no_grad()
+    def _first_step(self, slots: int) -> ReverseStep:
+        """The first step of the chain for one scene, computed once for each number of slots."""
+        if slots not in self._first_steps:
+            self._first_steps[slots] = self.distribution(self.prior.initial(1, slots, None), 0)
+        return self._first_steps[slots]
 
     @torch.no_grad()
     def _steps(self, slots: int) -> list[ReverseStep]:

@@ -14,20 +14,21 @@ from scene_envs.scene import SceneBatch
 
 
 def check_shares(config: PostTrainConfig, processes: int) -> None:
-    """Refuse a batch that cannot be split among ``processes`` without splitting siblings.
+    """Refuse a batch that cannot be split among ``processes``, or into groups of siblings, without splitting siblings.
 
     Raises:
-        InvalidInputError: the number of processes does not divide the batch.
+        InvalidInputError: processes times siblings do not divide the batch.
     """
     siblings = int(getattr(config.algorithm, "siblings", 1))
     unit = processes * siblings
-    if processes > 1 and config.batch_size % unit:
-        among = f"{processes} processes" + (f" times algorithm.siblings={siblings}" if siblings > 1 else "")
+    if config.batch_size % unit:
+        counts = [f"{processes} processes"] * (processes > 1) + [f"algorithm.siblings={siblings}"] * (siblings > 1)
+        among = " times ".join(counts)
         lower = config.batch_size // unit * unit
         nearest = f"{lower} or {lower + unit}" if lower else str(unit)
         raise InvalidInputError(
             f"batch_size={config.batch_size} is not a multiple of {unit}, the {among}; give batch_size={nearest}, or "
-            "another number of processes"
+            f"another {'number of processes' if processes > 1 else 'number of siblings'}"
         )
 
 

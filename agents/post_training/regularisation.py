@@ -56,14 +56,14 @@ class Regularisation:
         row = {} if self.target is None else {"regularisation_weight": self.weight, "hold_factor": self.state.factor}
         if self.base is None or not self.measures_kl:
             return row
-        terms = algorithm.kl(rollout, self.base, generator)
+        parts = algorithm.kl(rollout, self.base, generator)
         value, norm = math.nan, 0.0
         if self.kl_weight:
-            value, norm = add_gradient(terms, algorithm.policy.parameters(), self.kl_weight)
+            value, norm = add_gradient(parts, algorithm.policy.parameters(), self.kl_weight)
         else:
             with torch.no_grad():
                 processes = ProcessGroup.current()
-                value = processes.sum_numbers(sum(float(term) for term in terms))[0] / processes.size
+                value = processes.sum_numbers(sum(float(term) for part in parts for term in part))[0] / processes.size
         return {**row, "kl": value, "kl_weight": self.kl_weight, "kl_gradient_norm": norm}
 
     def accumulate_scenes(
@@ -113,6 +113,15 @@ class Regularisation:
         self.state = adjust(self.state, self.target, value, iteration)
         if held and self.state.lost_at is not None:
             logger.warning("%s", self.verdict())
+
+    def return_to_checkpoint(self, ratio: float) -> None:
+        """Keep the weights, and forget how the held figure changed before a return to an earlier checkpoint.
+
+        Args:
+            ratio: held-out loss of this checkpoint, as a ratio to the base prior's.
+        """
+        known = self.target is not None and self.target.figure == "guard"
+        self.state = self.state.returned(ratio if known else None)
 
     def verdict(self) -> str:
         """One sentence that says whether the target was held; empty without a target."""

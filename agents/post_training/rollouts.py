@@ -51,6 +51,7 @@ class Rollout:
         valid: (B,) bool.
         per_object: (B, N) credit per slot, or None.
         averages: whether the reward is a mean over the objects, so that an empty slot has no credit.
+        counts: whether the reward depends on which objects there are, wherever they are.
         judged: (B, N) bool, slots that such a reward gives credit to; None for the free objects.
         terms: named (B,) parts of the reward.
         batch: the finished scenes.
@@ -72,6 +73,7 @@ class Rollout:
     prompts: tuple[str, ...] | None = None
     text: Text | None = None
     averages: bool = False
+    counts: bool = False
     judged: Tensor | None = None
     observed: Tensor | None = None
     groups: Tensor | None = None

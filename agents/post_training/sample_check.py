@@ -66,11 +66,12 @@ class SampleCheck:
         """Scenes (b, N, D) from number ``start`` on, whose noise depends on that number."""
         count = min(_AT_ONCE, self.count - start)
         prompts = None if self.prompts is None else list(self.prompts[start : start + count])
+        guided = prompts is not None and any(prompts)
         batch = prior.sample(
             count,
             prompt=prompts,
-            guidance=self.guidance if prompts else 0.0,
-            claim_guidance=self.claim_guidance if prompts else 0.0,
+            guidance=self.guidance if guided else 0.0,
+            claim_guidance=self.claim_guidance if guided else 0.0,
             physics_guidance=0.0,
             num_steps=self.num_steps,
             slots=self.slots,

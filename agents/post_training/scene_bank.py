@@ -14,11 +14,13 @@ from agents.post_training.config import RegularisationSettings
 from agents.post_training.prompts import PROMPTS_NAME, PromptSets, save_prompts
 from agents.post_training.run_files import REPLAY_NAME, SCENES_NAME, writing
 from agents.priors.base import ScenePrior
+from agents.priors.prompt_validation import asked_objects
 from agents.utils.process_group import ProcessGroup
 from scene_envs.errors import InvalidInputError
 from scene_envs.progress import Progress
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_sources import find_scenes, load_scenes
+from scene_envs.scene_types import SceneType
 
 _WITHHELD = 0.1
 """Share of real scenes whose prompt is withheld, as in pretraining."""
@@ -97,12 +99,24 @@ class SceneBank:
             texts = None if texts is None else [*texts[: count - replayed], *[""] * replayed]
         return PromptedScenes(x0, texts)
 
-    def heldout_prompts(self) -> list[str] | None:
-        """One prompt of each held-out scene; kinds of prompts alternate from scene to scene; None without prompts."""
+    def heldout_prompts(
+        self, count: int | None = None, slots: int | None = None, scene_type: SceneType | None = None
+    ) -> list[str] | None:
+        """One prompt of each held-out scene; kinds of prompts alternate from scene to scene; None without prompts.
+
+        Args:
+            count: number of scenes; None for all.
+            slots: largest number of objects that a prompt may ask for; ``""`` stands for a prompt that asks for more.
+                None allows any number.
+            scene_type: of the scenes; only needed with ``slots``.
+        """
         if self.prompts is None:
             return None
-        first = len(self.train)
-        return [(group := self.prompts(first + i))[i % len(group)] for i in range(len(self.heldout))]
+        first, count = len(self.train), len(self.heldout) if count is None else count
+        texts = [(group := self.prompts(first + i))[i % len(group)] for i in range(count)]
+        if slots is None or scene_type is None:
+            return texts
+        return [text if asked_objects(text, scene_type) <= slots else "" for text in texts]
 
 
 def kept_scenes(

@@ -116,8 +116,9 @@ class PostTrainer:
         self.config = config
         self.directory = config.directory
         self.processes = ProcessGroup.current()
-        self.files = GuardFiles(config)
-        self.learner = Learner(config, ScenePrior.load(config.prior if prior is None else prior))
+        base = ScenePrior.load(config.prior if prior is None else prior)
+        self.files = GuardFiles(config, base.loaded_as)
+        self.learner = Learner(config, base)
         self.prior = self.learner.prior
         self.iteration = 0
         self.invalid_streak = 0
@@ -254,6 +255,7 @@ class PostTrainer:
         if reading.beyond and self.config.guard.action == "rollback":
             self.rollbacks += 1
             self.learner.return_to(self.files.best(self.prior))
+            self.learner.regularisation.return_to_checkpoint(self.guard.best_ratio)
 
     def _count_invalid(self) -> None:
         self.invalid_streak += 1

@@ -35,7 +35,7 @@ class AdapterFacts:
     Attributes:
         rank: of the updates.
         scale: of the updates.
-        prior: name of the prior that it was trained on.
+        prior: name of the prior that it was trained on; empty if that prior had none.
         digest: SHA-256 of that prior's weights.
     """
 
@@ -111,7 +111,7 @@ def attach_adapter(prior: Adaptable, name: str, *, rank: int, scale: float, seed
 
     Args:
         prior: is changed.
-        name: name of the prior, which the adapter's file records.
+        name: name of the prior, which the adapter's file records; empty for a prior that has none.
         rank: of the updates.
         scale: of the updates.
         seed: of the random initial values of the updates.
@@ -233,10 +233,11 @@ def _read_facts(term: AdapterTerm, name: str, digest: str) -> AdapterFacts:
         raise CorruptFileError(f"{str(file)!r} is not the description of an adapter: {error}") from error
     if facts.digest != digest:
         same = "" if facts.prior != name else ", whose weights have changed since"
+        named = f"the prior {facts.prior!r}" if facts.prior else "a prior without a name"
+        remedy = f"load it with prior={facts.prior}" if facts.prior else "load it with the prior that it was trained on"
         raise InvalidInputError(
-            f"the adapter {str(term.path)!r} was trained on the prior {facts.prior!r} (weights {facts.digest[:8]})"
-            f"{same}, and not on {name!r} (weights {digest[:8]}); load it with prior={facts.prior}, or train one "
-            f"of {name!r}"
+            f"the adapter {str(term.path)!r} was trained on {named} (weights {facts.digest[:8]})"
+            f"{same}, and not on {name!r} (weights {digest[:8]}); {remedy}, or train one of {name!r}"
         )
     return facts
 

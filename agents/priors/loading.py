@@ -10,7 +10,7 @@ from typing import Any, TypeVar, cast
 
 from torch import Tensor
 
-from agents.configuration.prior_names import split_name
+from agents.configuration.prior_names import joint_name, split_name
 from agents.diffusion import Preconditioning, ResidualVariance
 from agents.networks.low_rank import merged_weights
 from agents.networks.registry import config_state
@@ -39,6 +39,8 @@ class Loadable(ABC):
     normalizer: Normalizer
     preconditioning: Preconditioning
     card: dict[str, Any]
+    loaded_as: str = ""
+    """Name or path by which :meth:`load` found the prior, with its adapters; empty for one that was not loaded."""
     residual: ResidualVariance | None
 
     def __init_subclass__(cls, **settings: Any) -> None:
@@ -94,6 +96,7 @@ class Loadable(ABC):
             prior.load_weights(stored.tensors)
         if terms:
             merge_adapters(prior, str(name), terms)
+        prior.loaded_as = joint_name(name, [spec for spec in (named, adapter) if spec])
         return cast(Prior, prior.eval())
 
     def save(self, directory: str | os.PathLike[str], precision: str = "float32") -> Path:

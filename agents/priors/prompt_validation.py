@@ -69,6 +69,20 @@ def no_text(scene_type: SceneType, prompt: str) -> InvalidInputError:
     )
 
 
+def asked_objects(prompt: str, scene_type: SceneType) -> int:
+    """Number of objects that a prompt asks for; 0 for free text.
+
+    >>> from scene_envs.scene_types import get_scene_type
+    >>> asked_objects("A scene with 12 objects.", get_scene_type("dimsum_table"))
+    12
+    """
+    try:
+        facts = parse_prompt(prompt, scene_type)
+    except InvalidInputError:
+        return 0
+    return max(facts.count or 0, sum((facts.objects or {}).values()))
+
+
 def check_object_count(prompts: Sequence[str], scene_type: SceneType, slots: int) -> None:
     """Refuse prompts that ask for more objects than a scene has slots; free text is not checked.
 
@@ -76,11 +90,7 @@ def check_object_count(prompts: Sequence[str], scene_type: SceneType, slots: int
         InvalidInputError: names the prompt, the number and the remedy.
     """
     for prompt in dict.fromkeys(prompts):
-        try:
-            facts = parse_prompt(prompt, scene_type)
-        except InvalidInputError:
-            continue
-        asked = max(facts.count or 0, sum((facts.objects or {}).values()))
+        asked = asked_objects(prompt, scene_type)
         if asked > slots:
             raise InvalidInputError(
                 f"the prompt {prompt!r} asks for {asked} objects, a scene has {slots} slots; give slots={asked} or more"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Generic, TypeVar
 
 import torch
@@ -41,6 +42,18 @@ class WeightAverage:
         named = dict(module.named_parameters())
         get_ema_multi_avg_fn(decay)([self.tensors[name] for name in named], list(named.values()), self.updates)
         return decay
+
+    @torch.no_grad()
+    def restore(self, tensors: Mapping[str, Tensor], updates: int | None = None) -> None:
+        """Take the averages of a checkpoint, on the device of the present ones.
+
+        Args:
+            tensors: averages by the name of their parameter.
+            updates: number of updates that made them; None keeps the present number.
+        """
+        for name, present in self.tensors.items():
+            present.copy_(tensors[name])
+        self.updates = self.updates if updates is None else updates
 
     @torch.no_grad()
     def copy_to(self, module: nn.Module) -> None:

@@ -22,7 +22,7 @@ def small_config(output: Path | str, **changes: Any) -> PostTrainConfig:
         batch_size=6,
         num_steps=5,
         algorithm={"gradient_steps": 2},
-        regularisation={"weight": 1.0, "batch_size": 4, "bank_size": 24},
+        regularisation={"weight": 1.0, "batch_size": 6, "bank_size": 24},
         guard={"scenes": 8, "every": 2},
         logger={"checkpoint_every": 2, "progress": "none"},
         optimizer={"lr": 1e-3},

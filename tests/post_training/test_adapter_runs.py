@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -81,3 +82,24 @@ def test_keys_of_the_group_and_of_the_file_do_not_meet() -> None:
         compose("post-train", PostTrainConfig, ["adapter=runs/a", "adapter.rank=4", "prior=dimsum_table"])
     with pytest.raises(InvalidInputError, match="rank=-1"):
         compose("post-train", PostTrainConfig, ["adapter.rank=-1"])
+
+
+def test_a_prior_is_named_as_it_was_loaded(tmp_path: Path) -> None:
+    base = tiny_prior().save(tmp_path / "base")
+    assert ScenePrior.load(base).loaded_as == str(base)
+    config = changed(_config(tmp_path / "run", base, iterations=1), {"prior": "dimsum_table_continuous"})
+    post_train(config, prior=ScenePrior.load(base))
+    assert json.loads((tmp_path / "run" / "adapter.json").read_text())["prior"] == str(base)
+    assert ScenePrior.load(tmp_path / "run").card["post_training"]["base"] == "base"
+    ScenePrior.load(base, adapter=tmp_path / "run")
+    both = ScenePrior.load(base, adapter=f"0.5*{tmp_path / 'run'}")
+    assert both.loaded_as == f"{base} with 0.5*{tmp_path / 'run'}"
+    post_train(changed(_config(tmp_path / "more", base, iterations=1), {"adapter.rank": 0}), prior=both)
+    assert ScenePrior.load(tmp_path / "more").card["post_training"]["base"] == f"base with 0.5*{tmp_path / 'run'}"
+
+
+def test_a_prior_that_was_not_loaded_has_no_name(tmp_path: Path) -> None:
+    post_train(changed(_config(tmp_path / "run", tmp_path, iterations=1), {"adapter.rank": 0}), prior=tiny_prior())
+    assert "base" not in ScenePrior.load(tmp_path / "run").card["post_training"]
+    base = tiny_prior().save(tmp_path / "base")
+    ScenePrior.load(base, adapter=tmp_path / "run")

@@ -74,6 +74,9 @@ def test_siblings_are_compared_slot_by_slot() -> None:
     differences = torch.tensor([[1.0, 0.0], [-0.5, 0.0], [-0.5, 0.0], [0.0, -3.0], [0.0, -3.0], [0.0, 6.0]])
     scale = (differences.square().sum() / 9).sqrt()  # nine entries have a valid sibling
     torch.testing.assert_close(sibling_advantages(reward, valid, 3), differences / scale)
+    broken = reward.index_put((torch.tensor([1]), torch.tensor([1])), torch.tensor(torch.nan))
+    broken[2, 1], valid[2, 1] = torch.nan, True  # a credit that is no number is not valid
+    torch.testing.assert_close(sibling_advantages(broken, valid, 3), differences / scale)
 
 
 def test_equal_siblings_have_no_advantage() -> None:

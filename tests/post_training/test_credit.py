@@ -11,6 +11,7 @@ import torch
 from agents.post_training.learner import Learner
 from agents.post_training.rollouts import Rollout
 from agents.priors.testing import tiny_prior
+from rewards import WeightedSum
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.scene import SceneBatch
 from tests.helpers.small_runs import small_config
@@ -86,3 +87,38 @@ def test_furniture_that_overlaps_furniture_is_blamed(tmp_path: Path, algorithm: 
     assert blamed.any()
     assert bool((poses[apart] > 0).all())
     assert bool((poses[blamed] < 0).all())
+
+
+@pytest.mark.parametrize("algorithm", ["nft", "awm", "reward_weighted"])
+@pytest.mark.parametrize(
+    ("reward", "counts"),
+    [
+        ("object_count", True),
+        ({"name": "clip", "reward": "object_count", "high": 30}, True),
+        ({"name": "weighted_sum", "rewards": ["feasible_share", "object_count"]}, True),
+        ("penetration", False),
+    ],
+)
+def test_categories_have_credit_if_the_reward_counts_objects(
+    tmp_path: Path, algorithm: str, reward: Any, counts: bool
+) -> None:
+    config = small_config(tmp_path, reward=reward, algorithm={"name": algorithm}, slots=12)
+    learner = Learner(config, tiny_prior(process="mixed"))
+    try:
+        rollout = learner.rollout(0)
+        advantage = learner.algorithm.advantage(rollout)
+    finally:
+        learner.close()
+    assert float(rollout.reward.std()) > 0
+    assert bool(advantage["category_advantage"].any()) == counts
+
+
+def test_parts_of_a_sum_have_the_same_weights_in_credit_and_value() -> None:
+    """A share of the objects beside their number: credits of both are parts of the value."""
+    batch = tiny_prior().sample(6, num_steps=5, seed=1)
+    reward = WeightedSum([LeftHalf(True), "object_count"], weights=[1.0, 0.05])
+    output = reward(batch, RewardContext())
+    torch.testing.assert_close(output.per_object.sum(dim=1), output.value)
+    both = WeightedSum([LeftHalf(True), LeftHalf(True)])(batch, RewardContext())
+    shares = both.per_object.sum(dim=1) / batch.is_free.sum(dim=1).clamp(min=1)
+    torch.testing.assert_close(shares, both.value)  # a mean of means: credits of objects are means over them

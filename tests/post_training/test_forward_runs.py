@@ -25,7 +25,7 @@ def forward_config(
         "batch_size": 6,
         "num_steps": 5,
         "algorithm": {"name": algorithm, **(algorithm_settings or {})},
-        "regularisation": {"weight": 1.0, "batch_size": 4, "bank_size": 24},
+        "regularisation": {"weight": 1.0, "batch_size": 6, "bank_size": 24},
         "guard": {"scenes": 8, "every": 2},
         "logger": {"checkpoint_every": 2, "progress": "none"},
         "optimizer": {"lr": 1e-3},
@@ -154,5 +154,5 @@ def test_siblings_share_the_first_steps_and_differ_after(tmp_path: Path) -> None
 
 
 def test_siblings_must_divide_the_batch(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match=r"algorithm\.siblings=4; take a multiple, such as 4"):
+    with pytest.raises(InvalidInputError, match=r"batch_size=6 is not a multiple of 4, the algorithm\.siblings=4"):
         post_train(forward_config(tmp_path, "nft", algorithm_settings={"siblings": 4}), prior=tiny_prior())

@@ -12,6 +12,7 @@ from agents.evaluation import tallest_stacks
 from agents.evaluation.metrics import count_wasserstein
 from agents.post_training import post_train
 from agents.post_training.config import GuardSettings
+from agents.post_training.forward_process import ForwardProcess
 from agents.post_training.guard import Guard
 from agents.post_training.guard_report import guard_sections, guard_verdict
 from agents.post_training.sample_check import beyond
@@ -191,3 +192,30 @@ def test_a_limit_on_stacks_needs_geometry(tmp_path: Path, monkeypatch: pytest.Mo
 def test_a_figure_that_the_base_prior_lacks_is_within_its_limit() -> None:
     """A run of an earlier version continues, although its start did not measure stacks."""
     assert beyond({"stack_distance": 3.0}, {}, {"stack_distance": 0.5}) == []
+
+
+@pytest.mark.slow
+def test_a_rollback_takes_every_part_of_the_algorithm_back(tmp_path: Path) -> None:
+    """The copy that learns the mean of own samples belongs to the policy that made them."""
+    keys = {"algorithm": {"name": "nft", "expectation_lr": 1e-2}, "guard.limit": 1e-6, "guard.action": "rollback"}
+    trainer = PostTrainer(small_config(tmp_path, **keys), prior=tiny_prior(process="mixed"))
+    trainer.run()
+    algorithm = trainer.learner.algorithm
+    assert isinstance(algorithm, ForwardProcess)
+    assert algorithm.copy is not None
+    base = tiny_prior(process="mixed").state_dict()
+    for prior in (trainer.prior, algorithm.sampler, algorithm.copy.prior):
+        assert all(torch.equal(base[name], tensor) for name, tensor in prior.state_dict().items())
+    assert not algorithm.copy.optimizer.state
+    trainer.close()
+
+
+@pytest.mark.slow
+def test_figures_of_the_base_prior_are_not_those_of_the_kept_one(tmp_path: Path) -> None:
+    prior = tiny_prior()
+    prior.card = {"measures": {"feasible_fraction": 0.8}, "limits": "None.", "license": "MIT"}
+    result = post_train(small_config(tmp_path, iterations=2), prior=prior)
+    assert result.metrics["guard"]["best_iteration"] > 0
+    card = ScenePrior.load(tmp_path).card
+    assert card["license"] == "MIT"
+    assert not {"measures", "limits"} & card.keys()

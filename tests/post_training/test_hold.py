@@ -168,8 +168,8 @@ def test_both_estimates_of_the_kl_agree_on_long_chains(process: str) -> None:
     def estimates(trained: ScenePrior) -> list[float]:
         policy, generator = DenoisingPolicy(trained, steps), Generator().manual_seed(0)
         with torch.no_grad():
-            terms = chain_kl(policy, base, rollout, 8, generator), forward_kl(trained, base, rollout, generator)
-            return [float(sum(each)) for each in terms]
+            both = chain_kl(policy, base, rollout, 8, generator), forward_kl(trained, base, rollout, generator)
+            return [float(sum(term for part in each for term in part)) for each in both]
 
     assert estimates(base) == [0.0, 0.0]
     chain, forward = estimates(prior)
@@ -255,3 +255,17 @@ def test_a_target_that_was_not_reached_at_the_end_does_not_count_as_held() -> No
     assert "was not held at the end: guard 1.2" in regularisation.verdict()
     regularisation.observe("guard", 1.06, iteration=10)  # 0.2 of the way beyond
     assert regularisation.verdict() == "hold=guard:1.05 was held: guard 1.06 at the last measurement."
+
+
+def test_a_rollback_does_not_count_as_a_fall_of_the_figure() -> None:
+    """The figure rises by 0.002 per iteration before and after the run returns to a checkpoint with 1.0."""
+    target, state = Target("guard", 1.05), HoldState()
+    for iteration in range(5, 105, 5):
+        state = adjust(state, target, 1 + 0.002 * iteration, iteration)
+    kept, forgotten = state.returned(1.0), state
+    for iteration in range(105, 125, 5):
+        measured = 1 + 0.002 * (iteration - 100)
+        kept, forgotten = (adjust(one, target, measured, iteration) for one in (kept, forgotten))
+    assert kept.factor == pytest.approx(state.factor, rel=0.2)
+    assert forgotten.factor < 0.5 * state.factor  # as if training had lowered the figure
+    assert state.returned(None).factor == state.factor

@@ -19,9 +19,11 @@ from agents.post_training import AWMLoss, DDPOSFLoss, DenoisingPolicy, NFTLoss, 
 from agents.post_training.inpaint_deck import InpaintDeck, real_parts, sampled_parts
 from agents.post_training.inpaint_settings import InpaintSettings
 from agents.post_training.rollouts import Rollout, collect
+from agents.post_training.run_files import CHECKPOINT_NAME, load_resumable
 from agents.post_training.trainer import PostTrainer
 from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
+from agents.utils.checkpoints import save_checkpoint
 from agents.utils.seeds import derived_seed
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.envs.scoring import RewardScorer
@@ -276,7 +278,7 @@ class TestDeck:
 def config(output: Path, **keys: Any) -> PostTrainConfig:
     small: dict[str, Any] = {
         "output": str(output), "iterations": 2, "batch_size": 6, "num_steps": STEPS, "reward": "object_count",
-        "regularisation": {"bank_size": 20, "batch_size": 4}, "guard": {"scenes": 8, "samples": 0},
+        "regularisation": {"bank_size": 20, "batch_size": 6}, "guard": {"scenes": 8, "samples": 0},
         "logger": {"progress": "none", "report_scenes": 0}, "inpaint": {"mask": "random"},
     }  # fmt: skip
     return PostTrainConfig(**{**small, **keys})
@@ -326,3 +328,34 @@ def test_unknown_masks_are_refused_before_anything_is_written(tmp_path: Path, pr
         config(tmp_path, inpaint={"mask": 3})
     with pytest.raises(UnknownNameError, match="samples"):
         config(tmp_path, inpaint={"mask": "random", "scenes": "sampled"})
+
+
+@pytest.mark.parametrize(
+    ("before", "now"),
+    [
+        ({"name": "random", "share": 0.3}, None),
+        ({"name": "random", "share": 0.3}, "random"),
+        ({"name": "random", "share": 0.3}, {"name": "random"}),
+        (None, {"name": "random", "share": 0.3}),
+    ],
+)
+def test_a_run_is_not_resumed_with_another_mask(tmp_path: Path, before: Any, now: Any) -> None:
+    save_checkpoint(tmp_path / CHECKPOINT_NAME, {"config": config(tmp_path, inpaint={"mask": before}).plain()})
+    assert load_resumable(tmp_path, config(tmp_path, inpaint={"mask": before})) is not None
+    with pytest.raises(InvalidInputError, match=r"inpaint\.mask was"):
+        load_resumable(tmp_path, config(tmp_path, inpaint={"mask": now}))
+
+
+def test_entries_are_counted_without_a_whole_chain(prior: ScenePrior, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, calls = DenoisingPolicy(prior, 5), []
+    transition = type(prior).transition
+
+    def counted(self: ScenePrior, *arguments: Any, **keys: Any) -> Any:
+        calls.append(1)
+        return transition(self, *arguments, **keys)
+
+    monkeypatch.setattr(type(prior), "transition", counted)
+    observed = torch.zeros(2, 34, 2, dtype=torch.bool)
+    entries = [policy.unobserved_entries(observed) for _ in range(3)]
+    assert len(calls) == 1
+    assert entries[0].tolist() == entries[2].tolist() == [policy.random_entries(34)] * 2

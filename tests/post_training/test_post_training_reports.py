@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 from rich.console import Console
 
-from agents.post_training import post_train_and_compare
+from agents.post_training import learned_rewards, post_train_and_compare
 from agents.post_training.curves import draw_curve
 from agents.post_training.demo import run_demo
 from agents.post_training.doctor import diagnose
@@ -134,3 +134,25 @@ def test_the_band_of_a_share_ends_at_one(tmp_path: Path, monkeypatch: pytest.Mon
     draw_curve(history, tmp_path / "curve.png", reward_name="share", highest=1.0)
     draw_curve(history, tmp_path / "curve.png", reward_name="sum")
     assert bands == [([0.25, 0.25], [1.0, 0.75]), ([0.25, 0.25], [1.25, 0.75])]
+
+
+@pytest.mark.slow
+def test_a_reward_that_learns_is_measured_as_the_run_left_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pybullet")
+    monkeypatch.setattr(learned_rewards, "FIRST_STEPS", 5)
+    config = small_config(tmp_path, iterations=1, reward="discriminator", algorithm={"name": "nft"})
+    metrics = post_train_and_compare(config, scenes=3, num_steps=4, prior=tiny_prior(process="mixed", slots=6))
+    assert metrics["before"]["reward"] != 0.5  # that of a network that has seen no samples
+    assert metrics["after"]["reward"] != 0.5
+
+
+def test_doctor_says_when_no_advantage_differs(tmp_path: Path) -> None:
+    keys = {"algorithm": {"name": "nft", "category_credit": "none"}, "reward": "object_count"}
+    report = diagnose(small_config(tmp_path / "run", **keys), prior=tiny_prior(process="mixed"))
+    assert report.reward_std > 0
+    assert any("no advantage does" in line for line in report.advice)
+
+
+def test_doctor_asks_nothing_of_the_reward_of_an_algorithm_that_does_not_use_it(tmp_path: Path) -> None:
+    report = diagnose(small_config(tmp_path / "run", algorithm={"name": "neon"}), prior=tiny_prior(process="mixed"))
+    assert not any("nothing to learn" in line for line in report.advice)

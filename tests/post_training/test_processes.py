@@ -25,7 +25,7 @@ from tests.helpers.small_runs import small_config
 
 TWO = ["A scene with two cups.", "A scene with 9 objects."]
 CASES: dict[str, tuple[str, torch.dtype, dict[str, Any]]] = {
-    "ddpo_sf": ("continuous", torch.float64, {}),
+    "ddpo_sf": ("continuous", torch.float64, {"regularisation.kl": 1.0, "algorithm": {"gradient_steps": 2}}),
     "ddpo_is": ("mixed", torch.float64, {"algorithm": {"updates": 2, "scenes_per_prompt": 3}, "prompt": TWO}),
     "nft": (
         "mixed",

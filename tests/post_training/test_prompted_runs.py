@@ -229,3 +229,17 @@ def test_prompts_that_cannot_be_followed_are_refused(tmp_path: Path) -> None:
         small_config(tmp_path, scenes_per_prompt=1)
     with pytest.raises(InvalidInputError, match="asks for 200 objects"):
         post_train(small_config(tmp_path, prompt="A scene with 200 objects."), prior=reader())
+
+
+def test_the_guard_asks_for_no_more_objects_than_there_are_slots(tmp_path: Path) -> None:
+    keys = {"prompt": "A scene with 3 objects.", "slots": 8, "guard.scenes": 20, "guard.samples": 20, "bank_size": 40}
+    trainer = PostTrainer(small_config(tmp_path, **keys), prior=reader())
+    trainer.prepare()
+    assert trainer.guard.samples is not None
+    prompts = trainer.guard.samples.prompts
+    assert prompts is not None
+    assert len(prompts) == 20
+    assert "" in prompts  # in place of those of fuller scenes
+    assert any(prompts)
+    trainer.guard.start(trainer.prior)
+    trainer.close()

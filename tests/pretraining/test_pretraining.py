@@ -339,3 +339,11 @@ def test_one_prior_is_trained_on_several_scene_types(tmp_path: Path) -> None:
     assert len(prompts) == 150
     trained = Pretrainer(config, data, heldout if len(heldout) else scenes[:4], prior).run()
     assert trained.sample(2, prompt="A scene with 9 objects.", num_steps=2).tensor.shape[1] == 61
+
+
+def test_averages_of_a_checkpoint_go_to_the_device_of_the_present_ones() -> None:
+    saved = WeightAverage(torch.nn.Linear(2, 1), decay=0.5)
+    average = WeightAverage(torch.nn.Linear(2, 1, device="meta"), decay=0.5)
+    average.restore(saved.tensors, updates=3)
+    assert {tensor.device.type for tensor in average.tensors.values()} == {"meta"}
+    assert average.updates == 3
