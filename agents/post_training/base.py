@@ -67,7 +67,7 @@ class Algorithm(ABC, Generic[Credit]):
         return real
 
     def kl(self, rollout: Rollout, base: ScenePrior, generator: Generator) -> Parts:
-        """Terms, in parts of the batch, whose sum is the KL divergence of the prior in training from ``base``, nats per random variable."""
+        """Terms whose sum is the KL divergence of the prior in training from ``base``, nats per random variable."""
         prior = cast(ScenePrior, self.policy.prior)
         return forward_kl(prior, base, rollout, generator, self.policy.chunk)
 
