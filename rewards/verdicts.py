@@ -12,6 +12,7 @@ from torch import Tensor
 from scene_envs.scene import SceneBatch
 
 if TYPE_CHECKING:
+    from scene_envs.assets import Asset
     from scene_envs.physics import FeasibilityResult, PhysicsPool
 
 _MOST = 4096
@@ -20,6 +21,8 @@ _MOST = 4096
 _Verdict = tuple[Tensor, Tensor, Tensor, Tensor]
 """feasible, depth, displacement, rotation of one scene, (N,) each."""
 _known: OrderedDict[bytes, _Verdict] = OrderedDict()
+_assets: dict[tuple[int, ...], tuple[Asset, ...]] = {}
+"""Assets whose ids are in keys; while they are held, no other object has such an id."""
 
 
 def verdicts(batch: SceneBatch, limits: dict[str, float], pool: PhysicsPool | None) -> FeasibilityResult:
@@ -61,10 +64,14 @@ def verdicts(batch: SceneBatch, limits: dict[str, float], pool: PhysicsPool | No
 def forget_verdicts() -> None:
     """Let every scene be judged anew."""
     _known.clear()
+    _assets.clear()
 
 
 def _keys(batch: SceneBatch, limits: dict[str, float]) -> list[bytes]:
     """One digest per scene of all that its verdict depends on."""
-    common = repr((batch.scene_type, sorted(limits.items()), tuple(batch.tensor.shape[1:]))).encode()
+    assets = batch.scene_type.library.assets  # other objects once a file of a model has changed
+    models = tuple(map(id, assets))
+    _assets[models] = assets
+    common = repr((batch.scene_type, models, sorted(limits.items()), tuple(batch.tensor.shape[1:]))).encode()
     scenes = batch.tensor.detach().cpu().contiguous().numpy()
     return [hashlib.blake2b(scene.tobytes() + common, digest_size=16).digest() for scene in scenes]

@@ -27,7 +27,7 @@ def choose_measures(measures: str | Iterable[str], *, project: bool = True) -> l
     if not isinstance(measures, str | Iterable):
         raise InvalidInputError(f"measures={measures!r} is no list of names; known: all, {', '.join(MEASURE_NAMES)}")
     names = [name.strip() for name in measures.split(",")] if isinstance(measures, str) else [*map(str, measures)]
-    if names == ["all"]:
+    if "all" in names and all(name == "all" or name in MEASURE_NAMES for name in names):
         return [name for name in MEASURE_NAMES if project or name != "ready"]
     if not names:
         raise InvalidInputError(f"measures is empty; give all, or some of {', '.join(MEASURE_NAMES)}")

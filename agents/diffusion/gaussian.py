@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -219,4 +221,10 @@ def lognormal_timesteps(schedule: NoiseSchedule, mean: float, std: float) -> Ten
     log_sigma = schedule.noise_to_signal[1:].log()
     width = torch.gradient(log_sigma)[0]
     weight = torch.exp(-0.5 * ((log_sigma - mean) / std) ** 2) * width
-    return torch.cat([torch.zeros(1, dtype=weight.dtype), weight / weight.sum()])
+    total = float(weight.sum())
+    if not 0 < total < math.inf:
+        raise InvalidInputError(
+            f"noise levels with ln(noise-to-signal) of mean {mean:g} and standard deviation {std:g} lie outside the "
+            f"schedule, whose levels are {float(log_sigma.min()):.3g} to {float(log_sigma.max()):.3g}"
+        )
+    return torch.cat([torch.zeros(1, dtype=weight.dtype), weight / total])

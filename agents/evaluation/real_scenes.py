@@ -79,7 +79,7 @@ class RealScenes:
         ]
         slots = max(part.tensor.shape[1] for group in parts for part in group)
         reference, floor, train = (
-            SceneBatch.concatenate([part.with_slots(slots) for part in group]) for group in zip(*parts, strict=True)
+            _in_turn([part.with_slots(slots) for part in group]) for group in zip(*parts, strict=True)
         )
         return cls(reference, floor, train)
 
@@ -108,6 +108,13 @@ def _split(
     order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))[:training]
     batches = (held[:half], held[half : 2 * half], train[order])
     return tuple(SceneBatch(tensor, scene_type) for tensor in batches)  # type: ignore[return-value]
+
+
+def _in_turn(parts: list[SceneBatch]) -> SceneBatch:
+    """The scenes of all parts, in turn, so that the first ones are of every part."""
+    numbers = torch.cat([torch.arange(len(part)) for part in parts])
+    whole = SceneBatch.concatenate(parts)
+    return whole[numbers.argsort(stable=True)]
 
 
 def _read(folder: str, scene_type: SceneType) -> Tensor:

@@ -136,6 +136,7 @@ class ProcessSettings:
         one_of(self, "empty_slots", ("attended", "dropped"), "treatment of empty slots")
         one_of(self, "unmasking", ("systematic", "even", "independent"))
         positive(self, "noise_floor", "noise_ceiling")
+        finite(self, "noise_ceiling")
         at_least(self, 0, "denoised_clip")
         if not self.noise_floor < self.noise_ceiling:
             raise InvalidInputError(

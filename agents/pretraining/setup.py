@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -43,18 +44,41 @@ def prepare(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
         prompts = describe_all(sample, np.random.default_rng(config.seed), count=PROMPTS_PER_SCENE) if reads else []
         prior = build_prior(config, sample.tensor, fixed_normalizer(grammar), prompts)
         if config.heldout:
-            held_out = SceneBatch(SceneDataset.load(config.heldout).tensor[:2048], prior.scene_type)
+            held_out = SceneBatch(_heldout(config.heldout, prior.scene_type.name).tensor[:2048], prior.scene_type)
         else:
             held_out = grammar.sample(np.random.default_rng([config.seed, _SAMPLE, 1]), _HELD_OUT)
         return prior, GrammarStream(grammar, prior), prior.encode(held_out)
     if "," in config.data:
         return _prepare_union(config)
     dataset = SceneDataset.load(config.data)
+    name = dataset.scene_type.name
     if older is not None:
-        config = replace(config, scene=dataset.scene_type.name)
+        config = replace(config, scene=name)
+    elif name != _name_of(config.scene):
+        raise InvalidInputError(
+            f"data={config.data!r} holds scenes of {name!r}, and scene={_name_of(config.scene)}; give scene={name}"
+        )
+    if len(dataset) < 2:
+        raise InvalidInputError(
+            f"data={config.data!r} has {len(dataset)} scenes; one is held out, so give at least two"
+        )
     if config.heldout:
-        return prepare_from(config, dataset, SceneDataset.load(config.heldout))
+        return prepare_from(config, dataset, _heldout(config.heldout, name))
     return prepare_from(config, *split_heldout(dataset))
+
+
+def _heldout(folder: str, scene_type: str) -> SceneDataset:
+    """The dataset of held-out scenes, which must be of the scene type."""
+    found = SceneDataset.load(folder)
+    if found.scene_type.name != scene_type:
+        raise InvalidInputError(
+            f"heldout={folder!r} holds scenes of {found.scene_type.name!r}, the training scenes are of {scene_type!r}"
+        )
+    return found
+
+
+def _name_of(scene: Any) -> str:
+    return str(getattr(scene, "name", scene))
 
 
 def _older(config: PretrainConfig) -> PriorFacts:

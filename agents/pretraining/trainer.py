@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
@@ -15,6 +15,7 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
+from agents.configuration.prior_names import short_name
 from agents.configuration.tree import config_text, dotted
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.data import TrainingData
@@ -37,6 +38,8 @@ logger = logging.getLogger(__name__)
 
 _MAY_DIFFER = ("iterations", "output", "logger", "device", "recipe")
 """Keys that may change between a run and its continuation."""
+_RESIDUAL = 512
+"""Held-out scenes on which the error that is left is measured."""
 _PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 
@@ -85,6 +88,7 @@ class Pretrainer:
         chosen = config.logger.name if self.processes.is_first else "csv"
         self.log = TrainingLog(self.directory, make_logger(chosen, self.directory))
         self.evaluations: list[dict[str, float]] = []
+        self._origin = _origin(config.prior, prior.card)
 
     @property
     def checkpoint_path(self) -> Path:
@@ -109,7 +113,9 @@ class Pretrainer:
         if self.processes.is_first:
             logger.info("measuring the error that is left at 40 noise levels, for the samplers")
         with self._averaged():
-            self.prior.fit_residual(self.heldout_data[:512].to(self.config.device))
+            count = len(self.heldout_data)  # of a union the scenes of each type stand together
+            rows = torch.linspace(0, count - 1, min(_RESIDUAL, count)).long()
+            self.prior.fit_residual(self.heldout_data[rows].to(self.config.device))
         self.prior.denoiser.precision = torch.float32
         return self.save_prior()
 
@@ -147,9 +153,10 @@ class Pretrainer:
                 with self._averaged():
                     draw_samples(self.prior.eval(), self.directory, self.step, config.seed)
                 self.prior.train()
-            if self.step % config.logger.checkpoint_every == 0 or last or end.pending:
+            ending = self.processes.any(end.pending)
+            if self.step % config.logger.checkpoint_every == 0 or last or ending:
                 self._save()
-            end()
+            end(ending)
 
     def _update(self) -> tuple[float, float]:
         config = self.config
@@ -163,17 +170,23 @@ class Pretrainer:
             total += loss.detach()
         value = float(self.processes.sum(total))
         if not math.isfinite(value):
-            raise TrainingError(
-                f"the pretraining loss became {value} at step {self.step}; the last good state is "
-                f"{str(self.checkpoint_path)!r}: lower optimizer.lr (now {config.optimizer.lr}) and run again"
-            )
+            raise self._not_finite("loss", value)
         self.processes.sum_gradients(self.network.parameters())
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), config.optimizer.clip)
+        if not math.isfinite(float(norm)):
+            raise self._not_finite("gradient norm", float(norm))
         self.optimizer.step()
         self.schedule.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.average.update(self.network)
         return value, float(norm)
+
+    def _not_finite(self, what: str, value: float) -> TrainingError:
+        kept = f"; the last good state is {str(self.checkpoint_path)!r}" if self.checkpoint_path.exists() else ""
+        return TrainingError(
+            f"the {what} became {value} at step {self.step}, and the update was not applied{kept}. Lower optimizer.lr "
+            f"(now {self.config.optimizer.lr}) and give another output"
+        )
 
     def _part_loss(self, count: int, generator: Generator) -> Tensor:
         """The loss of ``count`` scenes, each with one of its prompts, or without a prompt if it is withheld."""
@@ -217,6 +230,7 @@ class Pretrainer:
                 "step": self.step,
                 "seconds": self.seconds,
                 "evaluations": self.evaluations,
+                "data": self._data_facts(),
             }
             save_checkpoint(self.checkpoint_path, state)
         self.save_prior()
@@ -228,6 +242,14 @@ class Pretrainer:
             raise InvalidInputError(
                 f"{str(self.directory)!r} holds a run that was started with {before}; give the same keys again to "
                 "resume it, or another output"
+            )
+        facts, known = self._data_facts(), state.get("data")
+        if known is not None and not (
+            known["scenes"] == facts["scenes"] and torch.allclose(known["mean"], facts["mean"], rtol=1e-3, atol=1e-4)
+        ):
+            raise InvalidInputError(
+                f"the run in {str(self.directory)!r} was started with other scenes than data={self.config.data!r} holds "
+                "now; give the same dataset to resume it, or another output"
             )
         check_tensors(self.network, state["network"], self.checkpoint_path)
         try:
@@ -247,6 +269,12 @@ class Pretrainer:
         self.evaluations = state["evaluations"]
         logger.info("resumed at step %d", self.step)
 
+    def _data_facts(self) -> dict[str, Any]:
+        """Facts by which a resumed run knows its data: numbers of scenes, and the means of the held-out ones."""
+        heldout = self.heldout_data.double()
+        mean = torch.stack([heldout.mean(dim=(0, 1)), heldout.square().mean(dim=(0, 1))])
+        return {"scenes": [self.data.size or 0, len(heldout)], "mean": mean}
+
     def _started_with(self, state: dict[str, Any]) -> str:
         """Keys of the checkpoint's run with values other than in this run; empty if all are the same."""
         before, now = dotted(state["config"]), dotted(asdict(self.config))
@@ -261,6 +289,7 @@ class Pretrainer:
         """Write the prior with averaged weights to ``output/prior``, and return it."""
         with self._averaged():
             self.prior.card = {
+                **self._origin,
                 "trained_steps": self.step,
                 "batch_size": self.config.batch_size,
                 "training_scenes": self.data.size or self.step * self.config.batch_size,
@@ -271,6 +300,14 @@ class Pretrainer:
                 self.prior.save(self.directory / "prior")
         self.processes.wait()
         return ScenePrior.load(self.directory)
+
+
+def _origin(base: str, card: Mapping[str, Any]) -> dict[str, Any]:
+    """Entries of a card that stay true when the prior ``base`` is trained further; none for a fresh prior."""
+    if not base:
+        return {}
+    kept = {key: card[key] for key in ("imported_from", "license", "post_training") if key in card}
+    return {**kept, "base": {"name": short_name(base), "trained_steps": card.get("trained_steps")}}
 
 
 def pretrain(config: PretrainConfig) -> dict[str, Any]:

@@ -246,6 +246,8 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
         """
         if count < 1:
             raise InvalidInputError(f"count={count}: ask for at least one scene")
+        if batch_size < 1:
+            raise InvalidInputError(f"batch_size={batch_size}: at least one scene must be denoised at a time")
         wide = self.config.slots if slots is None else slots
         prompts = check_prompts(
             prompt, guidance, count, scene_type=self.scene_type, slots=wide, conditional=self.conditional,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
@@ -57,7 +58,7 @@ def package_prior(
             that of the source.
 
     Raises:
-        InvalidInputError: no such evaluation, ``physics_guidance`` outside 0 to 1, a weight that half precision cannot
+        InvalidInputError: no such evaluation, one of another prior, ``physics_guidance`` outside 0 to 1, a weight that half precision cannot
             hold, or a folder that holds anything but a packaged prior.
         CorruptFileError: the evaluation is not a JSON mapping, as the command writes it.
     """
@@ -67,6 +68,12 @@ def package_prior(
 
     measures = {} if evaluation is None else read_measures(evaluation)
     prior = ScenePrior.load(source)
+    measured = None if evaluation is None else measured_digest(evaluation)
+    if measured is not None and measured != prior_digest(prior):
+        raise InvalidInputError(
+            f"evaluation={str(evaluation)!r} has figures of other weights than those of the prior (digest {measured}, "
+            f"and {prior_digest(prior)}); run scene-envs evaluate on this prior"
+        )
     config = prior.config
     if physics_guidance is not None:
         prior.with_physics_guidance(physics_guidance)
@@ -105,6 +112,22 @@ def _check_folder(folder: Path) -> None:
     )
 
 
+def prior_digest(prior: ScenePrior) -> str:
+    """Digest of the configuration and the weights of a prior, 16 characters; the strength of guidance is no part."""
+    state = {key: value for key, value in prior.config_state().items() if key != "physics_guidance"}
+    digest = hashlib.sha256(json.dumps(state, sort_keys=True).encode())
+    for name, tensor in sorted(prior.weights().items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
+def measured_digest(path: str | os.PathLike[str]) -> str | None:
+    """The digest of the prior that an evaluation measured; None for figures without one."""
+    identity = (_read_json(_metrics_file(path)).get("evaluation") or {}).get("identity") or {}
+    return identity.get("digest")
+
+
 def read_measures(path: str | os.PathLike[str]) -> dict[str, float]:
     """The figures of ``scene-envs evaluate`` that are numbers.
 
@@ -115,7 +138,7 @@ def read_measures(path: str | os.PathLike[str]) -> dict[str, float]:
         InvalidInputError: no such file, or no figure in it.
         CorruptFileError: not JSON.
     """
-    file = Path(path) / "metrics.json" if Path(path).is_dir() else Path(path)
+    file = _metrics_file(path)
     content = _read_json(file)
     figures = {
         name: value for name, value in content.items() if isinstance(value, int | float) and not isinstance(value, bool)
@@ -215,6 +238,7 @@ def _training(card: Mapping[str, Any]) -> str:
         f"{card['trained_steps']:,} steps" + (f" of {card['batch_size']} scenes" if card.get("batch_size") else "")
         if "trained_steps" in card
         else "",
+        _further(card.get("base") or {}),
         _OPTIMIZERS.get(run.get("optimizer", ""), ""),
         f"peak learning rate {run['learning_rate']:g}, EMA {run['ema']:g}" if "learning_rate" in run else "",
         f"{card['seconds'] / 60:.0f} minutes" if card.get("seconds") else "",
@@ -223,6 +247,12 @@ def _training(card: Mapping[str, Any]) -> str:
         f"imported from {card['imported_from']}" if "imported_from" in card else "",
     ]
     return ", ".join(part.rstrip(".") for part in parts if part)
+
+
+def _further(base: Mapping[str, Any]) -> str:
+    """Base prior of a further pretraining."""
+    steps = f" ({base['trained_steps']:,} steps)" if base.get("trained_steps") else ""
+    return f"from `{base['name']}`{steps}" if base.get("name") else ""
 
 
 def _post_training(card: Mapping[str, Any]) -> str:
@@ -271,6 +301,10 @@ def _without_folders(state: dict[str, Any]) -> dict[str, Any]:
     if not text or not os.path.isabs(text.get("model", "")):
         return state
     return {**state, "prior": {**state["prior"], "text": {**text, "model": os.path.basename(text["model"])}}}
+
+
+def _metrics_file(path: str | os.PathLike[str]) -> Path:
+    return Path(path) / "metrics.json" if Path(path).is_dir() else Path(path)
 
 
 def _read_json(file: Path) -> dict[str, Any]:

@@ -178,6 +178,11 @@ def scene_type_of(info: DatasetInfo, name: str) -> SceneType:
 
 def _reorder(tensors: dict[str, Tensor], order: Tensor) -> None:
     """Move category c of the file to ``order[c]``; the mask token stays last."""
+    if order.sort().values.tolist() != list(range(len(order))):
+        raise InvalidInputError(
+            f"aliases: the categories of the file become {order.tolist()}; each asset of the scene type must have one "
+            "model path, and each model path its own asset"
+        )
     rows = torch.empty_like(order)
     rows[order] = torch.arange(len(order))
     tensors["category_in.weight"] = tensors["category_in.weight"][torch.cat([rows, torch.tensor([len(order)])])]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -81,6 +82,12 @@ def random_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Te
     return mask
 
 
+def check_count(mask: str, key: str, value: Any) -> None:
+    """Refuse a number of slots that is no whole number from 0 on; None stands for all."""
+    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 0):
+        raise InvalidInputError(f"mask={mask}: {key}={value!r} must be a whole number from 0 on")
+
+
 @dataclass(frozen=True)
 class EmptyMask:
     """Empty slots, and no object.
@@ -90,6 +97,9 @@ class EmptyMask:
     """
 
     count: int | None = None
+
+    def __post_init__(self) -> None:
+        check_count("empty", "count", self.count)
 
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
         """(N,) bool, True where a slot is regenerated."""
@@ -108,6 +118,9 @@ class LowestScoringMask:
     """
 
     count: int = 4
+
+    def __post_init__(self) -> None:
+        check_count("lowest_scoring", "count", self.count)
 
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
         """(N,) bool, True where a slot is regenerated."""
@@ -139,6 +152,7 @@ class RegionMask:
     def __post_init__(self) -> None:
         if len(self.low) != 3 or len(self.high) != 3 or any(a > b for a, b in zip(self.low, self.high, strict=True)):
             raise InvalidInputError(f"mask=region: low={self.low} and high={self.high} are no corners x, y, z of a box")
+        check_count("region", "empty", self.empty)
 
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
         """(N,) bool, True where a slot is regenerated."""
@@ -234,6 +248,9 @@ class CulpritsMask:
 
     at_least: int = 4
 
+    def __post_init__(self) -> None:
+        check_count("culprits", "at_least", self.at_least)
+
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
         """(N,) bool, True where a slot is regenerated.
 
@@ -267,6 +284,9 @@ class BalancedMask:
     """
 
     at_least: int = 4
+
+    def __post_init__(self) -> None:
+        check_count("balanced", "at_least", self.at_least)
 
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
         """(N,) bool, True where a slot is regenerated; arguments as for :class:`CulpritsMask`."""

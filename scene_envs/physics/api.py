@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -18,6 +20,18 @@ from scene_envs.physics.results import (
     SettleResult,
 )
 from scene_envs.scene import SceneBatch
+
+
+def check_numbers(duration: float, **limits: float) -> None:
+    """Refuse a duration that is not a positive number, and limits that are negative or NaN.
+
+    >>> check_numbers(0.1, max_rotation=float("inf"))
+    """
+    if not 0 < duration < math.inf:
+        raise InvalidInputError(f"duration={duration} must be a positive number of seconds")
+    for name, limit in limits.items():
+        if not limit >= 0:
+            raise InvalidInputError(f"{name}={limit} must be at least 0")
 
 
 def feasibility(
@@ -46,9 +60,11 @@ def feasibility(
         pool: worker processes; None computes in this process.
 
     Raises:
-        InvalidInputError: a pose is not finite, or a matrix is not a rotation; the message names its scene and slot.
+        InvalidInputError: a pose is not finite, or a matrix is not a rotation; the message names its scene and slot. A
+            limit is negative or NaN, or the duration is not a positive number.
         MissingDependencyError: pybullet is not installed.
     """
+    check_numbers(duration, max_penetration=max_penetration, max_displacement=max_displacement, max_rotation=max_rotation)
     options = {
         "max_penetration": max_penetration,
         "max_displacement": max_displacement,
@@ -112,6 +128,7 @@ def equilibrium(batch: SceneBatch, *, duration: float = 0.1, pool: PhysicsPool |
 
     Raises InvalidInputError and MissingDependencyError as :func:`feasibility` does.
     """
+    check_numbers(duration)
     rows = run_kernel("equilibrium", batch, {"duration": duration}, pool)
     return EquilibriumResult(stack(rows, batch, "displacement"), stack(rows, batch, "rotation"), valid_rows(rows))
 
@@ -133,11 +150,12 @@ def settle(
         iterations: of the contact solver per step; more of them leave smaller overlaps.
         pool: worker processes; None computes in this process.
 
-    Raises InvalidInputError, also for fewer than one iteration, and MissingDependencyError as :func:`feasibility`
+    Raises InvalidInputError, also for fewer than one iteration or a duration that is not positive, and MissingDependencyError as :func:`feasibility`
     does.
     """
     if iterations < 1:
         raise InvalidInputError(f"iterations={iterations} must be at least 1")
+    check_numbers(duration)
     rows = run_kernel("settle", batch, {"duration": duration, "iterations": iterations}, pool)
     settled, displacement, rotation = poses_after(rows, batch)
     finished = stack(rows, batch, "finished", torch.bool, shape=())

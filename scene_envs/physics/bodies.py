@@ -136,6 +136,7 @@ class BodyPool:
 
     def _build(self, sizes: Mapping[BodyKey, int]) -> None:
         bullet, client = self.bullet, self.client
+        self.clear()  # an interrupt below must leave no ids of bodies that are gone
         bullet.resetSimulation(flags=bullet.RESET_USE_SIMPLE_BROADPHASE, physicsClientId=client)
         bullet.setPhysicsEngineParameter(
             numSubSteps=0,
@@ -149,16 +150,18 @@ class BodyPool:
         )
         # A shared small visual: without one PyBullet would read the collision mesh again for every body.
         visual = bullet.createVisualShape(bullet.GEOM_BOX, halfExtents=(1e-3, 1e-3, 1e-3), physicsClientId=client)
-        self._bodies, self._parking = {}, {}
+        bodies: dict[BodyKey, list[int]] = {}
+        self._parking = {}
         with tempfile.TemporaryDirectory() as folder:
             for key in sorted(sizes):  # the same order in every process, whatever was asked for first
                 shape = self._shape(key, Path(folder))
-                self._bodies[key] = []
+                bodies[key] = []
                 for _ in range(sizes[key]):
                     place = (0.0, 0.0, _PARKING + _PARKING_STEP * len(self._parking))
                     body = self._body(key[0], shape, visual, place)
                     self._parking[body] = place
-                    self._bodies[key].append(body)
+                    bodies[key].append(body)
+        self._bodies = bodies
 
     def _shape(self, key: BodyKey, folder: Path) -> int:
         """Collision shape of an asset: a compound of its convex parts, about the centre of mass, from a file."""

@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
+from scene_envs.assets import Asset
 from scene_envs.errors import InvalidInputError, PhysicsError, SceneEnvsError
 from scene_envs.physics.kernels import KERNELS, Chunk
 from scene_envs.scene_types import SceneType
@@ -74,6 +75,11 @@ class _Worker:
         return self.process.pid
 
     @property
+    def is_alive(self) -> bool:
+        """Whether the process runs."""
+        return self.process.poll() is None
+
+    @property
     def end(self) -> str:
         """How the process ended."""
         return f"exit status {self.process.returncode}"
@@ -111,7 +117,7 @@ class PhysicsPool:
         self.workers = workers
         self.timeout = timeout
         self._live: list[Any] = []  # of _Worker, or of what a subclass starts
-        self._scene_types: dict[SceneType, int] = {}
+        self._scene_types: dict[tuple[SceneType, tuple[int, ...]], tuple[int, tuple[Asset, ...]]] = {}
         self._lock = threading.Lock()
         self._closed = False
         self._failed_starts = 0
@@ -176,6 +182,9 @@ class PhysicsPool:
     def _run_all(
         self, kernel: str, tasks: deque[_Task], options: dict[str, Any], results: list[dict[str, Any] | None]
     ) -> None:
+        for worker in [w for w in self._live if w.task is None and not w.is_alive]:  # ended between two calls
+            self._live.remove(worker)
+            worker.stop()
         while tasks or any(worker.task for worker in self._live):
             while len(self._live) < min(self.workers, len(tasks) + sum(w.task is not None for w in self._live)):
                 self._live.append(self._start())
@@ -187,7 +196,9 @@ class PhysicsPool:
     def _next(self, worker: Any, tasks: deque[_Task], kernel: str, options: dict[str, Any]) -> None:
         """Give an idle worker the scene type it lacks, or its next task."""
         scene_type = tasks[0].chunk.scene_type
-        key = self._scene_types.setdefault(scene_type, len(self._scene_types))
+        own = scene_type.library.assets  # other objects once a file of a model has changed
+        entry = (scene_type, tuple(map(id, own)))
+        key, _ = self._scene_types.setdefault(entry, (len(self._scene_types), own))
         message: tuple[Any, ...]
         if key not in worker.known:
             assets = tuple(dataclasses.replace(asset, visual=_NO_MESH) for asset in scene_type.library)

@@ -85,6 +85,7 @@ class _RayWorker:
     """One actor and the reference to its next reply."""
 
     end = "an actor of Ray"
+    is_alive = True  # an actor that ended is noticed by :meth:`receive`
 
     def __init__(self, ray: Any) -> None:
         self._ray = ray

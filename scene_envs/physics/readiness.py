@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from scene_envs.errors import InvalidInputError
-from scene_envs.physics.api import project
+from scene_envs.physics.api import check_numbers, project
 from scene_envs.physics.batches import poses_after, run_kernel, spent, stack, valid_rows
 from scene_envs.physics.motion import CONVERGED, ITERATIONS
 from scene_envs.physics.pool import PhysicsPool
@@ -69,6 +69,7 @@ def make_ready(
     """
     if rounds < 1:
         raise InvalidInputError(f"rounds={rounds} must be at least 1: each projects and settles once")
+    check_numbers(duration)
     units = stack(run_kernel("units", batch, {}, pool), batch, "units", torch.float64, shape=())
     reserve = (1.0 - _ROUNDS_SHARE) * units
     units = units - reserve

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,7 +45,8 @@ class SolverSettings:
 class World:
     """PyBullet for one asset library; the motion of a scene depends on that scene alone, bit for bit.
 
-    Bodies are sorted the same way whatever the slot order, and never sleep.
+    Bodies are sorted, placed and parked in the same order whatever the slot order, and never sleep. Threads take turns. A
+    call that is interrupted leaves nothing behind.
 
     Args:
         library: geometry of the assets.
@@ -56,6 +58,7 @@ class World:
     def __init__(self, library: LibraryGeometry) -> None:
         self._library = library
         self._pool = BodyPool(library)
+        self._lock = threading.Lock()
 
     def simulate(
         self, objects: Objects, fine: Mask, group: Index, duration: float, settings: SolverSettings, budget: Budget
@@ -76,6 +79,16 @@ class World:
             (n,) left before the end: those at rest, or all when the budget was spent. Objects that Bullet lost to a
             numerical failure come back as NaN.
         """
+        with self._lock:
+            try:
+                return self._simulate(objects, fine, group, duration, settings, budget)
+            except BaseException:  # an interrupt too: bodies that are not parked would meet those of later scenes
+                self._pool.clear()
+                raise
+
+    def _simulate(
+        self, objects: Objects, fine: Mask, group: Index, duration: float, settings: SolverSettings, budget: Budget
+    ) -> tuple[Array, Array, Array, Mask]:
         bullet, client = self._pool.bullet, self._pool.client
         category, fixed, count = objects.category, objects.fixed, len(objects)
         axes = np.array([self._pool.principal(c)[1] for c in category.tolist()])
@@ -115,13 +128,14 @@ class World:
                 bullet.stepSimulation(physicsClientId=client)
             done += ahead
             budget.spend(ahead * sum(map(len, running.values())) * settings.iterations / _USUAL_ITERATIONS)
+            leaving = np.zeros(count, dtype=bool)
             for label, rows in list(running.items()):
                 if done < steps and (budget.is_spent or self._is_still(bodies[rows], duration)):
-                    self._leave(bodies, category, rows, end_position, end_quaternion)
-                    left[rows] = True
+                    leaving[rows] = True
                     del running[label]
-        for rows in (np.flatnonzero(fixed), *running.values()):
-            self._leave(bodies, category, rows, end_position, end_quaternion)
+            self._leave(bodies, category, order[leaving[order]], end_position, end_quaternion)
+            left |= leaving
+        self._leave(bodies, category, order[~left[order]], end_position, end_quaternion)
 
         end_rotation = rigid.matrices(end_quaternion)
         new_rotation = rigid.times(end_rotation, axes.swapaxes(-1, -2))

@@ -29,7 +29,9 @@ class CompleteConfig(InpaintingConfig):
 def run(settings: CompleteConfig, run: Run) -> None:
     """Fill the empty slots."""
     prior, batch = load_prior_and_scenes("complete", settings)
-    filled = prior.complete(batch, slots=settings.slots, fill=settings.fill, **settings.sampling())
+    filled = settings.in_parts(
+        batch, lambda part, keys: prior.complete(part, slots=settings.slots, fill=settings.fill, **keys)
+    )
     added = float((filled.counts - batch.counts).double().mean())
     run.say(f"{len(batch)} scenes, {added:.1f} objects added on average")
-    save_scenes(batch, filled.to("cpu"), settings.pictures, run, {"added": added})
+    save_scenes(batch, filled, settings.pictures, run, {"added": added})

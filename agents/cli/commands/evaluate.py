@@ -125,9 +125,15 @@ def run(settings: EvaluateConfig, run: Run) -> None:
         training=settings.training_scenes,
         seed=settings.seed,
     )
+    if len(real.floor) < settings.count:
+        results.note(
+            f"real scenes: {len(real.floor)} in each of the two sets, samples: {settings.count}; distances and "
+            "divergences are larger with fewer scenes, so compare them at equal numbers"
+        )
     samples = results.scenes(_SAMPLES, lambda: _sample(prior, settings, None))
     _draw(samples, settings.pictures, run)
-    optional = settings.measures in ("all", ["all"])
+    asked = settings.measures.split(",") if isinstance(settings.measures, str) else settings.measures
+    optional = "all" in [str(name).strip() for name in asked]
     with PhysicsPool(workers=settings.workers) as pool:
         inputs = EvaluationInputs(
             samples,
@@ -195,6 +201,7 @@ class _Results:
     def __init__(self, run: Run, identity: dict[str, Any], groups: dict[str, dict[str, float]]) -> None:
         self.run_, self.identity, self.groups = run, identity, groups
         self.skipped: dict[str, str] = {}
+        self.notes: list[str] = []
         keys: tuple[str, ...] = ("num_steps", "physics_guidance")
         self._sampling = {key: float(identity[key]) for key in keys if key in identity}
 
@@ -211,9 +218,13 @@ class _Results:
         if known and not changed:
             return cls(run, identity, groups)
         stale = [_PROMPTED]
-        if known and changed <= _OF_PROMPTS:
-            if groups.pop("prompts", None) is not None:
-                run.say(f"{path} has other {' and '.join(sorted(changed))}: measuring the prompts anew")
+        if known and changed <= _OF_PROMPTS | {"fid_weights"}:
+            asked = sorted(changed & _OF_PROMPTS)
+            if asked and groups.pop("prompts", None) is not None:
+                run.say(f"{path} has other {' and '.join(asked)}: measuring the prompts anew")
+            stale = [_PROMPTED] if changed & _OF_PROMPTS else []
+            if "fid_weights" in changed:
+                groups.pop("fid", None)
         elif known and changed != {"digest"}:
             told = "; ".join(
                 f"{key} was {known.get(key)!r}, is {identity.get(key)!r}" for key in sorted(changed - {"digest"})
@@ -247,6 +258,11 @@ class _Results:
         self.groups[name] = figures
         self.write()
 
+    def note(self, text: str) -> None:
+        """Say something in the log and under the table."""
+        self.notes.append(text)
+        self.run_.log(text)
+
     def skip(self, name: str, reason: str) -> None:
         """Keep the reason why a group was not measured."""
         self.skipped[name] = reason
@@ -266,23 +282,31 @@ class _Results:
         measured = {k: v for name in groups for k, v in self.groups.get(name, {}).items() if v is not None}
         figures = {**self._sampling, **measured}
         notes = [f"- {name} not measured: {reason}" for name, reason in self.skipped.items()]
+        notes += [f"- {text}" for text in self.notes]
         return "\n".join([figure_table(figures), *(["", *notes] if notes else [])])
 
 
 def _identity(settings: EvaluateConfig, prior: ScenePrior) -> dict[str, Any]:
     """The keys that figures depend on, and a digest of the configuration and the weights of the prior."""
+    from agents.priors.card import prior_digest
     from agents.priors.guidance import physics_strength
 
-    state = {key: value for key, value in prior.config_state().items() if key != "physics_guidance"}
-    digest = hashlib.sha256(json.dumps(state, sort_keys=True).encode())
-    for name, tensor in sorted(prior.weights().items()):
-        digest.update(name.encode())
-        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
     keys = {key: value for key, value in vars(settings).items() if key not in _NOT_PART}
     keys["physics_guidance"] = physics_strength(settings.physics_guidance, prior.config, prior.scene_type)
     if not keys["physics_guidance"]:
         del keys["physics_guidance"]  # folders of earlier versions have no such key
-    return {**keys, "digest": digest.hexdigest()[:16]}
+    if settings.fid_weights:
+        keys["fid_weights"] = _file_digest(Path(settings.fid_weights))
+    return {**keys, "digest": prior_digest(prior)}
+
+
+def _file_digest(path: Path) -> str:
+    """Digest of a file, 16 characters; empty for one that cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+    except OSError:
+        return ""
 
 
 def _sample(prior: ScenePrior, settings: EvaluateConfig, prompts: list[str] | None) -> SceneBatch:
@@ -308,6 +332,9 @@ def _draw(samples: SceneBatch, count: int, run: Run) -> None:
     """Draw ``gallery.png``, if the packages for pictures are installed."""
     from agents.cli.commands.scenes import draw_scenes
 
+    if not samples.scene_type.has_geometry:
+        run.log(f"no gallery: the assets of {samples.scene_type.name!r} have no geometry here")
+        return
     try:
         draw_scenes(samples, count, run, "gallery.png")
     except MissingDependencyError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 _FRESH = 12
 """Fresh samples when no number is given."""
+_AT_ONCE = 64
+"""Scenes that are denoised together."""
 
 
 @dataclass
@@ -55,16 +58,22 @@ class InpaintingConfig:
     device: str = "cpu"
     output: str = ""
 
-    def sampling(self) -> dict[str, Any]:
-        """Arguments of the methods of priors that these keys give."""
+    def sampling(self, first: int = 0) -> dict[str, Any]:
+        """Arguments of the methods of priors that these keys give, for scenes from number ``first`` on."""
         return {
             "prompt": self.prompt,
             "guidance": self.guidance,
             "claim_guidance": self.claim_guidance,
             "physics_guidance": self.physics_guidance,
             "num_steps": self.num_steps,
-            "seed": self.seed,
+            "seed": self.seed + first,
         }
+
+    def in_parts(self, batch: SceneBatch, change: Callable[[SceneBatch, dict[str, Any]], SceneBatch]) -> SceneBatch:
+        """The scenes as ``change`` makes them from a part and its arguments; parts bound the memory."""
+        starts = range(0, len(batch), _AT_ONCE)
+        parts = [change(batch[start : start + _AT_ONCE], self.sampling(start)).to("cpu") for start in starts]
+        return parts[0].concatenate(parts)
 
 
 def check(settings: InpaintingConfig) -> None:
@@ -80,7 +89,11 @@ def load_prior_and_scenes(command: str, settings: InpaintingConfig) -> tuple[Sce
     if not settings.scenes:
         fresh = ScenePrior.load(settings.prior).to(settings.device)
         count = _FRESH if settings.count is None else settings.count
-        return fresh, fresh.sample(count, num_steps=settings.num_steps, seed=settings.seed).to("cpu")
+        from agents.utils.seeds import derived_seed  # with the same noise, a scene would be rearranged into itself
+
+        seed, strength = derived_seed(settings.seed, 1), settings.physics_guidance
+        batch = fresh.sample(count, num_steps=settings.num_steps, seed=seed, physics_guidance=strength)
+        return fresh, batch.to("cpu")
     batch = load_scenes(Path(settings.scenes), settings.count)
     if not len(batch):
         raise InvalidInputError(f"{command}: scenes={settings.scenes!r} holds no scene")

@@ -15,5 +15,6 @@ def run(settings: PretrainConfig, run: Run) -> None:
     from agents.pretraining.trainer import pretrain
 
     metrics = pretrain(settings)
-    run.say(f"held-out loss {metrics['heldout_loss']:.4g} after {metrics['trained_steps']} steps")
+    loss = "" if metrics["heldout_loss"] is None else f"held-out loss {metrics['heldout_loss']:.4g} after "
+    run.say(f"{loss}{metrics['trained_steps']} steps")
     run.say(f"sample it: scene-envs sample prior={run.directory}")

@@ -15,7 +15,7 @@ __all__ = ["check", "run"]
 def run(settings: InpaintingConfig, run: Run) -> None:
     """Give the free objects new poses; welded objects stay."""
     prior, batch = load_prior_and_scenes("rearrange", settings)
-    moved = prior.rearrange(batch, **settings.sampling()).to("cpu")
+    moved = settings.in_parts(batch, lambda part, keys: prior.rearrange(part, **keys))
     distance = (moved.translations - batch.translations).norm(dim=-1)[batch.is_free]
     figures = {"mean_distance_m": float(distance.double().mean()) if len(distance) else 0.0}
     run.say(f"{len(batch)} scenes, objects moved by {figures['mean_distance_m']:.3f} m on average")
