@@ -98,6 +98,11 @@ class IsolatedReward:
             found: float | None = self._started().ask(("maximum", slots, free_slots), self.timeout)
         return found
 
+    @property
+    def named(self) -> str | Mapping[str, Any]:
+        """What names the reward."""
+        return self._reward
+
     def fit_statistics(self, batch: SceneBatch, context: RewardContext) -> None:
         """See :func:`rewards.statistics.fit_statistics`."""
         with self._lock:

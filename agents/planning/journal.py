@@ -8,13 +8,15 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import torch
 
+from rewards.isolation import IsolatedReward, SeededReward
+from rewards.local_files import local_files
 from scene_envs.envs import MaskChoiceState, SearchState
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.scene import SceneBatch
@@ -132,7 +134,11 @@ def _state(values: Mapping[str, Any]) -> SearchState:
 
 
 def _described(value: Any) -> str:
-    """A setting as text, the same in every process: a prior by its weights, other objects by their class alone."""
+    """A setting as text, the same in every process.
+
+    A prior is described by its weights, a reward in a process of its own by what names it and by its file, a dataclass
+    by its class and the fields that differ from the defaults, and other objects by their class alone.
+    """
     if isinstance(value, str | int | float | bool | None):
         return repr(value)
     if isinstance(value, Mapping):
@@ -147,5 +153,20 @@ def _described(value: Any) -> str:
         for name, tensor in sorted(value.weights().items()):
             digest.update(name.encode() + tensor.detach().cpu().contiguous().numpy().tobytes())
         return f"weights {digest.hexdigest()}"
+    if isinstance(value, IsolatedReward):
+        digest = hashlib.blake2b(digest_size=8)
+        for path in local_files(value.named):
+            digest.update(path.read_bytes() if path.is_file() else b"")
+        return f"isolated {_described(value.named)} {digest.hexdigest()}"
+    if isinstance(value, SeededReward):
+        return _described(value.reward)
     kind = value if hasattr(value, "__qualname__") else type(value)
-    return f"{kind.__module__}.{kind.__qualname__}"
+    name = f"{kind.__module__}.{kind.__qualname__}"
+    if isinstance(value, type) or not is_dataclass(value):
+        return name
+    settings = {
+        field.name: getattr(value, field.name)
+        for field in fields(value)
+        if field.init and field.compare and getattr(value, field.name) != field.default
+    }
+    return f"{name}{_described(settings)}" if settings else name

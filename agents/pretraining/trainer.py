@@ -248,8 +248,8 @@ class Pretrainer:
             known["scenes"] == facts["scenes"] and torch.allclose(known["mean"], facts["mean"], rtol=1e-3, atol=1e-4)
         ):
             raise InvalidInputError(
-                f"the run in {str(self.directory)!r} was started with other scenes than data={self.config.data!r} holds "
-                "now; give the same dataset to resume it, or another output"
+                f"the run in {str(self.directory)!r} was started with other scenes than data={self.config.data!r} "
+                "holds now; give the same dataset to resume it, or another output"
             )
         check_tensors(self.network, state["network"], self.checkpoint_path)
         try:

@@ -58,8 +58,8 @@ def package_prior(
             that of the source.
 
     Raises:
-        InvalidInputError: no such evaluation, one of another prior, ``physics_guidance`` outside 0 to 1, a weight that half precision cannot
-            hold, or a folder that holds anything but a packaged prior.
+        InvalidInputError: no such evaluation, one of another prior, ``physics_guidance`` outside 0 to 1, a weight that
+            half precision cannot hold, or a folder that holds anything but a packaged prior.
         CorruptFileError: the evaluation is not a JSON mapping, as the command writes it.
     """
     from agents.priors.base import ScenePrior

@@ -1,4 +1,4 @@
-"""Journal of verdicts on the candidates of an unfinished shard, for resuming it."""
+"""Journal of an unfinished shard, for resuming it: digests of its candidates, and verdicts on them."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,9 +79,19 @@ def make_shard(
         start = perf_counter()
         count = min(ahead, _MAX_CHUNK) if ahead > 0 else chunk
         scenes, drawn = _draw(grammar, job, tried, count)
-        verdicts = known[tried : tried + count] if ahead > 0 else _judge(scenes, grammar, normalizer, job.verify)
-        if journal is not None and ahead <= 0:
-            journal.append(tried, verdicts)
+        digests = [hashlib.blake2b(scene.numpy().tobytes(), digest_size=6).hexdigest() for scene in scenes]
+        if ahead > 0:
+            told = [line.partition(" ") for line in known[tried : tried + count]]
+            if [digest for digest, _, _ in told] != digests:  # the grammar has changed since: these are other scenes
+                known, ahead = [], 0
+        if ahead > 0:
+            verdicts = [verdict for _, _, verdict in told]
+        else:
+            verdicts = _judge(scenes, grammar, normalizer, job.verify)
+            if journal is not None:
+                journal.append(
+                    tried, [f"{digest} {verdict}" for digest, verdict in zip(digests, verdicts, strict=True)]
+                )
         before, fresh, first = reasons.copy(), len(kept), tried
         for scene, why, verdict in zip(scenes, drawn, verdicts, strict=True):
             if len(kept) == job.size:

@@ -81,6 +81,11 @@ class RewardScorer:
         terms = {name: torch.nan_to_num(term.float(), 0.0, 0.0, 0.0) for name, term in output.terms.items()}
         return Score(value, valid, terms, output.per_object, output.object_flags)
 
+    @property
+    def depends_on_batch(self) -> bool:
+        """Whether the score of a scene depends on the other scenes of its batch."""
+        return bool(getattr(self._score, "depends_on_batch", False))
+
     def maximum(self, slots: int, free_slots: int) -> float | None:
         """The largest value that the reward declares for scenes of this size, None where it declares none."""
         declared = getattr(self._score, "maximum", None)

@@ -149,6 +149,11 @@ class SearchProblem:
         self.prompting = EnvPrompts(self.prior, chosen.prompt, chosen.guidance, self.slots)
         self.prompt = self.prompting.draw(np.random.default_rng(0)) if self.prompting.given else None
         self.scorer = RewardScorer(chosen.objective, chosen.workers)
+        if self.scorer.depends_on_batch:
+            raise InvalidInputError(
+                f"objective={chosen.objective!r} scores a scene by the other scenes of its batch, and a search "
+                "compares scenes of different batches; take another objective, or give normalised both mean= and std="
+            )
         free_slots = self.slots - len(self.scene_type.fixed)
         declared = self.scorer.maximum(self.slots, free_slots) if chosen.objective_scale is None else None
         self.scale = chosen.objective_scale or declared or float(free_slots)

@@ -71,7 +71,8 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     ## Episode End
 
     The episode is `terminated` when nothing is left to improve: no slot is masked, or Φ is 1. It is `truncated` at
-    depth `max_depth`, or when `max_nfe` denoiser evaluations are spent since the reset.
+    depth `max_depth`, or when `max_nfe` denoiser evaluations are spent since the reset. If one of these holds at the
+    reset already, the first step ends the episode where it began, with reward 0.
 
     ## Arguments
 
@@ -139,6 +140,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
             self._tokens = problem.prompting.read([problem.prompt])[0].numpy()
         self.action_space = spaces.Discrete(problem.num_actions)
         self._state: SearchState | None = None
+        self._begun = False
         self._best: SearchState | None = None
         self._nfe_at_reset = 0
 
@@ -162,6 +164,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         else:
             self._state = self.problem.root(tree_seed, options.get("scene"))
         self._best = self._state
+        self._begun = False
         self._rendering.show(self.scene(), self._state)
         return self._observe(self._state)
 
@@ -174,7 +177,13 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         """
         parent = self.state
         if why := self._end(parent):
+            if not self._begun:  # nothing to do from the start: the first step ends the episode where it began
+                self._begun = True
+                observation, info = self._observe(parent)
+                solved = self.problem.is_solved(parent)
+                return observation, 0.0, solved, not solved, info
             raise ResetNeededError(f"the episode ended, {why}; call reset() first")
+        self._begun = True
         self._state = self._child(parent, action)
         self._rendering.show(self.scene(), self._state)
         observation, info = self._observe(self._state)

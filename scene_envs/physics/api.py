@@ -64,7 +64,9 @@ def feasibility(
             limit is negative or NaN, or the duration is not a positive number.
         MissingDependencyError: pybullet is not installed.
     """
-    check_numbers(duration, max_penetration=max_penetration, max_displacement=max_displacement, max_rotation=max_rotation)
+    check_numbers(
+        duration, max_penetration=max_penetration, max_displacement=max_displacement, max_rotation=max_rotation
+    )
     options = {
         "max_penetration": max_penetration,
         "max_displacement": max_displacement,
@@ -150,8 +152,8 @@ def settle(
         iterations: of the contact solver per step; more of them leave smaller overlaps.
         pool: worker processes; None computes in this process.
 
-    Raises InvalidInputError, also for fewer than one iteration or a duration that is not positive, and MissingDependencyError as :func:`feasibility`
-    does.
+    Raises InvalidInputError, also for fewer than one iteration or a duration that is not positive, and
+    MissingDependencyError as :func:`feasibility` does.
     """
     if iterations < 1:
         raise InvalidInputError(f"iterations={iterations} must be at least 1")

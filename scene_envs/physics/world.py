@@ -45,8 +45,8 @@ class SolverSettings:
 class World:
     """PyBullet for one asset library; the motion of a scene depends on that scene alone, bit for bit.
 
-    Bodies are sorted, placed and parked in the same order whatever the slot order, and never sleep. Threads take turns. A
-    call that is interrupted leaves nothing behind.
+    Bodies are sorted, placed and parked in the same order whatever the slot order, and never sleep. Threads take turns.
+    A call that is interrupted leaves nothing behind.
 
     Args:
         library: geometry of the assets.
