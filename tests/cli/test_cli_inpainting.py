@@ -180,3 +180,23 @@ def test_an_imported_prior_without_geometry_is_sampled_without_physics(
     assert "have none here" in capsys.readouterr().err
     assert main([*words[:-1], f"output={tmp_path / 'guided'}", "physics_guidance=1"]) == 2
     assert "physics_guidance=1 needs the geometry of the assets" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_fresh_scene_is_not_rearranged_into_itself(files: tuple[Path, Path], tmp_path: Path) -> None:
+    words = ["rearrange", "prior=dimsum_table", "count=1", "num_steps=10", "pictures=0", f"output={tmp_path}"]
+    assert main(words) == 0
+    assert json.loads((tmp_path / "metrics.json").read_text())["mean_distance_m"] > 0.1
+
+
+@pytest.mark.slow
+def test_scenes_are_completed_in_parts(
+    files: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenes, prior = files
+    words = ["complete", f"scenes={scenes}", f"prior={prior}", "num_steps=2", "pictures=0"]
+    assert main([*words, f"output={tmp_path / 'whole'}"]) == 0
+    monkeypatch.setattr("agents.cli.commands.inpainting._AT_ONCE", 2)
+    assert main([*words, f"output={tmp_path / 'parts'}"]) == 0
+    whole, parts = (SceneBatch.load(tmp_path / name / "scenes.safetensors").tensor for name in ("whole", "parts"))
+    torch.testing.assert_close(parts, whole, rtol=0, atol=1e-5)

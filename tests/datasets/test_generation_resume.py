@@ -13,12 +13,12 @@ from pathlib import Path
 
 import pytest
 
-from scene_envs.datasets import StorageError, judge_scenes
+from scene_envs.datasets import SceneDataset, StorageError, judge_scenes
 from scene_envs.datasets import shards as shards_module
 from scene_envs.errors import CorruptFileError
 from scene_envs.scene import SceneBatch
 from tests.helpers.forked import forked
-from tests.helpers.toy_grammars import CUPS_COUNT, generate_cups
+from tests.helpers.toy_grammars import CUPS_COUNT, ToyGrammar, generate_cups
 
 
 def _hashes(folder: Path) -> dict[str, str]:
@@ -185,3 +185,27 @@ def test_slow_grammars_report_scene_by_scene(tmp_path: Path, monkeypatch: pytest
     generate_cups(tmp_path)
     assert set(chunks) == {1}
     assert _hashes(tmp_path) == _hashes(cups)
+
+
+@pytest.mark.slow
+def test_a_grammar_that_was_changed_since_is_judged_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Killed(BaseException):
+        pass
+
+    def judge(batch: SceneBatch) -> list[str]:
+        nonlocal judged
+        judged += len(batch)
+        if judged > 10:
+            raise Killed
+        return ["kept"] * len(batch)  # what an earlier grammar made was in order
+
+    judged, sample = 0, ToyGrammar.sample_array
+    with monkeypatch.context() as patch:
+        patch.setattr(ToyGrammar, "sample_array", lambda self, rng, count: sample(self, rng.spawn(1)[0], count))
+        patch.setattr(shards_module, "judge_scenes", judge)
+        patch.setattr(shards_module, "_MAX_CHUNK", 5)
+        with pytest.raises(Killed):
+            generate_cups(tmp_path)
+    generate_cups(tmp_path)
+    batch = SceneDataset.load(tmp_path).batch()
+    assert set(judge_scenes(batch)) == {shards_module.KEPT}

@@ -289,3 +289,16 @@ def test_a_mask_that_breaks_its_contract_is_told_so(generator: Any, said: str, f
     problem = SearchProblem(prior=tiny_prior(), objective=free_objects, mask=generator, num_steps=2)
     with pytest.raises(InvalidInputError, match=said):
         problem.root(0, table_with(("teacup", 0.0, 0.0, 0.0)))
+
+
+@pytest.mark.parametrize(
+    ("mask", "told"),
+    [
+        ({"name": "lowest_scoring", "count": -1}, r"mask=lowest_scoring: count=-1 must be a whole number from 0 on"),
+        ({"name": "empty", "count": 1.5}, r"mask=empty: count=1.5"),
+        ({"name": "culprits", "at_least": -2}, r"mask=culprits: at_least=-2"),
+    ],
+)
+def test_numbers_of_slots_are_whole_and_not_negative(mask: dict[str, object], told: str) -> None:
+    with pytest.raises(InvalidInputError, match=told):
+        resolve_mask(mask)

@@ -330,3 +330,25 @@ def test_a_search_without_a_browser_says_where_the_page_is(prior, free_objects, 
 def test_an_unknown_render_mode_names_those_there_are(prior, free_objects):
     with pytest.raises(InvalidInputError, match="use 'human', 'rgb_array' or None"):
         SearchEnv(prior=prior, objective=free_objects, render_mode="ansi")
+
+
+@pytest.mark.parametrize("settings", [{"max_nfe": 2}, {"mask": lambda scene, score, rng: scene.is_empty[0] & False}])
+def test_an_episode_that_is_over_at_its_reset_ends_with_the_first_step(prior, free_objects, settings):
+    env = SearchEnv(prior=prior, objective=free_objects, branching=3, max_depth=3, num_steps=2, **settings)
+    before, _ = env.reset(seed=1)
+    after, reward, terminated, truncated, _ = env.step(0)
+    assert data_equivalence(before, after, exact=True)
+    assert reward == 0.0
+    assert terminated != truncated
+    with pytest.raises(ResetNeededError):
+        env.step(0)
+    env.reset(seed=1)
+    assert env.step(0)[1] == 0.0
+
+
+@pytest.mark.parametrize("objective", ["diversity", {"name": "normalised", "reward": "object_count"}])
+def test_an_objective_that_depends_on_the_batch_is_refused(prior, objective):
+    with pytest.raises(InvalidInputError, match="by the other scenes of its batch"):
+        SearchEnv(prior=prior, objective=objective, branching=3, num_steps=2)
+    fixed = {"name": "normalised", "reward": "object_count", "mean": 0.0, "std": 10.0}
+    SearchEnv(prior=prior, objective=fixed, branching=3, num_steps=2)

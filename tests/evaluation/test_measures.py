@@ -11,11 +11,11 @@ from agents.configuration.measure_names import choose_measures
 from agents.evaluation import grammar_scenes
 from agents.evaluation.measures import MEASURES, EvaluationInputs, compute_measure
 from agents.evaluation.real_scenes import RealScenes
-from scene_envs.datasets import SceneDataset
+from scene_envs.datasets import SceneDataset, generate
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import get_scene_type, union_scene_type
+from scene_envs.scene_types import get_scene_type, register_scene_type, union_scene_type
 
 
 def save(batch: SceneBatch, folder: Path) -> str:
@@ -110,3 +110,15 @@ def test_the_grammar_gives_two_different_sets() -> None:
     real = RealScenes.load(get_scene_type("dimsum_table"), 3)
     assert real.training is None
     assert not torch.equal(real.reference.tensor, real.floor.tensor)
+
+
+@pytest.mark.slow
+def test_the_first_real_scenes_of_a_union_are_of_all_its_types(tmp_path: Path) -> None:
+    for scene in ("dimsum_table", "pantry_shelf"):
+        generate(scene, 16, tmp_path / scene, workers=0, verify=False, progress=False)
+    union = register_scene_type(union_scene_type([get_scene_type(name) for name in ("dimsum_table", "pantry_shelf")]))
+    real = RealScenes.load(union, 8, data=f"{tmp_path / 'dimsum_table'},{tmp_path / 'pantry_shelf'}")
+    shelf = union.assets.index("shelf")
+    for batch in (real.reference, real.floor):
+        assert (batch.categories[:4] == shelf).any(dim=1).sum() == 2
+        assert (batch.categories == shelf).any(dim=1).sum() == len(batch) / 2

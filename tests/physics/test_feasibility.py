@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -296,3 +297,19 @@ def test_furniture_of_real_rooms_is_apart_and_a_pool_measures_the_same() -> None
     assert bool((depth > 0.01)[rooms.is_furniture].any(dim=0))
     with PhysicsPool(workers=1) as pool:
         assert torch.equal(furniture_overlap(together, pool=pool), depth)
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (lambda batch: feasibility(batch, max_penetration=float("nan")), "max_penetration=nan must be at least 0"),
+        (lambda batch: feasibility(batch, max_rotation=-1.0), "max_rotation=-1.0 must be at least 0"),
+        (lambda batch: feasibility(batch, duration=0.0), "duration=0.0 must be a positive number of seconds"),
+        (lambda batch: equilibrium(batch, duration=float("nan")), "duration=nan"),
+        (lambda batch: settle(batch, duration=-1.0), "duration=-1.0"),
+        (lambda batch: make_ready(batch, duration=float("inf")), "duration=inf"),
+    ],
+)
+def test_numbers_that_give_no_verdict_are_refused(call: Callable[[SceneBatch], object], told: str) -> None:
+    with pytest.raises(InvalidInputError, match=told):
+        call(SceneBatch.empty("dimsum_table", 1))

@@ -91,6 +91,21 @@ def test_a_worker_killed_mid_run_costs_nothing(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("copied_workers")
+def test_workers_killed_between_two_calls_cost_nothing(
+    batch: SceneBatch, expected: FeasibilityResult, pool: PhysicsPool
+) -> None:
+    feasibility(batch, pool=pool)
+    for victim in pool.process_ids:
+        os.kill(victim, signal.SIGKILL)
+    for worker in pool._live:
+        worker.process.wait()
+    one = feasibility(batch[:1], pool=pool)
+    assert bool(one.valid.all())
+    assert same(feasibility(batch, pool=pool), expected)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("copied_workers")
 def test_a_scene_that_fails_twice_is_invalid_and_the_others_are_not(
     batch: SceneBatch, expected: FeasibilityResult
 ) -> None:

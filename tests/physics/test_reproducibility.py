@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import torch
 from benchmarks.reproducibility import FUNCTIONS, crowded, same, settled
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import PhysicsPool, feasibility, settle
+from scene_envs.physics.motion import physics_of
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types.built_in import BUILT_IN
 
@@ -73,3 +75,36 @@ def test_a_spent_budget_ends_at_the_same_step(pool: PhysicsPool) -> None:
     settled(crowded(TYPE, NOISE[:1], seed=10))
     for again in (settle(batch), settle(batch, pool=pool)):
         assert same([first.batch.tensor, first.finished], [again.batch.tensor, again.finished])
+
+
+def test_the_order_of_slots_changes_no_settled_scene() -> None:
+    batch = crowded(TYPE, NOISE[:1], seed=11)
+    order = torch.randperm(batch.tensor.shape[1], generator=torch.Generator().manual_seed(1))
+    shuffled = SceneBatch(batch.tensor[:, order], batch.scene_type)
+    assert torch.equal(settle(shuffled).batch.tensor, settle(batch).batch.tensor[:, order])
+
+
+def test_an_interrupted_simulation_changes_no_later_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    batch, other = crowded(TYPE, NOISE[:1], seed=12), crowded(TYPE, NOISE[:1], seed=13)
+    expected = feasibility(other)
+    world = physics_of(batch.scene_type).world
+    still = world._is_still
+
+    def interrupted(*arguments: object) -> bool:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(world, "_is_still", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        settle(batch)
+    monkeypatch.setattr(world, "_is_still", still)
+    found = feasibility(other)
+    assert torch.equal(found.displacement, expected.displacement)
+    assert torch.equal(found.feasible, expected.feasible)
+
+
+def test_threads_take_turns() -> None:
+    batches = [crowded(TYPE, NOISE[:1], seed=seed) for seed in (14, 15)]
+    expected = [settle(batch).batch.tensor for batch in batches]
+    with ThreadPoolExecutor(2) as threads:
+        found = list(threads.map(lambda batch: settle(batch).batch.tensor, batches))
+    assert all(torch.equal(one, other) for one, other in zip(found, expected, strict=True))

@@ -22,6 +22,9 @@ from agents.planning import (
 from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards import RewardContext, RewardOutput
+from rewards.category_count import CategoryCount
+from rewards.isolation import IsolatedReward
+from rewards.local_files import allow_local_rewards
 from scene_envs.datasets import generate
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
@@ -164,3 +167,20 @@ def test_scenes_of_another_type_or_too_wide_are_refused(prior: ScenePrior, scene
 def test_wider_scenes_keep_their_slots(prior: ScenePrior, scenes: SceneBatch) -> None:
     outcome = run_search(prior, "object_count", scenes=scenes[:1].with_slots(40), baseline=False, **SMALL)
     assert outcome.best.tensor.shape[1] == 40
+
+
+@pytest.mark.slow
+def test_a_search_is_not_continued_with_another_objective(prior: ScenePrior, tmp_path: Path) -> None:
+    run_search(prior, CategoryCount("teacup"), output=tmp_path / "assets", **SMALL)
+    with pytest.raises(InvalidInputError, match="is of a search with objective"):
+        run_search(prior, CategoryCount("dinner_plate"), output=tmp_path / "assets", **SMALL)
+    file = tmp_path / "mine.py"
+    allow_local_rewards(file)
+    file.write_text("def a(batch):\n    return batch.counts\n\n\ndef b(batch):\n    return 90 - batch.counts\n")
+    with IsolatedReward(f"{file}:a") as reward:
+        run_search(prior, reward, output=tmp_path / "file", **SMALL)
+    with IsolatedReward(f"{file}:b") as reward, pytest.raises(InvalidInputError, match="is of a search with objective"):
+        run_search(prior, reward, output=tmp_path / "file", **SMALL)
+    file.write_text(file.read_text() + "# changed\n")
+    with IsolatedReward(f"{file}:a") as reward, pytest.raises(InvalidInputError, match="is of a search with objective"):
+        run_search(prior, reward, output=tmp_path / "file", **SMALL)

@@ -11,7 +11,7 @@ from agents import PretrainConfig
 from agents.cli import main
 from agents.configuration import config_text
 from agents.priors.base import ScenePrior
-from agents.priors.card import OWN_LICENSE, package_prior, read_measures
+from agents.priors.card import OWN_LICENSE, package_prior, prior_digest, read_measures
 from agents.priors.facts import PriorFacts
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
@@ -165,3 +165,13 @@ def test_a_packaged_prior_replaces_its_like_alone(run_folder: Path, tmp_path: Pa
         folder = package_prior(source, tmp_path / "packaged")
     assert ScenePrior.load(folder).card["trained_steps"] == 1200
     assert not [path for path in folder.iterdir() if path.name.startswith(".")]
+
+
+def test_figures_of_other_weights_are_refused(tmp_path: Path) -> None:
+    prior = tiny_prior()
+    figures = {"scenes": 2.0, "evaluation": {"identity": {"digest": prior_digest(prior)}}}
+    (tmp_path / "metrics.json").write_text(json.dumps(figures))
+    package_prior(prior, tmp_path / "right", evaluation=tmp_path)
+    with pytest.raises(InvalidInputError, match="figures of other weights"):
+        package_prior(tiny_prior(seed=1), tmp_path / "wrong", evaluation=tmp_path)
+    assert not (tmp_path / "wrong").exists()
