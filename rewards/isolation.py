@@ -109,10 +109,10 @@ class IsolatedReward:
             self.statistics = self._started().ask(("fit", *self._scenes(batch, context)), self.timeout)
 
     def load_statistics(self, statistics: Sequence[Any] | None) -> None:
-        """See :func:`rewards.statistics.load_statistics`."""
-        with self._lock:
-            self._started().ask(("load", statistics), self.timeout)
+        """See :func:`rewards.statistics.load_statistics`; the next call starts another worker with them."""
+        if statistics != self.statistics:
             self.statistics = statistics
+            self.close()
 
     def close(self) -> None:
         """End the worker; the next call starts another."""

@@ -62,9 +62,8 @@ class GuardFiles:
 
     def keep(self, prior: ScenePrior, guard: Guard, iteration: int) -> None:
         """Write the evaluated weights to ``prior/``, with a card that says how they were made."""
-        unknown = (
-            ("measures", "limits") if iteration else ()
-        )  # those of the base prior are not those of the new weights
+        # figures of the base prior are not those of other weights
+        unknown = ("measures", "limits") if iteration else ()
         prior.card = {
             **{key: value for key, value in prior.card.items() if key not in unknown},
             "post_training": {

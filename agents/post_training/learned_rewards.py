@@ -98,4 +98,4 @@ class LearnedRewards:
         """Inverse of :meth:`state`, after :meth:`begin`; a checkpoint of an earlier version has no statistics."""
         for part, own in zip(self.parts, state.get("learned_rewards", ()), strict=True):
             part.load_state_dict(own)
-        load_statistics(self._reward, state.get("reward_statistics"))
+        load_statistics(self._reward, state.get("reward_statistics") or None)
