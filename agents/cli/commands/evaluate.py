@@ -303,8 +303,7 @@ def _identity(settings: EvaluateConfig, prior: ScenePrior) -> dict[str, Any]:
 def _file_digest(path: Path) -> str:
     """Digest of a file, 16 characters; empty for one that cannot be read."""
     try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+        return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
     except OSError:
         return ""
 
