@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -15,7 +16,7 @@ from rewards.base import (
     declared_maximum,
     depends_on_batch,
 )
-from rewards.local_files import allowed_files, is_local, names_in
+from rewards.local_files import allowed_files, is_local, local_files, names_in
 from rewards.registry import (
     RewardInfo,
     allowed_targets,
@@ -99,9 +100,12 @@ class IsolatedReward:
         return found
 
     @property
-    def named(self) -> str | Mapping[str, Any]:
-        """What names the reward."""
-        return self._reward
+    def described_by(self) -> list[Any]:
+        """What tells this reward from others: what names it, and a digest of its files."""
+        digest = hashlib.blake2b(digest_size=8)
+        for path in local_files(self._reward):
+            digest.update(path.read_bytes() if path.is_file() else b"")
+        return [self._reward, digest.hexdigest()]
 
     def fit_statistics(self, batch: SceneBatch, context: RewardContext) -> None:
         """See :func:`rewards.statistics.fit_statistics`."""
@@ -157,6 +161,11 @@ class SeededReward:
         from rewards.evaluation import evaluate_reward
 
         return evaluate_reward(self.reward, batch, replace(context, seed=self.seed), strict=True)
+
+    @property
+    def described_by(self) -> Any:
+        """What tells this reward from others: the reward itself."""
+        return self.reward
 
     def maximum(self, slots: int, free_slots: int) -> float | None:
         """The largest value that the reward declares; see :func:`rewards.base.declared_maximum`."""

@@ -15,8 +15,6 @@ from typing import Any, BinaryIO
 
 import torch
 
-from rewards.isolation import IsolatedReward, SeededReward
-from rewards.local_files import local_files
 from scene_envs.envs import MaskChoiceState, SearchState
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.scene import SceneBatch
@@ -136,8 +134,8 @@ def _state(values: Mapping[str, Any]) -> SearchState:
 def _described(value: Any) -> str:
     """A setting as text, the same in every process.
 
-    A prior is described by its weights, a reward in a process of its own by what names it and by its file, a dataclass
-    by its class and the fields that differ from the defaults, and other objects by their class alone.
+    A prior is described by its weights, an object with an attribute ``described_by`` by the value of this attribute, a
+    dataclass by its class and the fields that differ from the defaults, and other objects by their class alone.
     """
     if isinstance(value, str | int | float | bool | None):
         return repr(value)
@@ -153,13 +151,8 @@ def _described(value: Any) -> str:
         for name, tensor in sorted(value.weights().items()):
             digest.update(name.encode() + tensor.detach().cpu().contiguous().numpy().tobytes())
         return f"weights {digest.hexdigest()}"
-    if isinstance(value, IsolatedReward):
-        digest = hashlib.blake2b(digest_size=8)
-        for path in local_files(value.named):
-            digest.update(path.read_bytes() if path.is_file() else b"")
-        return f"isolated {_described(value.named)} {digest.hexdigest()}"
-    if isinstance(value, SeededReward):
-        return _described(value.reward)
+    if hasattr(value, "described_by"):
+        return _described(value.described_by)
     kind = value if hasattr(value, "__qualname__") else type(value)
     name = f"{kind.__module__}.{kind.__qualname__}"
     if isinstance(value, type) or not is_dataclass(value):

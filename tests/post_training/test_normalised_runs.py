@@ -102,4 +102,4 @@ def test_a_reward_in_its_own_process_keeps_its_statistics_when_the_process_is_re
         assert float(reward(one, RewardContext()).value) == value
         assert statistics_of(reward) == kept
         load_statistics(reward, None)
-        assert float(reward(one, RewardContext()).value) == 0.0  # alone in its batch
+        assert reward.statistics is None
