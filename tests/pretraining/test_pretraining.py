@@ -18,6 +18,7 @@ from agents.pretraining.data import SceneTable
 from agents.pretraining.initial_prior import build_prior
 from agents.pretraining.setup import prepare
 from agents.pretraining.trainer import Pretrainer, learning_rate_at
+from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from agents.utils.seeds import derived_generator
 from agents.utils.weight_average import WeightAverage
@@ -389,9 +390,10 @@ def test_a_prior_trained_further_keeps_its_origin_and_licence(config: PretrainCo
         "limits": "None.",
     }  # fmt: skip
     path = older.save(config.directory / "older")
-    run = replace(config, prior=str(path), output=str(config.directory / "run"), iterations=1, data="grammar")
-    prior, data, heldout = prepare(run)
-    card = Pretrainer(run, data, heldout[:8], prior).run().card
+    run = replace(config, prior=str(path), output=str(config.directory / "run"), iterations=1)
+    prior = ScenePrior.load(path)
+    scenes = prior.encode(SceneBatch(raw, prior.scene_type))
+    card = Pretrainer(run, SceneTable(scenes[:56]), scenes[56:], prior).run().card
     assert card["license"] == "CC BY-NC"
     assert card["imported_from"] == "authors.ckpt"
     assert card["base"] == {"name": "older", "trained_steps": 100_000}
