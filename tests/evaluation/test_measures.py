@@ -112,6 +112,10 @@ def test_the_grammar_gives_two_different_sets() -> None:
     assert not torch.equal(real.reference.tensor, real.floor.tensor)
 
 
+def test_a_list_that_holds_all_is_all() -> None:
+    assert choose_measures("all,layout") == choose_measures(["layout", "all"]) == choose_measures("all")
+
+
 @pytest.mark.slow
 def test_the_first_real_scenes_of_a_union_are_of_all_its_types(tmp_path: Path) -> None:
     for scene in ("dimsum_table", "pantry_shelf"):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -18,43 +17,15 @@ from agents.pretraining.data import SceneTable
 from agents.pretraining.initial_prior import build_prior
 from agents.pretraining.setup import prepare
 from agents.pretraining.trainer import Pretrainer, learning_rate_at
-from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from agents.utils.seeds import derived_generator
 from agents.utils.weight_average import WeightAverage
 from scene_envs.datasets import generate
 from scene_envs.errors import CorruptFileError, InvalidInputError, TrainingError, UnknownNameError
 from scene_envs.normalizer import Normalizer
-from scene_envs.scene import SceneBatch
+from tests.helpers.small_pretraining import make_run
 
 pytestmark = pytest.mark.usefixtures("few_residual_levels")
-
-
-@pytest.fixture(scope="module")
-def raw() -> torch.Tensor:
-    """Tables with teapots somewhere: enough to train on."""
-    generator = torch.Generator().manual_seed(0)
-    scenes = SceneBatch.empty("dimsum_table", 64)
-    categories = torch.where(torch.rand(64, 34, generator=generator) < 0.5, 6, 7)
-    categories[:, 0] = 0
-    translations = torch.rand(64, 34, 3, generator=generator) - 0.5
-    translations[:, 0] = 0
-    rotations = torch.eye(3).expand(64, 34, 3, 3)
-    return SceneBatch.from_parts(translations, rotations, categories, scenes.scene_type).tensor
-
-
-@pytest.fixture
-def config(tmp_path: Path) -> PretrainConfig:
-    return PretrainConfig(
-        output=str(tmp_path), iterations=6, batch_size=8, network={"hidden": 16, "depth": 1, "heads": 2},
-        optimizer={"warmup": 2}, logger={"log_every": 1, "evaluate_every": 3, "checkpoint_every": 2},
-    )  # fmt: skip
-
-
-def make_run(config: PretrainConfig, raw: torch.Tensor) -> Pretrainer:
-    prior = build_prior(config, raw, Normalizer.fit(raw))
-    scenes = prior.encode(SceneBatch(raw, prior.scene_type))
-    return Pretrainer(config, SceneTable(scenes[:56]), scenes[56:], prior)
 
 
 class Killed(Exception):
@@ -349,75 +320,3 @@ def test_averages_of_a_checkpoint_go_to_the_device_of_the_present_ones() -> None
     average.restore(saved.tensors, updates=3)
     assert {tensor.device.type for tensor in average.tensors.values()} == {"meta"}
     assert average.updates == 3
-
-
-@pytest.mark.slow
-def test_a_gradient_that_is_not_finite_is_not_applied(config: PretrainConfig, raw: torch.Tensor) -> None:
-    run = make_run(config, raw)
-    clip = torch.nn.utils.clip_grad_norm_
-
-    def poisoned(parameters: Any, *arguments: Any) -> torch.Tensor:
-        parameters = list(parameters)
-        if run.step == 3:
-            parameters[0].grad.fill_(torch.nan)
-        return clip(parameters, *arguments)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(torch.nn.utils, "clip_grad_norm_", poisoned)
-        with pytest.raises(TrainingError, match=r"the gradient norm became nan at step 3.*give another output"):
-            run.run()
-    assert all(bool(tensor.isfinite().all()) for tensor in run.network.state_dict().values())
-    assert make_run(config, raw).run().card["trained_steps"] == 6
-
-
-@pytest.mark.slow
-def test_a_run_does_not_go_on_with_other_data(config: PretrainConfig, raw: torch.Tensor) -> None:
-    make_run(replace(config, iterations=2), raw).run()
-    others = raw.clone()
-    others[:, 1:, 0] += 0.2
-    with pytest.raises(InvalidInputError, match="was started with other scenes"):
-        make_run(config, others).run()
-    with pytest.raises(InvalidInputError, match="was started with other scenes"):
-        make_run(config, raw[:60]).run()
-    assert make_run(config, raw).run().card["trained_steps"] == 6
-
-
-@pytest.mark.slow
-def test_a_prior_trained_further_keeps_its_origin_and_licence(config: PretrainConfig, raw: torch.Tensor) -> None:
-    older = tiny_prior()
-    older.card = {
-        "imported_from": "authors.ckpt", "license": "CC BY-NC", "trained_steps": 100_000, "measures": {"scenes": 2.0},
-        "limits": "None.",
-    }  # fmt: skip
-    path = older.save(config.directory / "older")
-    run = replace(config, prior=str(path), output=str(config.directory / "run"), iterations=1)
-    prior = ScenePrior.load(path)
-    scenes = prior.encode(SceneBatch(raw, prior.scene_type))
-    card = Pretrainer(run, SceneTable(scenes[:56]), scenes[56:], prior).run().card
-    assert card["license"] == "CC BY-NC"
-    assert card["imported_from"] == "authors.ckpt"
-    assert card["base"] == {"name": "older", "trained_steps": 100_000}
-    assert card["trained_steps"] == 1
-    assert not {"measures", "limits"} & card.keys()
-
-
-def test_the_error_that_is_left_is_measured_on_scenes_of_every_part(
-    config: PretrainConfig, raw: torch.Tensor, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run = make_run(replace(config, iterations=0), raw)
-    monkeypatch.setattr("agents.pretraining.trainer._RESIDUAL", 3)
-    seen: list[torch.Tensor] = []
-    monkeypatch.setattr(type(run.prior), "fit_residual", lambda self, x0: seen.append(x0))
-    run.run()
-    assert torch.equal(seen[0], run.heldout_data[[0, 3, 7]])
-
-
-@pytest.mark.slow
-def test_datasets_of_another_scene_type_are_named(tmp_path: Path) -> None:
-    for scene in ("dimsum_table", "pantry_shelf"):
-        generate(scene, 4, tmp_path / scene, workers=0, verify=False, progress=False)
-    dimsum, pantry = str(tmp_path / "dimsum_table"), str(tmp_path / "pantry_shelf")
-    with pytest.raises(InvalidInputError, match=r"holds scenes of 'pantry_shelf', and scene=dimsum_table"):
-        prepare(PretrainConfig(data=pantry))
-    with pytest.raises(InvalidInputError, match=r"heldout=.* holds scenes of 'pantry_shelf'"):
-        prepare(PretrainConfig(data=dimsum, heldout=pantry))

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from agents.priors.base import ScenePrior
-from agents.priors.checkpoint_import import import_checkpoint
+from agents.priors.checkpoint_import import _reorder, import_checkpoint
 from agents.priors.lightning_files import read_lightning
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, UnknownNameError
 from tests.helpers.authors_flux import DIMSUM, forward, random_state, write_checkpoint
@@ -142,3 +142,11 @@ def test_what_does_not_fit_is_named(tmp_path: Path) -> None:
         read_lightning(tmp_path / "mixed.ckpt")
     with pytest.raises(InvalidInputError, match="no checkpoint"):
         read_lightning(tmp_path / "missing.ckpt")
+
+
+def test_two_model_paths_of_one_asset_are_refused() -> None:
+    tensors = {"category_in.weight": torch.arange(8.0).reshape(4, 2)}
+    with pytest.raises(InvalidInputError, match="each model path its own asset"):
+        _reorder(dict(tensors), torch.tensor([0, 2, 2]))
+    _reorder(tensors, torch.tensor([2, 0, 1]))
+    assert tensors["category_in.weight"][:, 0].tolist() == [2.0, 4.0, 0.0, 6.0]
