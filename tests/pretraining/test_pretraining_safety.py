@@ -115,5 +115,4 @@ def test_noise_levels_outside_the_schedule_are_refused(
     config: PretrainConfig, raw: torch.Tensor, keys: dict[str, Any], told: str
 ) -> None:
     with pytest.raises(InvalidInputError, match=told):
-        run = make_run(PretrainConfig(output=config.output, network=config.network, iterations=1, **keys), raw)
-        run._update()
+        make_run(PretrainConfig(output=config.output, network=config.network, iterations=1, **keys), raw)._update()
