@@ -8,6 +8,7 @@ import os
 import pickle
 import signal
 import time
+from collections.abc import Callable
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -23,6 +24,28 @@ from tests.helpers.toy_grammars import CUPS_COUNT, ToyGrammar, generate_cups
 
 def _hashes(folder: Path) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
+
+
+class _Killed(BaseException):
+    """Stands for a killed process."""
+
+
+def _generate_and_die(output: Path, verdicts: Callable[[SceneBatch], list[str]]) -> None:
+    """Generate until more than ten candidates are judged, in chunks of five at most."""
+    judged = 0
+
+    def judge(batch: SceneBatch) -> list[str]:
+        nonlocal judged
+        judged += len(batch)
+        if judged > 10:
+            raise _Killed
+        return verdicts(batch)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shards_module, "judge_scenes", judge)
+        patch.setattr(shards_module, "_MAX_CHUNK", 5)
+        with pytest.raises(_Killed):
+            generate_cups(output)
 
 
 def _generate_slowly(output: Path) -> None:
@@ -55,23 +78,7 @@ def test_killed_and_started_again_the_files_are_the_same(cups: Path, tmp_path: P
 def test_what_was_judged_before_a_kill_is_not_judged_again(
     cups: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    judged = 0
-
-    class Killed(BaseException):
-        pass
-
-    def judge(batch: SceneBatch) -> list[str]:
-        nonlocal judged
-        judged += len(batch)
-        if judged > 10:
-            raise Killed
-        return judge_scenes(batch)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(shards_module, "judge_scenes", judge)
-        patch.setattr(shards_module, "_MAX_CHUNK", 5)
-        with pytest.raises(Killed):
-            generate_cups(tmp_path)
+    _generate_and_die(tmp_path, judge_scenes)
     (journal,) = tmp_path.glob(".*.journal")
     known = journal.read_text().count("\n")
     assert 5 <= known <= 10
@@ -189,23 +196,10 @@ def test_slow_grammars_report_scene_by_scene(tmp_path: Path, monkeypatch: pytest
 
 @pytest.mark.slow
 def test_a_grammar_that_was_changed_since_is_judged_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Killed(BaseException):
-        pass
-
-    def judge(batch: SceneBatch) -> list[str]:
-        nonlocal judged
-        judged += len(batch)
-        if judged > 10:
-            raise Killed
-        return ["kept"] * len(batch)  # what an earlier grammar made was in order
-
-    judged, sample = 0, ToyGrammar.sample_array
-    with monkeypatch.context() as patch:
+    sample = ToyGrammar.sample_array
+    with monkeypatch.context() as patch:  # what an earlier grammar made was in order
         patch.setattr(ToyGrammar, "sample_array", lambda self, rng, count: sample(self, rng.spawn(1)[0], count))
-        patch.setattr(shards_module, "judge_scenes", judge)
-        patch.setattr(shards_module, "_MAX_CHUNK", 5)
-        with pytest.raises(Killed):
-            generate_cups(tmp_path)
+        _generate_and_die(tmp_path, lambda batch: ["kept"] * len(batch))
     generate_cups(tmp_path)
     batch = SceneDataset.load(tmp_path).batch()
     assert set(judge_scenes(batch)) == {shards_module.KEPT}
