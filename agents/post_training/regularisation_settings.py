@@ -30,9 +30,6 @@ class RegularisationSettings:
         scenes: source of the real scenes: ``grammar``, or a dataset folder.
         bank_size: number of real scenes that are drawn from the grammar or read from the dataset, including the
             held-out scenes.
-        replay: further scenes for the pretraining loss, such as the winners of a search: the folder of a run, a scene
-            file or a dataset; null for none.
-        replay_share: share of replayed scenes in each batch of the pretraining loss, if there is a replay.
     """
 
     objective: str = "pretraining"
@@ -43,15 +40,11 @@ class RegularisationSettings:
     batch_size: int | None = None
     scenes: str = "grammar"
     bank_size: int = 4096
-    replay: str | None = None
-    replay_share: float = 0.5
 
     def __post_init__(self) -> None:
         at_least(self, 1, "batch_size", "base_samples")
         one_of(self, "objective", OBJECTIVES)
         positive(self, "sharpness")
-        if not 0 < self.replay_share <= 1:
-            raise InvalidInputError(f"regularisation.replay_share={self.replay_share} must be in (0, 1]")
         if self.weight is not None and not self.weight >= 0:
             raise InvalidInputError(f"regularisation.weight={self.weight} must not be negative")
         if self.target is not None and self.weight == 0:
