@@ -125,11 +125,7 @@ def _check_prior(name: str) -> None:
     if not adapters or exists(Path(adapters)):
         return
     for part in adapters.split("+"):
-        if not exists(Path(part.rpartition("*")[2].strip())):
-            raise InvalidInputError(
-                f"adapter={adapters[:200]!r}: nothing is at {part[:200]!r}; name the folder of a run with adapter.rank "
-                "or its adapter.safetensors"
-            )
+        find_prior(part.rpartition("*")[2].strip())
 
 
 def _check_name(kind: str, value: Any, known: Any, registry: str, config_dir: str) -> None:

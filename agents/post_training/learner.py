@@ -22,7 +22,6 @@ from agents.post_training.regularisation import Regularisation
 from agents.post_training.rollouts import Rollout, collect, stream_seed
 from agents.post_training.run_files import CHECKPOINT_NAME
 from agents.post_training.scene_bank import SceneBank
-from agents.priors.adapters import attach_adapter
 from agents.priors.base import ScenePrior
 from agents.priors.prompt_validation import no_text
 from agents.utils.checkpoints import check_tensors
@@ -61,9 +60,6 @@ class Learner:
         self.processes = ProcessGroup.current()
         self.processes.share(self.prior.parameters())
         self.regularisation = Regularisation(config.regularisation, self.prior)
-        if config.adapter.rank:
-            adapter = config.adapter
-            attach_adapter(self.prior, prior.loaded_as, rank=adapter.rank, scale=adapter.scale, seed=config.seed)
         self.slots = self.prior.config.slots if config.slots is None else config.slots
         self.policy = DenoisingPolicy(
             self.prior, config.num_steps, chunk=config.optimizer.chunk, guidance=config.guidance,

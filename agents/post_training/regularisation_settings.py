@@ -1,4 +1,4 @@
-"""Settings of the regularisation and of adapters; imports no torch."""
+"""Settings of the regularisation; imports no torch."""
 
 from __future__ import annotations
 
@@ -64,25 +64,3 @@ class RegularisationSettings:
     def pretraining_weight(self) -> float:
         """``weight``, or 0 for null; the config of a run has replaced null by the default of the algorithm."""
         return self.weight or 0.0
-
-
-@dataclass
-class AdapterSettings:
-    """Low-rank updates of the attention and MLP matrices, which are trained in place of all weights.
-
-    Attributes:
-        rank: rank of the updates; 0 trains all weights.
-        alpha: scale of the updates, times the rank: they are multiplied by alpha / rank.
-    """
-
-    rank: int = 0
-    alpha: float = 16.0
-
-    def __post_init__(self) -> None:
-        at_least(self, 0, "rank")
-        positive(self, "alpha")
-
-    @property
-    def scale(self) -> float:
-        """Scale of the updates, alpha / rank."""
-        return self.alpha / self.rank

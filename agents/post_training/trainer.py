@@ -250,7 +250,7 @@ class PostTrainer:
         self.files.picture(self.guard, reading)
         if reading.beyond and self.config.guard.action == "rollback":
             self.rollbacks += 1
-            self.learner.return_to(self.files.best(self.prior))
+            self.learner.return_to(self.files.best())
             self.learner.regularisation.return_to_checkpoint(self.guard.best_ratio)
 
     def _count_invalid(self) -> None:
