@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from scene_envs.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from agents.post_training.advantages import compute_advantages
+    from agents.post_training.advantages import Advantage, compute_advantages
     from agents.post_training.algorithm_settings import AlgorithmSettings, DDPOSFSettings
     from agents.post_training.algorithms import list_algorithms, register_algorithm
     from agents.post_training.base import Algorithm
@@ -20,12 +20,14 @@ if TYPE_CHECKING:
     from agents.post_training.guidance_distillation import GuidanceDistillation, GuidanceDistillationLoss
     from agents.post_training.losses import DDPOSFLoss
     from agents.post_training.neon import Neon, SelfTrainingLoss
-    from agents.post_training.policy import DenoisingPolicy
+    from agents.post_training.policy import DenoisingPolicy, gradient_weights
+    from agents.post_training.rollouts import SeededPolicy, collect
     from agents.post_training.trainer import PostTrainer, PostTrainResult, post_train
 
 __all__ = [
     "DDPO",
     "AWMLoss",
+    "Advantage",
     "Algorithm",
     "AlgorithmSettings",
     "DDPOSFLoss",
@@ -43,8 +45,11 @@ __all__ = [
     "PostTrainResult",
     "PostTrainer",
     "RewardWeightedLoss",
+    "SeededPolicy",
     "SelfTrainingLoss",
+    "collect",
     "compute_advantages",
+    "gradient_weights",
     "list_algorithms",
     "post_train",
     "post_train_and_compare",

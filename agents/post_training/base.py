@@ -3,31 +3,30 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, Generic, TypeVar, cast
+from typing import Any
 
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Generator
 from torchrl.objectives import LossModule
 
-from agents.post_training.base_kl import Parts, forward_kl
 from agents.post_training.gradients import BatchGradient
 from agents.post_training.policy import DenoisingPolicy
-from agents.post_training.rollouts import Branching, Rollout
 from agents.priors.base import ScenePrior
 from agents.utils.weight_average import WeightAverage
 
-Credit = TypeVar("Credit")
-"""Advantages of a batch, in the form that the algorithm's loss reads."""
 
-
-class Algorithm(ABC, Generic[Credit]):
+class Algorithm(ABC):
     """Rule that turns a batch of scenes into a gradient.
 
     Attributes:
         policy: the reverse chain of the prior in training.
-        loss: what is minimised.
+        advantage: writes what the loss reads into a batch; None where the scenes are not weighted.
+        loss: the loss that is minimised.
     """
 
     policy: DenoisingPolicy
+    advantage: TensorDictModuleBase | None = None
     loss: LossModule
 
     @property
@@ -36,25 +35,17 @@ class Algorithm(ABC, Generic[Credit]):
         return self.policy
 
     @property
-    def branching(self) -> Branching:
-        """Groups of scenes that share the first steps of their chain; none unless an algorithm defines them."""
-        return Branching()
-
-    @property
     def average(self) -> WeightAverage | None:
         """Averaged weights that are evaluated and saved; None evaluates and saves the weights in training."""
         return None
 
     @abstractmethod
-    def advantage(self, rollout: Rollout) -> Credit:
-        """Advantages of the scenes of a batch, or of their objects."""
-
-    @abstractmethod
-    def accumulate(self, rollout: Rollout, advantage: Credit, generator: Generator) -> BatchGradient:
+    def accumulate(self, batch: TensorDictBase, generator: Generator) -> BatchGradient:
         """Add the gradient of a batch to ``.grad``; everything random is drawn from ``generator`` (CPU).
 
-        With several processes, each process adds the gradient of its own scenes, as a part of the mean over all scenes.
-        The training loop sums these parts.
+        The batch [B, S] is that of :func:`~agents.post_training.rollouts.collect`, after :attr:`advantage`. With
+        several processes, each process adds the gradient of its own scenes, as a part of the mean over all scenes. The
+        training loop sums these parts.
         """
 
     def real_generator(self, own: Generator, real: Generator) -> Generator:
@@ -65,11 +56,6 @@ class Algorithm(ABC, Generic[Credit]):
             real: generator that is independent of ``own``, and that drew the real scenes.
         """
         return real
-
-    def kl(self, rollout: Rollout, base: ScenePrior, generator: Generator) -> Parts:
-        """Terms whose sum is the KL divergence of the prior in training from ``base``, nats per random variable."""
-        prior = cast(ScenePrior, self.policy.prior)
-        return forward_kl(prior, base, rollout, generator, self.policy.chunk)
 
     def learning_rate(self, rate: float, update: int) -> float:
         """Learning rate of an update.

@@ -8,7 +8,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
+from tensordict import TensorDictBase
+
 from agents.configuration.tree import changed
+from agents.post_training.advantages import final_reward
 from agents.post_training.algorithm_settings import GuidanceDistillationSettings, NeonSettings
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.gradients import accumulate_policy_gradient, gradient_norm
@@ -19,8 +22,6 @@ from agents.priors.base import ScenePrior
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
-
-    from agents.post_training.rollouts import Rollout
 
 LOUD, QUIET = 30.0, 1 / 30.0
 """Ratios of policy to regularisation gradient norm beyond which one of the two gradients dominates."""
@@ -124,22 +125,24 @@ def _examine(trainer: PostTrainer) -> DoctorReport:
     trainer.prepare()
     learner = trainer.learner
     started = time.perf_counter()
-    rollout = learner.rollout(iteration=0)
+    batch = learner.rollout(iteration=0)
     sampled = time.perf_counter()
-    advantage = learner.algorithm.advantage(rollout)
-    row = learner.accumulate(rollout, advantage, trainer.scenes, index=0)
+    if learner.algorithm.advantage is not None:
+        learner.algorithm.advantage(batch)
+    row = learner.accumulate(batch, trainer.scenes, index=0)
     updated = time.perf_counter()
-    steps, largest = _step_rows(learner, rollout, advantage)
-    valid = rollout.reward[rollout.valid].double()
-    some = len(valid) > 0
+    steps, largest = _step_rows(learner, batch)
+    reward, valid = final_reward(batch[:, -1])
+    scored = reward[valid].double()
+    some = len(scored) > 0
     report = DoctorReport(
         log_ratio=max(largest, row.get("log_ratio", 0.0)),
         steps=steps,
-        reward_mean=float(valid.mean()) if some else float("nan"),
-        reward_std=float(valid.std(unbiased=False)) if some else float("nan"),
-        reward_min=float(valid.min()) if some else float("nan"),
-        reward_max=float(valid.max()) if some else float("nan"),
-        valid_fraction=float(rollout.valid.double().mean()),
+        reward_mean=float(scored.mean()) if some else float("nan"),
+        reward_std=float(scored.std(unbiased=False)) if some else float("nan"),
+        reward_min=float(scored.min()) if some else float("nan"),
+        reward_max=float(scored.max()) if some else float("nan"),
+        valid_fraction=float(valid.double().mean()),
         policy_gradient_norm=row["policy_gradient_norm"],
         pretraining_gradient_norm=row["pretraining_gradient_norm"],
         sampling_seconds=sampled - started,
@@ -149,7 +152,7 @@ def _examine(trainer: PostTrainer) -> DoctorReport:
     return replace(report, advice=_advice(report, trainer.config))
 
 
-def _step_rows(learner: Learner, rollout: Rollout, advantage: Any) -> tuple[list[StepRow], float]:
+def _step_rows(learner: Learner, batch: TensorDictBase) -> tuple[list[StepRow], float]:
     """The sigma table, and the largest log-ratio over the steps in the gradient; nothing without such steps."""
     loss = learner.algorithm.loss
     rows: list[StepRow] = []
@@ -161,7 +164,7 @@ def _step_rows(learner: Learner, rollout: Rollout, advantage: Any) -> tuple[list
         norm = 0.0
         if weight > 0:
             learner.optimizer.zero_grad(set_to_none=True)
-            found = accumulate_policy_gradient(loss, rollout, advantage, [step])
+            found = accumulate_policy_gradient(loss, batch, [step])
             norm, largest = gradient_norm(learner.parameters), max(largest, found.columns["log_ratio"])
         rows.append(StepRow(step, timesteps[step], float(learner.stds[step]), weight, norm))
     learner.optimizer.zero_grad(set_to_none=True)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from tensordict import TensorDictBase
+
 from agents.post_training.config import PostTrainConfig
-from agents.post_training.rollouts import Rollout, gathered, stream_seed
+from agents.post_training.rollouts import gathered_scenes, stream_seed
 from agents.priors.base import ScenePrior
 from agents.utils.process_group import ProcessGroup
 from rewards import RewardContext, learned_parts
@@ -76,10 +78,10 @@ class LearnedRewards:
             part.learn(batch, FIRST_STEPS)
         fit_statistics(self._reward, batch, RewardContext(None if prompts is None else tuple(prompts)))
 
-    def learn(self, rollout: Rollout) -> None:
+    def learn(self, batch: TensorDictBase) -> None:
         """Train the parts on the scenes of a batch, after these were scored."""
         if self.parts:
-            scenes = gathered(rollout)[-1]
+            scenes = gathered_scenes(batch)
             for part in self.parts:
                 part.learn(scenes)
 

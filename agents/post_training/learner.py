@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import replace
 from typing import Any
 
 import torch
+from tensordict import TensorDict, TensorDictBase
 from torch import Generator, nn
 
 from agents.post_training.algorithms import make_algorithm
@@ -21,7 +21,7 @@ from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.processes import WholeBatchReward
 from agents.post_training.prompts import PromptDeck, PromptSets
 from agents.post_training.regularisation import Regularisation
-from agents.post_training.rollouts import Rollout, collect, stream_seed
+from agents.post_training.rollouts import collect, stream_seed
 from agents.post_training.run_files import CHECKPOINT_NAME
 from agents.post_training.scene_bank import SceneBank
 from agents.priors.adapters import attach_adapter
@@ -30,7 +30,7 @@ from agents.priors.prompt_validation import no_text
 from agents.utils.checkpoints import check_tensors
 from agents.utils.process_group import ProcessGroup
 from agents.utils.weight_average import AveragedWeights, WeightAverage
-from rewards import averages_objects, counts_objects, depends_on_batch
+from rewards import depends_on_batch
 from rewards.isolation import close_reward, run_reward
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.envs.masks import resolve_mask
@@ -75,7 +75,7 @@ class Learner:
             claim_guidance=config.claim_guidance,
         )  # fmt: skip
         self.stds = self.policy.stds(self.slots).cpu()
-        self.algorithm: Algorithm[Any] = make_algorithm(config.algorithm, self.policy, self.stds)
+        self.algorithm: Algorithm = make_algorithm(config.algorithm, self.policy, self.stds)
         self.reward = run_reward(
             config.reward,
             seed=config.seed,
@@ -158,29 +158,14 @@ class Learner:
         parts = self.inpaint_deck.deal(units, prompts, stream_seed(self.config.seed, "inpaint", iteration))
         return parts.prompts, parts
 
-    def rollout(self, iteration: int) -> Rollout:
-        """A batch of fresh scenes, or this process's share of it."""
-        algorithm, batch = self.algorithm, self.config.batch_size
-        branching, own = algorithm.branching, self.processes.rows(batch)
-        observed, groups = None, None
-        prompts, parts = self.deal(iteration)
-        if parts is not None:
-            units = branching.groups(batch)
-            parts = parts.take(torch.arange(units).repeat_interleave(branching.siblings)[own])
-            observed, groups = self.prior.observe(parts.scenes, parts.mask), parts.groups
-        if prompts is not None:
-            prompts = [text for text in prompts for _ in range(branching.siblings)][own]
-        rollout = collect(
-            self.env,
-            algorithm.sampling_policy,
-            seed=self.config.seed,
-            iteration=iteration,
-            prompts=prompts,
-            branching=branching,
-            observed=observed,
-            groups=groups,
-        )
-        return replace(rollout, averages=averages_objects(self.reward), counts=counts_objects(self.reward))
+    def rollout(self, iteration: int) -> TensorDict:
+        """A batch [B, S] of fresh scenes, or this process's share of it; see :func:`collect`."""
+        prompts: Sequence[str] | None = None
+        if self.deck is not None:
+            batch = self.config.batch_size
+            prompts = self.deck.deal(batch, self._generator("prompts", iteration))[self.processes.rows(batch)]
+        policy = self.algorithm.sampling_policy
+        return collect(self.env, policy, seed=self.config.seed, iteration=iteration, prompts=prompts)
 
     def begin_rewards(self, real: SceneBatch, *, first: bool) -> None:
         """Give real scenes to the rewards that learn; does nothing if no reward learns or is normalised.
@@ -202,21 +187,20 @@ class Learner:
         except RewardError:  # its process cannot be asked any more
             return None
 
-    def accumulate(self, rollout: Rollout, advantage: Any, scenes: SceneBank, index: int) -> dict[str, float]:
+    def accumulate(self, batch: TensorDictBase, scenes: SceneBank, index: int) -> dict[str, float]:
         """Put the policy and regularisation gradients, summed over all processes, into ``.grad``; measure each one.
 
         Args:
-            rollout: the batch.
-            advantage: its advantages, as the algorithm makes them.
+            batch: whole episodes [B, S], with the advantages that the algorithm writes.
             scenes: real scenes for the regularisation.
             index: number of the update in the run, from which the draws of steps and real scenes follow.
         """
         config = self.config
         self.optimizer.zero_grad(set_to_none=True)
-        policy = self.algorithm.accumulate(rollout, advantage, self._generator("steps", index))
+        policy = self.algorithm.accumulate(batch, self._generator("steps", index))
         self.processes.sum_gradients(self.parameters)
         policy_norm = gradient_norm(self.parameters)
-        held = self.regularisation.accumulate(self.algorithm, rollout, self._generator("kl", index))
+        held = self.regularisation.accumulate(self.algorithm, batch, self._generator("kl", index))
         generator = self._generator("real", index)
         count = config.regularisation.real_scenes
         real = scenes.batch(count, generator)
@@ -231,7 +215,7 @@ class Learner:
             **policy.figures(),
         }
 
-    def update(self, rollout: Rollout, advantage: Any, scenes: SceneBank, index: int) -> dict[str, float]:
+    def update(self, batch: TensorDictBase, scenes: SceneBank, index: int) -> dict[str, float]:
         """One optimiser step.
 
         Raises:
@@ -239,7 +223,7 @@ class Learner:
         """
         config = self.config.optimizer
         rate = self.algorithm.learning_rate(self.lr * min(1.0, (index + 1) / max(1, config.warmup)), index)
-        row = self.accumulate(rollout, advantage, scenes, index)
+        row = self.accumulate(batch, scenes, index)
         row["gradient_norm"] = float(nn.utils.clip_grad_norm_(self.parameters, config.clip))
         if not all(math.isfinite(row[name]) for name in ("gradient_norm", "policy_loss", "pretraining_loss")):
             self.optimizer.zero_grad(set_to_none=True)

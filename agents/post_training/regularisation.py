@@ -16,7 +16,7 @@ from agents.post_training.discriminative import DiscriminativeLoss
 from agents.post_training.gradients import SceneLoss, add_gradient, add_regularisation_gradient
 from agents.post_training.hold import FAR, HIGHEST, HoldState, adjust
 from agents.post_training.regularisation_settings import RegularisationSettings
-from agents.post_training.rollouts import Rollout
+from tensordict import TensorDictBase
 from agents.post_training.scene_bank import PromptedScenes
 from agents.priors.base import ScenePrior
 from agents.utils.process_group import ProcessGroup
@@ -51,7 +51,7 @@ class Regularisation:
         """Coefficient of the KL divergence."""
         return self.settings.kl_weight * self.state.factor
 
-    def accumulate(self, algorithm: Algorithm[Any], rollout: Rollout, generator: Generator) -> dict[str, float]:
+    def accumulate(self, algorithm: Algorithm[Any], rollout: TensorDictBase, generator: Generator) -> dict[str, float]:
         """Add the gradient of the KL divergence to ``.grad``; returns columns of the log."""
         row = {} if self.target is None else {"regularisation_weight": self.weight, "hold_factor": self.state.factor}
         if self.base is None or not self.measures_kl:
