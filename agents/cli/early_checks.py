@@ -68,8 +68,7 @@ def check_early(settings: Any, config_dir: str = "", module: ModuleType | None =
         raise InvalidInputError(f"scene={str(scene)[:200]}: give the name of one scene type, or several joined by +")
     for scene in str(getattr(settings, "scene", "") or "").split("+"):
         _check_name("scene type", scene, known_scenes, "scene_envs.grammars", config_dir)
-    asked = [getattr(settings, "mask", None), _dotted(settings, "inpaint.mask")]
-    for mask in [*asked, *(getattr(settings, "masks", None) or [])]:
+    for mask in [getattr(settings, "mask", None), *(getattr(settings, "masks", None) or [])]:
         _check_name("mask", mask, known_masks, "scene_envs.envs.masks", config_dir)
     if isinstance(device := getattr(settings, "device", "cpu"), str):
         _check_device(device)

@@ -16,7 +16,6 @@ from agents.configuration.shared_keys import RewardLimits, SamplingKeys, Trainin
 from agents.configuration.tree import plain_tree
 from agents.post_training.algorithm_settings import AlgorithmSettings, DDPOSFSettings, NeonSettings
 from agents.post_training.algorithms import algorithm_settings, list_algorithms
-from agents.post_training.inpaint_settings import InpaintSettings
 from agents.post_training.regularisation_settings import REAL_SCENES, AdapterSettings, RegularisationSettings
 from scene_envs.envs.settings import PROMPT_SOURCES, check_claim_guidance
 from scene_envs.errors import InvalidInputError
@@ -146,7 +145,6 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
 
         - step_scale * sum over gradient steps of mean over scenes of  A * log p(x_{t-1} | x_t)
         + regularisation.weight * pretraining loss on real scenes
-        + regularisation.kl * KL divergence from the base prior
 
     where ``step_scale = steps with weight > 0 / gradient_steps``. ``algorithm.log_prob_reduction`` says how log p is
     reduced over a scene's entries. The pretraining loss is a mean over scenes and entries. The weight is meaningful
@@ -176,10 +174,9 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
         seed: seed of the initial noise, the chain's noise, the choice of steps and the real scenes.
         algorithm: the post-training algorithm.
         optimizer: the optimiser of the weights.
-        regularisation: losses that keep the prior near real scenes and near its base.
+        regularisation: losses that keep the prior near real scenes.
         guard: checks on held-out real scenes.
         adapter: low-rank updates, off by default.
-        inpaint: post-training inside inpainting, off by default.
         logger: log files and progress display.
     """
 
@@ -209,7 +206,6 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
     regularisation: RegularisationSettings = nested(RegularisationSettings)
     guard: GuardSettings = nested(GuardSettings)
     adapter: AdapterSettings = nested(AdapterSettings)
-    inpaint: InpaintSettings = nested(InpaintSettings)
     logger: PostTrainLoggerSettings = nested(PostTrainLoggerSettings, folder="logger", option="csv")
 
     def __post_init__(self) -> None:
@@ -229,11 +225,6 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
                 f"claim_guidance={self.claim_guidance:g} changes how scenes are drawn, and "
                 f"algorithm={self.algorithm.name} learns from the probability of its own draws; take algorithm=nft or "
                 "awm, or leave claim_guidance=0"
-            )
-        if self.claim_guidance and self.inpaint.mask is not None:
-            raise InvalidInputError(
-                f"claim_guidance={self.claim_guidance:g} guides whole scenes, and inpaint.mask={self.inpaint.mask} "
-                "regenerates parts; leave one of them out"
             )
         if self.optimizer.lr is None:
             factor = _ADAPTER_RATE if self.adapter.rank else 1.0
@@ -262,7 +253,7 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
                 f"hold={self.regularisation.hold} adjusts regularisation.weight, and the size of this weight does not "
                 "change the steps of algorithm=neon; lower algorithm.w for a shorter step, or take another algorithm"
             )
-        if target is not None and target.figure == "guard" and target.value > self.guard.limit:
+        if target is not None and target > self.guard.limit:
             raise InvalidInputError(
                 f"hold={self.regularisation.hold} lies beyond guard.limit={self.guard.limit:g}, past which no prior is "
                 f"kept; raise guard.limit, or hold at most guard:{self.guard.limit:g}"

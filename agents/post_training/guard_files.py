@@ -38,7 +38,7 @@ def make_guard(config: PostTrainConfig, learner: Learner, scenes: SceneBank) -> 
         )
     limits = config.guard.limits(config.algorithm.sample_limits)
     held = config.regularisation.target
-    target = held.value if held is not None and held.figure == "guard" else math.inf
+    target = math.inf if held is None else held
     seed, learns = stream_seed(config.seed, "guard"), bool(learner.learned)
     return Guard(scenes.heldout, config.guard.limit, seed, asked, check, limits, target, learns)
 

@@ -41,8 +41,6 @@ class GuidanceDistillationLoss(PlainLoss):
         denoised: (B, N, 12) float, the teacher's estimate of the normalised poses of x_0. Default ``"denoised"``.
         trained: (B, N) bool, optional, slots whose poses are trained; without it, all. Default ``"trained"``.
         text, text_mask: (B, L, W) tokens and (B, L) their mask, optional. Default ``"text"`` and ``"text_mask"``.
-        observed: (B, N, 2) bool, optional, True where the pose, or the category, of a slot is observed. Default
-            ``"observed"``.
 
     Args:
         prior: prior that is trained.
@@ -66,7 +64,6 @@ class GuidanceDistillationLoss(PlainLoss):
         trained: NestedKey = "trained"
         text: NestedKey = "text"
         text_mask: NestedKey = "text_mask"
-        observed: NestedKey = "observed"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -91,11 +88,10 @@ class GuidanceDistillationLoss(PlainLoss):
         text = None if tokens is None or mask is None else (tokens.detach(), mask)
         weight = self.prior.loss_weight(x.shape[1]).to(x)[:, :POSE_FEATURES].expand(len(x), -1, -1)
         weight = weight if trained is None else weight * trained[..., None]
-        observed = self.prior.observed_by_mask(x, flat.get(keys.observed, None))
         noised = NoisedScenes(
             x_t=x, t=t, target=teacher, weight=weight, scale=x.new_ones(len(x)),
             category=x[..., POSE_FEATURES:].argmax(dim=-1),
-            observed=self.prior.observed_entries(x, observed),
+            observed=self.prior.observed_entries(x),
         )  # fmt: skip
         found = self.prior.denoised(noised, self.prior.output(noised, text))[..., :POSE_FEATURES]
         entries = ((found - teacher) / self._std(t, x)).square() * weight

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -15,11 +14,10 @@ from agents.post_training.algorithms import make_algorithm
 from agents.post_training.base import Algorithm
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.gradients import gradient_norm
-from agents.post_training.inpaint_deck import InpaintDeck, Parts, real_parts, sampled_parts
 from agents.post_training.learned_rewards import FIRST_SAMPLES, LearnedRewards
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.processes import WholeBatchReward
-from agents.post_training.prompts import PromptDeck, PromptSets
+from agents.post_training.prompts import PromptDeck
 from agents.post_training.regularisation import Regularisation
 from agents.post_training.rollouts import collect, stream_seed
 from agents.post_training.run_files import CHECKPOINT_NAME
@@ -33,7 +31,6 @@ from agents.utils.weight_average import AveragedWeights, WeightAverage
 from rewards import depends_on_batch
 from rewards.isolation import close_reward, run_reward
 from scene_envs.envs import DenoisingTorchRLEnv
-from scene_envs.envs.masks import resolve_mask
 from scene_envs.envs.scoring import RewardScorer
 from scene_envs.errors import InvalidInputError, RewardError
 from scene_envs.scene import SceneBatch
@@ -58,8 +55,6 @@ class Learner:
     def __init__(self, config: PostTrainConfig, prior: ScenePrior) -> None:
         self.config = config
         self.prior = deepcopy(prior).to(config.device).eval()
-        if config.inpaint.mask is not None:
-            resolve_mask(config.inpaint.mask)  # raises now, not later, if there is no such mask
         if config.prompt is not None and not self.prior.conditional:
             raise no_text(self.prior.scene_type, str(config.prompt))
         self.prior.freeze_text()
@@ -97,7 +92,6 @@ class Learner:
         )
         self.scorer = RewardScorer(self.reward, config.workers) if shared else self.env.core.scorer
         self.deck: PromptDeck | None = None
-        self.inpaint_deck: InpaintDeck | None = None
         self.parameters = [p for p in self.prior.parameters() if p.requires_grad]
         self.lr = config.optimizer.lr or config.algorithm.learning_rate
         self.optimizer = torch.optim.AdamW(
@@ -206,12 +200,11 @@ class Learner:
         real = scenes.batch(count, generator)
         samples = None if scenes.base is None else scenes.base.batch(count, self._generator("base", index))
         noise = self.algorithm.real_generator(self._generator("steps", index), generator)
-        row = self.regularisation.accumulate_scenes(self.prior, real, samples, noise, config.optimizer.chunk)
+        row = self.regularisation.accumulate(self.prior, real, samples, noise, config.optimizer.chunk)
         return {
             "policy_loss": policy.loss,
             "policy_gradient_norm": policy_norm,
             **row,
-            **held,
             **policy.figures(),
         }
 
@@ -272,7 +265,7 @@ class Learner:
         if self.average is not None:
             self.average.restore(state["average"], state["average_updates"])
         self.algorithm.restore(state["algorithm"])
-        self.regularisation.load_state_dict(state.get("regularisation"))
+        self.regularisation.load_state_dict(state["regularisation"])
         self.learned.restore(state)
         torch.set_rng_state(state["random"])
 

@@ -19,22 +19,21 @@ from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.errors import TrainingError
 from scene_envs.scene import SceneBatch
 
-STREAMS = (
-    "start",
-    "noise",
-    "steps",
-    "real",
-    "bank",
-    "guard",
-    "prompts",
-    "samples",
-    "kl",
-    "inpaint",
-    "base",
-    "base_prompts",
-    "base_samples",
-    "discriminator",
-)
+STREAMS = {
+    "start": 0,
+    "noise": 1,
+    "steps": 2,
+    "real": 3,
+    "bank": 4,
+    "guard": 5,
+    "prompts": 6,
+    "samples": 7,
+    "base": 10,
+    "base_prompts": 11,
+    "base_samples": 12,
+    "discriminator": 13,
+}
+"""Purposes of random draws, and the number of each, which seeds depend on."""
 
 
 def stream_seed(seed: int, stream: str, iteration: int = 0) -> int:

@@ -108,7 +108,5 @@ def load_resumable(directory: Path, config: PostTrainConfig) -> dict[str, Any] |
 
 
 def _flat(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration with nested keys joined by dots; reward and mask stay one value, even if they are mappings."""
-    inpaint = {**config.get("inpaint", {})}
-    whole = {"reward": config.get("reward"), "inpaint.mask": inpaint.pop("mask", None)}
-    return {**dotted({**config, "reward": None, "inpaint": inpaint}), **whole}
+    """The configuration with nested keys joined by dots; the reward stays one value, even if it is a mapping."""
+    return {**dotted({**config, "reward": None}), "reward": config.get("reward")}

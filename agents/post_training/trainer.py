@@ -195,7 +195,6 @@ class PostTrainer:
         replay = kept_replay(self.directory, self.prior, config.regularisation, x0.shape[1], reuse=reuse_scenes)
         self.scenes = bank if replay is None else bank.with_replay(replay, config.regularisation.replay_share)
         self.learner.deal_prompts(self.scenes)
-        self.learner.deal_parts(batch[: len(self.scenes.train)], prompts)
         self.learner.begin_rewards(batch[: len(self.scenes.train)], first=not reuse_scenes)
         if not reuse_scenes:
             check_it_can_learn(self.learner, batch, prompts)
@@ -231,7 +230,6 @@ class PostTrainer:
             except NonFiniteGradient as error:
                 raise self._not_finite(error.figures) from None
         self.learner.algorithm.end_iteration()
-        self.learner.regularisation.observe("kl", row.get("kl"), self.iteration + 1)
         return row
 
     # -- guard ----------------------------------------------------------------------------------
@@ -251,7 +249,7 @@ class PostTrainer:
             reading = self.guard.check(prior, self.iteration, reward, realism(scenes), sample=sample)
             if reading.kept:
                 self.files.keep(prior, self.guard, self.iteration)
-        self.learner.regularisation.observe("guard", reading.ratio, self.iteration)
+        self.learner.regularisation.observe(reading.ratio, self.iteration)
         figures = {f"guard_{name}": value for name, value in reading.samples.items()}
         self.history[-1] |= {"guard_loss": reading.loss, "guard_ratio": reading.ratio, **figures, **reading.realism}
         self.files.picture(self.guard, reading)

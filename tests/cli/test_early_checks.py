@@ -44,7 +44,6 @@ LINES = {
     "search mask=given": "the mask 'given' has another name now: explicit",
     "search mask=culprit": "did you mean 'culprits'",
     "search mask={name:culprit,at_least:2}": "did you mean 'culprits'",
-    "post-train inpaint.mask=culprit": "did you mean 'culprits'",
     "post-train reward={name:clpi,reward:object_count,high:3}": "did you mean 'clip'",
     "search adapter=nowhere prior=dimsum_table": "nothing is at 'nowhere'",
     "demo workers=-3": "workers=-3: give a number of processes",

@@ -196,7 +196,7 @@ def test_words_win_over_a_file(tmp_path: Path) -> None:
     "words",
     [
         ["reward={name: weighted_sum, rewards: [object_count]}", "optimizer={lr: 0.1}", "optimizer.lr=1e-4"],
-        ["algorithm=nft", "algorithm={siblings: 2}", "seed=null", "prompt='${x}, y'"],
+        ["algorithm=nft", "algorithm={draws: 3}", "seed=null", "prompt='${x}, y'"],
         ["guard={action: rollback}", "hold=guard:1.05", "reward.name=clip"],
         ["seed=range(1,3)"],
         ["seed.x=3"],
