@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -120,38 +121,6 @@ class Learner:
                 self.prior, config.prompt, together, self.slots, scenes.prompts, len(scenes.train)
             )
 
-    def deal_parts(self, real: SceneBatch, prompts: PromptSets | None) -> None:
-        """Make the deck that deals the observed parts of batches; does nothing in a run that samples whole scenes.
-
-        Args:
-            real: real scenes that training may see.
-            prompts: prompts of each real scene; None for a prior that reads no prompts.
-        """
-        config, settings = self.config, self.config.inpaint
-        if settings.mask is None:
-            return
-        if settings.scenes == "real":
-            source = real_parts(real, self.slots, prompts if config.prompt == "data" else None)
-        else:
-            sampler: Any = self.algorithm.sampling_policy.prior
-            source = sampled_parts(sampler, config.num_steps, self.slots, config.guidance)
-        self.inpaint_deck = InpaintDeck(settings, source, self.scorer, config.algorithm.scenes_per_prompt)
-
-    def deal(self, iteration: int) -> tuple[Sequence[str] | None, Parts | None]:
-        """Prompts and observed parts of a batch, one per group of siblings; None where the run has none.
-
-        Raises:
-            InvalidInputError: the mask leaves nothing to regenerate in any scene.
-        """
-        units = self.algorithm.branching.groups(self.config.batch_size)
-        prompts: Sequence[str] | None = None
-        if self.deck is not None:
-            prompts = self.deck.deal(units, self._generator("prompts", iteration))
-        if self.inpaint_deck is None:
-            return prompts, None
-        parts = self.inpaint_deck.deal(units, prompts, stream_seed(self.config.seed, "inpaint", iteration))
-        return parts.prompts, parts
-
     def rollout(self, iteration: int) -> TensorDict:
         """A batch [B, S] of fresh scenes, or this process's share of it; see :func:`collect`."""
         prompts: Sequence[str] | None = None
@@ -194,7 +163,6 @@ class Learner:
         policy = self.algorithm.accumulate(batch, self._generator("steps", index))
         self.processes.sum_gradients(self.parameters)
         policy_norm = gradient_norm(self.parameters)
-        held = self.regularisation.accumulate(self.algorithm, batch, self._generator("kl", index))
         generator = self._generator("real", index)
         count = config.regularisation.real_scenes
         real = scenes.batch(count, generator)

@@ -45,7 +45,7 @@ class OwnSampleAlgorithm(AveragedSampler):
         With several processes, ``.grad`` gets the part of this process's scenes in the mean over all scenes.
         """
         x0 = self.prior.encode(finished_scenes(batch).to(self.prior.device))
-        scenes = batch.exclude("next")[:, -1].set("scene", x0)
+        scenes = batch.exclude("next", "timestep")[:, -1].set("scene", x0)
         size, processes = self.policy.chunk or len(x0), ProcessGroup.current()
         valid = max(1.0, processes.sum_numbers(int(scenes["valid"].sum()))[0])
         everything, own = gather_rows(x0), processes.rows(processes.size * len(x0))

@@ -13,7 +13,6 @@ from agents.post_training.discriminative import DiscriminativeLoss
 from agents.post_training.gradients import SceneLoss, add_regularisation_gradient
 from agents.post_training.hold import FAR, HIGHEST, HoldState, adjust, relative_error
 from agents.post_training.regularisation_settings import RegularisationSettings
-from tensordict import TensorDictBase
 from agents.post_training.scene_bank import PromptedScenes
 from agents.priors.base import ScenePrior
 
@@ -40,27 +39,7 @@ class Regularisation:
         """Coefficient of the pretraining loss on real scenes."""
         return self.settings.pretraining_weight * self.state.factor
 
-    @property
-    def kl_weight(self) -> float:
-        """Coefficient of the KL divergence."""
-        return self.settings.kl_weight * self.state.factor
-
-    def accumulate(self, algorithm: Algorithm[Any], rollout: TensorDictBase, generator: Generator) -> dict[str, float]:
-        """Add the gradient of the KL divergence to ``.grad``; returns columns of the log."""
-        row = {} if self.target is None else {"regularisation_weight": self.weight, "hold_factor": self.state.factor}
-        if self.base is None or not self.measures_kl:
-            return row
-        parts = algorithm.kl(rollout, self.base, generator)
-        value, norm = math.nan, 0.0
-        if self.kl_weight:
-            value, norm = add_gradient(parts, algorithm.policy.parameters(), self.kl_weight)
-        else:
-            with torch.no_grad():
-                processes = ProcessGroup.current()
-                value = processes.sum_numbers(sum(float(term) for part in parts for term in part))[0] / processes.size
-        return {**row, "kl": value, "kl_weight": self.kl_weight, "kl_gradient_norm": norm}
-
-    def accumulate_scenes(
+    def accumulate(
         self,
         prior: ScenePrior,
         real: PromptedScenes,

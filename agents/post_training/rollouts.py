@@ -38,7 +38,7 @@ STREAMS = {
 
 def stream_seed(seed: int, stream: str, iteration: int = 0) -> int:
     """A seed below 2^31 for one purpose in one iteration, so that a resumed run needs no generator's state."""
-    return derived_seed(seed, STREAMS.index(stream), iteration)
+    return derived_seed(seed, STREAMS[stream], iteration)
 
 
 class SeededPolicy(TensorDictModuleBase):
