@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from agents.post_training.guard import Guard
     from agents.post_training.guidance_distillation import GuidanceDistillation, GuidanceDistillationLoss
     from agents.post_training.losses import DDPOSFLoss
-    from agents.post_training.neon import Neon, SelfTrainingLoss
     from agents.post_training.policy import DenoisingPolicy
     from agents.post_training.trainer import PostTrainer, PostTrainResult, post_train
 
@@ -38,12 +37,10 @@ __all__ = [
     "GuidanceDistillation",
     "GuidanceDistillationLoss",
     "NFTLoss",
-    "Neon",
     "PostTrainConfig",
     "PostTrainResult",
     "PostTrainer",
     "RewardWeightedLoss",
-    "SelfTrainingLoss",
     "compute_advantages",
     "list_algorithms",
     "post_train",

@@ -13,7 +13,6 @@ from agents.post_training.algorithm_settings import (
     DDPOISSettings,
     DDPOSFSettings,
     GuidanceDistillationSettings,
-    NeonSettings,
     NFTSettings,
     RewardWeightedSettings,
 )
@@ -44,7 +43,6 @@ _ALGORITHMS = Registry(
         ),
         "nft": _Entry(NFTSettings, _FORWARD),
         "awm": _Entry(AWMSettings, _FORWARD),
-        "neon": _Entry(NeonSettings, "agents.post_training.neon:Neon"),
         "reward_weighted": _Entry(RewardWeightedSettings, _FORWARD),
     },
 )

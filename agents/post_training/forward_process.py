@@ -41,7 +41,6 @@ class ForwardProcess(OwnSampleAlgorithm):
     """
 
     loss: ForwardProcessLoss
-    copy: Expectation | None
 
     def __init__(self, settings: ForwardProcessSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
         super().__init__(policy, draws=settings.draws, sampler_decay=settings.sampler_decay)

@@ -216,11 +216,10 @@ class Learner:
         policy_norm = gradient_norm(self.parameters)
         held = self.regularisation.accumulate(self.algorithm, rollout, self._generator("kl", index))
         generator = self._generator("real", index)
-        count = config.regularisation.real_scenes
+        count = config.regularisation.batch_size
         real = scenes.batch(count, generator)
         samples = None if scenes.base is None else scenes.base.batch(count, self._generator("base", index))
-        noise = self.algorithm.real_generator(self._generator("steps", index), generator)
-        row = self.regularisation.accumulate_scenes(self.prior, real, samples, noise, config.optimizer.chunk)
+        row = self.regularisation.accumulate_scenes(self.prior, real, samples, generator, config.optimizer.chunk)
         return {
             "policy_loss": policy.loss,
             "policy_gradient_norm": policy_norm,
@@ -236,7 +235,7 @@ class Learner:
             NonFiniteGradient: the gradient is not finite; the weights in training are unchanged.
         """
         config = self.config.optimizer
-        rate = self.algorithm.learning_rate(self.lr * min(1.0, (index + 1) / max(1, config.warmup)), index)
+        rate = self.lr * min(1.0, (index + 1) / max(1, config.warmup))
         row = self.accumulate(rollout, advantage, scenes, index)
         row["gradient_norm"] = float(nn.utils.clip_grad_norm_(self.parameters, config.clip))
         if not all(math.isfinite(row[name]) for name in ("gradient_norm", "policy_loss", "pretraining_loss")):

@@ -10,8 +10,6 @@ from scene_envs.errors import InvalidInputError
 
 OBJECTIVES = ("pretraining", "discriminative")
 """Losses of the regularisation."""
-REAL_SCENES = 48
-"""Real scenes per update where neither the settings nor the algorithm name another number."""
 
 
 @dataclass
@@ -28,7 +26,7 @@ class RegularisationSettings:
             of a scene; null for none, or 1 with ``hold=kl:VALUE``.
         hold: target that the run holds by adjusting both coefficients. ``guard:1.05`` is the held-out loss as a ratio
             to the base prior's, ``kl:0.01`` the KL divergence; null keeps the coefficients constant.
-        batch_size: real scenes per update; null takes 48, or the run's ``batch_size`` with ``algorithm=neon``.
+        batch_size: real scenes per update.
         scenes: source of the real scenes: ``grammar``, or a dataset folder.
         bank_size: number of real scenes that are drawn from the grammar or read from the dataset, including the
             held-out scenes.
@@ -43,7 +41,7 @@ class RegularisationSettings:
     base_samples: int = 1024
     kl: float | None = None
     hold: str | None = None
-    batch_size: int | None = None
+    batch_size: int = 48
     scenes: str = "grammar"
     bank_size: int = 4096
     replay: str | None = None
@@ -63,11 +61,6 @@ class RegularisationSettings:
             raise InvalidInputError(
                 f"hold={self.hold} adjusts regularisation.weight and regularisation.kl, and both are 0; give one"
             )
-
-    @property
-    def real_scenes(self) -> int:
-        """``batch_size``, or its default for null; the config of a run has replaced null."""
-        return REAL_SCENES if self.batch_size is None else self.batch_size
 
     @property
     def target(self) -> Target | None:

@@ -110,8 +110,6 @@ def test_the_key_is_typed_with_or_without_its_group(word: str) -> None:
         (["hold=gard:1.05"], "guard"),
         (["hold=guard:1.05", "regularisation.weight=0"], "both are 0"),
         (["hold=guard:1.6"], "guard.limit"),
-        (["algorithm=neon", "hold=guard:1.05"], "does not change the steps of algorithm=neon"),
-        (["algorithm=neon", "hold=kl:0.01"], "lower algorithm.w"),
         (["regularisation.kl=-1"], "regularisation.kl=-1"),
     ],
 )

@@ -290,9 +290,7 @@ def algorithm(name: str) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", ["ddpo_sf", "ddpo_is", "nft", "awm", "guidance_distillation", "neon", "reward_weighted"]
-)
+@pytest.mark.parametrize("name", ["ddpo_sf", "ddpo_is", "nft", "awm", "guidance_distillation", "reward_weighted"])
 def test_every_algorithm_trains_inside_inpainting(tmp_path: Path, prior: ScenePrior, name: str) -> None:
     source = "samples" if name in ("ddpo_is", "awm") else "real"
     keys: dict[str, Any] = {"algorithm": algorithm(name), "inpaint": {"mask": "random", "scenes": source}}

@@ -157,5 +157,10 @@ def test_doctor_says_when_no_advantage_differs(tmp_path: Path) -> None:
 
 
 def test_doctor_asks_nothing_of_the_reward_of_an_algorithm_that_does_not_use_it(tmp_path: Path) -> None:
-    report = diagnose(small_config(tmp_path / "run", algorithm={"name": "neon"}), prior=tiny_prior(process="mixed"))
+    algorithm = {"name": "guidance_distillation", "draws": 1}
+    config = small_config(
+        tmp_path / "run", algorithm=algorithm, reward=lambda batch: RewardOutput(torch.ones(len(batch)))
+    )
+    report = diagnose(config, prior=tiny_prior(process="mixed", slots=8))
+    assert report.reward_std == 0
     assert not any("nothing to learn" in line for line in report.advice)

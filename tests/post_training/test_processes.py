@@ -47,7 +47,6 @@ CASES: dict[str, tuple[str, torch.dtype, dict[str, Any]]] = {
         torch.float64,
         {"algorithm": {"updates": 1, "draws": 1}, "prompt": TWO, "iterations": 1, "slots": 12},
     ),
-    "neon": ("mixed", torch.float64, {"algorithm": {"updates": 2, "period": 2}}),
     "reward_weighted": ("mixed", torch.float32, {"reward": "diversity"}),
 }
 """Algorithm: the process of the prior, the dtype, and further keys."""
