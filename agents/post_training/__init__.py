@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from agents.post_training.config import PostTrainConfig
     from agents.post_training.ddpo import DDPO
     from agents.post_training.discriminator import Discriminator
-    from agents.post_training.forward_losses import AWMLoss, NFTLoss, RewardWeightedLoss
+    from agents.post_training.forward_losses import AWMLoss, NFTLoss
     from agents.post_training.forward_process import ForwardProcess
     from agents.post_training.forward_process_loss import ForwardProcessLoss
     from agents.post_training.guard import Guard
@@ -40,7 +40,6 @@ __all__ = [
     "PostTrainConfig",
     "PostTrainResult",
     "PostTrainer",
-    "RewardWeightedLoss",
     "compute_advantages",
     "list_algorithms",
     "post_train",

@@ -197,22 +197,6 @@ class AWMSettings(ForwardProcessSettings):
 
 
 @dataclass
-class RewardWeightedSettings(ForwardProcessSettings):
-    """Reward-weighted fine-tuning: good samples pull, none pushes; the baseline of the other algorithms.
-
-    Attributes:
-        temperature: temperature of the weights exp(A / temperature), in standard deviations of the reward.
-    """
-
-    name: str = "reward_weighted"
-    temperature: float = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        positive(self, "temperature")
-
-
-@dataclass
 class GuidanceDistillationSettings(AlgorithmSettings):
     """Guidance distillation: the prior learns to place objects as physics guidance does; the reward is reported only.
 

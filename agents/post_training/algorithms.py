@@ -14,7 +14,6 @@ from agents.post_training.algorithm_settings import (
     DDPOSFSettings,
     GuidanceDistillationSettings,
     NFTSettings,
-    RewardWeightedSettings,
 )
 from scene_envs.registry import Registry
 
@@ -43,7 +42,6 @@ _ALGORITHMS = Registry(
         ),
         "nft": _Entry(NFTSettings, _FORWARD),
         "awm": _Entry(AWMSettings, _FORWARD),
-        "reward_weighted": _Entry(RewardWeightedSettings, _FORWARD),
     },
 )
 

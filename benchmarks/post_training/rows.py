@@ -11,7 +11,7 @@ TYPES = (
     "dimsum_table", "living_room_shelf", "pantry_shelf", "breakfast_table_low_clutter", "breakfast_table_high_clutter",
     "restaurant_low_clutter", "restaurant_high_clutter",
 )  # fmt: skip
-FORWARD, CHAIN, BASELINE = "nft", "ddpo_sf", "reward_weighted"
+FORWARD, CHAIN = "nft", "ddpo_sf"
 DISTILLATION = "guidance_distillation"
 LENGTH = 300
 """Iterations of a row."""
@@ -70,11 +70,11 @@ def _stability() -> tuple[Row, ...]:
 
 
 def _placement() -> tuple[Row, ...]:
-    """Three algorithms at equal sampled scenes, three seeds on Dimsum and one on the other types."""
+    """Two algorithms at equal sampled scenes, three seeds on Dimsum and one on the other types."""
     return tuple(
         Row(f"{prior}-{name}-{seed}", prior, _keys(name, "feasible_share", seed), LENGTH)
         for prior in TYPES
-        for name in (FORWARD, CHAIN, BASELINE)
+        for name in (FORWARD, CHAIN)
         for seed in range(3 if prior == "dimsum_table" else 1)
     )
 
@@ -85,7 +85,7 @@ def _equal_scenes() -> tuple[Row, ...]:
     return tuple(
         Row(f"{prior}-{name}-{seed}", prior, (*_keys(name, "feasible_share", seed), "batch_size=24", *guard), 40)
         for prior in TYPES
-        for name in (FORWARD, CHAIN, BASELINE, DISTILLATION)
+        for name in (FORWARD, CHAIN, DISTILLATION)
         for seed in range(3 if prior == "dimsum_table" else 1)
     )
 

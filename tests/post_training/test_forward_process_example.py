@@ -73,6 +73,17 @@ def test_its_gradient_is_that_of_the_package(example: ModuleType, process: str) 
             torch.testing.assert_close(ours, reference, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.parametrize("process", ["continuous", "mixed"])
+def test_its_reward_weighting_without_advantages_is_the_pretraining_loss(example: ModuleType, process: str) -> None:
+    prior, other = tiny_prior(process=process), tiny_prior(process=process, seed=1)
+    x0 = prior.encode(prior.sample(3, num_steps=3, seed=0))
+    none, args = torch.zeros(x0.shape[:2]), example.Args(loss="reward_weighted")
+    found, _ = example.losses(prior, other, other, x0, none, args, torch.Generator().manual_seed(5))
+    torch.testing.assert_close(found.mean(), prior.pretraining_loss(x0, torch.Generator().manual_seed(5)))
+    good, _ = example.losses(prior, other, other, x0, none + 1, args, torch.Generator().manual_seed(5))
+    assert bool((good > found).all())
+
+
 def test_its_advantages_are_those_of_the_package(example: ModuleType) -> None:
     batch = get_grammar("dimsum_table").sample(np.random.default_rng(0), 4)
     batch.tensor[:, 3:, :3] += 0.003 * torch.randn(4, 31, 3, generator=torch.Generator().manual_seed(0))

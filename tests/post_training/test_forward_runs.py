@@ -39,7 +39,6 @@ def forward_config(
     [
         ("nft", "mixed"),
         ("awm", "continuous"),
-        ("reward_weighted", "mixed"),
         ("guidance_distillation", "continuous"),
     ],
 )
