@@ -40,7 +40,7 @@ from agents import ScenePrior
 from agents.cli import main
 from agents.post_training import Algorithm, AlgorithmSettings, DenoisingPolicy, register_algorithm
 from agents.post_training.gradients import BatchGradient
-from agents.post_training.rollouts import finished_scenes
+from agents.post_training.rollouts import finished_scenes, text_of
 
 
 @dataclass
@@ -84,8 +84,7 @@ class Neon(Algorithm):
     def accumulate(self, batch: TensorDictBase, generator: Generator) -> BatchGradient:
         """One optimiser step of the copy; the prior gets no gradient."""
         x0 = self.own.encode(finished_scenes(batch).to(self.own.device))
-        text = (batch["text"][:, -1], batch["text_mask"][:, -1]) if "text" in batch.keys() else None
-        loss = self.own.noised_loss(self.own.noised(x0, generator), text).mean()
+        loss = self.own.noised_loss(self.own.noised(x0, generator), text_of(batch[:, -1])).mean()
         loss.backward()
         clip_grad_norm_(self.parameters, 1.0)
         self.optimizer.param_groups[0]["lr"] = self.settings.lr * (1 - self.updates / self.round)

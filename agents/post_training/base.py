@@ -48,7 +48,6 @@ class Algorithm(ABC):
         training loop sums these parts.
         """
 
-
     def end_iteration(self) -> None:
         """Called after the last update of every batch."""
         return

@@ -127,9 +127,7 @@ def _examine(trainer: PostTrainer) -> DoctorReport:
     started = time.perf_counter()
     batch = learner.rollout(iteration=0)
     sampled = time.perf_counter()
-    if learner.algorithm.advantage is not None:
-        learner.algorithm.advantage(batch)
-    row = learner.accumulate(batch, trainer.scenes, index=0)
+    row = learner.accumulate(learner.write_advantage(batch), trainer.scenes, index=0)
     updated = time.perf_counter()
     steps, largest = _step_rows(learner, batch)
     reward, valid = final_reward(batch[:, -1])

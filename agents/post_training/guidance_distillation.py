@@ -15,6 +15,7 @@ from agents.post_training.averaged_sampler import AveragedSampler
 from agents.post_training.gradients import BatchGradient, GradientSum
 from agents.post_training.own_sample_loss import PlainLoss
 from agents.post_training.policy import DenoisingPolicy
+from agents.post_training.rollouts import text_of
 from agents.priors.base import ScenePrior
 from agents.priors.forward import NoisedScenes
 from agents.priors.hooks import position_std
@@ -193,8 +194,7 @@ class GuidanceDistillation(AveragedSampler):
 
     def _corrected_at(self, states: TensorDictBase, step: int) -> TensorDict:
         """The states [R] of a chain at one step, as the loss reads them."""
-        x, tokens = states["scene"], states.get("text", None)
-        text = None if tokens is None else (tokens, states["text_mask"])
+        x, text = states["scene"], text_of(states)
         denoised = self._teacher.distribution(x, step, text).denoised
         assert denoised is not None
         movable = torch.ones(x.shape[:2], dtype=torch.bool, device=x.device)

@@ -129,6 +129,10 @@ class Learner:
         policy = self.algorithm.sampling_policy
         return collect(self.env, policy, seed=self.config.seed, iteration=iteration, prompts=prompts)
 
+    def write_advantage(self, batch: TensorDict) -> TensorDict:
+        """The batch with the advantages that the algorithm's loss reads, if it reads any."""
+        return batch if self.algorithm.advantage is None else self.algorithm.advantage(batch)
+
     def begin_rewards(self, real: SceneBatch, *, first: bool) -> None:
         """Give real scenes to the rewards that learn; does nothing if no reward learns.
 

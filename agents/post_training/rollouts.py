@@ -162,6 +162,12 @@ def finished_scenes(batch: TensorDictBase) -> SceneBatch:
     return SceneBatch(batch["finished"][:, -1].cpu(), batch["scene_type"])
 
 
+def text_of(states: TensorDictBase) -> Text | None:
+    """What the network attends to in ``states`` [...]; None when the prior reads no prompts."""
+    tokens = states.get("text", None)
+    return None if tokens is None else (tokens, states["text_mask"])
+
+
 def gathered_scenes(batch: TensorDictBase) -> SceneBatch:
     """The finished scenes of all processes."""
     scenes = finished_scenes(batch)

@@ -219,9 +219,7 @@ class PostTrainer:
 
     def _learn(self, batch: TensorDict) -> dict[str, float]:
         row: dict[str, float] = {}
-        advantage = self.learner.algorithm.advantage
-        if advantage is not None:
-            advantage(batch)
+        batch = self.learner.write_advantage(batch)
         updates = self.config.algorithm.optimiser_steps
         for update in range(updates):
             index = self.iteration * updates + update
