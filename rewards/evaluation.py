@@ -15,7 +15,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rewards.base import RewardContext, RewardOutput, declared_maximum, depends_on_batch
+from rewards.base import (
+    RewardContext,
+    RewardOutput,
+    averages_objects,
+    counts_objects,
+    declared_maximum,
+    depends_on_batch,
+)
 from rewards.function_reward import as_output
 from rewards.registry import is_own, resolve_reward, reward_name
 from rewards.seeding import seeded_generators
@@ -75,7 +82,8 @@ def reward_scorer(reward: Any) -> SceneScorer:
         return evaluate_reward(resolved, batch, RewardContext(prompts=prompts, pool=pool))
 
     score.maximum = partial(declared_maximum, resolved)  # type: ignore[attr-defined]
-    score.depends_on_batch = depends_on_batch(resolved)  # type: ignore[attr-defined]
+    for fact in (depends_on_batch, averages_objects, counts_objects):
+        setattr(score, fact.__name__, fact(resolved))
     return score
 
 

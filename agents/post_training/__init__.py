@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from scene_envs.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from agents.post_training.advantages import compute_advantages
+    from agents.post_training.advantages import Advantage, compute_advantages
     from agents.post_training.algorithm_settings import AlgorithmSettings, DDPOSFSettings
     from agents.post_training.algorithms import list_algorithms, register_algorithm
     from agents.post_training.base import Algorithm
@@ -13,19 +13,20 @@ if TYPE_CHECKING:
     from agents.post_training.config import PostTrainConfig
     from agents.post_training.ddpo import DDPO
     from agents.post_training.discriminator import Discriminator
-    from agents.post_training.forward_losses import AWMLoss, NFTLoss, RewardWeightedLoss
+    from agents.post_training.forward_losses import AWMLoss, NFTLoss
     from agents.post_training.forward_process import ForwardProcess
     from agents.post_training.forward_process_loss import ForwardProcessLoss
     from agents.post_training.guard import Guard
     from agents.post_training.guidance_distillation import GuidanceDistillation, GuidanceDistillationLoss
     from agents.post_training.losses import DDPOSFLoss
-    from agents.post_training.neon import Neon, SelfTrainingLoss
-    from agents.post_training.policy import DenoisingPolicy
+    from agents.post_training.policy import DenoisingPolicy, gradient_weights
+    from agents.post_training.rollouts import SeededPolicy, collect
     from agents.post_training.trainer import PostTrainer, PostTrainResult, post_train
 
 __all__ = [
     "DDPO",
     "AWMLoss",
+    "Advantage",
     "Algorithm",
     "AlgorithmSettings",
     "DDPOSFLoss",
@@ -38,13 +39,13 @@ __all__ = [
     "GuidanceDistillation",
     "GuidanceDistillationLoss",
     "NFTLoss",
-    "Neon",
     "PostTrainConfig",
     "PostTrainResult",
     "PostTrainer",
-    "RewardWeightedLoss",
-    "SelfTrainingLoss",
+    "SeededPolicy",
+    "collect",
     "compute_advantages",
+    "gradient_weights",
     "list_algorithms",
     "post_train",
     "post_train_and_compare",

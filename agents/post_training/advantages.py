@@ -3,13 +3,125 @@
 from __future__ import annotations
 
 import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from agents.post_training.algorithm_settings import BASELINES
-from agents.utils.process_group import gather_rows
+from agents.utils.process_group import ProcessGroup, gather_rows
 from scene_envs.errors import InvalidInputError
 
 _MIN_STD = 1e-8
+
+
+class Advantage(TensorDictModuleBase):
+    """Writes the advantages of whole episodes [B, S], one episode in each row, at all of their steps.
+
+    Scenes with equal prompts are compared with each other. The steps share the memory of one value per episode.
+
+    Reads:
+        ("next", "reward"), ("next", "done"): (B, S, 1).
+        ("next", "valid"): (B, S, 1) bool, optional; False at the last step where the reward could not score the scene.
+        prompt: (B, S, L) int64 token indices, optional.
+        per_object, credited: (B, S, N) credit per slot, and bool whether the slot has credit, both optional.
+
+    Writes:
+        advantage: (B, S, 1), or (B, S, N) for credit per object.
+        valid: (B, S, 1) bool, whether the reward could score the scene at the end of the episode.
+
+    Args:
+        credit: ``"scene"``, ``"object"``, or ``"auto"`` for credit per object where there is ``per_object``.
+        baseline: baseline of :func:`compute_advantages`.
+        clip: bound of :func:`compute_advantages`.
+
+    Raises:
+        InvalidInputError: a row is not one whole episode, or credit per object is asked of a reward that gives none.
+
+    >>> from tensordict import TensorDict
+    >>> done = torch.tensor([[[False], [True]]]).expand(3, 2, 1)
+    >>> reward = torch.tensor([0.0, 1.0, 5.0])[:, None, None] * done
+    >>> batch = Advantage(baseline="mean")(TensorDict({"next": {"reward": reward, "done": done}}, [3, 2]))
+    >>> batch["advantage"][:, 0, 0]
+    tensor([-0.9258, -0.4629,  1.3887])
+    """
+
+    in_keys = [("next", "reward"), ("next", "done")]  # noqa: RUF012  (torchrl reads lists)
+    out_keys = ["advantage", "valid"]  # noqa: RUF012
+
+    def __init__(self, *, credit: str = "auto", baseline: str = "leave_one_out", clip: float = 5.0) -> None:
+        super().__init__()
+        self.credit, self.baseline, self.clip = credit, baseline, clip
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``out_keys``."""
+        final = last_steps(tensordict)
+        reward, valid = self.credited(final)
+        advantage = compute_advantages(
+            reward, valid, baseline=self.baseline, clip=self.clip, groups=prompt_groups(final)
+        )
+        tensordict["advantage"] = at_all_steps(advantage, tensordict)
+        tensordict["valid"] = at_all_steps(final_reward(final)[1], tensordict)
+        return tensordict
+
+    def credited(self, final: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Rewards and their validity from the last transitions [B]: (B,) with credit per scene, (B, N) per object.
+
+        Raises:
+            InvalidInputError: credit per object is asked of a reward that has no ``per_object``.
+        """
+        reward, valid = final_reward(final)
+        per_object = final.get("per_object", None)
+        if self.credit == "scene" or (self.credit == "auto" and per_object is None):
+            return reward, valid
+        if per_object is None:
+            raise no_credit_per_object()
+        credited = final.get("credited", torch.ones_like(per_object, dtype=torch.bool))
+        return per_object.float(), credited & valid[:, None]
+
+
+def last_steps(episodes: TensorDictBase) -> TensorDictBase:
+    """The last transitions [B] of whole episodes [B, S].
+
+    Raises:
+        InvalidInputError: a row is not one whole episode.
+    """
+    done = episodes["next", "done"][..., 0]
+    if done.ndim != 2 or not bool(done[:, -1].all()) or bool(done[:, :-1].any()):
+        raise InvalidInputError(
+            f"a batch of shape {tuple(episodes.shape)} does not hold one whole episode in each row; give "
+            "env.rollout the number of steps of an episode, and a collector that number times the environments"
+        )
+    return episodes[:, -1]
+
+
+def at_all_steps(values: Tensor, episodes: TensorDictBase) -> Tensor:
+    """``values`` (B,) or (B, K) of B episodes [B, S] as (B, S, 1) or (B, S, K), without a copy."""
+    values = values[:, None] if values.ndim == 1 else values
+    return values[:, None].expand(-1, episodes.shape[1], *values.shape[1:])
+
+
+def final_reward(final: TensorDictBase) -> tuple[Tensor, Tensor]:
+    """Rewards (B,) of episodes from their last transitions [B], and (B,) bool whether the reward could score them."""
+    reward, valid = final["next", "reward"][:, 0], final.get(("next", "valid"), None)
+    return reward, torch.ones_like(reward, dtype=torch.bool) if valid is None else valid[:, 0]
+
+
+def prompt_groups(final: TensorDictBase) -> Tensor | None:
+    """(B,) int64, equal for scenes with equal prompts, over all processes; None where there are no prompts."""
+    prompt = final.get("prompt", None)
+    if prompt is None:
+        return None
+    everywhere = gather_rows(prompt)
+    groups: Tensor = torch.unique(everywhere, dim=0, return_inverse=True)[1]
+    return groups[ProcessGroup.current().rows(len(everywhere))]
+
+
+def no_credit_per_object() -> InvalidInputError:
+    """The error where credit per object is asked of a reward that gives none."""
+    return InvalidInputError(
+        "algorithm.credit=object (credit='object') needs a reward with per_object values, and this one scores scenes "
+        "only; take algorithm.credit=scene, or auto"
+    )
 
 
 def compute_advantages(

@@ -5,15 +5,13 @@ from __future__ import annotations
 from copy import deepcopy
 from typing import Any
 
-from tensordict import TensorDict
-
 from agents.post_training.base import Algorithm
 from agents.post_training.policy import DenoisingPolicy
 from agents.priors.base import ScenePrior
 from agents.utils.weight_average import WeightAverage
 
 
-class AveragedSampler(Algorithm[TensorDict]):
+class AveragedSampler(Algorithm):
     """An algorithm that samples with a separate copy of the prior, whose weights are also evaluated and saved.
 
     After each batch the copy moves towards the prior in training.

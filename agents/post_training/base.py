@@ -3,30 +3,30 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, Generic, TypeVar
+from typing import Any
 
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Generator
 from torchrl.objectives import LossModule
 
 from agents.post_training.gradients import BatchGradient
 from agents.post_training.policy import DenoisingPolicy
-from agents.post_training.rollouts import Rollout
 from agents.priors.base import ScenePrior
 from agents.utils.weight_average import WeightAverage
 
-Credit = TypeVar("Credit")
-"""Advantages of a batch, in the form that the algorithm's loss reads."""
 
-
-class Algorithm(ABC, Generic[Credit]):
+class Algorithm(ABC):
     """Rule that turns a batch of scenes into a gradient.
 
     Attributes:
         policy: the reverse chain of the prior in training.
-        loss: what is minimised.
+        advantage: writes what the loss reads into a batch; None where the scenes are not weighted.
+        loss: the loss that is minimised.
     """
 
     policy: DenoisingPolicy
+    advantage: TensorDictModuleBase | None = None
     loss: LossModule
 
     @property
@@ -40,34 +40,13 @@ class Algorithm(ABC, Generic[Credit]):
         return None
 
     @abstractmethod
-    def advantage(self, rollout: Rollout) -> Credit:
-        """Advantages of the scenes of a batch, or of their objects."""
-
-    @abstractmethod
-    def accumulate(self, rollout: Rollout, advantage: Credit, generator: Generator) -> BatchGradient:
+    def accumulate(self, batch: TensorDictBase, generator: Generator) -> BatchGradient:
         """Add the gradient of a batch to ``.grad``; everything random is drawn from ``generator`` (CPU).
 
-        With several processes, each process adds the gradient of its own scenes, as a part of the mean over all scenes.
-        The training loop sums these parts.
+        The batch [B, S] is that of :func:`~agents.post_training.rollouts.collect`, after :attr:`advantage`. With
+        several processes, each process adds the gradient of its own scenes, as a part of the mean over all scenes. The
+        training loop sums these parts.
         """
-
-    def real_generator(self, own: Generator, real: Generator) -> Generator:
-        """Source of the timesteps and noise of real scenes in an update (CPU).
-
-        Args:
-            own: generator in the same state as the one that :meth:`accumulate` got in this update.
-            real: generator that is independent of ``own``, and that drew the real scenes.
-        """
-        return real
-
-    def learning_rate(self, rate: float, update: int) -> float:
-        """Learning rate of an update.
-
-        Args:
-            rate: ``optimizer.lr``, after its warm-up.
-            update: number of the update in the run.
-        """
-        return rate
 
     def end_iteration(self) -> None:
         """Called after the last update of every batch."""

@@ -1,19 +1,19 @@
-"""DDPO on a denoising policy: loss, advantages and gradient of a batch."""
+"""DDPO on a denoising policy: advantages, loss and gradient of a batch."""
 
 from __future__ import annotations
 
+from tensordict import TensorDictBase
 from torch import Generator, Tensor
 
-from agents.post_training.advantages import compute_advantages
+from agents.post_training.advantages import Advantage
 from agents.post_training.algorithm_settings import DDPOISSettings, DDPOSFSettings
 from agents.post_training.base import Algorithm
-from agents.post_training.gradients import BatchGradient, accumulate_policy_gradient, credited_reward, draw_steps
+from agents.post_training.gradients import BatchGradient, accumulate_policy_gradient, draw_steps
 from agents.post_training.losses import DDPOSFLoss
 from agents.post_training.policy import DenoisingPolicy, gradient_weights
-from agents.post_training.rollouts import Rollout, rollout_groups
 
 
-class DDPO(Algorithm[Tensor]):
+class DDPO(Algorithm):
     """DDPO-SF, or DDPO-IS if given the settings of DDPO-IS (Black et al. 2024).
 
     Args:
@@ -29,6 +29,7 @@ class DDPO(Algorithm[Tensor]):
 
     def __init__(self, settings: DDPOSFSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
         self.settings, self.policy = settings, policy
+        self.advantage = Advantage(credit=settings.credit, baseline=settings.baseline, clip=settings.advantage_clip)
         weights = gradient_weights(
             stds, min_std=settings.min_std, skip_first=settings.skip_first, weighting=settings.step_weighting
         )
@@ -37,16 +38,7 @@ class DDPO(Algorithm[Tensor]):
             policy, step_weights=weights, reduction=settings.log_prob_reduction, clip_epsilon=clip
         ).to(next(policy.parameters()).device)
 
-    def advantage(self, rollout: Rollout) -> Tensor:
-        """Advantages (B,) or (B, N), as ``credit`` says, within the scenes of one prompt."""
-        settings = self.settings
-        reward, valid = credited_reward(rollout, settings.credit)
-        groups = rollout_groups(rollout)
-        return compute_advantages(
-            reward, valid, baseline=settings.baseline, clip=settings.advantage_clip, groups=groups
-        )
-
-    def accumulate(self, rollout: Rollout, advantage: Tensor, generator: Generator) -> BatchGradient:
+    def accumulate(self, batch: TensorDictBase, generator: Generator) -> BatchGradient:
         """Add the policy gradient of a batch to ``.grad``; ``generator`` draws the steps that enter it."""
         steps, scale = draw_steps(self.loss.step_weights.cpu(), self.settings.gradient_steps, generator)
-        return accumulate_policy_gradient(self.loss, rollout, advantage, steps, scale=scale)
+        return accumulate_policy_gradient(self.loss, batch, steps, scale=scale)

@@ -8,8 +8,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
+from tensordict import TensorDictBase
+
 from agents.configuration.tree import changed
-from agents.post_training.algorithm_settings import GuidanceDistillationSettings, NeonSettings
+from agents.post_training.advantages import final_reward
+from agents.post_training.algorithm_settings import GuidanceDistillationSettings
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.gradients import accumulate_policy_gradient, gradient_norm
 from agents.post_training.learner import Learner
@@ -19,8 +22,6 @@ from agents.priors.base import ScenePrior
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
-
-    from agents.post_training.rollouts import Rollout
 
 LOUD, QUIET = 30.0, 1 / 30.0
 """Ratios of policy to regularisation gradient norm beyond which one of the two gradients dominates."""
@@ -111,7 +112,7 @@ def diagnose(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> Doc
     """
     with TemporaryDirectory() as scratch:
         real = config.regularisation
-        bank = min(real.bank_size, config.guard.scenes + 4 * real.real_scenes)
+        bank = min(real.bank_size, config.guard.scenes + 4 * real.batch_size)
         small = changed(config, {"output": str(Path(scratch) / "run"), "regularisation.bank_size": bank})
         trainer = PostTrainer(small, prior=prior)
         try:
@@ -124,22 +125,22 @@ def _examine(trainer: PostTrainer) -> DoctorReport:
     trainer.prepare()
     learner = trainer.learner
     started = time.perf_counter()
-    rollout = learner.rollout(iteration=0)
+    batch = learner.rollout(iteration=0)
     sampled = time.perf_counter()
-    advantage = learner.algorithm.advantage(rollout)
-    row = learner.accumulate(rollout, advantage, trainer.scenes, index=0)
+    row = learner.accumulate(learner.write_advantage(batch), trainer.scenes, index=0)
     updated = time.perf_counter()
-    steps, largest = _step_rows(learner, rollout, advantage)
-    valid = rollout.reward[rollout.valid].double()
-    some = len(valid) > 0
+    steps, largest = _step_rows(learner, batch)
+    reward, valid = final_reward(batch[:, -1])
+    scored = reward[valid].double()
+    some = len(scored) > 0
     report = DoctorReport(
         log_ratio=max(largest, row.get("log_ratio", 0.0)),
         steps=steps,
-        reward_mean=float(valid.mean()) if some else float("nan"),
-        reward_std=float(valid.std(unbiased=False)) if some else float("nan"),
-        reward_min=float(valid.min()) if some else float("nan"),
-        reward_max=float(valid.max()) if some else float("nan"),
-        valid_fraction=float(rollout.valid.double().mean()),
+        reward_mean=float(scored.mean()) if some else float("nan"),
+        reward_std=float(scored.std(unbiased=False)) if some else float("nan"),
+        reward_min=float(scored.min()) if some else float("nan"),
+        reward_max=float(scored.max()) if some else float("nan"),
+        valid_fraction=float(valid.double().mean()),
         policy_gradient_norm=row["policy_gradient_norm"],
         pretraining_gradient_norm=row["pretraining_gradient_norm"],
         sampling_seconds=sampled - started,
@@ -149,7 +150,7 @@ def _examine(trainer: PostTrainer) -> DoctorReport:
     return replace(report, advice=_advice(report, trainer.config))
 
 
-def _step_rows(learner: Learner, rollout: Rollout, advantage: Any) -> tuple[list[StepRow], float]:
+def _step_rows(learner: Learner, batch: TensorDictBase) -> tuple[list[StepRow], float]:
     """The sigma table, and the largest log-ratio over the steps in the gradient; nothing without such steps."""
     loss = learner.algorithm.loss
     rows: list[StepRow] = []
@@ -161,7 +162,7 @@ def _step_rows(learner: Learner, rollout: Rollout, advantage: Any) -> tuple[list
         norm = 0.0
         if weight > 0:
             learner.optimizer.zero_grad(set_to_none=True)
-            found = accumulate_policy_gradient(loss, rollout, advantage, [step])
+            found = accumulate_policy_gradient(loss, batch, [step])
             norm, largest = gradient_norm(learner.parameters), max(largest, found.columns["log_ratio"])
         rows.append(StepRow(step, timesteps[step], float(learner.stds[step]), weight, norm))
     learner.optimizer.zero_grad(set_to_none=True)
@@ -177,7 +178,7 @@ def _advice(report: DoctorReport, config: PostTrainConfig) -> list[str]:
         )
     if report.valid_fraction < 1:
         advice.append(f"{1 - report.valid_fraction:.0%} of the scenes have no valid reward; see the log for why.")
-    rewarded = not isinstance(config.algorithm, NeonSettings | GuidanceDistillationSettings)
+    rewarded = not isinstance(config.algorithm, GuidanceDistillationSettings)
     if rewarded and report.valid_fraction > 0 and not report.reward_std > 0:
         advice.append("All rewards are equal: there is nothing to learn from. Use a graded reward or more scenes.")
     if rewarded and report.reward_std > 0 and report.policy_gradient_norm == 0:

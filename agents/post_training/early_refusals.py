@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Generator
 
+from agents.post_training.advantages import no_credit_per_object
 from agents.post_training.config import PostTrainConfig
-from agents.post_training.gradients import no_credit_per_object
 from agents.post_training.learner import Learner
 from agents.post_training.prompts import PromptSets
 from scene_envs.errors import InvalidInputError, TrainingError

@@ -7,28 +7,63 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 
-from agents.post_training.advantages import compute_advantages
-from agents.post_training.algorithm_settings import (
-    AWMSettings,
-    ForwardProcessSettings,
-    NFTSettings,
-    RewardWeightedSettings,
-)
+from agents.post_training.advantages import Advantage, at_all_steps, compute_advantages, final_reward, prompt_groups
+from agents.post_training.algorithm_settings import AWMSettings, NFTSettings
 from agents.post_training.expectation import Expectation
-from agents.post_training.forward_losses import AWMLoss, NFTLoss, RewardWeightedLoss
+from agents.post_training.forward_losses import AWMLoss, NFTLoss
 from agents.post_training.forward_process_loss import ForwardProcessLoss
-from agents.post_training.gradients import BatchGradient, credited_reward, judged_slots
+from agents.post_training.gradients import BatchGradient
 from agents.post_training.own_samples import OwnSampleAlgorithm
 from agents.post_training.policy import DenoisingPolicy
-from agents.post_training.rollouts import Rollout, rollout_groups
 from agents.priors.base import ScenePrior
 
 
+class ForwardAdvantage(Advantage):
+    """Writes advantages that are not clipped, of poses and of categories.
+
+    Reads, in addition to the keys of :class:`Advantage`:
+        judged: (B, S, N) bool, optional. Slots that the reward does not judge have no advantage of their own: a table
+            of credit 0 would otherwise be repelled like an object that is not feasible.
+        counts_objects: (B, S, 1) bool, optional, whether the reward depends on which objects there are.
+
+    Writes, in addition:
+        category_advantage: (B, S, 1), the scene's advantage, or zeros for no credit.
+
+    Args:
+        credit: ``"scene"``, ``"object"`` or ``"auto"``, for poses.
+        category_credit: ``"scene"``, ``"none"``, or ``"auto"``: none where poses have credit per object and the reward
+            does not count objects.
+    """
+
+    out_keys = ["advantage", "category_advantage", "valid"]  # noqa: RUF012
+
+    def __init__(self, *, credit: str = "auto", category_credit: str = "auto") -> None:
+        super().__init__(credit=credit, clip=math.inf)
+        self.category_credit = category_credit
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``out_keys``."""
+        final = super().forward(tensordict)[:, -1]
+        per_object = self.credited(final)[0].ndim == 2
+        poses_alone = per_object and not bool(final.get("counts_objects", torch.zeros(1)).any())
+        if self.category_credit == "none" or (self.category_credit == "auto" and poses_alone):
+            categories = torch.zeros_like(final["advantage"][:, 0])
+        else:
+            categories = compute_advantages(*final_reward(final), clip=math.inf, groups=prompt_groups(final))
+        return tensordict.set("category_advantage", at_all_steps(categories, tensordict))
+
+    def credited(self, final: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Rewards of slots that are judged, or of scenes."""
+        reward, valid = super().credited(final)
+        judged = final.get("judged", None)
+        return reward, valid if reward.ndim == 1 or judged is None else valid & judged
+
+
 class ForwardProcess(OwnSampleAlgorithm):
-    """Algorithm of NFT, AWM and reward weighting, which differ in their loss; see :class:`ForwardProcessLoss`.
+    """Algorithm of NFT and AWM, which differ in their loss; see :class:`ForwardProcessLoss`.
 
     A slower copy of the prior in training, an average of its weights, samples the scenes. This copy is also evaluated
     and saved.
@@ -40,53 +75,28 @@ class ForwardProcess(OwnSampleAlgorithm):
     """
 
     loss: ForwardProcessLoss
-    copy: Expectation | None
 
-    def __init__(self, settings: ForwardProcessSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
+    def __init__(self, settings: NFTSettings | AWMSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
         super().__init__(policy, draws=settings.draws, sampler_decay=settings.sampler_decay)
         self.settings = settings
-        rate = getattr(settings, "expectation_lr", 0.0)
+        self.advantage = ForwardAdvantage(credit=settings.credit, category_credit=settings.category_credit)
+        rate = settings.expectation_lr
         self.copy = Expectation(self.sampler, rate) if rate else None
         self.loss = self.make_loss()
 
     def make_loss(self) -> ForwardProcessLoss:
         """The loss that the settings name."""
-        settings, pair = self.settings, (self.prior, self.sampler)
-        if isinstance(settings, NFTSettings | AWMSettings):
-            kind = NFTLoss if isinstance(settings, NFTSettings) else AWMLoss
-            return kind(*pair, beta=settings.beta, clip=settings.advantage_clip, expectation=self.copy)
-        assert isinstance(settings, RewardWeightedSettings)
-        return RewardWeightedLoss(*pair, temperature=settings.temperature)
-
-    def advantage(self, rollout: Rollout) -> TensorDict:
-        """``advantage`` (B, 1) or (B, N) for poses and ``category_advantage`` (B, 1), as the credit settings say."""
         settings = self.settings
-        reward, valid = credited_reward(rollout, settings.credit)
-        per_object = reward.ndim == 2
-        if per_object:  # a table that is not judged has credit 0; with an advantage it would be repelled
-            valid = valid & judged_slots(rollout).to(valid.device)
-            poses = compute_advantages(reward, valid, clip=math.inf, groups=rollout_groups(rollout))
-        else:
-            poses = self._scene_advantages(rollout)
-        poses_alone = per_object and not rollout.counts
-        if settings.category_credit == "none" or (settings.category_credit == "auto" and poses_alone):
-            categories = torch.zeros_like(poses[:, :1])
-        else:
-            categories = self._scene_advantages(rollout)
-        return TensorDict({"advantage": poses, "category_advantage": categories}, [len(reward)])
-
-    def _scene_advantages(self, rollout: Rollout) -> Tensor:
-        """(B, 1) advantages of whole scenes."""
-        groups = rollout_groups(rollout)
-        return compute_advantages(rollout.reward, rollout.valid, clip=math.inf, groups=groups)[:, None]
+        kind = NFTLoss if isinstance(settings, NFTSettings) else AWMLoss
+        return kind(self.prior, self.sampler, beta=settings.beta, clip=settings.advantage_clip, expectation=self.copy)
 
     def measure(self, result: TensorDict) -> dict[str, float]:
         """Mean square of the trained denoiser's output minus the sampling policy's."""
         return {"distance": float(result["distance"]) ** 2}
 
-    def accumulate(self, rollout: Rollout, advantage: TensorDict, generator: Generator) -> BatchGradient:
+    def accumulate(self, batch: TensorDictBase, generator: Generator) -> BatchGradient:
         """See :class:`OwnSampleAlgorithm`; ``distance`` is a root mean square."""
-        gradient = super().accumulate(rollout, advantage, generator)
+        gradient = super().accumulate(batch, generator)
         return replace(gradient, columns={**gradient.columns, "distance": gradient.columns["distance"] ** 0.5})
 
     def return_to(self, prior: ScenePrior) -> None:

@@ -6,15 +6,14 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
+from tensordict import TensorDictBase
 from torch import Generator, Tensor, nn
 
 from agents.networks.text import Text
 from agents.post_training.losses import DDPOSFLoss
-from agents.post_training.rollouts import Rollout
 from agents.priors.base import ScenePrior
 from agents.priors.forward import NoisedScenes
 from agents.utils.process_group import ProcessGroup
-from scene_envs.errors import InvalidInputError
 
 SceneLoss = Callable[[NoisedScenes, Text | None], Tensor]
 """(B,) losses of noised scenes and their prompts."""
@@ -81,31 +80,30 @@ def draw_steps(weights: Tensor, count: int, generator: Generator) -> tuple[list[
 
 
 def accumulate_policy_gradient(
-    loss: DDPOSFLoss, rollout: Rollout, advantage: Tensor, steps: Sequence[int], *, scale: float = 1.0
+    loss: DDPOSFLoss, batch: TensorDictBase, steps: Sequence[int], *, scale: float = 1.0
 ) -> BatchGradient:
-    """Add the policy gradient of a rollout to ``.grad``, one chunk of scenes and one step at a time.
+    """Add the policy gradient of a batch to ``.grad``, one chunk of scenes and one step at a time.
 
     The graph of a step is freed after the step, so memory does not depend on the number of steps. With several
     processes, ``.grad`` gets the part of this process's scenes in the mean over all scenes.
 
     Args:
         loss: the objective; its policy's ``chunk`` bounds the scenes per pass.
-        rollout: B episodes.
-        advantage: (B,) or (B, N).
+        batch: whole episodes [B, S] with what the loss reads.
         steps: indices of the steps in the gradient.
         scale: factor on the sum over ``steps``.
     """
     total, largest, clipped = 0.0, 0.0, 0.0
-    batch = rollout.reward.shape[0]
-    size = loss.policy.chunk or batch
+    valid = batch["valid"][:, -1, 0]
+    size = loss.policy.chunk or len(valid)
     processes = ProcessGroup.current()
-    valid_count = max(1.0, processes.sum_numbers(int(rollout.valid.sum()))[0])
+    valid_count = max(1.0, processes.sum_numbers(int(valid.sum()))[0])
     gradient = GradientSum(loss.policy.parameters())
-    for start in range(0, batch, size):
-        rows = slice(start, min(start + size, batch))
-        share = int(rollout.valid[rows].sum()) / valid_count  # turns a chunk's mean into its part of the batch's mean
+    for start in range(0, len(valid), size):
+        rows = slice(start, min(start + size, len(valid)))
+        share = int(valid[rows].sum()) / valid_count  # turns a chunk's mean into its part of the batch's mean
         for step in steps if share else ():
-            result = loss(rollout.transitions(step, advantage, rows))
+            result = loss(batch[rows, step])
             objective = result["loss_objective"] * (scale * share)
             objective.backward()
             total += float(objective.detach())
@@ -183,36 +181,3 @@ def gradient_norm(parameters: Iterable[nn.Parameter]) -> float:
     """Euclidean norm of all ``.grad``; 0 when there is none."""
     norms = [p.grad.norm() for p in parameters if p.grad is not None]
     return float(torch.stack(norms).norm()) if norms else 0.0
-
-
-def judged_slots(rollout: Rollout) -> Tensor:
-    """(B, N) bool: slots that the reward judges."""
-    return rollout.batch.is_free if rollout.judged is None else rollout.judged
-
-
-def no_credit_per_object() -> InvalidInputError:
-    """The error where credit per object is asked of a reward that gives none."""
-    return InvalidInputError(
-        "algorithm.credit=object (credit='object') needs a reward with per_object values, and this one scores scenes "
-        "only; take algorithm.credit=scene, or auto"
-    )
-
-
-def credited_reward(rollout: Rollout, credit: str) -> tuple[Tensor, Tensor]:
-    """Rewards and their validity, (B,) for credit ``"scene"`` and (B, N) for ``"object"``; ``"auto"`` takes one.
-
-    Fixed slots have no credit. If the reward is a mean over the objects, only the slots that it judges have credit. If
-    it does not name these slots, they are the free objects.
-
-    Raises:
-        InvalidInputError: credit per object is asked of a reward that has no ``per_object``.
-    """
-    if credit == "scene" or (credit == "auto" and rollout.per_object is None):
-        return rollout.reward, rollout.valid
-    if rollout.per_object is None:
-        raise no_credit_per_object()
-    free = torch.ones(rollout.per_object.shape, dtype=torch.bool, device=rollout.per_object.device)
-    free[:, : len(rollout.batch.scene_type.fixed)] = False  # fixed slots are not drawn
-    if rollout.averages:
-        free &= judged_slots(rollout).to(free.device)
-    return rollout.per_object.float(), free & rollout.valid.unsqueeze(-1)

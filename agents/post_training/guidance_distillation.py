@@ -15,7 +15,7 @@ from agents.post_training.averaged_sampler import AveragedSampler
 from agents.post_training.gradients import BatchGradient, GradientSum
 from agents.post_training.own_sample_loss import PlainLoss
 from agents.post_training.policy import DenoisingPolicy
-from agents.post_training.rollouts import Rollout
+from agents.post_training.rollouts import text_of
 from agents.priors.base import ScenePrior
 from agents.priors.forward import NoisedScenes
 from agents.priors.hooks import position_std
@@ -152,25 +152,21 @@ class GuidanceDistillation(AveragedSampler):
                 "steps; pretrain the prior for longer"
             )
 
-    def advantage(self, rollout: Rollout) -> TensorDict:
-        """No keys: the scenes are not weighted."""
-        return TensorDict({}, [len(rollout.reward)])
-
-    def accumulate(self, rollout: Rollout, advantage: TensorDict, generator: Generator) -> BatchGradient:
+    def accumulate(self, batch: TensorDictBase, generator: Generator) -> BatchGradient:
         """Add the gradient of a batch to ``.grad``: ``draws`` random steps of the chain of every scene.
 
         With several processes, ``.grad`` gets the part of this process's scenes in the mean over all scenes.
         """
-        processes, batch = ProcessGroup.current(), len(rollout.reward)
-        count, draws = processes.size * batch, self.settings.draws
+        processes, own = ProcessGroup.current(), len(batch)
+        count, draws = processes.size * own, self.settings.draws
         chosen = [
             torch.tensor(self.steps)[torch.randint(len(self.steps), (count,), generator=generator)]
             for _ in range(draws)
         ]
-        states = [self.corrected(rollout, steps[processes.rows(count)]) for steps in chosen]
-        size, total = self.policy.chunk or batch, 0.0
+        states = [self.corrected(batch, steps[processes.rows(count)]) for steps in chosen]
+        size, total = self.policy.chunk or own, 0.0
         gradient = GradientSum(self.prior.parameters())
-        for start in range(0, batch, size):
+        for start in range(0, own, size):
             for state in states:
                 part = state[start : start + size]
                 objective = self.loss(part)["loss_objective"] * (len(part) / count / draws)
@@ -183,23 +179,22 @@ class GuidanceDistillation(AveragedSampler):
         return BatchGradient(total, {"correction_mm": 1e3 * moved / max(1.0, objects)})
 
     @torch.no_grad()
-    def corrected(self, rollout: Rollout, steps: Tensor) -> TensorDict:
+    def corrected(self, batch: TensorDictBase, steps: Tensor) -> TensorDict:
         """The states (B,) of scenes at ``steps`` (B,) of their chains, all in :attr:`steps`, as the loss reads them.
 
         ``moved`` (B, N) is how far the guidance moves each object, m.
         """
         rows = [torch.nonzero(steps == step)[:, 0] for step in self.steps]
         parts = [
-            self._corrected_at(step, rollout, at.to(rollout.scenes.device))
+            self._corrected_at(batch[at.to(batch.device), step], step)
             for step, at in zip(self.steps, rows, strict=True)
             if len(at)
         ]
         return torch.cat(parts)[torch.cat(rows).argsort()]
 
-    def _corrected_at(self, step: int, rollout: Rollout, rows: Tensor) -> TensorDict:
-        """The states of scenes ``rows`` (R,) at one step of their chains."""
-        x = rollout.scenes[step][rows]
-        text = None if rollout.text is None else (rollout.text[0][rows], rollout.text[1][rows])
+    def _corrected_at(self, states: TensorDictBase, step: int) -> TensorDict:
+        """The states [R] of a chain at one step, as the loss reads them."""
+        x, text = states["scene"], text_of(states)
         denoised = self._teacher.distribution(x, step, text).denoised
         assert denoised is not None
         movable = torch.ones(x.shape[:2], dtype=torch.bool, device=x.device)
@@ -215,11 +210,11 @@ class GuidanceDistillation(AveragedSampler):
         target[..., TRANSLATION] += scale * moves * (self.settings.clip / far.clamp(min=self.settings.clip))
         fields: dict[str, Any] = {
             "scene": x,
-            "timestep": rollout.timesteps[step].expand(len(x)),
+            "timestep": states["timestep"],
             "denoised": target,
             "trained": movable & ~scenes.is_empty.to(x.device),
             "moved": moves.norm(dim=-1),
         }
         if text is not None:
-            fields |= {"text": text[0], "text_mask": text[1]}
+            fields["text"], fields["text_mask"] = text
         return TensorDict(fields, [len(x)])

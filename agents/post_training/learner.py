@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import replace
 from typing import Any
 
 import torch
+from tensordict import TensorDict, TensorDictBase
 from torch import Generator, nn
 
 from agents.post_training.algorithms import make_algorithm
@@ -19,7 +20,7 @@ from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.processes import WholeBatchReward
 from agents.post_training.prompts import PromptDeck
 from agents.post_training.regularisation import Regularisation
-from agents.post_training.rollouts import Rollout, collect, stream_seed
+from agents.post_training.rollouts import collect, stream_seed
 from agents.post_training.run_files import CHECKPOINT_NAME
 from agents.post_training.scene_bank import SceneBank
 from agents.priors.base import ScenePrior
@@ -27,7 +28,7 @@ from agents.priors.prompt_validation import no_text
 from agents.utils.checkpoints import check_tensors
 from agents.utils.process_group import ProcessGroup
 from agents.utils.weight_average import AveragedWeights, WeightAverage
-from rewards import averages_objects, counts_objects, depends_on_batch
+from rewards import depends_on_batch
 from rewards.isolation import close_reward, run_reward
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.envs.scoring import RewardScorer
@@ -66,7 +67,7 @@ class Learner:
             claim_guidance=config.claim_guidance,
         )  # fmt: skip
         self.stds = self.policy.stds(self.slots).cpu()
-        self.algorithm: Algorithm[Any] = make_algorithm(config.algorithm, self.policy, self.stds)
+        self.algorithm: Algorithm = make_algorithm(config.algorithm, self.policy, self.stds)
         self.reward = run_reward(
             config.reward,
             seed=config.seed,
@@ -102,7 +103,6 @@ class Learner:
 
     def close(self) -> None:
         """Stop the workers of physics and of the reward, if any."""
-        self.learned.end()
         self.env.close()
         self.scorer.close()
         close_reward(self.reward)
@@ -116,25 +116,28 @@ class Learner:
                 self.prior, config.prompt, together, self.slots, scenes.prompts, len(scenes.train)
             )
 
-    def rollout(self, iteration: int) -> Rollout:
-        """A batch of fresh scenes, or this process's share of it."""
-        batch, prompts = self.config.batch_size, None
+    def rollout(self, iteration: int) -> TensorDict:
+        """A batch [B, S] of fresh scenes, or this process's share of it; see :func:`collect`."""
+        prompts: Sequence[str] | None = None
         if self.deck is not None:
+            batch = self.config.batch_size
             prompts = self.deck.deal(batch, self._generator("prompts", iteration))[self.processes.rows(batch)]
         policy = self.algorithm.sampling_policy
-        rollout = collect(self.env, policy, seed=self.config.seed, iteration=iteration, prompts=prompts)
-        return replace(rollout, averages=averages_objects(self.reward), counts=counts_objects(self.reward))
+        return collect(self.env, policy, seed=self.config.seed, iteration=iteration, prompts=prompts)
+
+    def write_advantage(self, batch: TensorDict) -> TensorDict:
+        """The batch with the advantages that the algorithm's loss reads, if it reads any."""
+        return batch if self.algorithm.advantage is None else self.algorithm.advantage(batch)
 
     def begin_rewards(self, real: SceneBatch, *, first: bool) -> None:
-        """Give real scenes to the rewards that learn; does nothing if no reward learns or is normalised.
+        """Give real scenes to the rewards that learn; does nothing if no reward learns.
 
         Args:
             real: real scenes that training may see.
-            first: also train them on samples of the base prior, and fix the statistics of normalised rewards; False for
-                a run whose state is restored.
+            first: also train them on samples of the base prior; False for a run whose state is restored.
         """
         self.learned.begin(real)
-        if self.learned.needs_samples and first:
+        if self.learned and first:
             prompts = None if self.deck is None else self.deck.deal(FIRST_SAMPLES, self._generator("discriminator", 0))
             self.learned.learn_from_prior(self.prior, self.slots, prompts)
 
@@ -145,26 +148,24 @@ class Learner:
         except RewardError:  # its process cannot be asked any more
             return None
 
-    def accumulate(self, rollout: Rollout, advantage: Any, scenes: SceneBank, index: int) -> dict[str, float]:
+    def accumulate(self, batch: TensorDictBase, scenes: SceneBank, index: int) -> dict[str, float]:
         """Put the policy and regularisation gradients, summed over all processes, into ``.grad``; measure each one.
 
         Args:
-            rollout: the batch.
-            advantage: its advantages, as the algorithm makes them.
+            batch: whole episodes [B, S], with the advantages that the algorithm writes.
             scenes: real scenes for the regularisation.
             index: number of the update in the run, from which the draws of steps and real scenes follow.
         """
         config = self.config
         self.optimizer.zero_grad(set_to_none=True)
-        policy = self.algorithm.accumulate(rollout, advantage, self._generator("steps", index))
+        policy = self.algorithm.accumulate(batch, self._generator("steps", index))
         self.processes.sum_gradients(self.parameters)
         policy_norm = gradient_norm(self.parameters)
         generator = self._generator("real", index)
-        count = config.regularisation.real_scenes
+        count = config.regularisation.batch_size
         real = scenes.batch(count, generator)
         samples = None if scenes.base is None else scenes.base.batch(count, self._generator("base", index))
-        noise = self.algorithm.real_generator(self._generator("steps", index), generator)
-        row = self.regularisation.accumulate(self.prior, real, samples, noise, config.optimizer.chunk)
+        row = self.regularisation.accumulate(self.prior, real, samples, generator, config.optimizer.chunk)
         return {
             "policy_loss": policy.loss,
             "policy_gradient_norm": policy_norm,
@@ -172,15 +173,15 @@ class Learner:
             **policy.figures(),
         }
 
-    def update(self, rollout: Rollout, advantage: Any, scenes: SceneBank, index: int) -> dict[str, float]:
+    def update(self, batch: TensorDictBase, scenes: SceneBank, index: int) -> dict[str, float]:
         """One optimiser step.
 
         Raises:
             NonFiniteGradient: the gradient is not finite; the weights in training are unchanged.
         """
         config = self.config.optimizer
-        rate = self.algorithm.learning_rate(self.lr * min(1.0, (index + 1) / max(1, config.warmup)), index)
-        row = self.accumulate(rollout, advantage, scenes, index)
+        rate = self.lr * min(1.0, (index + 1) / max(1, config.warmup))
+        row = self.accumulate(batch, scenes, index)
         row["gradient_norm"] = float(nn.utils.clip_grad_norm_(self.parameters, config.clip))
         if not all(math.isfinite(row[name]) for name in ("gradient_norm", "policy_loss", "pretraining_loss")):
             self.optimizer.zero_grad(set_to_none=True)

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections import defaultdict
-from typing import Any
 
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Generator
 
 from agents.post_training.averaged_sampler import AveragedSampler
-from agents.post_training.expectation import TrainedCopy
+from agents.post_training.expectation import Expectation
 from agents.post_training.gradients import BatchGradient, GradientSum
 from agents.post_training.own_sample_loss import OwnSampleLoss
 from agents.post_training.policy import DenoisingPolicy
-from agents.post_training.rollouts import Rollout
+from agents.post_training.rollouts import finished_scenes
 from agents.utils.process_group import ProcessGroup, gather_rows
 
 
@@ -31,32 +29,25 @@ class OwnSampleAlgorithm(AveragedSampler):
     """
 
     loss: OwnSampleLoss
-    copy: TrainedCopy | None
+    copy: Expectation | None
 
     def __init__(self, policy: DenoisingPolicy, *, draws: int, sampler_decay: float) -> None:
         super().__init__(policy, sampler_decay=sampler_decay)
         self.draws = draws
 
-    @abstractmethod
-    def advantage(self, rollout: Rollout) -> TensorDict:
-        """The tensors that the loss reads in addition to the scenes, by key."""
-
     def measure(self, result: TensorDict) -> dict[str, float]:
         """Figures of a part of the batch, from ``result``, the loss of this part."""
         return {}
 
-    def accumulate(self, rollout: Rollout, advantage: TensorDict, generator: Generator) -> BatchGradient:
+    def accumulate(self, batch: TensorDictBase, generator: Generator) -> BatchGradient:
         """Add the gradient of a batch to ``.grad``: ``draws`` timesteps and noises of every scene.
 
         With several processes, ``.grad`` gets the part of this process's scenes in the mean over all scenes.
         """
-        x0 = self.prior.encode(rollout.batch.to(self.prior.device))
-        fields: dict[str, Any] = {"scene": x0, "valid": rollout.valid, **advantage}
-        if rollout.text is not None:
-            fields |= {"text": rollout.text[0], "text_mask": rollout.text[1]}
-        scenes = TensorDict(fields, [len(x0)])
+        x0 = self.prior.encode(finished_scenes(batch).to(self.prior.device))
+        scenes = batch.exclude("next", "timestep")[:, -1].set("scene", x0)
         size, processes = self.policy.chunk or len(x0), ProcessGroup.current()
-        valid = max(1.0, processes.sum_numbers(int(rollout.valid.sum()))[0])
+        valid = max(1.0, processes.sum_numbers(int(scenes["valid"].sum()))[0])
         everything, own = gather_rows(x0), processes.rows(processes.size * len(x0))
         draws = [self.prior.noised(everything, generator).rows(own) for _ in range(self.draws)]
         total, sums = 0.0, defaultdict[str, float](float)

@@ -7,7 +7,7 @@ from typing import Any
 
 from agents.post_training.config import PostTrainConfig
 from agents.utils.process_group import ProcessGroup, gather_rows
-from rewards import RewardContext, RewardOutput, reward_name
+from rewards import RewardContext, RewardOutput, averages_objects, counts_objects, reward_name
 from rewards.evaluation import evaluate_reward
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
@@ -41,6 +41,7 @@ class WholeBatchReward:
     def __init__(self, reward: Any, processes: ProcessGroup) -> None:
         self._reward, self._processes = reward, processes
         self.name = reward_name(reward)
+        self.averages_objects, self.counts_objects = averages_objects(reward), counts_objects(reward)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Scores of ``batch``."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Generator, Tensor
+from torch import Generator
 
 from agents.priors.base import ScenePrior
 from scene_envs.datasets.prompts import describe_all
@@ -97,12 +96,6 @@ def prompts_beside(directory: Path, batch: SceneBatch, seed: int) -> PromptSets:
     """The prompts of a run's real scenes: those kept in the run's folder, or else descriptions of the scenes."""
     path = directory / PROMPTS_NAME
     return load_prompts(path) if path.exists() else GrammarPrompts(batch, seed)
-
-
-def prompt_groups(prompts: Sequence[str]) -> Tensor:
-    """(B,) int64 hashes of prompts; equal prompts have equal hashes on every worker."""
-    hashes = {text: hashlib.blake2b(text.encode(), digest_size=8).digest() for text in dict.fromkeys(prompts)}
-    return torch.tensor([int.from_bytes(hashes[text], "little", signed=True) for text in prompts])
 
 
 def save_prompts(path: Path, prompts: Sequence[Sequence[str]]) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDict
 
 from agents.post_training.base_samples import kept_base_samples
 from agents.post_training.config import PostTrainConfig
@@ -21,7 +22,7 @@ from agents.post_training.learner import Learner, NonFiniteGradient
 from agents.post_training.processes import check_shares
 from agents.post_training.progress import run_progress
 from agents.post_training.prompts import PromptSets, prompts_beside
-from agents.post_training.rollouts import Rollout, gathered, reward_figures, stream_seed
+from agents.post_training.rollouts import gathered_scenes, reward_figures, stream_seed
 from agents.post_training.run_files import (
     CHECKPOINT_NAME,
     load_resumable,
@@ -155,14 +156,14 @@ class PostTrainer:
             finishing_steps() as end,
         ):
             while self.iteration < config.iterations and not self._stopped:
-                rollout, row = self.step()
+                batch, row = self.step()
                 self.seconds = time.perf_counter() - started
                 self.history.append({**row, "seconds": round(self.seconds, 2)})
                 last = self.iteration == config.iterations
                 sample = last or self.iteration % config.guard.samples_every == 0
                 checked = self.iteration % config.guard.every == 0 or last or (sample and config.guard.sampled > 0)
                 if checked:
-                    self._check(rollout, sample=sample)
+                    self._check(batch, sample=sample)
                 # a rollback reads prior/, which must be of the same iteration as the checkpoint
                 due = self.iteration % config.logger.checkpoint_every == 0 or (
                     checked and config.guard.action == "rollback"
@@ -201,27 +202,27 @@ class PostTrainer:
             self.scenes = replace(self.scenes, base=samples)
         self.guard = make_guard(config, self.learner, self.scenes)
 
-    def step(self) -> tuple[Rollout, dict[str, float]]:
-        """One iteration: a batch of fresh scenes and its updates. Returns the scenes and the row for the log."""
-        rollout = self.learner.rollout(self.iteration)
-        row = {"iteration": float(self.iteration + 1), **reward_figures(rollout)}
+    def step(self) -> tuple[TensorDict, dict[str, float]]:
+        """One iteration: a batch of fresh scenes and its updates. Returns the batch and the row for the log."""
+        batch = self.learner.rollout(self.iteration)
+        row = {"iteration": float(self.iteration + 1), **reward_figures(batch)}
         if row["valid_fraction"] > 0:
             self.invalid_streak = 0
-            row |= self._learn(rollout)
+            row |= self._learn(batch)
         else:
             self._count_invalid()
-        self.learner.learned.learn(rollout)
+        self.learner.learned.learn(batch)
         self.iteration += 1
-        return rollout, row
+        return batch, row
 
-    def _learn(self, rollout: Rollout) -> dict[str, float]:
+    def _learn(self, batch: TensorDict) -> dict[str, float]:
         row: dict[str, float] = {}
-        advantage = self.learner.algorithm.advantage(rollout)
+        batch = self.learner.write_advantage(batch)
         updates = self.config.algorithm.optimiser_steps
         for update in range(updates):
             index = self.iteration * updates + update
             try:
-                row = self.learner.update(rollout, advantage, self.scenes, index)
+                row = self.learner.update(batch, self.scenes, index)
             except NonFiniteGradient as error:
                 raise self._not_finite(error.figures) from None
         self.learner.algorithm.end_iteration()
@@ -235,11 +236,11 @@ class PostTrainer:
             return self.rollbacks > _MOST_ROLLBACKS
         return self.config.guard.action == "stop" and self.guard.over_limit_at is not None
 
-    def _check(self, rollout: Rollout, *, sample: bool) -> None:
+    def _check(self, batch: TensorDict, *, sample: bool) -> None:
         since = self.guard.readings[-1].iteration if self.guard.readings else 0
         recent = [row["reward"] for row in self.history[since:] if math.isfinite(row["reward"])]
         reward = sum(recent) / len(recent) if recent else float("nan")
-        scenes = gathered(rollout)[-1]
+        scenes = gathered_scenes(batch)
         with self.learner.averaged() as prior:
             reading = self.guard.check(prior, self.iteration, reward, realism(scenes), sample=sample)
             if reading.kept:

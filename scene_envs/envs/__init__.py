@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from scene_envs.envs.search_gymnasium import SearchEnv
     from scene_envs.envs.search_masks import MaskChoiceProblem, MaskChoiceState
     from scene_envs.envs.search_masks_gymnasium import SearchMaskEnv
-    from scene_envs.envs.trajectories import StepResult, Trajectories
+    from scene_envs.envs.trajectories import StepResult
 
 __all__ = [
     "DenoisingCore",
@@ -40,7 +40,6 @@ __all__ = [
     "SearchProblem",
     "SearchState",
     "StepResult",
-    "Trajectories",
     "check_branchable",
     "list_masks",
     "register_mask",

@@ -6,7 +6,7 @@ the noise of the prior's own reverse step instead, so that actions from N(0, I) 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ from scene_envs.envs.spaces import (
     prior_features,
     resolve_scene_and_prior,
 )
-from scene_envs.envs.trajectories import BoolArray, IntArray, StepResult, Trajectories, replace_rows, take_rows
+from scene_envs.envs.trajectories import BoolArray, IntArray, StepResult, replace_rows, take_rows
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
@@ -262,43 +262,6 @@ class DenoisingCore:
         if not together:
             return StepResult(reward, valid, terminated, terms)
         return StepResult(reward, valid, terminated, terms, score, batch)
-
-    # -- whole trajectories ---------------------------------------------------------------------
-
-    @torch.no_grad()
-    def collect(
-        self,
-        policy: Callable[[Tensor, int], Tensor],
-        rngs: Sequence[np.random.Generator],
-        prompts: Sequence[str] | None = None,
-    ) -> Trajectories:
-        """Reset every environment and run ``policy`` to the end; the same episodes as single steps give.
-
-        Args:
-            policy: ``(x_t (B, N, D), step) -> action (B, N, D)``; ``step`` indexes ``self.table``.
-            rngs: one NumPy generator per environment, for x_T and prompts.
-            prompts: one per environment, in place of drawn ones.
-        """
-        self.reset(rngs, prompts=prompts)
-        scenes = torch.empty(self.num_steps + 1, *self._x.shape, device=self.device)
-        actions = torch.empty(self.num_steps, *self._x.shape, device=self.device)
-        scenes[0] = self._x
-        for step in range(self.num_steps):
-            action = policy(self._x, step)
-            result = self.step(action)
-            scenes[step + 1], actions[step] = self._x, action
-        assert result.score is not None
-        assert result.batch is not None
-        return Trajectories(
-            scenes=scenes,
-            actions=actions,
-            timesteps=torch.from_numpy(self._schedule[:-1].copy()),
-            reward=result.reward,
-            valid=result.valid,
-            score=result.score,
-            batch=result.batch,
-            prompts=self.prompts,
-        )
 
     def close(self) -> None:
         """Stop physics workers, if any."""

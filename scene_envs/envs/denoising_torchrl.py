@@ -1,21 +1,25 @@
-"""The torchrl adapter of the denoising MDP: batched tensors in and out. Training uses this one."""
+"""The torchrl adapter of the denoising MDP: batched tensors in and out. Training samples through this one.
+
+Training calls ``env.rollout``, not a torchrl ``Collector``. A collector resets the environment at the end of a batch,
+so the first scenes of the next batch follow the seed of this one: a resumed run would draw others. With
+``reset_at_each_iter=True`` its batches depend on their own seed alone, but it still hands no prompts to ``reset``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from gymnasium.utils import seeding
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from scene_envs.envs.denoising import DenoisingCore
 from scene_envs.envs.settings import DenoisingSettings, takes
 from scene_envs.envs.spaces import STATE_BOUND
-from scene_envs.envs.trajectories import StepResult, Trajectories
+from scene_envs.envs.trajectories import StepResult
 
 
 class DenoisingTorchRLEnv(EnvBase):
@@ -26,12 +30,16 @@ class DenoisingTorchRLEnv(EnvBase):
     prior reads prompts, ``action`` (B, N, D), ``reward``, ``terminated``, ``truncated`` and ``done`` (B, 1). Everything
     lives on the prior's device.
 
-    With the same seed, ``reset`` and ``step`` give bit for bit what ``DenoisingVectorEnv`` gives; :meth:`collect`
-    gives the same episodes without a tensordict per step.
+    With the same seed, ``reset`` and ``step`` give bit for bit what ``DenoisingVectorEnv`` gives, and
+    ``rollout(S, policy)`` gives B whole episodes as a TensorDict [B, S]. ``reset(prompts=...)`` takes one prompt per
+    episode in place of drawn ones.
 
     Args:
         num_envs: B.
         **settings: fields of :class:`~scene_envs.envs.settings.DenoisingSettings`.
+
+    Attributes:
+        result: everything about the last step, such as the score of the scenes that it finished; None after a reset.
 
     >>> env = DenoisingTorchRLEnv(2, reward="object_count", num_steps=3)
     >>> env.rollout(3)["next", "terminated"].squeeze(-1).tolist()
@@ -43,6 +51,7 @@ class DenoisingTorchRLEnv(EnvBase):
         core = DenoisingCore(num_envs, **settings)
         super().__init__(device=core.device, batch_size=torch.Size([num_envs]))
         self.core = core
+        self.result: StepResult | None = None
         self._rngs = [seeding.np_random()[0] for _ in range(num_envs)]
         self._make_specs()
 
@@ -76,16 +85,19 @@ class DenoisingTorchRLEnv(EnvBase):
         else:
             self._rngs = [seeding.np_random(int(seed) + i)[0] for i in range(self.core.num_envs)]
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, prompts: Sequence[str] | None = None, **kwargs: Any
+    ) -> TensorDictBase:
         flags = None if tensordict is None else tensordict.get("_reset", None)
         mask = None if flags is None else flags.reshape(self.core.num_envs).cpu().numpy()
-        self.core.reset(self._rngs, mask)
+        self.core.reset(self._rngs, mask, prompts)
+        self.result = None
         return self._observe(None)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        result = self.core.step(tensordict["action"])
-        observed = self._observe(result)
-        observed["reward"] = result.reward.unsqueeze(-1)
+        self.result = self.core.step(tensordict["action"])
+        observed = self._observe(self.result)
+        observed["reward"] = self.result.reward.unsqueeze(-1)
         return observed
 
     def _observe(self, result: StepResult | None) -> TensorDict:
@@ -99,20 +111,6 @@ class DenoisingTorchRLEnv(EnvBase):
             "truncated": torch.zeros_like(finished),
         }
         return TensorDict(fields, batch_size=self.batch_size, device=self.device)
-
-    def collect(self, policy: Callable[[Tensor, int], Tensor], prompts: Sequence[str] | None = None) -> Trajectories:
-        """Reset, then run ``policy`` to the end of all episodes. Training calls this method.
-
-        Args:
-            policy: ``(x_t (B, N, D), step) -> action (B, N, D)``. Called without gradients.
-            prompts: one per episode, in place of drawn ones; an environment made without ``prompt`` ignores them.
-
-        >>> env = DenoisingTorchRLEnv(2, reward="object_count", num_steps=3, action_mode="noise")
-        >>> trajectories = env.collect(lambda x, step: torch.randn_like(x))
-        >>> tuple(trajectories.scenes.shape), tuple(trajectories.reward.shape)
-        ((4, 2, 34, 20), (2,))
-        """
-        return self.core.collect(policy, self._rngs, prompts)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Stop physics workers, if any."""

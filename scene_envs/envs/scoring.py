@@ -86,6 +86,16 @@ class RewardScorer:
         """Whether the score of a scene depends on the other scenes of its batch."""
         return bool(getattr(self._score, "depends_on_batch", False))
 
+    @property
+    def averages_objects(self) -> bool:
+        """Whether the reward is a mean over the objects, so that an empty slot has no credit."""
+        return bool(getattr(self._score, "averages_objects", False))
+
+    @property
+    def counts_objects(self) -> bool:
+        """Whether the reward depends on which objects there are, wherever they are."""
+        return bool(getattr(self._score, "counts_objects", False))
+
     def maximum(self, slots: int, free_slots: int) -> float | None:
         """The largest value that the reward declares for scenes of this size, None where it declares none."""
         declared = getattr(self._score, "maximum", None)

@@ -1,4 +1,4 @@
-"""Records of the denoising MDP: results of one step, whole trajectories, and rows of their tensors."""
+"""Results of one step of the denoising MDP, and rows of their tensors."""
 
 from __future__ import annotations
 
@@ -35,31 +35,6 @@ class StepResult:
     terms: dict[str, Tensor]
     score: Score | None = None
     batch: SceneBatch | None = None
-
-
-@dataclass(frozen=True)
-class Trajectories:
-    """B whole episodes of S steps.
-
-    Attributes:
-        scenes: (S + 1, B, N, D) float32 normalised, from x_T to x_0.
-        actions: (S, B, N, D) float32 as given by the policy.
-        timesteps: (S,) int64; ``scenes[i]`` is at ``timesteps[i]``, the last scene at 0.
-        reward: (B,) float32; 0 where not valid.
-        valid: (B,) bool.
-        score: value, terms, credit and flags per object, on the prior's device.
-        batch: the finished scenes x_0, on the CPU.
-        prompts: one per scene, or None without prompts.
-    """
-
-    scenes: Tensor
-    actions: Tensor
-    timesteps: Tensor
-    reward: Tensor
-    valid: Tensor
-    score: Score
-    batch: SceneBatch
-    prompts: tuple[str, ...] | None = None
 
 
 def take_rows(x: Tensor, rows: IntArray) -> Tensor:

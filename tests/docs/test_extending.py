@@ -123,7 +123,7 @@ def test_the_loss_starts_as_the_policy_gradient_and_holds_the_policy_back() -> N
     ours = make_algorithm(algorithm_settings("proximal")(min_std=1e-3), policy, policy.stds(6)).loss
     plain = DDPOSFLoss(policy, step_weights=ours.step_weights, reduction="mean")
     parameters = list(prior.denoiser.network.parameters())
-    transitions = rollout.transitions(1, advantage)
+    transitions = rollout[:, 1].set("advantage", advantage)
     found, expected = (
         torch.autograd.grad(loss(transitions)["loss_objective"], parameters, allow_unused=True)
         for loss in (ours, plain)

@@ -75,12 +75,14 @@ def test_noise_mode_with_normal_actions_has_the_priors_distribution(prior, heigh
     count, steps = 64, 10
     core = make(prior, height, count=count, num_steps=steps, action_mode="noise")
     draw = torch.Generator().manual_seed(0)
-    episodes = core.collect(lambda x, step: torch.randn(x.shape, generator=draw), generators(count))
+    core.reset(generators(count))
+    for _ in range(steps):
+        core.step(torch.randn(core.x.shape, generator=draw))
     mean, variance = 0.0, 1.0
     for step in range(steps):
         a, b, std = prior.linear_step(step, core.table)
         mean, variance = a * mean + b, a * a * variance + std * std
-    free = episodes.scenes[-1][:, 1:].double()
+    free = core.x[:, 1:].double()
     samples = free.numel()
     assert abs(float(free.mean()) - mean) < 5 * (variance / samples) ** 0.5
     assert abs(float(free.var()) / variance - 1) < 5 * (2 / samples) ** 0.5
@@ -99,23 +101,6 @@ def test_actions_are_clipped_at_the_bound(prior, height):
     core.reset(generators(3))
     core.step(torch.full((3, 34, 20), 7.0))
     assert torch.equal(core.x[:, 1:], torch.full((3, 33, 20), 0.5))
-
-
-def test_collect_gives_the_same_episodes_as_single_steps(prior, height):
-    def policy(x, step):
-        return 0.5 * x + 0.01 * step
-
-    collected = make(prior, height).collect(policy, generators(3))
-    core = make(prior, height)
-    core.reset(generators(3))
-    for step in range(4):
-        assert torch.equal(core.x, collected.scenes[step])
-        result = core.step(policy(core.x, step))
-    assert torch.equal(core.x, collected.scenes[4])
-    assert torch.equal(result.reward, collected.reward)
-    assert collected.scenes.shape == (5, 3, 34, 20)
-    assert collected.actions.shape == (4, 3, 34, 20)
-    assert torch.equal(collected.batch.tensor, core.scenes().tensor)
 
 
 def test_extra_slots_are_allowed(prior, height):

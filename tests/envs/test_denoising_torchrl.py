@@ -44,28 +44,6 @@ def test_bit_identical_to_the_vector_face(height, action_mode):
             assert torch.equal(stepped["next", "scene"], final)
 
 
-def test_collect_equals_a_rollout(prior, height):
-    env = DenoisingTorchRLEnv(3, prior=prior, reward=height, num_steps=4, action_mode="noise")
-
-    def policy(x, step):
-        return 0.1 * x + step
-
-    env.set_seed(1)
-    fast = env.collect(policy)
-    env.set_seed(1)
-    slow = env.rollout(4, lambda td: td.set("action", policy(td["scene"], int(4 - _remaining(env, td)))))
-    assert torch.equal(fast.scenes[:-1].transpose(0, 1), slow["scene"])
-    assert torch.equal(fast.scenes[-1], slow["next", "scene"][:, -1])
-    assert torch.equal(fast.actions.transpose(0, 1), slow["action"])
-    assert torch.equal(fast.reward, slow["next", "reward"][:, -1, 0])
-    assert fast.timesteps.tolist() == slow["timestep"][0, :, 0].tolist()
-
-
-def _remaining(env, tensordict):
-    timesteps = env.core.table.timesteps.tolist()
-    return len(timesteps) - timesteps.index(int(tensordict["timestep"][0]))
-
-
 def test_partial_reset_restarts_only_the_asked_episodes(prior, height):
     env = DenoisingTorchRLEnv(3, prior=prior, reward=height, num_steps=4)
     env.set_seed(0)
@@ -100,8 +78,8 @@ def test_episodes_carry_no_graph(height):
     prior = tiny_prior()
     env = DenoisingTorchRLEnv(2, prior=prior, reward=height, num_steps=2, action_mode="noise")
     weight = torch.ones(1, requires_grad=True)
-    trajectories = env.collect(lambda x, step: weight * x)
-    assert not trajectories.scenes.requires_grad
+    episodes = env.rollout(2, lambda td: td.set("action", weight * td["scene"]))
+    assert not episodes["next", "scene"].requires_grad
     current = env.reset()
     assert not env.step(current.set("action", weight * current["scene"]))["next", "scene"].requires_grad
 

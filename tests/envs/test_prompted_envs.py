@@ -121,12 +121,12 @@ def test_the_reward_is_told_the_prompt_of_every_episode(reader):
 
     env = DenoisingTorchRLEnv(4, prior=reader, num_steps=1, reward=reward, prompt=PROMPTS)
     env.set_seed(0)
-    trajectories = env.collect(lambda x, step: x)
-    assert trajectories.prompts == seen[-1]
-    assert set(trajectories.prompts) <= set(PROMPTS)
-    env.collect(lambda x, step: x, ["A scene with a cup."] * 4)
+    env.rollout(1)
+    assert env.core.prompts == seen[-1]
+    assert set(env.core.prompts) <= set(PROMPTS)
+    env.rollout(1, auto_reset=False, tensordict=env.reset(prompts=["A scene with a cup."] * 4))
     assert seen[-1] == ("A scene with a cup.",) * 4
-    DenoisingTorchRLEnv(1, prior=reader, num_steps=1, reward=reward).collect(lambda x, step: x)
+    DenoisingTorchRLEnv(1, prior=reader, num_steps=1, reward=reward).rollout(1)
     assert seen[-1] is None
 
 

@@ -1,12 +1,11 @@
-"""A training loop of torchrl's own parts: collector, policy and public loss."""
+"""A training loop of torchrl's own parts: collector, policy, and the public advantage and loss."""
 
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
-from agents.post_training import DDPOSFLoss, DenoisingPolicy, compute_advantages
+from agents.post_training import Advantage, DDPOSFLoss, DenoisingPolicy
 from agents.priors.testing import tiny_prior
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.envs import DenoisingTorchRLEnv
@@ -20,13 +19,6 @@ def to_the_front(batch: SceneBatch, context: RewardContext) -> RewardOutput:
     return RewardOutput(batch.translations[..., 0].mean(dim=1), valid=batch.counts % 2 == 0)
 
 
-def with_advantage(batch: TensorDictBase) -> TensorDictBase:
-    """The batch of whole episodes [B, S] with the advantage of each at all its steps."""
-    final = batch["next"][:, -1]
-    advantage = compute_advantages(final["reward"][:, 0], final["valid"][:, 0])
-    return batch.set("advantage", advantage[:, None].expand(batch.shape))
-
-
 def test_every_step_of_the_loop_improves_its_batch_and_the_next_is_sampled_with_it() -> None:
     prior = tiny_prior(slots=12)
     policy = DenoisingPolicy(prior, STEPS)
@@ -34,11 +26,11 @@ def test_every_step_of_the_loop_improves_its_batch_and_the_next_is_sampled_with_
     env.set_seed(0)
     torch.manual_seed(0)
     collector = Collector(env, policy, frames_per_batch=SCENES * STEPS, total_frames=3 * SCENES * STEPS)
-    loss = DDPOSFLoss(policy, reduction="mean", clip_epsilon=0.2)
+    advantage, loss = Advantage(), DDPOSFLoss(policy, reduction="mean", clip_epsilon=0.2)
     optimizer = torch.optim.SGD(policy.parameters(), lr=1e-3)
     iterations = 0
     for batch in collector:
-        before = loss(with_advantage(batch))
+        before = loss(advantage(batch))
         optimizer.zero_grad()
         before["loss_objective"].backward()
         optimizer.step()

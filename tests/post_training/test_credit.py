@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from agents.post_training.learner import Learner
-from agents.post_training.rollouts import Rollout
+from agents.post_training.rollouts import finished_scenes
 from agents.priors.testing import tiny_prior
 from rewards import WeightedSum
 from rewards.base import RewardContext, RewardOutput
@@ -36,13 +36,13 @@ class LeftHalf:
 def test_an_empty_slot_has_credit_under_a_sum_alone(tmp_path: Path, averages: bool) -> None:
     learner = Learner(small_config(tmp_path, reward=LeftHalf(averages), batch_size=12), tiny_prior())
     try:
-        rollout = learner.rollout(0)
-        advantage = learner.algorithm.advantage(rollout)
+        batch = learner.write_advantage(learner.rollout(0))
     finally:
         learner.close()
-    welded = len(rollout.batch.scene_type.fixed)
-    credit, empty = rollout.per_object[:, welded:], rollout.batch.is_empty[:, welded:]
-    advantage = advantage[:, welded:]
+    scenes = finished_scenes(batch)
+    welded = len(scenes.scene_type.fixed)
+    credit, empty = batch["per_object"][:, -1, welded:], scenes.is_empty[:, welded:]
+    advantage = batch["advantage"][:, -1, welded:]
     assert empty.any()
     assert (~empty).any()
     if averages:
@@ -56,33 +56,32 @@ def test_an_empty_slot_has_credit_under_a_sum_alone(tmp_path: Path, averages: bo
     assert bool((advantage[good] > 0).all())
 
 
-def _credit_in_rooms(folder: Path, reward: Any, algorithm: str) -> tuple[Rollout, torch.Tensor]:
-    """Samples of an untrained prior of rooms, and the advantage of their poses (B, N)."""
+def _credit_in_rooms(folder: Path, reward: Any, algorithm: str) -> tuple[SceneBatch, torch.Tensor, torch.Tensor]:
+    """Samples of an untrained prior of rooms, and the credit and the advantage of their poses (B, N)."""
     prior = tiny_prior("restaurant_low_clutter", process="mixed", seed=3)
     learner = Learner(small_config(folder, reward=reward, batch_size=12, algorithm={"name": algorithm}), prior)
     try:
-        rollout = learner.rollout(0)
-        advantage = learner.algorithm.advantage(rollout)
+        batch = learner.write_advantage(learner.rollout(0))
     finally:
         learner.close()
-    return rollout, advantage["advantage"] if algorithm == "nft" else advantage
+    return finished_scenes(batch), batch["per_object"][:, -1], batch["advantage"][:, -1]
 
 
 @pytest.mark.parametrize(("algorithm", "averages"), [("ddpo_sf", True), ("nft", True), ("nft", False)])
 def test_generated_furniture_is_not_treated_as_infeasible(tmp_path: Path, algorithm: str, averages: bool) -> None:
-    rollout, poses = _credit_in_rooms(tmp_path, LeftHalf(averages), algorithm)
-    furniture, free = rollout.batch.is_furniture, rollout.batch.is_free
+    scenes, credit, poses = _credit_in_rooms(tmp_path, LeftHalf(averages), algorithm)
+    furniture, free = scenes.is_furniture, scenes.is_free
     assert furniture.any()
     assert not poses[furniture].any()
-    assert bool((poses[free & (rollout.per_object > 0)] > 0).all())
-    assert bool((poses[free & (rollout.per_object == 0)] < 0).all())
+    assert bool((poses[free & (credit > 0)] > 0).all())
+    assert bool((poses[free & (credit == 0)] < 0).all())
 
 
 @pytest.mark.parametrize("algorithm", ["ddpo_sf", "nft"])
 def test_furniture_that_overlaps_furniture_is_blamed(tmp_path: Path, algorithm: str) -> None:
-    rollout, poses = _credit_in_rooms(tmp_path, "feasible_share", algorithm)
-    furniture = rollout.batch.is_furniture
-    apart, blamed = furniture & (rollout.per_object > 0), furniture & (rollout.per_object == 0)
+    scenes, credit, poses = _credit_in_rooms(tmp_path, "feasible_share", algorithm)
+    furniture = scenes.is_furniture
+    apart, blamed = furniture & (credit > 0), furniture & (credit == 0)
     assert apart.any()
     assert blamed.any()
     assert bool((poses[apart] > 0).all())
@@ -102,12 +101,11 @@ def test_categories_have_credit_if_the_reward_counts_objects(tmp_path: Path, rew
     config = small_config(tmp_path, reward=reward, algorithm={"name": "nft"}, slots=12)
     learner = Learner(config, tiny_prior(process="mixed"))
     try:
-        rollout = learner.rollout(0)
-        advantage = learner.algorithm.advantage(rollout)
+        batch = learner.write_advantage(learner.rollout(0))
     finally:
         learner.close()
-    assert float(rollout.reward.std()) > 0
-    assert bool(advantage["category_advantage"].any()) == counts
+    assert float(batch["next", "reward"][:, -1].std()) > 0
+    assert bool(batch["category_advantage"].any()) == counts
 
 
 def test_parts_of_a_sum_have_the_same_weights_in_credit_and_value() -> None:

@@ -1,4 +1,4 @@
-"""The one-file example: it trains priors of every kind in the public environment and agrees with the package."""
+"""The one-file example: it trains priors of every kind in a torchrl loop, with the gradient of the package."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from types import ModuleType
 import pytest
 import torch
 
-from agents.diffusion import GaussianStep
-from agents.diffusion.reverse_steps import gaussian_log_prob
-from agents.post_training import compute_advantages
+from agents.post_training import DDPO, DDPOSFSettings, DenoisingPolicy
 from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
+from scene_envs.envs import DenoisingTorchRLEnv
+from scene_envs.errors import InvalidInputError
 from tests.helpers.examples import load_example
 
 
@@ -66,45 +66,23 @@ def test_the_command_in_its_first_lines_runs(
 
 def test_a_chain_without_a_noisy_step_is_refused(example: ModuleType, tmp_path: Path) -> None:
     tiny_prior().save(tmp_path / "base")
-    with pytest.raises(SystemExit, match="no step has a std of --min-std 100"):
+    with pytest.raises(InvalidInputError, match="no step is left in the policy gradient: min_std=100"):
         example.main(
             example.Args(prior=str(tmp_path / "base"), output=str(tmp_path / "run"), **{**SMALL, "min_std": 100.0})
         )
 
 
-def test_its_advantages_agree_with_the_package(example: ModuleType) -> None:
-    reward = torch.randn(7, generator=torch.Generator().manual_seed(0))
-    valid = torch.tensor([1, 1, 0, 1, 1, 1, 0]).bool()
-    torch.testing.assert_close(example.advantages(reward, valid, 5.0), compute_advantages(reward, valid))
-
-
-def test_its_log_probabilities_agree_with_the_package(example: ModuleType) -> None:
-    generator = torch.Generator().manual_seed(0)
-    x, mean = torch.randn(2, 3, 4, generator=generator), torch.randn(2, 3, 4, generator=generator)
-    std = torch.rand(3, 4, generator=generator) + 0.1
-    std[0] = 0.0
-    expected = gaussian_log_prob(x, mean, std).sum(dim=1) / 8
-    torch.testing.assert_close(example.log_prob(GaussianStep(mean, std), x), expected)
-
-
 @pytest.mark.parametrize("process", ["continuous", "mixed"])
 def test_its_gradient_is_that_of_the_package(example: ModuleType, process: str) -> None:
-    """Their log-probabilities differ by which slots are unmasked together: a constant, without a gradient."""
-    prior, generator = tiny_prior(process=process), torch.Generator().manual_seed(0)
-    table = prior.step_table(4)
-    x = prior.initial(3, 34, generator)
-    for step in range(2):
-        reverse = prior.transition(x, step, table)
-        action = reverse.from_noise(torch.randn(x.shape, generator=generator)).detach()
-        ours, theirs = example.log_prob(reverse, action), reverse.log_prob(action).sum(dim=1) / reverse.entries
-        weights = list(prior.denoiser.network.parameters())
-        advantage = torch.tensor([1.0, -0.5, 0.25])
-        gradients = [
-            torch.autograd.grad((advantage * value).sum(), weights, retain_graph=True, allow_unused=True)
-            for value in (ours, theirs)
-        ]
-        for mine, reference in zip(*gradients, strict=True):
-            assert (mine is None) == (reference is None)
-            if mine is not None:
-                torch.testing.assert_close(mine, reference, rtol=1e-4, atol=1e-6)
-        x = action
+    policy = DenoisingPolicy(tiny_prior(process=process), 4)
+    algorithm = DDPO(DDPOSFSettings(gradient_steps=2, min_std=0.01), policy, policy.stds(34))
+    env = DenoisingTorchRLEnv(3, prior=policy.prior, reward="object_count", num_steps=4)
+    env.set_seed(0)
+    batch = algorithm.advantage(env.rollout(4, policy))
+    example.add_policy_gradient(algorithm.loss, batch, 2, torch.Generator().manual_seed(0))
+    ours = [p.grad for p in policy.parameters()]
+    policy.zero_grad(set_to_none=True)
+    algorithm.accumulate(batch, torch.Generator().manual_seed(0))
+    assert example.norm(ours) > 0
+    for mine, parameter in zip(ours, policy.parameters(), strict=True):
+        torch.testing.assert_close(mine, parameter.grad)

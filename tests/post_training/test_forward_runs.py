@@ -39,8 +39,6 @@ def forward_config(
     [
         ("nft", "mixed"),
         ("awm", "continuous"),
-        ("reward_weighted", "mixed"),
-        ("neon", "mixed"),
         ("guidance_distillation", "continuous"),
     ],
 )
@@ -104,13 +102,13 @@ def test_credit_per_object_leaves_categories_alone(tmp_path: Path) -> None:
     trainer = PostTrainer(forward_config(tmp_path, "nft"), prior=tiny_prior())
     try:
         trainer.prepare()
-        rollout = trainer.learner.rollout(0)
-        advantage = trainer.learner.algorithm.advantage(rollout)
+        final = trainer.learner.write_advantage(trainer.learner.rollout(0))[:, -1]
     finally:
         trainer.close()
-    assert advantage["advantage"].shape == rollout.batch.is_empty.shape
-    assert (advantage["category_advantage"] == 0).all()
-    assert (advantage["advantage"][rollout.batch.is_empty] == 0).all()
+    empty = final["finished"][..., -1] == 1
+    assert final["advantage"].shape == empty.shape
+    assert (final["category_advantage"] == 0).all()
+    assert (final["advantage"][empty] == 0).all()
 
 
 def test_chunks_do_not_change_the_gradient_of_given_noise(tmp_path: Path) -> None:
@@ -118,13 +116,12 @@ def test_chunks_do_not_change_the_gradient_of_given_noise(tmp_path: Path) -> Non
     try:
         trainer.prepare()
         algorithm = trainer.learner.algorithm
-        rollout = trainer.learner.rollout(0)
-        advantage = algorithm.advantage(rollout)
+        batch = trainer.learner.write_advantage(trainer.learner.rollout(0))
         norms = []
         for chunk in (None, 6, 12):
             algorithm.policy.chunk = chunk
             trainer.learner.optimizer.zero_grad(set_to_none=True)
-            norms.append(algorithm.accumulate(rollout, advantage, torch.Generator().manual_seed(0)).loss)
+            norms.append(algorithm.accumulate(batch, torch.Generator().manual_seed(0)).loss)
     finally:
         trainer.close()
     assert norms == pytest.approx([norms[0]] * 3)

@@ -77,10 +77,10 @@ def test_targets_are_the_corrections_of_what_the_sampler_denoises(trainer: PostT
     learner, found = algorithm(trainer), trainer.learner.rollout(0)
     learner.settings.clip = 1e9
     step, prior, table = learner.steps[-3], learner.sampler, trainer.learner.policy.table
-    states = learner.corrected(found, torch.full((len(found.reward),), step))
-    torch.testing.assert_close(states["scene"], found.scenes[step])
+    states = learner.corrected(found, torch.full((len(found),), step))
+    torch.testing.assert_close(states["scene"], found["scene"][:, step])
     with torch.no_grad():
-        reverse: Any = prior.transition(found.scenes[step], step, table)
+        reverse: Any = prior.transition(found["scene"][:, step], step, table)
     std = position_std(prior, step, table)  # type: ignore[arg-type]
     moves = corrections(prior.decode(reverse.denoised), std.double().numpy())
     expected = reverse.denoised[..., :POSE_FEATURES].clone()
@@ -95,7 +95,7 @@ def test_targets_are_the_corrections_of_what_the_sampler_denoises(trainer: PostT
 def test_no_target_is_further_than_the_clip(trainer: PostTrainer) -> None:
     learner, found = algorithm(trainer), trainer.learner.rollout(0)
     for step in learner.steps:
-        at = torch.full((len(found.reward),), step)
+        at = torch.full((len(found),), step)
         learner.settings.clip = 0.5
         near = learner.corrected(found, at)["denoised"]
         learner.settings.clip = 1e-9

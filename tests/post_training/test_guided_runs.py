@@ -11,6 +11,7 @@ import torch
 
 from agents.diffusion.reverse_steps import concatenate_steps
 from agents.post_training import PostTrainConfig, PostTrainer
+from agents.post_training.rollouts import finished_scenes
 from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError
@@ -41,10 +42,10 @@ def test_the_scenes_of_a_batch_hold_the_numbers_of_their_prompts(tmp_path: Path,
     algorithm = {"name": "nft", "scenes_per_prompt": 4}
     trainer = PostTrainer(config(tmp_path, algorithm=algorithm, optimizer={"lr": 1e-3, "chunk": chunk}), prior=reader())
     trainer.prepare()
-    rollout = trainer.learner.rollout(0)
+    scenes, prompts = finished_scenes(trainer.learner.rollout(0)), trainer.learner.env.core.prompts
     trainer.close()
-    assert rollout.prompts is not None
-    assert rollout.batch.counts.tolist() == [{TWO[0]: 9, TWO[1]: 20}[prompt] for prompt in rollout.prompts]
+    assert prompts is not None
+    assert scenes.counts.tolist() == [{TWO[0]: 9, TWO[1]: 20}[prompt] for prompt in prompts]
 
 
 def test_the_guard_samples_as_the_run_does(tmp_path: Path) -> None:

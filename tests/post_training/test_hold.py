@@ -100,7 +100,6 @@ def test_the_key_is_typed_with_or_without_its_group(word: str) -> None:
         (["hold=gard:1.05"], "must be guard:RATIO"),
         (["hold=guard:1.05", "regularisation.weight=0"], "which is 0"),
         (["hold=guard:1.6"], "guard.limit"),
-        (["algorithm=neon", "hold=guard:1.05"], "does not change the steps of algorithm=neon"),
     ],
 )
 def test_nonsense_is_refused(words: list[str], said: str) -> None:

@@ -17,8 +17,8 @@ from agents.post_training import (
     post_train_and_compare,
 )
 from agents.post_training.doctor import diagnose
-from agents.post_training.prompts import PromptDeck, prompt_groups
-from agents.post_training.rollouts import collect
+from agents.post_training.prompts import PromptDeck
+from agents.post_training.rollouts import collect, text_of
 from agents.priors.base import ScenePrior
 from agents.priors.mixed import MixedPrior
 from agents.priors.testing import tiny_prior
@@ -59,21 +59,17 @@ def test_prompts_are_dealt_in_groups_without_repetition() -> None:
     assert len(set(PromptDeck(texts[:2], share=2).deal(8, Generator().manual_seed(0)))) == 2
 
 
-def test_groups_are_those_of_equal_prompts() -> None:
-    groups = prompt_groups([TWO[0], TWO[1], TWO[0]])
-    assert groups[0] == groups[2] != groups[1]
-
-
 def test_scenes_are_compared_with_those_of_the_same_prompt(tmp_path: Path) -> None:
     """A reward of the prompt alone teaches nothing: within a prompt all are equal."""
     config = small_config(tmp_path, prompt=TWO, scenes_per_prompt=3, reward=longest_prompt)
     trainer = PostTrainer(config, prior=reader())
     trainer.prepare()
-    rollout = trainer.learner.rollout(0)
-    assert sorted(set(rollout.prompts or ())) == sorted(TWO)
-    assert len(set(rollout.reward.tolist())) == 2
-    assert (trainer.learner.algorithm.advantage(rollout) == 0).all()
-    assert (compute_advantages(rollout.reward, rollout.valid) != 0).all()
+    batch = trainer.learner.write_advantage(trainer.learner.rollout(0))
+    reward = batch["next", "reward"][:, -1, 0]
+    assert sorted(set(trainer.learner.env.core.prompts or ())) == sorted(TWO)
+    assert len(set(reward.tolist())) == 2
+    assert (batch["advantage"] == 0).all()
+    assert (compute_advantages(reward) != 0).all()
     trainer.close()
 
 
@@ -91,15 +87,16 @@ def test_the_policy_depends_on_the_prompt_in_rollout_and_gradient() -> None:
     prior = reader()
     env = DenoisingTorchRLEnv(4, prior=prior, num_steps=3, prompt=TWO)
     policy = DenoisingPolicy(prior, 3)
-    rollout = collect(env, policy, seed=0, prompts=[TWO[0]] * 4)
-    assert rollout.prompts == (TWO[0],) * 4
-    assert rollout.text is not None
+    transitions = collect(env, policy, seed=0, prompts=[TWO[0]] * 4)[:, 0]
+    assert env.core.prompts == (TWO[0],) * 4
+    scene, action, text = transitions["scene"], transitions["action"], text_of(transitions)
+    assert text is not None
     other = policy.read(env.core.prompting.read([TWO[1]] * 4))
-    log_prob = policy.log_prob(rollout.scenes[0], 0, rollout.actions[0], rollout.text)
-    torch.testing.assert_close(log_prob, rollout.slot_log_prob[0], atol=0, rtol=0)
-    assert not torch.equal(log_prob, policy.log_prob(rollout.scenes[0], 0, rollout.actions[0], other))
-    transitions = rollout.transitions(0, torch.tensor([1.0, -1.0, 0.5, 2.0]))
-    from_tokens = transitions.exclude("text", "text_mask").set("prompt", env.core.prompting.read([TWO[0]] * 4))
+    log_prob = policy.log_prob(scene, 0, action, text)
+    torch.testing.assert_close(log_prob, transitions["slot_log_prob"], atol=0, rtol=0)
+    assert not torch.equal(log_prob, policy.log_prob(scene, 0, action, other))
+    transitions["advantage"] = torch.tensor([1.0, -1.0, 0.5, 2.0])
+    from_tokens = transitions.exclude("text", "text_mask")
     losses = [DDPOSFLoss(policy)(kind)["loss_objective"] for kind in (transitions, from_tokens)]
     torch.testing.assert_close(losses[0], losses[1])
 
@@ -169,8 +166,10 @@ def test_real_scenes_bring_their_own_prompts(tmp_path: Path) -> None:
     for scene, text in zip(x0, texts, strict=True):
         row = int((scenes.train == scene).all(dim=(1, 2)).nonzero()[0])
         assert text == "" or text in scenes.prompts(row)
-    assert trainer.learner.rollout(0).prompts is not None
-    assert set(trainer.learner.rollout(0).prompts or ()) <= {text for i in range(12) for text in scenes.prompts(i)}
+    trainer.learner.rollout(0)
+    prompts = trainer.learner.env.core.prompts
+    assert prompts is not None
+    assert set(prompts) <= {text for i in range(12) for text in scenes.prompts(i)}
     trainer.close()
 
 

@@ -215,10 +215,10 @@ def test_the_policy_gradient_reaches_poses_and_categories(prior: MixedPrior) -> 
     env = DenoisingTorchRLEnv(4, prior=prior, num_steps=4, reward="object_count")
     policy = DenoisingPolicy(prior, 4, chunk=3)
     rollout = collect(env, policy, seed=0)
-    assert len(set(rollout.reward.tolist())) > 1
+    assert len(rollout["next", "reward"][:, -1].unique()) > 1
     loss = DDPOSFLoss(policy)
     for step in range(4):
-        result = loss(rollout.transitions(step, torch.tensor([1.0, -1.0, 0.5, 2.0])))
+        result = loss(rollout[:, step].set("advantage", torch.tensor([1.0, -1.0, 0.5, 2.0])))
         assert float(result["log_ratio"]) < 1e-4
         result["loss_objective"].backward()
     heads = [prior.denoiser.network.pose_out[-1].weight, prior.denoiser.network.logits_out[-1].weight]

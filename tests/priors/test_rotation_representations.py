@@ -261,7 +261,7 @@ def test_post_training_takes_them(rotation: str, scenes: SceneBatch) -> None:
     prior = _prior(rotation, scenes)
     policy = DenoisingPolicy(prior, 3)
     rollout = collect(DenoisingTorchRLEnv(2, prior=prior, reward="object_count", num_steps=3), policy, seed=0)
-    result = DDPOSFLoss(policy)(rollout.transitions(0, torch.tensor([1.0, -1.0])))
+    result = DDPOSFLoss(policy)(rollout[:, 0].set("advantage", torch.tensor([1.0, -1.0])))
     assert float(result["log_ratio"]) < 1e-4
     result["loss_objective"].backward()
     head = prior.denoiser.network.out.weight.grad
