@@ -33,16 +33,16 @@ def run_kernel(
     """Run a kernel on a batch: the results of each scene, None where it failed twice.
 
     Args:
-        kernel: name of a function of :data:`scene_envs.physics.kernels.KERNELS`.
+        kernel: Name of a function of :data:`scene_envs.physics.kernels.KERNELS`.
         batch: B scenes.
-        options: keyword arguments of the kernel.
-        pool: worker processes; None computes in this process.
+        options: Keyword arguments of the kernel.
+        pool: Worker processes; None computes in this process.
         units: (B,) float64, units that the simulation of each scene may spend; None derives them from its objects.
 
     Raises:
         InvalidInputError: a pose is not finite, or a matrix is not a rotation; the message names its scene and slot.
     """
-    _check(batch)
+    _require_rigid_poses(batch)
     translations = batch.translations.double().cpu().numpy()
     rotations = batch.rotations.double().cpu().numpy()
     categories = batch.categories.cpu().numpy()
@@ -57,7 +57,7 @@ def run_kernel(
     return (pool or PhysicsPool(workers=0)).run(kernel, chunks, options)
 
 
-def _check(batch: SceneBatch) -> None:
+def _require_rigid_poses(batch: SceneBatch) -> None:
     present = ~batch.is_empty
     finite = torch.isfinite(batch.tensor[..., :12]).all(dim=-1)
     product = batch.rotations.transpose(-1, -2) @ batch.rotations - torch.eye(3, device=batch.tensor.device)
@@ -68,7 +68,7 @@ def _check(batch: SceneBatch) -> None:
             scene, slot = bad[0].tolist()
             raise InvalidInputError(
                 f"scene {scene}, slot {slot} holds {what}: {batch.tensor[scene, slot, :12].tolist()}; "
-                "SceneBatch.from_tensor makes valid poses of a sampler's output"
+                "SceneBatch.from_tensor turns the output of a sampler into valid poses"
             )
 
 
@@ -78,7 +78,7 @@ def valid_rows(rows: Rows) -> Tensor:
 
 
 def spent(rows: Rows) -> Tensor:
-    """(B,) float64, units of simulation that each scene took; infinitely many if the scene failed twice."""
+    """(B,) float64, units of simulation that each scene took; infinite if the scene failed twice."""
     return torch.tensor([np.inf if row is None else float(row["spent"]) for row in rows], dtype=torch.float64)
 
 

@@ -19,15 +19,15 @@ _SAME_AREA = 1e-3
 
 @dataclass(frozen=True)
 class ContactFace:
-    """A horizontal face of an asset: where it is, and how far its solid area reaches.
+    """Position of a horizontal face of an asset, and extent of its solid area.
 
     Attributes:
-        height: z in the asset frame, m.
-        center: (x, y) in the asset frame, m.
-        inner: radius (m) of the largest circle inside the outline.
-        corners: smallest distance (m) of an outline corner from the centre.
-        outer: largest distance (m) of an outline corner from the centre.
-        hole: radius (m) outside of which the face is solid up to its outline; 0 without a hole.
+        height: Height z in the asset frame, m.
+        center: Centre (x, y) in the asset frame, m.
+        inner: Radius (m) of the largest circle inside the outline.
+        corners: Smallest distance (m) of an outline corner from the centre.
+        outer: Largest distance (m) of an outline corner from the centre.
+        hole: Radius (m) outside of which the face is solid up to its outline; 0 without a hole.
     """
 
     height: float
@@ -89,7 +89,7 @@ def _area(polygon: Array) -> float:
 
 
 def _outside(points: Array, polygon: Array) -> Array:
-    """(P,): how far (m) each point lies outside the convex polygon; negative inside."""
+    """(P,) m, distance of each point outside the convex polygon; negative inside."""
     edge = np.roll(polygon, -1, axis=0) - polygon
     normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
     return ((points[:, None] - polygon[None]) * normal[None]).sum(axis=2).max(axis=1)

@@ -23,10 +23,10 @@ class LevelGeometry:
     """All parts of one asset at one level of detail.
 
     Attributes:
-        parts: the convex parts.
+        parts: Convex parts.
         ids: (P,) index of each part in the library.
         vertices: (sum V, 3) corners of all parts, m.
-        starts: (P,) where each part begins in ``vertices``.
+        starts: (P,) first row of each part in ``vertices``.
     """
 
     parts: tuple[PartGeometry, ...]
@@ -40,11 +40,11 @@ class AssetGeometry:
     """One asset: its two levels of detail, and the flat faces it can stand on or carry others with.
 
     Attributes:
-        asset: the asset.
-        fine: parts that are hollow where the asset is hollow.
-        coarse: fewer parts that enclose ``fine``; the same object as ``fine`` where there are none.
-        bottom: the flat face at the lowest z of the asset frame, or None.
-        top: the flat face at the highest z, or None.
+        asset: Asset with this geometry.
+        fine: Parts that are hollow where the asset is hollow.
+        coarse: Fewer parts that enclose ``fine``; the same object as ``fine`` where there are none.
+        bottom: Flat face at the lowest z of the asset frame, or None.
+        top: Flat face at the highest z, or None.
     """
 
     asset: Asset
@@ -75,11 +75,7 @@ class PartTable:
 
 
 class LibraryGeometry:
-    """Collision geometry of several assets; category ``c`` is ``assets[c]``.
-
-    Args:
-        assets: the assets of a scene type, in category order.
-    """
+    """Collision geometry of several assets; category ``c`` is ``assets[c]``."""
 
     def __init__(self, assets: Sequence[Asset]) -> None:
         self.parts: list[PartGeometry] = []

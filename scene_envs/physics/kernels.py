@@ -30,7 +30,7 @@ class Chunk:
     """Some scenes of one type, as workers receive them.
 
     Attributes:
-        scene_type: the scene type itself, so that types registered elsewhere work in workers.
+        scene_type: The scene type itself, so that types registered elsewhere work in workers.
         translations: (b, N, 3) float64 m.
         rotations: (b, N, 3, 3) float64.
         categories: (b, N) int64.
@@ -60,9 +60,7 @@ def _is_heap(physics: Physics, objects: Objects) -> bool:
     """Whether objects of one scene overlap too much to be simulated in bounded time."""
     if not heaps(physics.collider, objects).any():
         return False
-    _LOGGER.warning(
-        "objects of a scene are too deep in each other to be simulated; project it first; its row is invalid"
-    )
+    _LOGGER.warning("objects of a scene overlap too deeply to be simulated; project it first; its row is invalid")
     return True
 
 

@@ -15,10 +15,8 @@ class Contacts(Rows):
     """Near pairs of parts.
 
     Attributes:
-        first: (Q,) object rows.
-        second: (Q,) object rows, larger than ``first``.
-        part_first: (Q,) part of the first object in the library.
-        part_second: (Q,) part of the second.
+        first, second: (Q,) object rows; ``second`` is the larger one.
+        part_first, part_second: (Q,) index of each object's part in the library.
         gap: (Q,) m along ``direction``; the true distance is at least this much.
         direction: (Q, 3) unit vector in the world, from the first part to the second.
     """
@@ -41,16 +39,14 @@ class ObjectPairs:
     """Pairs of objects whose boxes are near each other.
 
     Attributes:
-        first: (P,) row of the object.
-        second: (P,) row of the other object, larger than ``first``.
+        first, second: (P,) object rows; ``second`` is the larger one.
         gap: (P,) m, signed gap of the coarse parts along ``direction``.
         direction: (P, 3) unit vector in the world, from the first object to the second.
-        depth: (P,) m, how deep the fine parts overlap; 0 when they do not.
+        depth: (P,) m, overlap of the fine parts; 0 without overlap.
         total: (P,) m, the sum of the depths of all overlapping fine parts (only when asked for).
         part_count: (P,) overlapping fine part pairs (only when asked for).
-        low: (n, 3) lowest corner of each object's box, m.
-        high: (n, 3) highest corner of each object's box, m.
-        contacts: near pairs of their coarse parts.
+        low, high: (n, 3) lowest and highest corner of each object's box, m.
+        contacts: Near pairs of the coarse parts of these objects.
         rough: (P,) bool, True where the depth is an upper bound, from face planes of the coarse parts, because exact
             depths of the scene would take too long.
     """

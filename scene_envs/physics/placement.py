@@ -57,8 +57,7 @@ class PlacedObjects:
         parts: (I,) placed parts, those of one object together.
         start: (n,) first part of each object.
         count: (n,) number of parts of each object.
-        low: (I, 3) lowest corner of each part's box, m.
-        high: (I, 3) highest corner.
+        low, high: (I, 3) lowest and highest corner of each part's box, m.
     """
 
     parts: PlacedParts
@@ -101,7 +100,7 @@ def part_pairs(placed: PlacedObjects, first: Index, second: Index) -> tuple[Inde
     """All pairs of parts of the object pairs (``first``, ``second``), both (P,).
 
     Returns:
-        pair (Q,) which object pair, and the two parts (Q,), (Q,) as rows of ``placed.parts``.
+        index (Q,) of the object pair, and the two parts (Q,), (Q,) as rows of ``placed.parts``.
     """
     sizes = placed.count[first] * placed.count[second]
     pair = np.repeat(np.arange(len(first)), sizes)

@@ -42,8 +42,8 @@ class Rest(Rows):
 
     Attributes:
         still: (n,) bool; free objects that need no simulation.
-        rise: (n,) m, how far each of them moves up; negative is down. 0 elsewhere.
-        tilt: (n,) rad, the angle by which it comes to stand upright.
+        rise: (n,) m, upward motion of each of them, negative for downward; 0 elsewhere.
+        tilt: (n,) rad, angle that each of them turns to stand upright.
     """
 
     still: Mask
@@ -86,18 +86,14 @@ class _Polygons:
         return cls(height, corners, normals, offsets)
 
     def outside(self, rows: Index, points: Array) -> Array:
-        """(Q, K): how far (m) points (Q, K, 2) in the asset frame lie outside polygons ``rows`` (Q,)."""
+        """(Q, K) m, distance of points (Q, K, 2) in the asset frame outside polygons ``rows`` (Q,)."""
         normals, offsets = self.normals[rows][:, None], self.offsets[rows][:, None]
         along = normals[..., 0] * points[:, :, None, 0] + normals[..., 1] * points[:, :, None, 1]
         return (along - offsets).max(axis=2)  # type: ignore[no-any-return]
 
 
 class Statics:
-    """Closed-form test of rest, from precomputed feet and surfaces.
-
-    Args:
-        library: geometry of the assets.
-    """
+    """Closed-form test of rest, from precomputed feet and surfaces."""
 
     def __init__(self, library: LibraryGeometry) -> None:
         self._library = library
@@ -121,10 +117,10 @@ class Statics:
         """Objects that need no simulation for ``duration`` seconds.
 
         Args:
-            objects: the objects of one or more scenes.
-            pairs: their near pairs.
-            contacts: the near parts of these pairs.
-            duration: s.
+            objects: Objects of one or more scenes.
+            pairs: Near pairs of the objects.
+            contacts: Near parts of these pairs.
+            duration: Length of time without simulation, s.
         """
         count = len(objects)
         tilt = np.hypot(objects.rotation[:, 0, 2], objects.rotation[:, 1, 2])
@@ -239,7 +235,7 @@ class Statics:
 
 
 def _rises(support: Index, drop: Array, fixed: Mask) -> tuple[Array, Index]:
-    """How far (m) each object moves up until it meets its support, and how many objects carry it."""
+    """Upward motion (m) of each object until it meets its support, and the number of objects that carry it."""
     rise, height = np.zeros(len(support)), np.zeros(len(support), dtype=np.int64)
     carried = np.flatnonzero(support >= 0)
     under = support[carried]
