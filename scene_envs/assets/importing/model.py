@@ -20,14 +20,14 @@ class Shape:
     """One piece of geometry of a model.
 
     Attributes:
-        kind: what it is.
-        size: m. Box (x, y, z), cylinder and capsule (radius, length along z without the caps), sphere (radius,),
+        kind: Kind of geometry.
+        size: Size, m: box (x, y, z), cylinder and capsule (radius, length along z without the caps), sphere (radius,),
             ellipsoid (x, y, z radii); the scale (x, y, z) of a mesh.
-        pose: (4, 4) shape frame to model frame.
-        where: link and element, for messages.
-        path: file of a mesh.
-        color: (r, g, b) that the model gives it, or None.
-        is_convex: the model declares the mesh convex.
+        pose: (4, 4) transform from the shape frame to the model frame.
+        where: Link and element, for messages.
+        path: File of a mesh.
+        color: Colour (r, g, b) given by the model, or None.
+        is_convex: Whether the model declares the mesh convex.
     """
 
     kind: Kind
@@ -53,11 +53,11 @@ class Model:
     """A model file at zero joint positions, in one frame.
 
     Attributes:
-        visuals: what is seen.
-        collisions: what is touched.
-        inertials: one per link that has one.
-        static: the model is fixed to the world; None when the file does not say.
-        notes: what was read differently from what the file might mean.
+        visuals: Shapes to draw.
+        collisions: Shapes for collisions.
+        inertials: Inertials of the links that have one.
+        static: Whether the model is fixed to the world; None when the file does not say.
+        notes: Choices of the reader that the file may not intend.
     """
 
     visuals: tuple[Shape, ...]

@@ -1,4 +1,4 @@
-"""Asset library of a folder of files."""
+"""Asset library of a folder of model files."""
 
 from __future__ import annotations
 
@@ -40,9 +40,6 @@ def load_library(folder: str | os.PathLike[str]) -> AssetLibrary:
     that cannot be read are left out. The log and :func:`import_report` list these choices and all corrections. Each
     file is read once per process.
 
-    Args:
-        folder: path of the folder.
-
     Raises:
         InvalidInputError: no such folder or no assets in it, a wrong entry, or a mesh that does not exist.
         CorruptFileError: a file that ``library.yaml`` lists cannot be read; file and reason are named.
@@ -80,13 +77,13 @@ def import_report(folder: str | os.PathLike[str]) -> ImportReport:
 
 @dataclass(frozen=True, eq=False)
 class FolderIndex:
-    """The assets that a folder offers; each is built when it is asked for.
+    """The assets of a folder; each is built on first use.
 
     Attributes:
-        folder: absolute path.
-        entries: in the order of the library.
-        is_listed: whether ``library.yaml`` lists them.
-        notes: what was assumed about the folder.
+        folder: Absolute path.
+        entries: Entries of the assets, in the order of the library.
+        is_listed: Whether ``library.yaml`` lists the assets.
+        notes: Assumptions about the folder.
     """
 
     folder: Path
