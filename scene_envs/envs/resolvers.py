@@ -1,4 +1,4 @@
-"""Resolvers of reward and prior names, through entry points, when an environment is built."""
+"""Resolvers of reward and prior names through entry points."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def resolve_reward(reward: Any) -> SceneScorer:
 
 
 def resolve_prior(prior: Any) -> PriorLike:
-    """A prior from a name or a path; anything else comes back as it is.
+    """A prior from a name or a path; any other value is returned unchanged.
 
     Raises:
         UnknownNameError: no shipped prior has that name; the nearest known one is offered.
