@@ -22,18 +22,13 @@ _CELL = 4
 
 
 class AssetFiles:
-    """Writer of asset files; each file is written when a format first asks for it.
+    """Writer of asset files; each file is written on first use.
 
     Args:
-        folder: the ``assets`` folder.
-        assets: all assets that may be asked for; their unique identifiers are derived from all names together.
-        friction: friction coefficient that formats write into their files.
-        package: a name for the whole export, for formats whose paths need one.
-
-    Attributes:
-        root: the ``assets`` folder.
-        friction: as given.
-        package: as given.
+        folder: Folder of the assets, ``root``.
+        assets: All assets of the export; their unique identifiers are derived from all names together.
+        friction: Friction coefficient that formats write into their files.
+        package: Name of the whole export, for formats whose paths need one.
     """
 
     def __init__(self, folder: Path, assets: Sequence[Asset], friction: float, package: str) -> None:
