@@ -22,6 +22,8 @@ POSE = slice(0, POSE_FEATURES)
 TRANSLATION = slice(0, 3)
 ROTATION = slice(3, POSE_FEATURES)
 CATEGORY = slice(POSE_FEATURES, None)
+_ORTHOGONAL = 1e-3
+"""Largest entry of R^T R - I of a rotation matrix R."""
 
 
 class SceneBatch(AssetFacts):
@@ -222,6 +224,22 @@ class SceneBatch(AssetFacts):
             if isinstance(error, UnknownNameError):
                 raise
             raise CorruptFileError(f"{str(path)!r} is not a scene file written by SceneBatch.save: {error}") from error
+
+
+def require_rigid_poses(batch: SceneBatch) -> None:
+    """Raise InvalidInputError for a pose that is not finite, and for a matrix that is not a rotation."""
+    present = ~batch.is_empty
+    finite = torch.isfinite(batch.tensor[..., POSE]).all(dim=-1)
+    product = batch.rotations.transpose(-1, -2) @ batch.rotations - torch.eye(3, device=batch.tensor.device)
+    rotation = (product.abs().amax(dim=(-1, -2)) < _ORTHOGONAL) & (torch.linalg.det(batch.rotations) > 0)
+    for good, what in ((finite, "a pose that is not finite"), (rotation, "a matrix that is not a rotation")):
+        bad = torch.nonzero(present & ~good)
+        if len(bad):
+            scene, slot = bad[0].tolist()
+            raise InvalidInputError(
+                f"scene {scene}, slot {slot} holds {what}: {batch.tensor[scene, slot, POSE].tolist()}; "
+                "SceneBatch.from_tensor turns the output of a sampler into valid poses"
+            )
 
 
 def _require_scene_tensor(tensor: Tensor, scene_type: SceneType) -> None:

@@ -26,27 +26,16 @@ _DIRECTIONS = np.stack([np.cos(np.arange(8) * np.pi / 4.0), np.sin(np.arange(8) 
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """n objects of several scenes, one after the other.
+    """n objects of several scenes, one after the other."""
 
-    Attributes:
-        scene: (n,) index of the scene, ascending.
-        category: (n,) index of the asset.
-        rotation: (n, 3, 3) rotation from the asset frame to the world.
-        translation: (n, 3) position of the asset frame, m.
-        center: (n, 3) centre of mass, world frame, m.
-        points: (n, 3, V) extreme points, world frame, m.
-        feet: (n, 9, 3) eight low points all round and their mean, m.
-        fixed: (n,) bool, static or welded.
-    """
-
-    scene: Index
-    category: Index
-    rotation: Array
-    translation: Array
-    center: Array
-    points: Array
-    feet: Array
-    fixed: Mask
+    scene: Index  # (n,) index of the scene, ascending
+    category: Index  # (n,) index of the asset
+    rotation: Array  # (n, 3, 3) rotation from the asset frame to the world
+    translation: Array  # (n, 3) position of the asset frame, m
+    center: Array  # (n, 3) centre of mass, world frame, m
+    points: Array  # (n, 3, V) extreme points, world frame, m
+    feet: Array  # (n, 9, 3) eight low points all round and their mean, m
+    fixed: Mask  # (n,) bool, static or welded
 
     @classmethod
     def of(
@@ -91,21 +80,13 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class Holding:
-    """Supports of n objects; indices are into the same n.
+    """Supports of n objects; indices are into the same n."""
 
-    Attributes:
-        support: (n,) object that each object stands on or lies in; -1 for none.
-        contained: (n,) bool; True where the object lies in its support.
-        inside: (n,) innermost container with the object in it or on top of its contents; -1 for none.
-        place: (n,) first fixed object down the chain of supports; -1 for none.
-        tier: (n,) tier of ``place``, counted from the top; -1 where ``place`` has none.
-    """
-
-    support: Index
-    contained: Mask
-    inside: Index
-    place: Index
-    tier: Index
+    support: Index  # (n,) object that each object stands on or lies in; -1 for none
+    contained: Mask  # (n,) bool; True where the object lies in its support
+    inside: Index  # (n,) innermost container with the object in it or on top of its contents; -1 for none
+    place: Index  # (n,) first fixed object down the chain of supports; -1 for none
+    tier: Index  # (n,) tier of ``place``, counted from the top; -1 where ``place`` has none
 
     def part(self, rows: slice) -> Holding:
         """Supports of the objects of ``rows``, which are whole scenes; indices count from their first object."""

@@ -66,7 +66,7 @@ def bounds_of(parts: Sequence[ConvexPart]) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Asset:
-    """One model of the library. Frame: z up, base at z = 0 unless the notes of its recipe say otherwise.
+    """One model of the library. Frame: z up, base at z = 0 unless its recipe has another frame.
 
     Attributes:
         name: Identifier, such as ``"steamer_lid"``.

@@ -26,35 +26,20 @@ _LEVEL = 0.005
 
 @dataclass(frozen=True, eq=False)
 class LibraryShapes:
-    """Shapes of C assets as padded arrays, in asset frames, m.
+    """Shapes of C assets as padded arrays, in asset frames, m."""
 
-    Attributes:
-        points: (C, 3, V) extreme points.
-        center: (C, 3) centre of mass.
-        bounds: (C, 2, 3) lowest and highest corner.
-        top: (C, G, G) height of the upper side per cell; -inf outside the asset.
-        wide: (C, G, G) height of the upper side, widened by about a centimetre.
-        covered: (C, G, G) bool, the widened outline with its holes filled.
-        low: (C, 2) lowest corner of the maps.
-        cell: (C, 2) size of a cell.
-        rim: (C,) height of the lowest way out of a container; -inf for other assets.
-        well: (C,) height of the bottom of a container.
-        tiers: (C, L) heights of tiers from the top, NaN beyond their number; assets with fewer than two have none.
-        static: (C,) bool.
-    """
-
-    points: Array
-    center: Array
-    bounds: Array
-    top: Array
-    wide: Array
-    covered: Mask
-    low: Array
-    cell: Array
-    rim: Array
-    well: Array
-    tiers: Array
-    static: Mask
+    points: Array  # (C, 3, V) extreme points
+    center: Array  # (C, 3) centre of mass
+    bounds: Array  # (C, 2, 3) lowest and highest corner
+    top: Array  # (C, G, G) height of the upper side per cell; -inf outside the asset
+    wide: Array  # (C, G, G) height of the upper side, widened by about a centimetre
+    covered: Mask  # (C, G, G) bool, the widened outline with its holes filled
+    low: Array  # (C, 2) lowest corner of the maps
+    cell: Array  # (C, 2) size of a cell
+    rim: Array  # (C,) height of the lowest way out of a container; -inf for other assets
+    well: Array  # (C,) height of the bottom of a container
+    tiers: Array  # (C, L) heights of tiers from the top, NaN beyond their number; assets with fewer than two have none
+    static: Mask  # (C,) bool
 
     def cells(self, category: Index, points: Array) -> tuple[Index, ...]:
         """Indices (category, i, j) of asset-frame ``points`` (..., 3) into the maps; cells at the edge are empty."""

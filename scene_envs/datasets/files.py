@@ -24,38 +24,23 @@ BLOCK = 2000
 
 @dataclass(frozen=True)
 class Block:
-    """A run of rows of one file: the unit that is read at a time.
+    """A run of rows of one file: the unit that is read at a time."""
 
-    Attributes:
-        file: Parquet or arrow file.
-        start: First row of the block.
-        rows: Number of rows.
-        group: Row group of a parquet file that holds the block; -1 for arrow.
-        skip: Number of rows of the group before the block.
-    """
-
-    file: Path
-    start: int
-    rows: int
-    group: int = -1
-    skip: int = 0
+    file: Path  # parquet or arrow file
+    start: int  # first row of the block
+    rows: int  # number of rows
+    group: int = -1  # row group of a parquet file that holds the block; -1 for arrow
+    skip: int = 0  # number of rows of the group before the block
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Rows of a file, unchanged.
+    """Rows of a file, unchanged."""
 
-    Attributes:
-        scenes: (M, N, D) float32 or float64, normalised.
-        prompt_sets: M tuples of prompts, at least one each.
-        place: Name of the file, for messages.
-        start: Row of the first scene in the file.
-    """
-
-    scenes: NDArray[np.floating]
-    prompt_sets: list[tuple[str, ...]]
-    place: str
-    start: int
+    scenes: NDArray[np.floating]  # (M, N, D) float32 or float64, normalised
+    prompt_sets: list[tuple[str, ...]]  # M tuples of prompts, at least one each
+    place: str  # name of the file, for messages
+    start: int  # row of the first scene in the file
 
 
 def find_files(path: str | os.PathLike[str]) -> list[Path]:

@@ -33,21 +33,13 @@ _UNFIT = "outside the normalizer"
 
 @dataclass(frozen=True)
 class Job:
-    """Specification of one shard.
+    """Specification of one shard."""
 
-    Attributes:
-        index: Index of the shard.
-        size: Number of scenes in the shard.
-        seed: Seed of the dataset.
-        verify: Whether to keep only scenes that pass :func:`~scene_envs.datasets.verification.judge_scenes`.
-        path: Path of the shard's file.
-    """
-
-    index: int
-    size: int
-    seed: int
-    verify: bool
-    path: str
+    index: int  # index of the shard
+    size: int  # number of scenes in the shard
+    seed: int  # seed of the dataset
+    verify: bool  # whether to keep only scenes that pass ``judge_scenes``
+    path: str  # path of the shard's file
 
 
 def make_shard(

@@ -199,7 +199,7 @@ class OffPromptMask:
         return self if self.prompt is not None else OffPromptMask(prompt)
 
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-        """(N,) bool, True where a slot is regenerated; none when the scene is as the prompt says.
+        """(N,) bool, True where a slot is regenerated; none when the scene follows the prompt.
 
         Raises:
             InvalidInputError: there is no prompt, or it cannot be read.

@@ -10,8 +10,8 @@ from scene_envs.plugins import plugin_entry_points
 from scene_envs.protocols import PriorLike, SceneScorer
 
 ENTRY_POINT_GROUP = "scene_envs.resolvers"
-"""Entry points of this group. ``reward = "module:function"`` names a function that takes what :func:`resolve_reward`
-takes, and returns a :class:`~scene_envs.protocols.SceneScorer`. ``prior = "module:function"`` names a function that
+"""Entry points of this group. ``reward = "module:function"`` names a function with the argument of
+:func:`resolve_reward` that returns a :class:`~scene_envs.protocols.SceneScorer`. ``prior = "module:function"`` names a function that
 takes a name or path, and returns a :class:`~scene_envs.protocols.PriorLike`."""
 
 

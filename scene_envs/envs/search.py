@@ -80,15 +80,10 @@ class SearchState:
 
 @dataclass(frozen=True)
 class NodeRandomness:
-    """The two independent sources of random numbers of one node of the tree.
+    """The two independent sources of random numbers of one node of the tree."""
 
-    Attributes:
-        noise: Torch generator for the diffusion that makes the node's scene.
-        mask: NumPy generator for the node's mask.
-    """
-
-    noise: torch.Generator
-    mask: np.random.Generator
+    noise: torch.Generator  # torch generator for the diffusion that makes the node's scene
+    mask: np.random.Generator  # NumPy generator for the node's mask
 
     @classmethod
     def at(cls, seed: int, path: tuple[int, ...]) -> NodeRandomness:
@@ -225,7 +220,7 @@ class SearchProblem:
         return self.with_scene(state, torch.where(state.mask[:, None], empty, state.scene))
 
     def with_scene(self, state: SearchState, scene: Tensor) -> SearchState:
-        """The node of ``state`` with another ``scene`` (N, D), scored and masked anew; nothing is denoised."""
+        """The node of ``state`` with another ``scene`` (N, D), scored and masked again; nothing is denoised."""
         batch = SceneBatch(scene.unsqueeze(0), self.scene_type)
         return self._score(batch, [(state.seed, state.path, state.value)])[0]
 

@@ -265,7 +265,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         return self.problem.without_masked(state)
 
     def with_scene(self, state: SearchState, scene: Tensor) -> SearchState:
-        """``state`` with another ``scene`` (N, D), scored and masked anew; nothing is denoised."""
+        """``state`` with another ``scene`` (N, D), scored and masked again; nothing is denoised."""
         return self.problem.with_scene(state, scene)
 
     def scene(self, state: SearchState | None = None) -> SceneBatch:

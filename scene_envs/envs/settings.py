@@ -36,7 +36,7 @@ class EnvSettings:
         guidance: Weight of classifier-free guidance in the prior's own steps; needs a prompt.
 
     Raises:
-        InvalidInputError: a number is outside what is accepted.
+        InvalidInputError: a number is outside its range.
     """
 
     scene: str | SceneType | None = None
@@ -75,7 +75,7 @@ class DenoisingSettings(EnvSettings):
         max_action: Bound to which the entries of actions are clipped.
 
     Raises:
-        InvalidInputError, UnknownNameError: a value is outside what is accepted.
+        InvalidInputError, UnknownNameError: a value is outside its range.
     """
 
     reward: Any = "object_count"
@@ -109,7 +109,7 @@ class TreeSettings(EnvSettings):
         physics_guidance: Strength with which objects are moved out of overlaps and onto supports, 0 to 1.
 
     Raises:
-        InvalidInputError: a value is outside what is accepted.
+        InvalidInputError: a value is outside its range.
     """
 
     objective: Any = "feasible_objects"

@@ -97,17 +97,11 @@ def visual_mesh(asset: Asset) -> trimesh.Trimesh:
 
 @dataclass(frozen=True, eq=False)
 class Palette:
-    """The colours of a mesh as a texture with one cell per colour.
+    """The colours of a mesh as a texture with one cell per colour."""
 
-    Attributes:
-        image: (H, W, 3) the texture.
-        uv: (K, 2) middle of each cell, v upward.
-        cells: (F,) cell of each face.
-    """
-
-    image: NDArray[np.uint8]
-    uv: Array
-    cells: NDArray[np.int64]
+    image: NDArray[np.uint8]  # (H, W, 3) the texture
+    uv: Array  # (K, 2) middle of each cell, v upward
+    cells: NDArray[np.int64]  # (F,) cell of each face
 
     @classmethod
     def of(cls, mesh: trimesh.Trimesh) -> Palette:

@@ -14,13 +14,9 @@ from numpy.typing import NDArray
 
 from scene_envs.arrays import Array
 from scene_envs.assets.base import Asset
-from scene_envs.errors import InvalidInputError
 from scene_envs.rotations import matrix_to_quaternion, project_to_so3
-from scene_envs.scene import SceneBatch
+from scene_envs.scene import SceneBatch, require_rigid_poses
 from scene_envs.scene_types import SceneType
-
-_ORTHOGONAL = 1e-3
-"""Largest entry of R^T R - I that still passes for a rotation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,14 +84,14 @@ def place(batch: SceneBatch) -> list[PlacedScene]:
     rounding. Objects are named after their asset and numbered in slot order. An asset without mass is welded.
 
     Raises:
-        InvalidInputError: a matrix is not a rotation; the message names its scene and slot.
+        InvalidInputError: a pose is not finite, or a matrix is not a rotation; the message names its scene and slot.
 
     >>> scene = place(SceneBatch.empty("dimsum_table", 1))[0]
     >>> [(item.name, item.welded) for item in scene.objects]
     [('cafe_table_0', True)]
     """
     batch = batch.to("cpu")
-    _require_rotations(batch)
+    require_rigid_poses(batch)
     scene_type, library = batch.scene_type, batch.scene_type.library
     names = identifiers(library.names)
     translations = batch.translations.double().numpy()
@@ -188,16 +184,3 @@ def number(value: float) -> str:
 def numbers(values: Sequence[float] | Array) -> str:
     """Several numbers as :func:`number` writes them, separated by spaces."""
     return " ".join(number(value) for value in np.asarray(values, dtype=np.float64).ravel())
-
-
-def _require_rotations(batch: SceneBatch) -> None:
-    product = batch.rotations.transpose(-1, -2) @ batch.rotations - torch.eye(3)
-    rotation = (product.abs().amax(dim=(-1, -2)) < _ORTHOGONAL) & (torch.linalg.det(batch.rotations) > 0)
-    bad = torch.nonzero(~batch.is_empty & ~rotation)
-    if len(bad):
-        scene, slot = bad[0].tolist()
-        raise InvalidInputError(
-            f"scene {scene}, slot {slot} holds a matrix that is not a rotation: "
-            f"{batch.rotations[scene, slot].flatten().tolist()}; SceneBatch.from_tensor turns the output of a "
-            "sampler into valid poses"
-        )

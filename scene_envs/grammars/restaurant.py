@@ -74,7 +74,7 @@ def tables(numbers: Mapping[int, float], table: Node) -> Node:
 
 
 def stack_of_three(towers: Sequence[Tower]) -> bool:
-    """Whether a stack of at least three steamers, lid included, stands somewhere."""
+    """Whether a stack of at least three steamers, lid included, exists."""
     parts = (part for tower in towers for part in tower.walk())
     return any(len(part.assets) >= 3 and part.assets[0] == "steamer_bottom" for part in parts)
 

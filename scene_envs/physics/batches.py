@@ -8,16 +8,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scene_envs.errors import InvalidInputError
 from scene_envs.physics.kernels import Chunk
 from scene_envs.physics.pool import PhysicsPool
 from scene_envs.rotations import geodesic_angle, project_to_so3
-from scene_envs.scene import SceneBatch
+from scene_envs.scene import SceneBatch, require_rigid_poses
 
 _CHUNK = 8
 """Scenes per message to a worker."""
-_ORTHOGONAL = 1e-3
-"""Largest entry of R^T R - I that still passes for a rotation."""
 
 Rows = list[dict[str, Any] | None]
 """Results of a kernel, one per scene."""
@@ -42,7 +39,7 @@ def run_kernel(
     Raises:
         InvalidInputError: a pose is not finite, or a matrix is not a rotation; the message names its scene and slot.
     """
-    _require_rigid_poses(batch)
+    require_rigid_poses(batch)
     translations = batch.translations.double().cpu().numpy()
     rotations = batch.rotations.double().cpu().numpy()
     categories = batch.categories.cpu().numpy()
@@ -55,21 +52,6 @@ def run_kernel(
         some = None if limits is None else limits[rows]
         chunks.append(Chunk(batch.scene_type, translations[rows], rotations[rows], categories[rows], some))
     return (pool or PhysicsPool(workers=0)).run(kernel, chunks, options)
-
-
-def _require_rigid_poses(batch: SceneBatch) -> None:
-    present = ~batch.is_empty
-    finite = torch.isfinite(batch.tensor[..., :12]).all(dim=-1)
-    product = batch.rotations.transpose(-1, -2) @ batch.rotations - torch.eye(3, device=batch.tensor.device)
-    rotation = (product.abs().amax(dim=(-1, -2)) < _ORTHOGONAL) & (torch.linalg.det(batch.rotations) > 0)
-    for good, what in ((finite, "a pose that is not finite"), (rotation, "a matrix that is not a rotation")):
-        bad = torch.nonzero(present & ~good)
-        if len(bad):
-            scene, slot = bad[0].tolist()
-            raise InvalidInputError(
-                f"scene {scene}, slot {slot} holds {what}: {batch.tensor[scene, slot, :12].tolist()}; "
-                "SceneBatch.from_tensor turns the output of a sampler into valid poses"
-            )
 
 
 def valid_rows(rows: Rows) -> Tensor:

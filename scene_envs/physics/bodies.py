@@ -32,7 +32,7 @@ _PARKING = 1000.0
 _PARKING_STEP = 10.0 * SCALE
 _SPARE_BODIES = 64
 _SPARE_FACTOR = 3
-"""A pool is built anew when it has more bodies than this many times the bodies that a scene needs, plus
+"""A pool is built again when it has more bodies than this many times the bodies that a scene needs, plus
 ``_SPARE_BODIES``: in every step Bullet compares the boxes of all bodies, including parked ones."""
 _ZERO = (0.0, 0.0, 0.0)
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)

@@ -30,14 +30,10 @@ class Budget:
 
     A unit of a search is one tested pair of convex parts. A unit of simulation is one free object over one step of
     35 solver iterations: about 0.05 ms, several times that where objects are deep in each other.
-
-    Attributes:
-        limit: Number of units at which the work ends.
-        spent: Number of units spent so far.
     """
 
-    limit: float
-    spent: float = 0.0
+    limit: float  # number of units at which the work ends
+    spent: float = 0.0  # number of units spent so far
 
     def spend(self, units: float) -> None:
         """Add ``units`` of work."""

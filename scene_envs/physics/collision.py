@@ -25,7 +25,7 @@ _TOO_MANY = 20_000_000
 
 
 class Collider:
-    """Search for near and overlapping objects; geometry is built once, poses come per call."""
+    """Search for near and overlapping objects; geometry is built once, poses are arguments."""
 
     def __init__(self, library: LibraryGeometry) -> None:
         self.library = library

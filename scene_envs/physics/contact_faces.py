@@ -19,23 +19,14 @@ _SAME_AREA = 1e-3
 
 @dataclass(frozen=True)
 class ContactFace:
-    """Position of a horizontal face of an asset, and extent of its solid area.
+    """Position of a horizontal face of an asset, and extent of its solid area."""
 
-    Attributes:
-        height: Height z in the asset frame, m.
-        center: Centre (x, y) in the asset frame, m.
-        inner: Radius (m) of the largest circle inside the outline.
-        corners: Smallest distance (m) of an outline corner from the centre.
-        outer: Largest distance (m) of an outline corner from the centre.
-        hole: Radius (m) outside of which the face is solid up to its outline; 0 without a hole.
-    """
-
-    height: float
-    center: tuple[float, float]
-    inner: float
-    corners: float
-    outer: float
-    hole: float
+    height: float  # height z in the asset frame, m
+    center: tuple[float, float]  # centre (x, y) in the asset frame, m
+    inner: float  # radius (m) of the largest circle inside the outline
+    corners: float  # smallest distance (m) of an outline corner from the centre
+    outer: float  # largest distance (m) of an outline corner from the centre
+    hole: float  # radius (m) outside of which the face is solid up to its outline; 0 without a hole
 
 
 def contact_face(fine: Sequence[PartGeometry], coarse: Sequence[PartGeometry], side: int) -> ContactFace | None:

@@ -16,11 +16,11 @@ from scene_envs.physics.projection import Corners, separated
 from scene_envs.scene import SceneBatch
 
 _DEEP = 5e-4
-"""Overlap (m) up to which two objects are left as they are; feasible objects may overlap by 1e-3 m."""
+"""Overlap (m) up to which two objects are not moved; feasible objects may overlap by 1e-3 m."""
 _FLOATING = 3e-4
 """Height (m) up to which an object counts as standing."""
 _FALL = 0.03
-"""An object higher than this (m) above everything is left as it is."""
+"""An object higher than this (m) above all others is not moved down."""
 _MIN_SPREAD = 0.02
 """Smallest standard deviation along an axis, as a share of the largest one."""
 _LEVEL = np.array([1.0, 1.0, 50.0])

@@ -37,7 +37,7 @@ def falls(collider: Collider, objects: Objects, limit: float) -> Array:
 
 
 def _over(objects: Objects, low: Array, high: Array, limit: float) -> tuple[Index, Index]:
-    """Pairs (P,), (P,) of a free object and one that its box may come down on."""
+    """Pairs (P,), (P,) of a free object and one that its box may fall on."""
     first, second = scene_pairs(objects)
     upper, lower = np.concatenate([first, second]), np.concatenate([second, first])
     meets: Mask = ~objects.fixed[upper] & (low[lower, 2] < low[upper, 2]) & (low[upper, 2] < high[lower, 2] + limit)

@@ -28,7 +28,7 @@ TURNS = tuple(np.arange(4) * np.pi / 4)
 PLACES = (0.5, 0.0, 1.0)
 """Grasp positions as fractions of the object's extent in the closing direction: its middle, then its two edges."""
 PART_PAIRS = 35_000.0
-"""Limit of pairs of convex parts tested per scene: six times what a crowded scene takes, about 0.6 s."""
+"""Limit of pairs of convex parts tested per scene: six times the number of a crowded scene, about 0.6 s."""
 
 
 @dataclass(frozen=True)

@@ -77,17 +77,11 @@ def physics_of(scene_type: SceneType) -> Physics:
 
 @dataclass(frozen=True, eq=False)
 class Moved:
-    """Objects of one scene after some time.
+    """Objects of one scene after some time."""
 
-    Attributes:
-        rotation: (n, 3, 3).
-        translation: (n, 3) m.
-        angle: (n,) rad, angle that each object turned.
-    """
-
-    rotation: Array
-    translation: Array
-    angle: Array
+    rotation: Array  # (n, 3, 3)
+    translation: Array  # (n, 3) m
+    angle: Array  # (n,) rad, angle that each object turned
 
     @property
     def is_finite(self) -> bool:

@@ -38,19 +38,12 @@ _ROWS_SQUARED = 25.0
 
 @dataclass(frozen=True, eq=False)
 class Planes(Rows):
-    """Half-spaces: ``direction . (x_second - x_first) >= bound``; object -1 is the world's origin.
+    """Half-spaces: ``direction . (x_second - x_first) >= bound``; object -1 is the world's origin."""
 
-    Attributes:
-        first: (Q,) object rows, or -1.
-        second: (Q,) object rows.
-        direction: (Q, 3) unit.
-        bound: (Q,) m.
-    """
-
-    first: Index
-    second: Index
-    direction: Array
-    bound: Array
+    first: Index  # (Q,) object rows, or -1
+    second: Index  # (Q,) object rows
+    direction: Array  # (Q, 3) unit
+    bound: Array  # (Q,) m
 
 
 def near_pairs(collider: Collider, objects: Objects) -> tuple[Index, Index]:

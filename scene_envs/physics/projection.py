@@ -36,7 +36,7 @@ SEARCHES = 5
 _OVERLAPPING = 2_000_000
 """Limit of corner tests in overlapping object pairs; more are too much work for minimum translations."""
 _ROUNDS = 30
-"""Largest number of rounds of a search; objects that still overlap after them are left as they are."""
+"""Largest number of rounds of a search; objects that still overlap after them are not moved further."""
 _PATIENCE = 10
 """A search also ends after more rounds than this without any improvement."""
 _REFINEMENTS = 8
@@ -53,21 +53,13 @@ _OUTSIDE = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """Translations of one scene's objects after projection.
+    """Translations of one scene's objects after projection."""
 
-    Attributes:
-        translation: (n, 3) m.
-        residual_depth: Deepest overlap that is left, m.
-        total_depth: Sum of the overlaps of object pairs that are left, m.
-        overlapping: (n,) bool, objects that still overlap another one.
-        heap: Whether the objects were a heap, which was spread before the first round.
-    """
-
-    translation: Array
-    residual_depth: float
-    total_depth: float
-    overlapping: Mask
-    heap: bool = False
+    translation: Array  # (n, 3) m
+    residual_depth: float  # deepest overlap that is left, m
+    total_depth: float  # sum of the overlaps of object pairs that are left, m
+    overlapping: Mask  # (n,) bool, objects that still overlap another one
+    heap: bool = False  # whether the objects were a heap, which was spread before the first round
 
 
 def project_objects(collider: Collider, objects: Objects, workspace: Corners) -> Projection:
@@ -100,7 +92,7 @@ def separated(
 ) -> Array:
     """Translations (n, 3) after one round of projection of overlapping objects and their neighbours.
 
-    A heap of objects, which would take too much work, is left as it is.
+    A heap of objects, which would take too much work, is not changed.
 
     Args:
         collider: Geometry of the assets.
@@ -174,7 +166,7 @@ def _round(
     budget: Budget,
     cost: Array | None = None,
 ) -> Array:
-    """The next translations: overlapping pairs (``first``, ``second``) come free, other ``near`` pairs stay apart."""
+    """The next translations: they free overlapping pairs (``first``, ``second``) and keep other ``near`` pairs apart."""
     near_first, near_second = near
     extra = np.zeros((len(near_first), 3))
     if len(first):

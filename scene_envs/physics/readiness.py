@@ -35,7 +35,7 @@ _LEANING: tuple[dict[str, Any], ...] = tuple(
 """Trials with tilted gravity, in four directions. In a round they are made for scenes that pass the shorter trials, and
 at the end for scenes that did not pass all trials of their round."""
 _PATIENCE = 2
-"""Rounds without more ready objects after which a scene is left as it is."""
+"""Number of rounds without more ready objects after which a scene has no further round."""
 _ROUNDS_SHARE = 0.5
 """Share of a scene's work that the rounds may do; the rest is for the trials at the end."""
 _UNMOVED = 1e-4
@@ -110,21 +110,13 @@ def _keep(batch: SceneBatch, kept: Tensor) -> SceneBatch:
 
 @dataclass(frozen=True, eq=False)
 class _Round:
-    """Scenes after one round of :func:`make_ready`.
+    """Scenes after one round of :func:`make_ready`."""
 
-    Attributes:
-        batch: Settled scenes.
-        ready: (B, N) free objects that passed the trials of a round.
-        valid: (B,) whether projection and settling gave an answer.
-        finished: (B,) whether the round ended before its work was spent.
-        lasting: (B,) whether all trials of the round were made, the longest included, and no object moved in them.
-    """
-
-    batch: SceneBatch
-    ready: Tensor
-    valid: Tensor
-    finished: Tensor
-    lasting: Tensor
+    batch: SceneBatch  # settled scenes
+    ready: Tensor  # (B, N) free objects that passed the trials of a round
+    valid: Tensor  # (B,) whether projection and settling gave an answer
+    finished: Tensor  # (B,) whether the round ended before its work was spent
+    lasting: Tensor  # (B,) whether all trials of the round were made, the longest included, and no object moved in them
 
     @property
     def counts(self) -> Tensor:

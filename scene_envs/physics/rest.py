@@ -38,34 +38,21 @@ _DEEPEST = 2e-3
 
 @dataclass(frozen=True, eq=False)
 class Rest(Rows):
-    """Objects whose motion has a closed form.
+    """Objects whose motion has a closed form."""
 
-    Attributes:
-        still: (n,) bool; free objects that need no simulation.
-        rise: (n,) m, upward motion of each of them, negative for downward; 0 elsewhere.
-        tilt: (n,) rad, angle that each of them turns to stand upright.
-    """
-
-    still: Mask
-    rise: Array
-    tilt: Array
+    still: Mask  # (n,) bool; free objects that need no simulation
+    rise: Array  # (n,) m, upward motion of each of them, negative for downward; 0 elsewhere
+    tilt: Array  # (n,) rad, angle that each of them turns to stand upright
 
 
 @dataclass(frozen=True, eq=False)
 class _Polygons:
-    """Convex polygons in the asset's xy plane, padded with copies of their first corner and edge.
+    """Convex polygons in the asset's xy plane, padded with copies of their first corner and edge."""
 
-    Attributes:
-        height: (P,) z in the asset frame, m; NaN where there is no polygon.
-        corners: (P, V, 2) m.
-        normals: (P, V, 2) outward.
-        offsets: (P, V) m; inside is ``normals @ x <= offsets``.
-    """
-
-    height: Array
-    corners: Array
-    normals: Array
-    offsets: Array
+    height: Array  # (P,) z in the asset frame, m; NaN where there is no polygon
+    corners: Array  # (P, V, 2) m
+    normals: Array  # (P, V, 2) outward
+    offsets: Array  # (P, V) m; inside is ``normals @ x <= offsets``
 
     @classmethod
     def of(cls, polygons: list[tuple[float, Array] | None]) -> _Polygons:

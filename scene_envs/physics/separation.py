@@ -23,17 +23,11 @@ _BLOCK = 1 << 16
 
 @dataclass(frozen=True, eq=False)
 class PlacedParts:
-    """Parts of placed objects.
+    """Parts of placed objects."""
 
-    Attributes:
-        part: (I,) index of the part in the library.
-        rotation: (I, 3, 3), asset frame to world.
-        translation: (I, 3) m, world.
-    """
-
-    part: Index
-    rotation: Array
-    translation: Array
+    part: Index  # (I,) index of the part in the library
+    rotation: Array  # (I, 3, 3), asset frame to world
+    translation: Array  # (I, 3) m, world
 
 
 def rotate(rotation: Array, points: Array) -> Array:

@@ -25,21 +25,13 @@ _STILL_WAY, _STILL_ANGLE = 1e-4, 1e-3
 
 @dataclass(frozen=True)
 class SolverSettings:
-    """Settings of the integration of motion.
+    """Settings of the integration of motion."""
 
-    Attributes:
-        time_step: Length of a step, s.
-        iterations: Iterations of the sequential-impulse solver per step.
-        linear_damping: Fraction of velocity lost per second.
-        angular_damping: Fraction of angular velocity lost per second.
-        tilt: (x, y) angles by which gravity is tilted toward the x and the y axis, rad.
-    """
-
-    time_step: float = 1.0 / 240.0
-    iterations: int = 50
-    linear_damping: float = 0.0
-    angular_damping: float = 0.0
-    tilt: tuple[float, float] = (0.0, 0.0)
+    time_step: float = 1.0 / 240.0  # length of a step, s
+    iterations: int = 50  # iterations of the sequential-impulse solver per step
+    linear_damping: float = 0.0  # fraction of velocity lost per second
+    angular_damping: float = 0.0  # fraction of angular velocity lost per second
+    tilt: tuple[float, float] = (0.0, 0.0)  # (x, y) angles by which gravity is tilted toward the x and the y axis, rad
 
 
 class World:

@@ -18,19 +18,12 @@ _RAYS = 24
 
 @dataclass(frozen=True, eq=False)
 class Framing:
-    """Points to show, with the directions of camera and lamp.
+    """Points to show, with the directions of camera and lamp."""
 
-    Attributes:
-        points: (P, 3) points that the picture shows, world frame, m.
-        to_camera: (3,) unit vector from the scene towards the camera.
-        to_light: (3,) unit vector from the scene towards the lamp.
-        ground: Lowest z of all supports, m.
-    """
-
-    points: Array
-    to_camera: Array
-    to_light: Array
-    ground: float
+    points: Array  # (P, 3) points that the picture shows, world frame, m
+    to_camera: Array  # (3,) unit vector from the scene towards the camera
+    to_light: Array  # (3,) unit vector from the scene towards the lamp
+    ground: float  # lowest z of all supports, m
 
     @property
     def center(self) -> Array:

@@ -26,21 +26,13 @@ _CELL, _CELLS = 8, 32
 
 @dataclass(frozen=True)
 class Frame:
-    """Images of one camera.
+    """Images of one camera."""
 
-    Attributes:
-        color: (H, W, 3) float32 in 0..255, lit but without shadows.
-        depth: (H, W) float32, distance along the viewing direction, m; inf without an object.
-        slots: (H, W) int64, slot of the visible object; -1 without one.
-        view: (4, 4) transform from world to camera (x right, y up, z backward).
-        focal: (2,) focal lengths, in half image widths and heights.
-    """
-
-    color: NDArray[np.float32]
-    depth: NDArray[np.float32]
-    slots: NDArray[np.int64]
-    view: NDArray[np.float64]
-    focal: NDArray[np.float64]
+    color: NDArray[np.float32]  # (H, W, 3) float32 in 0..255, lit but without shadows
+    depth: NDArray[np.float32]  # (H, W) float32, distance along the viewing direction, m; inf without an object
+    slots: NDArray[np.int64]  # (H, W) int64, slot of the visible object; -1 without one
+    view: NDArray[np.float64]  # (4, 4) transform from world to camera (x right, y up, z backward)
+    focal: NDArray[np.float64]  # (2,) focal lengths, in half image widths and heights
 
 
 def load_pybullet() -> ModuleType:

@@ -37,19 +37,12 @@ class LargeImportError(BaseException):
 
 @dataclass
 class _Clock:
-    """The import of one asset.
+    """The import of one asset."""
 
-    Attributes:
-        path: File of the asset.
-        end: Time of the monotonic clock at which the import must be done.
-        seconds: Time limit of the import.
-        room: Bytes of files that the import may still read in this process.
-    """
-
-    path: Path
-    end: float
-    seconds: float
-    room: float
+    path: Path  # file of the asset
+    end: float  # time of the monotonic clock at which the import must be done
+    seconds: float  # time limit of the import
+    room: float  # bytes of files that the import may still read in this process
 
 
 _clock: ContextVar[_Clock | None] = ContextVar("import_clock", default=None)

@@ -77,19 +77,12 @@ def import_report(folder: str | os.PathLike[str]) -> ImportReport:
 
 @dataclass(frozen=True, eq=False)
 class FolderIndex:
-    """The assets of a folder; each is built on first use.
+    """The assets of a folder; each is built on first use."""
 
-    Attributes:
-        folder: Absolute path.
-        entries: Entries of the assets, in the order of the library.
-        is_listed: Whether ``library.yaml`` lists the assets.
-        notes: Assumptions about the folder.
-    """
-
-    folder: Path
-    entries: tuple[AssetEntry, ...]
-    is_listed: bool
-    notes: tuple[str, ...]
+    folder: Path  # absolute path
+    entries: tuple[AssetEntry, ...]  # entries of the assets, in the order of the library
+    is_listed: bool  # whether ``library.yaml`` lists the assets
+    notes: tuple[str, ...]  # assumptions about the folder
 
     @property
     def names(self) -> list[str]:
@@ -97,7 +90,7 @@ class FolderIndex:
         return [entry.name for entry in self.entries]
 
     def build(self, name: str) -> Asset:
-        """The asset called ``name``; raises what :func:`load_library` raises, and UnknownNameError."""
+        """The asset called ``name``; raises like :func:`load_library`, or UnknownNameError."""
         return self._built(name)[0]
 
     def report(self, name: str) -> AssetReport:

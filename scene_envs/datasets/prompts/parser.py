@@ -74,7 +74,7 @@ class _Reader:
             self.need([", and", ",", "and"], "a comma, 'and' or the end")
             claims.append(read())
         if len(claims) > 1 and any(isinstance(claim, ObjectCount) for claim in claims):
-            raise self.error("one number of objects and no other claims")
+            raise self.error("only one number of objects and no other claims")
         return PromptFacts(tuple(claims))
 
     def amount(self) -> Claim:
@@ -127,7 +127,7 @@ class _Reader:
         tier = ordinal - 1 if end == "top" else -ordinal
         if word == "shelf":
             return Place(Reference("shelf"), tier)
-        self.need(["of"], "'of' and the object that has the tier")
+        self.need(["of"], "'of' and the object to which the tier belongs")
         return Place(self.reference(placed=False), tier)
 
     def number(self) -> int:

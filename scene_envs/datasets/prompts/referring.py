@@ -14,13 +14,9 @@ _LAST_ORDINAL = 5
 
 @dataclass(frozen=True, eq=False)
 class ReferringExpressions:
-    """Expressions that single out the same object in every one of several views of a scene.
+    """Expressions that single out the same object in every one of several views of a scene."""
 
-    Attributes:
-        views: Facts of one scene under several tolerances.
-    """
-
-    views: Sequence[SceneFacts]
+    views: Sequence[SceneFacts]  # facts of one scene under several tolerances
     _known: dict[int, list[Reference]] = field(default_factory=dict, repr=False)
 
     @property
