@@ -14,10 +14,7 @@ def lazy_names(package: str, file: str) -> Callable[[str], Any]:
     """A module's ``__getattr__`` (PEP 562), which imports the names that the module lists under ``if TYPE_CHECKING:``.
 
     Type checkers and readers see plain imports, which are the only list of names and of the modules that define them.
-
-    Args:
-        package: ``__name__`` of the module.
-        file: ``__file__`` of the module, whose source is read at the first lookup.
+    ``package`` and ``file`` are ``__name__`` and ``__file__`` of the module, whose source is read at the first lookup.
     """
 
     @cache

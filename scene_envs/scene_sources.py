@@ -26,7 +26,7 @@ def find_scenes(path: Path, key: str = "scenes") -> Path:
 
     if not exists(path):
         raise InvalidInputError(
-            f"{key}={str(path)[:200]!r}: there is no scene file, run or dataset; sample and generate make them"
+            f"{key}={str(path)[:200]!r}: no scene file, run or dataset is there; sample and generate make them"
         )
     if not path.is_dir():
         return path

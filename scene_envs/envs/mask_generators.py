@@ -1,4 +1,4 @@
-"""Shipped mask generators: masks by the objective's blame, by physics, by prompt and by place."""
+"""Built-in mask generators: masks by the objective's blame, by physics, by prompt and by place."""
 
 from __future__ import annotations
 
@@ -90,11 +90,7 @@ def check_count(mask: str, key: str, value: Any) -> None:
 
 @dataclass(frozen=True)
 class EmptyMask:
-    """Empty slots, and no object.
-
-    Args:
-        count: Number of empty slots, chosen at random; None for all.
-    """
+    """Empty slots, and no object: ``count`` of them at random, or all with None."""
 
     count: int | None = None
 
@@ -108,10 +104,7 @@ class EmptyMask:
 
 @dataclass(frozen=True)
 class LowestScoringMask:
-    """The free objects of the lowest credit, ties at random.
-
-    Args:
-        count: Number of objects.
+    """The ``count`` free objects of the lowest credit, ties at random.
 
     Raises:
         InvalidInputError: the objective gives no credit per object.
@@ -163,11 +156,7 @@ class RegionMask:
 
 @dataclass(frozen=True)
 class ExplicitMask:
-    """Slots that the user lists.
-
-    Args:
-        slots: Indices of the slots.
-    """
+    """Slots that the user lists by their indices."""
 
     slots: Sequence[int] = ()
 
@@ -186,10 +175,7 @@ class OffPromptMask:
     """Objects that contradict a prompt, and empty slots for objects that are missing.
 
     These are the objects beyond the numbers in the prompt, both objects of a relation that does not hold, and one empty
-    slot for each missing object.
-
-    Args:
-        prompt: Text of the prompt; None takes the prompt of the search.
+    slot for each missing object. Without a ``prompt`` of its own, the mask takes the prompt of the search.
     """
 
     prompt: str | None = None
@@ -241,9 +227,6 @@ class CulpritsMask:
     by clamping therefore adds too many objects and spoils the observed ones.
 
     A scene without free objects is regenerated whole.
-
-    Args:
-        at_least: Smallest number of slots to regenerate, if the scene has as many.
     """
 
     at_least: int = 4
@@ -271,10 +254,8 @@ class BalancedMask:
     """The culprits of :class:`CulpritsMask`, and random slots until the shares of objects and of empty slots are equal.
 
     Such a mask does not depend on the content of slots, like the masks of training, so the number of objects stays the
-    same. A mask of all empty slots depends on the content, and the prior then adds too many objects.
-
-    Args:
-        at_least: Smallest number of slots to regenerate, if the scene has as many; the share grows to reach it.
+    same. A mask of all empty slots depends on the content, and the prior then adds too many objects. The share grows
+    until ``at_least`` slots are masked, if the scene has as many.
     """
 
     at_least: int = 4

@@ -11,8 +11,8 @@ from scene_envs.protocols import PriorLike, SceneScorer
 
 ENTRY_POINT_GROUP = "scene_envs.resolvers"
 """Entry points of this group. ``reward = "module:function"`` names a function with the argument of
-:func:`resolve_reward` that returns a :class:`~scene_envs.protocols.SceneScorer`. ``prior = "module:function"`` names a function that
-takes a name or path, and returns a :class:`~scene_envs.protocols.PriorLike`."""
+:func:`resolve_reward` that returns a :class:`~scene_envs.protocols.SceneScorer`. ``prior = "module:function"`` names a
+function of a name or path that returns a :class:`~scene_envs.protocols.PriorLike`."""
 
 
 def resolve_reward(reward: Any) -> SceneScorer:

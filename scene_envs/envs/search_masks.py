@@ -1,4 +1,4 @@
-"""Search MDP with a choice of masks: an action is one of K masks and one of B inpaintings of its slots."""
+"""Search MDP with a choice of masks: an action chooses one of K masks and one of B inpaintings of its slots."""
 
 from __future__ import annotations
 

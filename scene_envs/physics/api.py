@@ -1,4 +1,4 @@
-"""The public functions of the physics: batches of scenes in, results per scene and object out."""
+"""Public functions of the physics: batches of scenes in, results per scene and object out."""
 
 from __future__ import annotations
 

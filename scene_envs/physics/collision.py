@@ -32,11 +32,9 @@ class Collider:
         self.depth = PenetrationDepth([part.vertices for part in library.parts])
 
     def pairs(self, objects: Objects, *, totals: bool = False) -> ObjectPairs:
-        """Near pairs of objects within each scene; two fixed objects are never a pair.
+        """Near pairs of objects within each of one or more scenes; two fixed objects are never a pair.
 
-        Args:
-            objects: Objects of one or more scenes.
-            totals: Whether to sum over all part pairs as well, the literature's per-geometry measure.
+        With ``totals`` the depths of all part pairs are summed as well, the literature's per-geometry measure.
         """
         coarse = place(self.library, objects, "coarse")
         low, high = object_boxes(coarse)
@@ -57,13 +55,7 @@ class Collider:
         return ObjectPairs(first, second, gap, direction, depth, total, part_count, low, high, contacts, rough)
 
     def contacts(self, objects: Objects, pairs: ObjectPairs, fine: Mask) -> Contacts:
-        """Near parts: the fine ones of some object pairs, the coarse ones of the others.
-
-        Args:
-            objects: Objects of one or more scenes.
-            pairs: Near pairs of these objects, from :meth:`pairs`.
-            fine: (P,) bool, pairs whose fine parts are taken.
-        """
+        """Near parts of the ``pairs`` of objects: fine parts for the pairs in ``fine`` (P,), coarse ones for others."""
         if not fine.any():
             return pairs.contacts
         count = len(objects)

@@ -166,7 +166,7 @@ def _round(
     budget: Budget,
     cost: Array | None = None,
 ) -> Array:
-    """The next translations: they free overlapping pairs (``first``, ``second``) and keep other ``near`` pairs apart."""
+    """The next translations: they free overlapping pairs (``first``, ``second``) and keep other ``near`` ones apart."""
     near_first, near_second = near
     extra = np.zeros((len(near_first), 3))
     if len(first):

@@ -101,14 +101,7 @@ class Statics:
         self._foot_center = np.array([(0.0, 0.0) if bottom is None else bottom.center for bottom in bottoms])
 
     def at_rest(self, objects: Objects, pairs: ObjectPairs, contacts: Contacts, duration: float) -> Rest:
-        """Objects that need no simulation for ``duration`` seconds.
-
-        Args:
-            objects: Objects of one or more scenes.
-            pairs: Near pairs of the objects.
-            contacts: Near parts of these pairs.
-            duration: Length of time without simulation, s.
-        """
+        """Objects of one or more scenes that need no simulation for ``duration`` seconds."""
         count = len(objects)
         tilt = np.hypot(objects.rotation[:, 0, 2], objects.rotation[:, 1, 2])
         upright = (tilt < _FLAT) & (objects.rotation[:, 2, 2] > 0)

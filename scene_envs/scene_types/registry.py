@@ -1,4 +1,4 @@
-"""Registry of scene types: built-in ones, those of installed packages, yours, and unions of them."""
+"""Registry of scene types: built-in ones, those of installed packages, users' own, and unions of them."""
 
 from __future__ import annotations
 

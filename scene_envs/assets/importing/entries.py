@@ -1,4 +1,4 @@
-"""``library.yaml``: a user's settings for the files of a folder."""
+"""Reader of ``library.yaml``, a user's settings for the files of a folder."""
 
 from __future__ import annotations
 

@@ -124,11 +124,9 @@ def check_triangles(path: Path, count: int) -> None:
 
 @contextmanager
 def timed(path: Path, room: float = math.inf) -> Iterator[None]:
-    """Context in which the time of the import of one asset runs; see :func:`seconds_left`.
+    """Context in which the time of the import of the asset at ``path`` runs; see :func:`seconds_left`.
 
-    Args:
-        path: File of the asset.
-        room: Bytes of files beyond which :func:`check_file` raises LargeImportError.
+    :func:`check_file` raises LargeImportError for files of more than ``room`` bytes together.
     """
     seconds = ImportLimits.current().seconds
     token = _clock.set(_Clock(path, time.monotonic() + seconds, seconds, room))
