@@ -161,7 +161,7 @@ def test_old_keys_name_the_new_ones(command: str) -> None:
         (lambda: PretrainConfig(text=True), "text is a group of keys; give one of text.encoder"),
         (lambda: PostTrainConfig(rewrad="x"), "did you mean 'reward'"),
         (lambda: PostTrainConfig(guard={"action": "halt"}), "unknown action 'halt'. Known: report, rollback, stop"),
-        (lambda: SearchConfig(planner={"name": "uctt"}), "did you mean 'uct'"),
+        (lambda: SearchConfig(planner={"name": "beem"}), "did you mean 'beam'"),
     ],
 )
 def test_wrong_values_in_python_are_named(make: Any, message: str) -> None:
