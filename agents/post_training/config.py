@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from agents.configuration.checks import at_least, one_of, positive
-from agents.configuration.fields import composed, moved, named, nested
+from agents.configuration.fields import composed, named, nested
 from agents.configuration.prior_names import split_name
 from agents.configuration.settings import LoggerSettings, OptimizerSettings
 from agents.configuration.shared_keys import RewardLimits, SamplingKeys, TrainingKeys
@@ -183,18 +183,6 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
         logger: log files and progress display.
     """
 
-    RENAMED: ClassVar[Mapping[str, str]] = {
-        **moved("optimizer", "warmup", "weight_decay", "clip", "ema", "chunk", learning_rate="lr"),
-        **moved("algorithm", "gradient_steps", "min_std", "skip_first", "step_weighting", "log_prob_reduction"),
-        **moved("algorithm", "credit", "baseline", "advantage_clip", "scenes_per_prompt"),
-        **moved("guard", "max_invalid", guard_every="every", guard_scenes="scenes", guard_limit="limit"),
-        **moved("guard", guard_action="action"),
-        **moved("regularisation", "bank_size", regularisation_batch="batch_size", real_scenes="scenes"),
-        **moved("logger", "progress", "checkpoint_every", "report_scenes"),
-        "clip_epsilon": "algorithm.clip_epsilon, of algorithm=ddpo_is",
-        "updates": "algorithm.updates, of algorithm=ddpo_is",
-    }
-    """Keys of earlier versions, and their names."""
     SHORT: ClassVar[Mapping[str, str]] = {"hold": "regularisation.hold"}
     """Keys that may be written without their group."""
 

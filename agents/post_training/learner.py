@@ -276,7 +276,7 @@ class Learner:
         """Inverse of :meth:`state`.
 
         Raises:
-            InvalidInputError: the weights are of another network, such as an earlier version's.
+            InvalidInputError: the weights are of another network.
         """
         check_tensors(self.prior, state["prior"], self.config.directory / CHECKPOINT_NAME)
         self.prior.load_state_dict(state["prior"])
@@ -285,7 +285,7 @@ class Learner:
         if self.average is not None:
             self.average.restore(state["average"], state["average_updates"])
         self.algorithm.restore(state["algorithm"])
-        self.regularisation.load_state_dict(state.get("regularisation"))
+        self.regularisation.load_state_dict(state["regularisation"])
         self.learned.restore(state)
         torch.set_rng_state(state["random"])
 

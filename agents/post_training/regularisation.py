@@ -160,6 +160,6 @@ class Regularisation:
         """For a checkpoint."""
         return asdict(self.state)
 
-    def load_state_dict(self, state: dict[str, Any] | None) -> None:
-        """Inverse of :meth:`state_dict`; None, for a checkpoint of an earlier version, gives the initial state."""
-        self.state = HoldState(**(state or {}))
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Inverse of :meth:`state_dict`."""
+        self.state = HoldState(**state)

@@ -28,7 +28,15 @@ def small_config(output: Path | str, **changes: Any) -> PostTrainConfig:
         optimizer={"lr": 1e-3},
         **{key: changes.pop(key) for key in ("prompt", "guidance") if key in changes},
     )
-    places = {**PostTrainConfig.RENAMED, "regularisation": "regularisation.weight", "lr": "optimizer.lr"}
+    groups = {
+        "optimizer": ("lr", "warmup", "weight_decay", "clip", "ema", "chunk"),
+        "algorithm": ("gradient_steps", "min_std", "skip_first", "credit", "baseline", "scenes_per_prompt"),
+        "guard": ("max_invalid",),
+        "regularisation": ("bank_size",),
+        "logger": ("progress", "checkpoint_every", "report_scenes"),
+    }
+    places = {key: f"{group}.{key}" for group, keys in groups.items() for key in keys}
+    places["regularisation"] = "regularisation.weight"
     return changed(config, {places.get(key, key): value for key, value in changes.items()})
 
 

@@ -154,14 +154,14 @@ def test_truncated_checkpoint_is_named(tmp_path: Path) -> None:
         post_train(small_config(tmp_path), prior=tiny_prior())
 
 
-def test_a_run_that_an_earlier_version_began_is_refused_in_plain_words(tmp_path: Path) -> None:
+def test_a_run_that_another_prior_began_is_refused_in_plain_words(tmp_path: Path) -> None:
     post_train(small_config(tmp_path, iterations=2), prior=tiny_prior())
     state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
     weights = state["learner"]["prior"]
     name = next(iter(weights))
     weights["its_old_name"] = weights.pop(name)
     torch.save(state, tmp_path / "checkpoint.pt")
-    with pytest.raises(InvalidInputError, match=r"cannot be resumed: 2 .* earlier version .* another output"):
+    with pytest.raises(InvalidInputError, match=r"cannot be resumed: 2 .* another prior.* another output"):
         post_train(small_config(tmp_path), prior=tiny_prior())
 
 
