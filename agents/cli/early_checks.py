@@ -23,7 +23,7 @@ from scene_envs.files import exists, is_file
 from scene_envs.plugins import plugin_entry_points
 from scene_envs.scene_sources import find_scenes
 
-COMPOSITES = ("clip", "gate", "normalised", "product", "weighted_sum")
+COMPOSITES = ("clip", "gate", "product", "weighted_sum")
 """Rewards that need settings, so the group ``reward`` has no options with their names."""
 _LEAST = {
     "count": 1,

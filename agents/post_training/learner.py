@@ -112,7 +112,6 @@ class Learner:
 
     def close(self) -> None:
         """Stop the workers of physics and of the reward, if any."""
-        self.learned.end()
         self.env.close()
         self.scorer.close()
         close_reward(self.reward)
@@ -183,15 +182,14 @@ class Learner:
         return replace(rollout, averages=averages_objects(self.reward), counts=counts_objects(self.reward))
 
     def begin_rewards(self, real: SceneBatch, *, first: bool) -> None:
-        """Give real scenes to the rewards that learn; does nothing if no reward learns or is normalised.
+        """Give real scenes to the rewards that learn; does nothing if no reward learns.
 
         Args:
             real: real scenes that training may see.
-            first: also train them on samples of the base prior, and fix the statistics of normalised rewards; False for
-                a run whose state is restored.
+            first: also train them on samples of the base prior; False for a run whose state is restored.
         """
         self.learned.begin(real)
-        if self.learned.needs_samples and first:
+        if self.learned and first:
             prompts = None if self.deck is None else self.deck.deal(FIRST_SAMPLES, self._generator("discriminator", 0))
             self.learned.learn_from_prior(self.prior, self.slots, prompts)
 
