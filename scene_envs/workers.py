@@ -226,14 +226,18 @@ class _Worker:
         raise NotImplementedError
 
     def ask(self, body: Any, timeout: float | None) -> Any:
-        """The answer to one task.
+        """The answer to one task; raises as :meth:`answer`."""
+        self.send(body, timeout)
+        return self.answer()
+
+    def answer(self) -> Any:
+        """The answer to what was sent last, or to the start.
 
         Raises:
             WorkerFailure: there is none; a worker that was lost is not alive afterwards.
             SceneEnvsError: as raised by the target.
         """
         try:
-            self.send(body, timeout)
             kind, answer = self.receive()
             while kind == "report":
                 kind, answer = self.receive()

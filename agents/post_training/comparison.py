@@ -73,7 +73,7 @@ def measure_prior(
         guidance: weight of classifier-free guidance.
         claim_guidance: strength of claim guidance.
         slots: per sample; None means as trained.
-        reward: reward that the run trains with, as :func:`rewards.isolation.run_reward` gives it; None measures none.
+        reward: reward that the run trains with, as :func:`rewards.process.run_reward` gives it; None measures none.
     """
     from agents.post_training.guard import realism
     from scene_envs.physics import feasibility, make_ready

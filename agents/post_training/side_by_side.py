@@ -12,10 +12,11 @@ import threading
 import time
 from collections.abc import Generator, Iterable, Mapping
 
+from scene_envs.worker_processes import module_command, module_environment
+
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.trainer import PostTrainResult, post_train
 from agents.priors.base import ScenePrior
-from scene_envs.worker_processes import module_command, module_environment
 
 _GRACE = 30.0
 """Seconds in which a process that is told to end may finish its step and save."""

@@ -5,12 +5,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from scene_envs.worker_processes import module_command, module_environment
 
 from rewards import IsolatedReward, allow_local_rewards, evaluate_reward
 from scene_envs import SceneBatch
 from scene_envs.datasets import generate
 from scene_envs.physics import PhysicsPool, feasibility
-from scene_envs.worker_processes import module_command, module_environment
 
 
 @pytest.fixture
