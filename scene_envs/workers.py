@@ -66,7 +66,9 @@ class WorkerFailure(Exception):
 
     def __init__(self, text: str, *, is_late: bool = False, traceback: str = "") -> None:
         super().__init__(text)
-        self.is_late, self.traceback = is_late, traceback
+        self.is_late = is_late
+        if traceback:
+            self.__cause__ = RuntimeError(f"\n{traceback}")
 
 
 @dataclass(frozen=True)
@@ -177,12 +179,13 @@ def _limit_memory(memory: int) -> None:
         resource.setrlimit(resource.RLIMIT_DATA, (now + memory, now + memory))
 
 
-def main_module() -> dict[str, str]:
-    """Name or path of the main module of this process, for :func:`import_main` in a worker."""
-    return {key: value for key, value in spawn.get_preparation_data("").items() if key.startswith("init_main")}
+def main_module() -> dict[str, Any]:
+    """What :func:`import_main` in a worker needs to know about the main module of this process."""
+    facts = spawn.get_preparation_data("")
+    return {key: value for key, value in facts.items() if key.startswith("init_main") or key == "sys_argv"}
 
 
-def import_main(main: Mapping[str, str]) -> None:
+def import_main(main: Mapping[str, Any]) -> None:
     """Import the main module of the parent, so that what it defines can be unpickled; it may start no workers."""
     global _is_importing_main
     _is_importing_main = True
@@ -482,6 +485,15 @@ class _Actor(_Worker):
         self.kill()
 
 
+def require_ray() -> Any:
+    """The module ray; raises MissingDependencyError."""
+    try:
+        import ray
+    except ImportError as error:
+        raise MissingDependencyError("workers on a Ray cluster need Ray: pip install 'scene-envs[ray]'") from error
+    return ray
+
+
 _ray_users = 0
 """Number of pools of this process that use the connection to Ray; one of these pools made it."""
 
@@ -658,11 +670,8 @@ class WorkerPool:
 
     def _connect(self, cpus: int | None, address: str | None) -> None:
         global _ray_users
-        try:
-            import ray
-        except ImportError as error:
-            raise MissingDependencyError("workers on a Ray cluster need Ray: pip install 'scene-envs[ray]'") from error
-        self._ray, self._has_connection = ray, False
+        self._ray, self._has_connection = require_ray(), False
+        ray = self._ray
         if ray.is_initialized() and not _ray_users:
             return  # other code made the connection
         if not _ray_users:
