@@ -18,7 +18,9 @@ import select
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
+import time
 import traceback
 import weakref
 from collections import deque
@@ -301,6 +303,7 @@ class Process(_Worker):
         environment: variables that are added to the environment of this process.
         stdout: where the process prints to, as for ``subprocess.Popen``.
         stderr: where its messages go; None for those of this process.
+        start_up: seconds that the process may take to start; None sets no limit.
     """
 
     def __init__(
@@ -312,6 +315,7 @@ class Process(_Worker):
         environment: Mapping[str, str] | None = None,
         stdout: int = subprocess.DEVNULL,
         stderr: Any = None,
+        start_up: float | None = START_UP,
     ) -> None:
         super().__init__()
         if _is_importing_main:
@@ -336,7 +340,7 @@ class Process(_Worker):
         self._outbox, self._inbox = Connection(parent_writes, readable=False), Connection(parent_reads, writable=False)
         self._end = weakref.finalize(self, _end, self.process, self._outbox, self._inbox)
         self._number = 0
-        self.send((target, arguments, memory), START_UP)
+        self.send((target, arguments, memory), start_up)
 
     @staticmethod
     def answering(workers: Sequence[Process]) -> list[Process]:
@@ -401,6 +405,27 @@ def _end(process: subprocess.Popen[bytes], outbox: Connection, inbox: Connection
 def _kill(process: subprocess.Popen[bytes]) -> None:
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(process.pid, signal.SIGKILL)
+
+
+def run_apart(target: str, body: Any, timeout: float | None) -> Any:
+    """The answer of a target to one task, in a process of its own, which may take ``timeout`` seconds with its start.
+
+    Raises:
+        WorkerFailure: there is none; says the last line that the process wrote to stderr.
+        SceneEnvsError: as raised by the target.
+    """
+    started = time.monotonic()
+    with tempfile.TemporaryFile() as stderr:
+        worker = Process(target, None, stderr=stderr, start_up=timeout)
+        try:
+            worker.answer()
+            return worker.ask(body, None if timeout is None else max(0.0, started + timeout - time.monotonic()))
+        except WorkerFailure as failure:
+            stderr.seek(0)
+            reason = stderr.read().decode(errors="replace").strip().rpartition("\n")[2][:300]
+            raise WorkerFailure(f"{failure}{reason and ': '}{reason}", is_late=failure.is_late) from failure
+        finally:
+            worker.stop()
 
 
 class _Here(_Worker):

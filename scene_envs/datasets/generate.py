@@ -130,7 +130,9 @@ def _make(
         return
     is_ray = backend == "ray"
     factory, scene_type = grammar_factory(name), get_scene_type(grammar.scene_type)
-    plain = SceneType(**{field.name: getattr(scene_type, field.name) for field in fields(scene_type)})  # no built assets
+    plain = SceneType(
+        **{field.name: getattr(scene_type, field.name) for field in fields(scene_type)}
+    )  # no built assets
     inputs = _pickled(factory, (factory, plain, normalizer.state()), is_ray)
 
     def done(task: Task, shard: Any) -> None:
