@@ -153,7 +153,9 @@ def _start(name: str, memory: float) -> Process:
 def _answer(worker: Process, name: str, message: Any = None, timeout: float = START_UP) -> Any:
     """The answer to a message, or to the start; raises RewardError and what the reward's process raises."""
     try:
-        return worker.answer() if message is None else worker.ask(message, timeout)
+        if message is not None:
+            worker.send(message, timeout)
+        return worker.answer()
     except WorkerFailure as failure:
         if not failure.is_late:
             raise RewardError(f"reward {name!r} {failure}") from None

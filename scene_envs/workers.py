@@ -1,11 +1,8 @@
 """Worker processes, and actors of a Ray cluster, that answer tasks one at a time.
 
-A worker imports a target, ``"module:name"``, and calls it with the body of each task. A target that is a factory is called
-once with its arguments, and its result answers. An answer that is a generator sends what it yields as reports, and returns
-its result.
-
-A worker ends when its task takes too long, when the pool closes, and when the parent process is gone. Processes import
-neither the main module of the parent nor anything from the current folder.
+A worker imports a target, ``"module:name"``, and calls it with the body of each task. A target with arguments is called
+once with them, and its result answers. If an answer is a generator, what it yields is sent as reports, and what it
+returns is the answer. A worker ends when its task takes too long, when its pool closes, and when the parent is gone.
 """
 
 from __future__ import annotations
@@ -18,7 +15,6 @@ import select
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 import traceback
@@ -29,6 +25,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from multiprocessing import spawn
 from multiprocessing.connection import Connection, wait
+from types import MappingProxyType
 from typing import Any
 
 from scene_envs import errors
@@ -46,14 +43,13 @@ _MAX_TEXT = 2000
 """Largest number of characters of an error message from a worker."""
 _KINDS = ("report", "done", "refused", "failed")
 _DISTURBED = (
-    "disturbed the answers of its process, which was ended; code that runs there may write to and close no file "
-    "descriptor that it did not open"
+    "disturbed the answers of its process, which was ended; its code may write to and close no file descriptor that it "
+    "did not open"
 )
 _CODE = (
-    "import sys; sys.path[:] = filter(None, sys.path); "
+    "import sys; sys.path[:] = filter(None, sys.path); "  # without the current folder, the first place of imports
     "from scene_envs.workers import serve; serve(*map(int, sys.argv[1:]))"
 )
-"""Code of a worker process, without the current folder as the first place of imports."""
 _is_importing_main = False
 
 
@@ -63,14 +59,11 @@ class WorkerFailure(Exception):
     Args:
         text: the predicate.
         is_late: whether the deadline was over.
-        traceback: text of the traceback in the worker.
     """
 
-    def __init__(self, text: str, *, is_late: bool = False, traceback: str = "") -> None:
+    def __init__(self, text: str, is_late: bool = False) -> None:
         super().__init__(text)
         self.is_late = is_late
-        if traceback:
-            self.__cause__ = RuntimeError(f"\n{traceback}")
 
 
 @dataclass(frozen=True)
@@ -94,18 +87,24 @@ class Task:
 
 
 class _Target:
-    """A target in its worker; the first message says which.
+    """A target in its worker.
 
     Args:
-        caught: exceptions of tasks that are failures of the task alone.
+        here: whether this is the process of the pool itself, where exits and interrupts are raised.
+        paths: further places of imports, for machines that share a disk.
     """
 
-    def __init__(self, caught: type[BaseException] = BaseException) -> None:
-        self._caught = caught
+    def __init__(self, here: bool = False, paths: Sequence[str] = ()) -> None:
+        sys.path.extend(path for path in paths if path not in sys.path)
+        self._here = here
         self._answer: Callable[[Any], Any] | None = None
 
+    def process_id(self) -> int:
+        """Id of this process in the operating system."""
+        return os.getpid()
+
     def messages(self, body: Any) -> Iterator[tuple[str, Any]]:
-        """Kinds and contents of the messages with which a task is answered; the last is no report."""
+        """Kinds and contents of the messages that answer a task, the first of which says what the target is."""
         try:
             answer = self._start(*body) if self._answer is None else self._answer(body)
             while isinstance(answer, Generator):
@@ -114,19 +113,14 @@ class _Target:
                 except StopIteration as end:
                     answer = end.value
             last: tuple[str, Any] = ("done", answer)
-        except SceneEnvsError as error:
-            last = ("refused", error)
-        except MemoryError:
-            last = ("failed", ("ran out of memory", ""))
-        except self._caught as error:
+        except SceneEnvsError as error:  # by names and text, since not every error can be pickled
+            names = [base.__name__ for base in type(error).__mro__]
+            last = ("refused", error if self._here else (names, str(error)[:_MAX_TEXT]))
+        except BaseException as error:
+            if self._here and not isinstance(error, Exception):
+                raise
             last = ("failed", (f"failed ({type(error).__name__}: {error})"[:_MAX_TEXT], traceback.format_exc()))
         yield last
-
-    def sendable(self, body: Any) -> Iterator[tuple[str, Any]]:
-        """As :meth:`messages`, with an error as the names of its classes and its text, since not every error pickles."""
-        for kind, part in self.messages(body):
-            refused = kind == "refused"
-            yield kind, ([base.__name__ for base in type(part).__mro__], str(part)[:_MAX_TEXT]) if refused else part
 
     def _start(self, name: str, arguments: Sequence[Any] | None, memory: int | None) -> None:
         module, _, attribute = name.partition(":")
@@ -151,7 +145,7 @@ def serve(read: int, write: int) -> None:
             os._exit(1)
         if timeout is not None:  # the default action of the signal ends even code that holds the GIL
             signal.setitimer(signal.ITIMER_REAL, timeout + _ALARM)
-        for kind, part in target.sendable(body):
+        for kind, part in target.messages(body):
             if os.getpid() != process:  # a copy that the target forked came back here: it must not answer
                 os._exit(0)
             if kind != "report":
@@ -201,39 +195,34 @@ def import_main(main: Mapping[str, Any]) -> None:
 
 
 class _Worker:
-    """State of one worker; subclasses send, receive and end.
+    """State of one worker; subclasses send to it, receive from it and end it.
 
     Attributes:
         is_alive: False once it was ended.
-        is_ready: whether it waits for a task.
+        is_ready: whether it has started, and has taken in what it was sent once.
         known: keys of what it was sent once.
         task: what the pool keeps about the task that it works on.
+        source: object that is ready for reading when the worker has answered or ended.
     """
+
+    source: Any
 
     def __init__(self) -> None:
         self.is_alive, self.is_ready = True, False
         self.known: set[Hashable] = set()
         self.task: Any = None
-        self._clock: threading.Timer | None = None
-        self._timeout: float | None = None
         self._is_late = False
+        self._timeout: float | None = None
+        self._clock: threading.Timer | None = None
 
     def send(self, body: Any, timeout: float | None) -> None:
-        """Give the worker a task; one that takes longer than ``timeout`` seconds ends it."""
+        """Give the worker a task, and end it if that takes longer than ``timeout`` seconds."""
         self._timeout = timeout
-        if timeout is not None:
-            self._clock = threading.Timer(timeout, self._end_late)
-            self._clock.daemon = True
-            self._clock.start()
+        self.start_clock()
 
     def receive(self) -> tuple[str, Any]:
-        """Kind and content of the next message; of a worker that was lost, a failure."""
+        """Kind and content of the next message; a failure if the worker is lost."""
         raise NotImplementedError
-
-    def ask(self, body: Any, timeout: float | None) -> Any:
-        """The answer to one task; raises as :meth:`answer`."""
-        self.send(body, timeout)
-        return self.answer()
 
     def answer(self) -> Any:
         """The answer to what was sent last, or to the start.
@@ -242,8 +231,8 @@ class _Worker:
             WorkerFailure: there is none; a worker that was lost is not alive afterwards.
             SceneEnvsError: as raised by the target.
         """
+        kind = "report"
         try:
-            kind, answer = self.receive()
             while kind == "report":
                 kind, answer = self.receive()
         except BaseException:
@@ -256,32 +245,37 @@ class _Worker:
     def stop(self) -> None:
         """End the worker, whatever it does."""
         self.is_alive = False
-        self._stop_clock()
+        self.stop_clock()
 
     def kill(self) -> None:
-        """End the worker at once, from any thread; the next :meth:`receive` notices."""
-
-    @property
-    def has_ended(self) -> bool:
-        """Whether the worker is known to have ended by itself."""
-        return False
+        """End the worker from any thread; :meth:`receive` notices."""
 
     def _end_late(self) -> None:
         self._is_late = True
         self.kill()
 
-    def _stop_clock(self) -> None:
+    def start_clock(self) -> None:
+        """Let the time run after which the worker is ended."""
+        if self._timeout is not None:
+            self._clock = threading.Timer(self._timeout, self._end_late)
+            self._clock.daemon = True
+            self._clock.start()
+
+    def stop_clock(self) -> None:
+        """Let the time run no longer."""
         if self._clock is not None:
             self._clock.cancel()
 
     def _taken(self, kind: str, body: Any) -> tuple[str, Any]:
         if kind == "report":
             return kind, body
-        self._stop_clock()
+        self.stop_clock()
         if self._is_late:  # it answered at the last moment, and was ended all the same
             self.stop()
         if kind == "failed":
-            body = WorkerFailure(body[0], traceback=body[1])
+            text, told = body
+            body = WorkerFailure(text)
+            body.__cause__ = RuntimeError(f"\n{told}")
         elif kind == "refused" and not isinstance(body, SceneEnvsError):
             names, text = body
             body = next(getattr(errors, name) for name in names if hasattr(errors, name))(text)
@@ -290,7 +284,7 @@ class _Worker:
     def _lost(self, how: str, is_late: bool = False) -> tuple[str, WorkerFailure]:
         late = self._is_late or is_late
         self.stop()
-        return "failed", WorkerFailure(f"took longer than {self._timeout:g} s" if late else how, is_late=late)
+        return "failed", WorkerFailure(f"took longer than {self._timeout:g} s" if late else how, late)
 
 
 class Process(_Worker):
@@ -301,8 +295,8 @@ class Process(_Worker):
         arguments: arguments with which the target makes what answers; None if the target itself answers.
         memory: bytes that the process may allocate beyond what it needs to import the target (on Linux); None for any.
         environment: variables that are added to the environment of this process.
-        stdout: where the process prints to, as for ``subprocess.Popen``.
-        stderr: where its messages go; None for those of this process.
+        stdout: descriptor that the process prints to.
+        stderr: descriptor that its messages go to; None for that of this process.
         start_up: seconds that the process may take to start; None sets no limit.
     """
 
@@ -312,9 +306,9 @@ class Process(_Worker):
         arguments: Sequence[Any] | None = (),
         *,
         memory: int | None = None,
-        environment: Mapping[str, str] | None = None,
+        environment: Mapping[str, str] = MappingProxyType({}),
         stdout: int = subprocess.DEVNULL,
-        stderr: Any = None,
+        stderr: int | None = None,
         start_up: float | None = START_UP,
     ) -> None:
         super().__init__()
@@ -322,13 +316,12 @@ class Process(_Worker):
             raise InvalidInputError("a script must start workers under `if __name__ == '__main__':`")
         child_reads, parent_writes = os.pipe()
         parent_reads, child_writes = os.pipe()
+        places = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
         try:
             self.process = subprocess.Popen(
                 [sys.executable, "-c", _CODE, str(child_reads), str(child_writes)],
                 pass_fds=(child_reads, child_writes),
-                env=os.environ
-                | {"PYTHONPATH": os.pathsep.join(entry or os.getcwd() for entry in sys.path)}
-                | dict(environment or {}),
+                env={**os.environ, "PYTHONPATH": places, **environment},
                 stdin=subprocess.DEVNULL,
                 stdout=stdout,
                 stderr=stderr,
@@ -337,36 +330,27 @@ class Process(_Worker):
         finally:
             os.close(child_reads)
             os.close(child_writes)
-        self._outbox, self._inbox = Connection(parent_writes, readable=False), Connection(parent_reads, writable=False)
-        self._end = weakref.finalize(self, _end, self.process, self._outbox, self._inbox)
+        self.process_id = self.process.pid
+        self._outbox, self.source = Connection(parent_writes, readable=False), Connection(parent_reads, writable=False)
+        self._end = weakref.finalize(self, _end, self.process, self._outbox, self.source)
         self._number = 0
         self.send((target, arguments, memory), start_up)
-
-    @staticmethod
-    def answering(workers: Sequence[Process]) -> list[Process]:
-        """Those of the workers that answered or ended, as soon as there are some."""
-        ready = wait([worker._inbox for worker in workers])
-        return [worker for worker in workers if worker._inbox in ready]
-
-    @property
-    def process_id(self) -> int:
-        """Id of the process in the operating system."""
-        return self.process.pid
-
-    @property
-    def has_ended(self) -> bool:
-        return self.process.poll() is not None
 
     def send(self, body: Any, timeout: float | None) -> None:
         self._number += 1
         message = pickle.dumps((self._number, timeout, body))
         super().send(body, timeout)
-        with contextlib.suppress(OSError):  # a process that ended is noticed by receive()
+        try:
             self._outbox.send_bytes(message)
+        except OSError:
+            pass  # the process ended, which receive() notices
+        except BaseException:
+            self.stop()
+            raise
 
     def receive(self) -> tuple[str, Any]:
         try:
-            number, kind, body = self._inbox.recv()
+            number, kind, body = self.source.recv()
             if number != self._number or kind not in _KINDS:
                 return self._lost(_DISTURBED)
         except (EOFError, OSError):
@@ -408,62 +392,33 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
 
 
 def run_apart(target: str, body: Any, timeout: float | None) -> Any:
-    """The answer of a target to one task, in a process of its own, which may take ``timeout`` seconds with its start.
+    """The answer of a target to one task, from a process of its own that may take ``timeout`` seconds in all.
 
-    Raises:
-        WorkerFailure: there is none; says the last line that the process wrote to stderr.
-        SceneEnvsError: as raised by the target.
+    Raises as :meth:`Process.answer`.
     """
-    started = time.monotonic()
-    with tempfile.TemporaryFile() as stderr:
-        worker = Process(target, None, stderr=stderr, start_up=timeout)
-        try:
-            worker.answer()
-            return worker.ask(body, None if timeout is None else max(0.0, started + timeout - time.monotonic()))
-        except WorkerFailure as failure:
-            stderr.seek(0)
-            reason = stderr.read().decode(errors="replace").strip().rpartition("\n")[2][:300]
-            raise WorkerFailure(f"{failure}{reason and ': '}{reason}", is_late=failure.is_late) from failure
-        finally:
-            worker.stop()
+    end = None if timeout is None else time.monotonic() + timeout
+    worker = Process(target, None, stderr=subprocess.DEVNULL, start_up=timeout)
+    try:
+        worker.answer()
+        worker.send(body, None if end is None else max(0.0, end - time.monotonic()))
+        return worker.answer()
+    finally:
+        worker.stop()
 
 
 class _Here(_Worker):
-    """This process in place of a worker: no deadlines, and only errors that are no exits or interrupts are caught."""
-
-    process_id = os.getpid()
+    """This process in place of a worker, without deadlines."""
 
     def __init__(self, target: str, arguments: Sequence[Any] | None) -> None:
         super().__init__()
-        self._target = _Target(Exception)
+        self._target = _Target(here=True)
         self.send((target, arguments, None), None)
 
-    @staticmethod
-    def answering(workers: Sequence[_Here]) -> Sequence[_Here]:
-        """All of them."""
-        return workers
-
     def send(self, body: Any, timeout: float | None) -> None:
-        self._messages = self._target.messages(body)
+        self.source = self._target.messages(body)
 
     def receive(self) -> tuple[str, Any]:
-        return self._taken(*next(self._messages))
-
-
-class _RemoteTarget:
-    """A target inside an actor of Ray."""
-
-    def __init__(self, paths: Sequence[str]) -> None:
-        sys.path.extend(path for path in paths if path not in sys.path)  # for machines that share a disk
-        self.sendable = _Target().sendable
-
-    def process_id(self) -> int:
-        """Id of this process in the operating system."""
-        return os.getpid()
-
-    def answer(self, body: Any) -> Iterator[tuple[str, Any]]:
-        """The messages that answer one task."""
-        yield from self.sendable(body)
+        return self._taken(*next(self.source))
 
 
 class _Actor(_Worker):
@@ -474,14 +429,8 @@ class _Actor(_Worker):
         self._ray = ray
         # no CPU is reserved: a pool that has nothing to do must not keep another pool from starting workers
         options = {"num_cpus": 0, "max_restarts": 0, "scheduling_strategy": "SPREAD"}
-        self._actor = ray.remote(_RemoteTarget).options(**options).remote([path or os.getcwd() for path in sys.path])
+        self._actor = ray.remote(_Target).options(**options).remote(False, [path or os.getcwd() for path in sys.path])
         self.send((target, arguments, None), START_UP)
-
-    @staticmethod
-    def answering(workers: Sequence[_Actor]) -> list[_Actor]:
-        """Those of the actors that answered or ended, as soon as there are some."""
-        ready, _ = workers[0]._ray.wait([worker._messages for worker in workers], num_returns=1)
-        return [worker for worker in workers if worker._messages in ready]
 
     @property
     def process_id(self) -> int:
@@ -489,12 +438,12 @@ class _Actor(_Worker):
         return int(self._ray.get(self._actor.process_id.remote()))
 
     def send(self, body: Any, timeout: float | None) -> None:
-        self._messages = self._actor.answer.options(num_returns="streaming").remote(body)
+        self.source = self._actor.messages.options(num_returns="streaming").remote(body)
         super().send(body, timeout)
 
     def receive(self) -> tuple[str, Any]:
         try:
-            kind, body = self._ray.get(next(self._messages))
+            kind, body = self._ray.get(next(self.source))
         except self._ray.exceptions.RayError as error:
             return self._lost(f"lost its actor ({type(error).__name__})")
         if isinstance(body, dict):  # arrays of the object store are read-only
@@ -526,20 +475,19 @@ _ray_users = 0
 class WorkerPool:
     """Workers that answer tasks; the results do not depend on their number.
 
-    A task whose worker ends or takes longer than ``timeout``, and a task that raises, is tried once more. The pool stays
-    usable: lost workers are replaced.
+    A task that raises, ends its worker or takes too long is tried once more. Lost workers are replaced.
 
     Args:
         target: ``"module:name"`` of what answers.
         arguments: arguments with which the target makes what answers; None if the target itself answers.
-        workers: number of processes; 0 computes in this process. With Ray, None is the number of CPUs of the cluster, and
-            another number that of a cluster started here.
+        workers: number of processes; 0 computes in this process. With Ray, number of CPUs of a cluster that is started
+            here; None takes all CPUs of this machine.
         timeout: seconds that a task may take; None sets no limit.
-        environment: variables that are added to the environment of processes.
-        stdout: where processes print to, as for ``subprocess.Popen``.
-        ray: whether workers are actors of a Ray cluster: the one that this process is connected to, or else the one at
-            ``address`` or ``RAY_ADDRESS``, or else one that is started on this machine and ends with the last pool.
+        ray: whether workers are actors of a Ray cluster, as many as it has CPUs. The cluster is the one that this
+            process is connected to, or else the one at ``address`` or ``RAY_ADDRESS``, or else one that is started on
+            this machine and ends with the last pool.
         address: address of a running Ray cluster.
+        options: further arguments of :class:`Process`.
 
     Raises:
         InvalidInputError: a number is out of range, or there is no cluster at the address.
@@ -553,30 +501,28 @@ class WorkerPool:
         *,
         workers: int | None,
         timeout: float | None = None,
-        environment: Mapping[str, str] | None = None,
-        stdout: int = subprocess.DEVNULL,
         ray: bool = False,
         address: str | None = None,
+        **options: Any,
     ) -> None:
-        self._closed = True
-        self._ray: Any = None
+        self._closed, self._has_connection = True, False
         self._live: list[Any] = []
+        self._ray: Any = None
+        self._lock = threading.Lock()
+        self._failed_starts = 0
         if workers is not None and workers < 0:
             raise InvalidInputError(f"workers must be 0 or more, got {workers}; 0 computes in this process")
         if timeout is not None and not timeout > 0:
             raise InvalidInputError(f"timeout must be a positive number of seconds, got {timeout}")
-        self.timeout = timeout
-        self._kind: Any = Process
-        self._make: Callable[[], Any] = lambda: Process(target, arguments, environment=environment, stdout=stdout)
         if ray:
             self._connect(workers, address)
             workers = max(1, int(self._ray.cluster_resources().get("CPU", 1)))
-            self._kind, self._make = _Actor, lambda: _Actor(self._ray, target, arguments)
-        elif not workers:
-            self._kind, self._make = _Here, lambda: _Here(target, arguments)
-        self.workers = workers or 0
-        self._lock = threading.Lock()
-        self._failed_starts = 0
+        self.workers, self.timeout = workers or 0, timeout
+        self._make: Callable[[], Any] = (
+            (lambda: _Actor(self._ray, target, arguments))
+            if ray
+            else (lambda: Process(target, arguments, **options) if workers else _Here(target, arguments))
+        )
         self._closed = False
 
     def __enter__(self) -> Any:
@@ -595,7 +541,7 @@ class WorkerPool:
         self._closed = True
         while self._live:
             self._live.pop().stop()
-        if self._ray is not None and self._has_connection:
+        if self._has_connection:
             self._has_connection = False
             _ray_users -= 1
             if not _ray_users:
@@ -604,7 +550,7 @@ class WorkerPool:
     @property
     def process_ids(self) -> list[int]:
         """Operating-system ids of the running workers."""
-        return [worker.process_id for worker in self._live]
+        return [worker.process_id for worker in self._live if self.workers]
 
     def map(
         self,
@@ -632,16 +578,29 @@ class WorkerPool:
         queue = deque(((place,), task, False) for place, task in enumerate(tasks))
         with self._lock:
             try:
-                self._discard(lambda worker: worker.has_ended)  # between two calls
+                self._discard(lambda one: isinstance(one, Process) and one.process.poll() is not None)  # between calls
+                for worker in self._live:  # those that were starting at the end of the last call
+                    if not worker.is_ready:
+                        worker.start_clock()
                 while queue or any(worker.task for worker in self._live):
                     self._give(queue)
-                    waiting = [worker for worker in self._live if worker.task or not worker.is_ready]
-                    for worker in self._kind.answering(waiting) if waiting else ():
+                    for worker in self._answering():
                         self._take(worker, queue, results, done, report)
             except BaseException:
-                self._discard(lambda worker: worker.task is not None or not worker.is_ready)
+                self._discard(lambda one: one.task is not None or not one.is_ready)
                 raise
+            for worker in self._live:
+                worker.stop_clock()
         return [results[place] for place in sorted(results)]
+
+    def _answering(self) -> list[Any]:
+        """The workers that have answered or ended, as soon as there are some."""
+        waiting = [worker for worker in self._live if worker.task is not None or not worker.is_ready]
+        if not waiting or not self.workers:
+            return waiting
+        sources = [worker.source for worker in waiting]
+        ready = wait(sources) if self._ray is None else self._ray.wait(sources, num_returns=1)[0]
+        return [worker for worker in waiting if worker.source in ready]
 
     def _give(self, queue: deque[Any]) -> None:
         """Start the workers that there is work for, and give idle ones what they lack or their next task."""
@@ -695,17 +654,17 @@ class WorkerPool:
 
     def _connect(self, cpus: int | None, address: str | None) -> None:
         global _ray_users
-        self._ray, self._has_connection = require_ray(), False
-        ray = self._ray
-        if ray.is_initialized() and not _ray_users:
+        self._ray = require_ray()
+        if self._ray.is_initialized() and not _ray_users:
             return  # other code made the connection
         if not _ray_users:
             options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "configure_logging": False}
             address = address or os.environ.get("RAY_ADDRESS") or None
-            own = {"num_cpus": cpus, "include_dashboard": False}
+            if not address:
+                options |= {"num_cpus": cpus, "include_dashboard": False}
             try:
-                ray.init(address=address, **options, **({} if address else own))
+                self._ray.init(address=address, **options)
             except (ConnectionError, ValueError, RuntimeError) as error:
-                raise InvalidInputError(f"cannot connect to a Ray cluster at {address!r}: {error}") from error
+                raise InvalidInputError(f"cannot connect to a Ray cluster at address={address!r}: {error}") from error
         _ray_users += 1
         self._has_connection = True

@@ -137,7 +137,7 @@ def _judge(scenes: Tensor, grammar: Grammar, normalizer: Normalizer, verify: boo
 
 
 def write_shard(job: Job, grammar: Grammar, normalizer: Normalizer) -> Generator[tuple[int, int, dict[str, int]]]:
-    """Make one shard, with a journal, and write it where it belongs; yields as :func:`make_shard`, raises StorageError."""
+    """Make one shard with a journal, and write it; yields as :func:`make_shard`, raises StorageError."""
     journal = shard_journal(job)
     store.write_bytes(Path(job.path), (yield from make_shard(job, grammar, normalizer, journal)))
     journal.remove()

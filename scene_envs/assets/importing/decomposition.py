@@ -191,7 +191,7 @@ def run_coacd(vertices: Array, faces: Array, settings: dict[str, Any], what: str
 
 
 def coacd_pieces(request: tuple[Array, Array, dict[str, Any]]) -> list[Array]:
-    """Corners (P, 3) of the convex pieces of a mesh, computed in compiled code that only the end of a process interrupts."""
+    """Corners (P, 3) of the convex pieces of a mesh, in compiled code that nothing interrupts."""
     import coacd
 
     vertices, faces, settings = request
