@@ -246,7 +246,7 @@ _LABELS = {
     "height_error_stack_mm": "height error in stacks, median mm",
     "prompt_match": "match of prompt and scene, 1 at best",
     "reward_invalid": "scenes that the reward could not score",
-    "invalid_scenes": "scenes whose physics failed",
+    "invalid_scenes": "scenes whose simulation was ended",
 }
 
 
