@@ -86,7 +86,7 @@ def generate(
             the grammar.
         UnknownNameError: no grammar, or no backend, of that name.
         CorruptFileError: a shard found in ``output`` cannot be read.
-        PhysicsError: worker processes keep dying, or nothing passes verification.
+        PhysicsError: a shard failed twice, or nothing passes verification.
         StorageError: the disk is full, or the folder may not be written to.
         MissingDependencyError: Ray is asked for and not installed.
     """

@@ -229,25 +229,22 @@ def test_workers_import_nothing_from_the_current_folder(trap: Path, tmp_path: Pa
     assert not trap.exists()
 
 
-@pytest.mark.slow
-def test_a_script_defines_its_grammar_and_must_have_a_guard(tmp_path: Path) -> None:
-    script = tmp_path / "script.py"
-    script.write_text(
-        "import sys\n"
-        "from scene_envs.datasets import generate\n"
-        "from scene_envs.grammars import register_grammar\n"
-        "from tests.helpers.toy_grammars import ToyGrammar\n\n"
-        "@register_grammar('mine')\n"
-        "def mine():\n"
-        "    return ToyGrammar()\n\n"
-        "if __name__ == '__main__' or sys.argv[2] == 'bare':\n"
-        "    print(generate('mine', 2, sys.argv[1], workers=1, shard_size=1, progress=False).scenes)\n"
+def test_a_script_is_imported_for_what_it_defines_and_must_have_a_guard(tmp_path: Path) -> None:
+    """As for a grammar whose function stands in the script that generates."""
+    (tmp_path / "target.py").write_text(
+        "import sys\nfrom scene_envs.workers import import_main\n\n"
+        "def mine(main):\n    import_main(main)\n    return sys.modules['__main__'].number\n"
+    )
+    (tmp_path / "script.py").write_text(
+        "import sys\nfrom scene_envs.workers import main_module, run_apart\n\nnumber = 7\n"
+        "if __name__ == '__main__' or sys.argv[1] == 'bare':\n"
+        "    print(run_apart('target:mine', main_module(), 60.0))\n"
     )
 
     def run(word: str) -> subprocess.CompletedProcess[str]:
         environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])}
-        command = [sys.executable, str(script), str(tmp_path / word), word]
+        command = [sys.executable, str(tmp_path / "script.py"), word]
         return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
 
-    assert run("guarded").stdout == "2\n"
+    assert run("guarded").stdout == "7\n"
     assert "a script must start workers under `if __name__ == '__main__':`" in run("bare").stderr.splitlines()[-1]
