@@ -122,12 +122,13 @@ class _Target:
             last = ("failed", (f"failed ({type(error).__name__}: {error})"[:_MAX_TEXT], traceback.format_exc()))
         yield last
 
-    def _start(self, name: str, arguments: Sequence[Any] | None, memory: int | None) -> None:
+    def _start(self, name: str, arguments: Sequence[Any] | None, memory: int | None) -> Any:
         module, _, attribute = name.partition(":")
         made = getattr(import_module(module), attribute)
         if memory is not None:
             _limit_memory(memory)
         self._answer = made if arguments is None else made(*arguments)
+        return None
 
 
 def serve(read: int, write: int) -> None:
@@ -515,8 +516,7 @@ class WorkerPool:
         if timeout is not None and not timeout > 0:
             raise InvalidInputError(f"timeout must be a positive number of seconds, got {timeout}")
         if ray:
-            self._connect(workers, address)
-            workers = max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+            workers = self._connect(workers, address)
         self.workers, self.timeout = workers or 0, timeout
         self._make: Callable[[], Any] = (
             (lambda: _Actor(self._ray, target, arguments))
@@ -652,12 +652,12 @@ class WorkerPool:
             self._live.remove(worker)
             worker.stop()
 
-    def _connect(self, cpus: int | None, address: str | None) -> None:
+    def _connect(self, cpus: int | None, address: str | None) -> int:
+        """Connect to Ray, if nothing has; returns the CPUs of the cluster."""
         global _ray_users
         self._ray = require_ray()
-        if self._ray.is_initialized() and not _ray_users:
-            return  # other code made the connection
-        if not _ray_users:
+        is_ours = bool(_ray_users) or not self._ray.is_initialized()  # or other code made the connection
+        if is_ours and not _ray_users:
             options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "configure_logging": False}
             address = address or os.environ.get("RAY_ADDRESS") or None
             if not address:
@@ -666,5 +666,6 @@ class WorkerPool:
                 self._ray.init(address=address, **options)
             except (ConnectionError, ValueError, RuntimeError) as error:
                 raise InvalidInputError(f"cannot connect to a Ray cluster at address={address!r}: {error}") from error
-        _ray_users += 1
-        self._has_connection = True
+        self._has_connection = is_ours
+        _ray_users += is_ours
+        return max(1, int(self._ray.cluster_resources().get("CPU", 1)))

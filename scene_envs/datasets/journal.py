@@ -12,8 +12,8 @@ class Journal:
     """An append-only text file with the number of a candidate and its verdict per line.
 
     A process may be killed while it writes, so a last line without its end is dropped. Two processes that make the same
-    shard may write by turns, because a worker may outlive its killed parent for a moment; a verdict that is written twice
-    counts once.
+    shard may write by turns, because a worker may outlive its killed parent for a moment; a verdict that is written
+    twice counts once.
 
     Args:
         path: the file; made by the first :meth:`append`.

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +58,7 @@ class Target:
             raise InvalidInputError(argument)
         return os.getpid()
 
-    def steps(self, count: int) -> Iterator[tuple[int]]:
+    def steps(self, count: int) -> Generator[tuple[int], None, int]:
         """A report for each step; returns their number."""
         for step in range(count):
             yield (step,)
@@ -93,8 +93,7 @@ def test_results_come_in_order_for_any_number_of_workers(workers: int) -> None:
 def test_a_task_that_fails_is_split_and_a_part_that_fails_again_has_a_reason(pool: WorkerPool) -> None:
     here = WorkerPool(TARGET, (10,), workers=0)
     for some in (pool, here):
-        parts = [tasks("sum", [number])[0] for number in (4, 5, 6)]
-        whole = Task(("sum", [4, 5, 6]), "numbers 4 to 6", split=lambda parts=parts: parts)
+        whole = Task(("sum", [4, 5, 6]), "numbers 4 to 6", split=lambda: tasks("sum", [4], [5], [6]))
         first, four, five, six, last = some.map([*tasks("sum", [1, 2]), whole, *tasks("sum", [7])])
         assert (first, four, six, last) == (3, 4, 6, 7)
         assert isinstance(five, WorkerFailure)
