@@ -14,11 +14,11 @@ from rewards.diversity import Diversity
 from rewards.evaluation import evaluate_reward
 from rewards.feasible_objects import FeasibleObjects
 from rewards.feasible_share import FeasibleShare
-from rewards.isolation import IsolatedReward
 from rewards.learned import LearnedReward, learned_parts
 from rewards.local_files import allow_local_rewards
 from rewards.object_count import ObjectCount
 from rewards.penetration import Penetration
+from rewards.process import IsolatedReward
 from rewards.prompt_match import PromptMatch
 from rewards.reachability import Reachability
 from rewards.realism import Realism

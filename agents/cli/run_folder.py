@@ -208,13 +208,14 @@ class Run:
 
     def _start_logging(self) -> None:
         screen = logging.StreamHandler(sys.stderr)
+        screen.setLevel(logging.INFO)
         screen.setFormatter(logging.Formatter("%(message)s"))
         file = logging.FileHandler(self.directory / "log.txt", encoding="utf-8")
         file.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%Y-%m-%d %H:%M:%S"))
         self._handlers = [screen, file]
         for package in _PACKAGES:
             logger = logging.getLogger(package)
-            logger.setLevel(logging.INFO)
+            logger.setLevel(logging.DEBUG)  # details for the file alone
             for handler in self._handlers:
                 logger.addHandler(handler)
 

@@ -73,7 +73,7 @@ def measure_prior(
         guidance: weight of classifier-free guidance.
         claim_guidance: strength of claim guidance.
         slots: per sample; None means as trained.
-        reward: reward that the run trains with, as :func:`rewards.isolation.run_reward` gives it; None measures none.
+        reward: reward that the run trains with, as :func:`rewards.process.run_reward` gives it; None measures none.
     """
     from agents.post_training.guard import realism
     from scene_envs.physics import feasibility, make_ready
@@ -246,7 +246,7 @@ _LABELS = {
     "height_error_stack_mm": "height error in stacks, median mm",
     "prompt_match": "match of prompt and scene, 1 at best",
     "reward_invalid": "scenes that the reward could not score",
-    "invalid_scenes": "scenes whose physics failed",
+    "invalid_scenes": "scenes whose simulation was ended",
 }
 
 

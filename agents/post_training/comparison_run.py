@@ -20,7 +20,7 @@ from agents.priors.base import ScenePrior
 from agents.utils.checkpoints import load_checkpoint
 from agents.utils.process_group import ProcessGroup
 from rewards import reward_label
-from rewards.isolation import close_reward, run_reward
+from rewards.process import close_reward, run_reward
 from scene_envs.scene import SceneBatch
 
 SAMPLE_SEED = 100_000

@@ -29,7 +29,7 @@ from agents.utils.checkpoints import check_tensors
 from agents.utils.process_group import ProcessGroup
 from agents.utils.weight_average import AveragedWeights, WeightAverage
 from rewards import depends_on_batch
-from rewards.isolation import close_reward, run_reward
+from rewards.process import close_reward, run_reward
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.envs.scoring import RewardScorer
 from scene_envs.errors import InvalidInputError, RewardError

@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import os
+import pickle
+import sys
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from time import perf_counter
 from typing import Any
+
+import torch
 
 from scene_envs.datasets import store
 from scene_envs.datasets.info import read_metadata
 from scene_envs.datasets.progress import Report, generation_progress
 from scene_envs.datasets.ranges import fixed_normalizer
-from scene_envs.datasets.ray_workers import run_ray
-from scene_envs.datasets.shards import Job, shard_journal
-from scene_envs.datasets.workers import Work, run_processes, write_shard_of
-from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
+from scene_envs.datasets.shards import Job, make_shard, shard_journal, write_shard
+from scene_envs.errors import CorruptFileError, InvalidInputError, PhysicsError, unknown_name
 from scene_envs.files import storage_error, with_digest, write_json
 from scene_envs.grammars import Grammar, get_grammar
 from scene_envs.grammars.catalogue import grammar_factory
 from scene_envs.normalizer import Normalizer
-from scene_envs.scene_types import SceneType, get_scene_type
+from scene_envs.scene_types import SceneType, get_scene_type, register_scene_type
+from scene_envs.workers import Task, WorkerFailure, WorkerPool, import_main, main_module, require_ray
 
 BACKENDS = ("processes", "ray")
 """Backends that make shards."""
@@ -83,7 +86,7 @@ def generate(
             the grammar.
         UnknownNameError: no grammar, or no backend, of that name.
         CorruptFileError: a shard found in ``output`` cannot be read.
-        PhysicsError: worker processes keep dying, or nothing passes verification.
+        PhysicsError: a shard failed twice, or nothing passes verification.
         StorageError: the disk is full, or the folder may not be written to.
         MissingDependencyError: Ray is asked for and not installed.
     """
@@ -120,14 +123,81 @@ def _make(
     backend: str,
     address: str | None,
 ) -> None:
-    work = Work.of(grammar_factory(name), get_scene_type(grammar.scene_type), normalizer)
-    if backend == "ray":
-        run_ray(jobs, work, workers, address, report)
-    elif workers:
-        run_processes(jobs, work, min(workers, len(jobs)), report)
-    else:
+    if backend == "processes" and not workers:
         for job in jobs:
-            write_shard_of(job, grammar, normalizer, report)
+            for progress in write_shard(job, grammar, normalizer):
+                report(*progress)
+        return
+    is_ray = backend == "ray"
+    factory, scene_type = grammar_factory(name), get_scene_type(grammar.scene_type)
+    plain = SceneType(
+        **{field.name: getattr(scene_type, field.name) for field in fields(scene_type)}
+    )  # no built assets
+    inputs = _pickled(factory, (factory, plain, normalizer.state()), is_ray)
+
+    def done(task: Task, shard: Any) -> None:
+        if isinstance(shard, WorkerFailure):
+            raise PhysicsError(
+                f"{task.name} {shard}, twice; finished shards are kept. When memory ran out, run again to resume, with "
+                "fewer workers"
+            ) from shard
+        if shard is not None:
+            store.write_bytes(Path(task.body.path), shard)
+
+    with WorkerPool(
+        f"{__name__}:ShardMaker",
+        (inputs, None if is_ray else main_module()),
+        workers=max(1, workers) if is_ray else min(workers, len(jobs)),
+        stdout=2,  # what a grammar prints goes to stderr
+        ray=is_ray,
+        address=address,
+    ) as pool:
+        pool.map([Task(job, f"shard {job.index}") for job in jobs], done=done, report=report)
+
+
+def _pickled(factory: Any, inputs: tuple[Any, ...], is_ray: bool) -> bytes:
+    """The inputs of workers; Ray gets functions that workers cannot import as well."""
+    if is_ray:
+        return require_ray().cloudpickle.dumps(inputs)  # type: ignore[no-any-return]
+    main = sys.modules["__main__"]
+    if factory.__module__ == "__main__" and not Path(getattr(main, "__file__", None) or "").is_file():
+        raise InvalidInputError(
+            "the grammar's function stands in a notebook or at a prompt, where worker processes cannot import it; "
+            "define it in a module, or use workers=0"
+        )
+    try:
+        return pickle.dumps(inputs)
+    except (pickle.PicklingError, AttributeError) as error:
+        raise InvalidInputError(
+            f"the grammar's function cannot be sent to worker processes ({error}); "
+            "define it at the top level of a module, or use workers=0"
+        ) from error
+
+
+class ShardMaker:
+    """Answers of a worker of a generation: whole shards.
+
+    Args:
+        inputs: maker of the grammar, its scene type, and state of the normalizer, pickled.
+        main: main module of the parent on the same machine, for which shards are written; None returns their bytes.
+    """
+
+    def __init__(self, inputs: bytes, main: dict[str, Any] | None) -> None:
+        self._make = make_shard if main is None else write_shard
+        torch.set_num_threads(1)
+        import_main(main or {})
+        try:
+            factory, scene_type, state = pickle.loads(inputs)
+            register_scene_type(scene_type)
+            self._grammar, self._normalizer = factory(), Normalizer.from_state(state)
+        except (ImportError, AttributeError) as error:
+            raise InvalidInputError(
+                f"workers cannot import what the grammar needs ({error}); install it on every machine, or use workers=0"
+            ) from error
+
+    def __call__(self, job: Job) -> Any:
+        """Make a shard, with reports of the progress."""
+        return self._make(job, self._grammar, self._normalizer)
 
 
 def _prepare(folder: Path, grammar: Grammar, settings: dict[str, Any]) -> Normalizer:

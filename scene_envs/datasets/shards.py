@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
+from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -14,7 +15,6 @@ from torch import Tensor
 
 from scene_envs.datasets import store
 from scene_envs.datasets.journal import Journal
-from scene_envs.datasets.progress import Report
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.datasets.verification import KEPT, judge_scenes
 from scene_envs.errors import PhysicsError
@@ -43,9 +43,9 @@ class Job:
 
 
 def make_shard(
-    job: Job, grammar: Grammar, normalizer: Normalizer, report: Report, journal: Journal | None = None
-) -> bytes:
-    """The bytes of the shard's parquet file.
+    job: Job, grammar: Grammar, normalizer: Normalizer, journal: Journal | None = None
+) -> Generator[tuple[int, int, dict[str, int]], None, bytes]:
+    """Yield the progress after each chunk, as arguments of a ``Report``; return the bytes of the shard's parquet file.
 
     Candidate k is drawn from a random generator of its own, seeded by (seed, shard, k), and the shard holds the first
     ``job.size`` candidates that pass. So neither the size of chunks nor an interruption changes the result.
@@ -54,7 +54,6 @@ def make_shard(
         job: Specification of the shard.
         grammar: Grammar that draws the candidates.
         normalizer: Normalizer of the dataset.
-        report: Function called after each chunk.
         journal: Verdicts of an earlier, interrupted attempt, which are not computed again; None keeps none.
 
     Raises:
@@ -95,7 +94,7 @@ def make_shard(
                 kept.append(scene)
             else:
                 reasons[verdict] += 1
-        report(len(kept) - fresh, tried - first, dict(reasons - before))
+        yield len(kept) - fresh, tried - first, dict(reasons - before)
         if fruitless >= _MAX_FRUITLESS:
             raise PhysicsError(
                 f"grammar {grammar.name!r}: {fruitless} scenes in a row were rejected; "
@@ -127,6 +126,13 @@ def _judge(scenes: Tensor, grammar: Grammar, normalizer: Normalizer, verify: boo
     fits = error < 1e-4  # False where a feature varies that is constant in the normalizer
     verdicts = judge_scenes(batch) if verify else [KEPT] * len(batch)
     return [v if v != KEPT or ok else _UNFIT for v, ok in zip(verdicts, fits.tolist(), strict=True)]
+
+
+def write_shard(job: Job, grammar: Grammar, normalizer: Normalizer) -> Generator[tuple[int, int, dict[str, int]]]:
+    """Make one shard with a journal, and write it; yields as :func:`make_shard`, raises StorageError."""
+    journal = shard_journal(job)
+    store.write_bytes(Path(job.path), (yield from make_shard(job, grammar, normalizer, journal)))
+    journal.remove()
 
 
 def shard_journal(job: Job) -> Journal:

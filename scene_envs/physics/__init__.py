@@ -18,9 +18,7 @@ if TYPE_CHECKING:
         project,
         settle,
     )
-    from scene_envs.physics.pool import PhysicsPool
-    from scene_envs.physics.pools import make_pool
-    from scene_envs.physics.ray_pool import RayPhysicsPool
+    from scene_envs.physics.pool import PhysicsPool, RayPhysicsPool, make_pool
     from scene_envs.physics.readiness import make_ready
     from scene_envs.physics.results import (
         EquilibriumResult,

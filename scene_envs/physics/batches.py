@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from scene_envs.physics.pool import PhysicsPool
 from scene_envs.rotations import geodesic_angle, project_to_so3
 from scene_envs.scene import SceneBatch, require_rigid_poses
 
+_LOGGER = logging.getLogger(__name__)
 _CHUNK = 8
 """Scenes per message to a worker."""
 
@@ -51,7 +53,13 @@ def run_kernel(
         rows = slice(start, start + size)
         some = None if limits is None else limits[rows]
         chunks.append(Chunk(batch.scene_type, translations[rows], rotations[rows], categories[rows], some))
-    return (pool or PhysicsPool(workers=0)).run(kernel, chunks, options)
+    results = (pool or PhysicsPool(workers=0)).run(kernel, chunks, options)
+    if lost := sum(row is not None and not row["valid"] for row in results):
+        _LOGGER.debug(
+            "%s: %d of %d scenes are invalid: too deep in each other to be simulated or measured, or the simulation "
+            "diverged or took more work than a scene may, and was ended", kernel, lost, len(results),
+        )  # fmt: skip
+    return results
 
 
 def valid_rows(rows: Rows) -> Tensor:

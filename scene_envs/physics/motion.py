@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -19,8 +18,6 @@ from scene_envs.physics.rest import Rest, Statics
 from scene_envs.physics.support import Support, clusters, company
 from scene_envs.physics.world import SolverSettings, World
 from scene_envs.scene_types import SceneType
-
-_LOGGER = logging.getLogger(__name__)
 
 _FAR, _MARGIN = 2e-3, 1e-3
 """An object that moved further than ``_FAR`` (m) may have met others, whose boxes are within ``_MARGIN`` (m) of the box
@@ -117,8 +114,6 @@ def motion(
         rows = np.flatnonzero(objects.scene == scene)
         moved = advance(physics, objects[rows], pairs.among(rows), rest[rows], duration, budgets[scene], tilt=tilt)
         if budgets[scene].is_spent or not moved.is_finite:
-            why = "diverged" if not moved.is_finite else "takes more work than a scene may"
-            _LOGGER.warning("the simulation of a scene %s; it was ended", why)
             lost.append(int(scene))
             continue
         displacement[rows] = np.linalg.norm(moved.translation - objects.translation[rows], axis=1)

@@ -144,7 +144,7 @@ def test_a_process_of_an_import_that_crashes_is_told(tmp_path: Path, monkeypatch
     sphere(tmp_path, "sphere.stl", 5)
     (tmp_path / "sitecustomize.py").write_text("import os\nos._exit(7)\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    refused(tmp_path, "sphere.stl: the import ended with status 7; simplify the file")
+    refused(tmp_path, "sphere.stl: the import ended its process .exit status 7. without an answer; simplify the file")
 
 
 @pytest.mark.slow

@@ -9,7 +9,6 @@ import pickle
 import signal
 import time
 from collections.abc import Callable
-from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
@@ -108,11 +107,12 @@ def test_the_result_does_not_depend_on_the_size_of_chunks(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("copied_workers")
 def test_two_workers_write_the_same_files_and_a_dying_one_is_replaced(
     cups: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Workers here begin as copies of this process; those of ``test_own_scene_type.py`` are new interpreters."""
-    monkeypatch.setattr("scene_envs.datasets.workers.get_context", lambda _: get_context("fork"))
+    monkeypatch.setenv("SCENE_ENVS_TEST_PARENT", str(os.getpid()))
     monkeypatch.setenv("SCENE_ENVS_TEST_FLAG", str(tmp_path / "died"))
     report = generate_cups(tmp_path / "data", grammar="toy_mortal", workers=2)
     assert (tmp_path / "died").exists()

@@ -17,6 +17,8 @@ from typing import Any
 
 import pytest
 
+from scene_envs import workers
+
 
 def forked(function: Callable[..., Any], *args: Any) -> ForkProcess:
     """Run ``function(*args)`` in a copy of this process, with nothing of its threads; join or kill it."""
@@ -26,7 +28,7 @@ def forked(function: Callable[..., Any], *args: Any) -> ForkProcess:
 
 
 class ForkedModule:
-    """``subprocess.Popen`` of ``python -m MODULE ...``, or of a ``module_command``, as a copy of this process.
+    """``subprocess.Popen`` of ``python -m MODULE ...``, or of a worker process, as a copy of this process.
 
     It has its own descriptors, session, signals, limits and memory. Its interpreter is not new: what this process
     registered is known there, so a test that asks what a new one finds starts a real one.
@@ -45,7 +47,7 @@ class ForkedModule:
         self.returncode: int | None = None
         option = command[1]
         assert option in ("-c", "-m")
-        self._module, *self._words = command[2 if option == "-m" else 3 :]
+        self._module, *self._words = command[2:] if option == "-m" else ("", *command[3:])
         sys.stdout.flush()
         sys.stderr.flush()
         self.pid = os.fork()
@@ -71,6 +73,9 @@ class ForkedModule:
                     os.close(descriptor)
         os.environ.update(env)
         sys.argv = [self._module, *self._words]
+        if not self._module:
+            workers.serve(*map(int, self._words))
+            return
         sys.modules.pop(self._module, None)
         runpy.run_module(self._module, run_name="__main__")
 
@@ -98,9 +103,8 @@ class ForkedModule:
 
 @contextlib.contextmanager
 def forked_workers() -> Iterator[None]:
-    """Workers of physics and of isolated rewards that start meanwhile are copies of this process."""
+    """Worker processes that start meanwhile are copies of this process."""
     stand_in = SimpleNamespace(**{**vars(subprocess), "Popen": ForkedModule})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("scene_envs.physics.pool.subprocess", stand_in)
-        patch.setattr("rewards.reward_process.subprocess", stand_in)
+        patch.setattr(workers, "subprocess", stand_in)
         yield

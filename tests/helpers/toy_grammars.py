@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections import Counter
 from dataclasses import dataclass, field
-from multiprocessing import current_process
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +75,7 @@ def toy_cups() -> ToyGrammar:
 
 @register_grammar("toy_mortal")
 def toy_mortal() -> ToyGrammar:
-    """Toy cups, but the first process that draws scene 10 of a shard dies; the flag file says that it happened."""
+    """Toy cups, but the first worker that draws scene 10 of a shard dies; the flag file says that it happened."""
     return _Mortal()
 
 
@@ -84,7 +83,7 @@ class _Mortal(ToyGrammar):
     def sample_array(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
         flag = Path(os.environ["SCENE_ENVS_TEST_FLAG"])
         sequence = rng.bit_generator.seed_seq.entropy
-        if current_process().name != "MainProcess" and sequence[-1] == 10 and not flag.exists():
+        if os.environ["SCENE_ENVS_TEST_PARENT"] != str(os.getpid()) and sequence[-1] == 10 and not flag.exists():
             flag.touch()
             os._exit(1)
         return super().sample_array(rng, count)

@@ -24,8 +24,8 @@ from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards import RewardContext, RewardOutput
 from rewards.category_count import CategoryCount
-from rewards.isolation import IsolatedReward
 from rewards.local_files import allow_local_rewards
+from rewards.process import IsolatedReward
 from scene_envs.datasets import generate
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar

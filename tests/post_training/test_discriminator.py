@@ -15,7 +15,7 @@ from agents.post_training.discriminator import Discriminator
 from agents.priors.testing import tiny_prior
 from rewards import allow_local_rewards, check_reward, learned_parts, resolve_reward
 from rewards.base import RewardContext
-from rewards.isolation import IsolatedReward
+from rewards.process import IsolatedReward
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch

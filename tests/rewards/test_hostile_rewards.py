@@ -19,7 +19,7 @@ from rewards import (
     register_reward,
     resolve_reward,
 )
-from rewards.isolation import SeededReward, is_foreign, run_reward
+from rewards.process import SeededReward, is_foreign, run_reward
 from scene_envs.errors import InvalidInputError, RewardError, RewardTimeoutError
 from tests.helpers import hostile_rewards as hostile
 from tests.helpers.forked import forked_workers

@@ -18,7 +18,7 @@ from rewards import (
     resolve_reward,
 )
 from rewards.base import averages_objects, declared_maximum
-from rewards.isolation import run_reward
+from rewards.process import run_reward
 from scene_envs import SceneBatch
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar

@@ -30,7 +30,7 @@ class CheckRewardConfig:
 def run(settings: CheckRewardConfig) -> None:
     """Print what was checked; raises RewardError with every broken clause."""
     from rewards import check_reward, reward_name
-    from rewards.isolation import close_reward, run_reward
+    from rewards.process import close_reward, run_reward
 
     reward = run_reward(settings.reward, timeout=settings.reward_timeout)
     try:

@@ -28,6 +28,8 @@ def run(settings: PostTrainConfig, run: Run) -> None:
         if first is not None:
             run.say(f"mean reward of a batch: {first:.4g} at first, {last:.4g} at last")
         run.say(f"held-out loss {metrics['guard']['ratio']:.2f}x of the base prior's")
+        if lost := metrics["reward"]["invalid_scenes"]:
+            run.say(f"{lost} scenes without a valid reward; log.txt says why")
     run.say(f"sample it: scene-envs sample prior={run.directory}")
 
 
@@ -45,3 +47,5 @@ def say_change(metrics: Mapping[str, Any], run: Run) -> None:
             change = f"  ({after[name] / before[name] - 1:+.0%})" if before[name] > 0 else ""
             run.say(f"{label:<20} {before[name]:6.2f} -> {after[name]:6.2f}{change}")
     run.say(f"{'held-out loss':<20} {metrics['guard']['ratio']:.2f}x of the base prior's")
+    if before["invalid_scenes"] or after["invalid_scenes"]:
+        run.say(f"{'simulation ended':<20} {before['invalid_scenes']:6.0f} -> {after['invalid_scenes']:6.0f} scenes")

@@ -21,7 +21,7 @@ class RewardsConfig:
 def run(settings: RewardsConfig) -> None:
     """Print every reward with its settings and where it comes from."""
     from rewards import list_rewards
-    from rewards.isolation import describe_rewards
+    from rewards.process import describe_rewards
 
     for name, info, problem in describe_rewards(list_rewards(), timeout=settings.reward_timeout):
         if info is None:

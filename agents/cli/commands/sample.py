@@ -62,7 +62,7 @@ def run(settings: SampleConfig, run: Run) -> None:
     """Draw, score, save and picture the scenes."""
     from agents.priors.base import ScenePrior
     from agents.priors.guidance import physics_strength
-    from rewards.isolation import close_reward, run_reward
+    from rewards.process import close_reward, run_reward
     from scene_envs.export.formats import resolve_formats
     from scene_envs.physics import PhysicsPool
     from scene_envs.scene import SceneBatch

@@ -48,7 +48,7 @@ def run(settings: SearchKeys, run: Run) -> None:
     """Search; the search writes its own metrics and pictures."""
     from agents.planning import run_search
     from agents.utils.interrupts import Terminated
-    from rewards.isolation import close_reward, is_foreign, run_reward
+    from rewards.process import close_reward, is_foreign, run_reward
 
     search = SearchConfig(**{field.name: getattr(settings, field.name) for field in fields(SearchConfig)})
     limits = {"timeout": settings.reward_timeout, "memory": settings.reward_memory}

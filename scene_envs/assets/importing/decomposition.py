@@ -11,8 +11,6 @@ import io
 import json
 import logging
 import os
-import subprocess
-import tempfile
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -27,7 +25,7 @@ from scene_envs.assets.importing.limits import seconds_left, too_slow
 from scene_envs.assets.importing.mesh_files import bare
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.files import replacing
-from scene_envs.worker_processes import module_command, module_environment
+from scene_envs.workers import WorkerFailure, run_apart
 
 if TYPE_CHECKING:
     import trimesh
@@ -182,29 +180,26 @@ def run_coacd(vertices: Array, faces: Array, settings: dict[str, Any], what: str
     Raises:
         InvalidInputError: CoACD took too long, or failed.
     """
-    left = seconds_left()
-    with tempfile.TemporaryDirectory() as folder:
-        source, target = Path(folder) / "mesh.npz", Path(folder) / "parts.npz"
-        np.savez(source, vertices=vertices, faces=faces, settings=np.array(json.dumps(settings)))
-        try:
-            done = subprocess.run(
-                module_command("scene_envs.assets.importing.coacd_worker", str(source), str(target)),
-                env=module_environment(),
-                stdin=subprocess.DEVNULL,
-                capture_output=True,
-                timeout=left,
-                check=False,
-            )
-        except subprocess.TimeoutExpired:
+    try:
+        return run_apart(f"{__name__}:coacd_pieces", (vertices, faces, settings), seconds_left())  # type: ignore[no-any-return]
+    except WorkerFailure as failure:
+        if failure.is_late:
             raise too_slow(f"CoACD decomposing {what} of {len(faces):,} triangles") from None
-        pieces = _read(target)
-        if done.returncode or pieces is None:
-            reason = done.stderr.decode(errors="replace").strip().rpartition("\n")[2][:300]
-            raise InvalidInputError(
-                f"CoACD failed on {what} (exit status {done.returncode}{reason and ': '}{reason}); set "
-                "`decomposition: convex` for it"
-            )
-    return pieces
+        raise InvalidInputError(
+            f"CoACD failed on {what}: it {failure}; set `decomposition: convex` for it"
+        ) from failure
+
+
+def coacd_pieces(request: tuple[Array, Array, dict[str, Any]]) -> list[Array]:
+    """Corners (P, 3) of the convex pieces of a mesh, in compiled code that nothing interrupts."""
+    import coacd
+
+    vertices, faces, settings = request
+    coacd.set_log_level("error")
+    found = [np.asarray(corners) for corners, _ in coacd.run_coacd(coacd.Mesh(vertices, faces), **settings)]
+    if not all(len(piece) >= 4 and np.isfinite(piece).all() for piece in found):
+        raise ValueError("a piece has no volume")
+    return found
 
 
 def snap_to_surface(points: Array, body: trimesh.Trimesh, max_distance: float) -> Array:

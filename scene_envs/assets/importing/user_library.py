@@ -22,11 +22,19 @@ from scene_envs.assets.importing.entries import (
     default_entry,
     read_entries,
 )
-from scene_envs.assets.importing.limits import READ_HERE, LargeImportError, check_file, in_time, timed
+from scene_envs.assets.importing.limits import (
+    READ_HERE,
+    LargeImportError,
+    check_file,
+    in_time,
+    seconds_left,
+    timed,
+    too_slow,
+)
 from scene_envs.assets.importing.model import Color
-from scene_envs.assets.importing.process import build_apart
 from scene_envs.assets.importing.report import AssetReport, ImportReport
 from scene_envs.errors import InvalidInputError, SceneEnvsError, unknown_name
+from scene_envs.workers import WorkerFailure, run_apart
 
 _LOGGER = logging.getLogger(__name__)
 _DESCRIPTIONS = (".urdf", ".sdf")
@@ -177,6 +185,24 @@ def _colored(entries: list[AssetEntry]) -> tuple[AssetEntry, ...]:
     )
 
 
+def build_in_time(request: tuple[Path, AssetEntry]) -> tuple[Asset, AssetReport]:
+    """As :func:`~scene_envs.assets.importing.build.build_asset`, while the time of an import runs."""
+    from scene_envs.assets.importing.build import build_asset  # imported here, because it loads trimesh
+
+    with timed(request[0]):
+        return build_asset(*request)
+
+
+def _build_apart(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
+    """As :func:`build_in_time`, in a process of its own; InvalidInputError when it takes too long or crashes."""
+    try:
+        return run_apart(f"{__name__}:build_in_time", (path, entry), seconds_left())  # type: ignore[no-any-return]
+    except WorkerFailure as failure:
+        if failure.is_late:
+            raise too_slow("") from None
+        raise InvalidInputError(f"{path}: the import {failure}; simplify the file") from failure
+
+
 @cache
 def _built(folder: Path, entry: AssetEntry, stamp: tuple[int, int]) -> tuple[Asset, AssetReport]:
     from scene_envs.assets.importing.build import build_asset  # imported here, because it loads trimesh
@@ -186,7 +212,7 @@ def _built(folder: Path, entry: AssetEntry, stamp: tuple[int, int]) -> tuple[Ass
             asset, report = in_time(lambda: build_asset(folder / entry.file, entry))
     except LargeImportError:
         with timed(folder / entry.file):
-            asset, report = build_apart(folder / entry.file, entry)
+            asset, report = _build_apart(folder / entry.file, entry)
     level = logging.WARNING if report.warnings else logging.INFO
     _LOGGER.log(level, "%s", report)
     return asset, report

@@ -1,4 +1,4 @@
-"""Rewards in separate processes that can be ended, so that a failing reward harms no run."""
+"""Rewards in worker processes that can be ended, so that a failing reward harms no run."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+import torch
+
 from rewards.base import (
     RewardContext,
     RewardOutput,
@@ -16,9 +19,12 @@ from rewards.base import (
     declared_maximum,
     depends_on_batch,
 )
-from rewards.local_files import allowed_files, is_local, local_files, names_in
+from rewards.evaluation import describe_error, evaluate_reward
+from rewards.learned import learned_parts
+from rewards.local_files import allow_local_rewards, allowed_files, is_local, local_files, names_in
 from rewards.registry import (
     RewardInfo,
+    allow_reward_targets,
     allowed_targets,
     is_own,
     plugin_module,
@@ -27,10 +33,12 @@ from rewards.registry import (
     reward_info,
     reward_name,
 )
-from rewards.reward_process import RewardProcess, unpacked
-from rewards.seeding import current_draw, seeded_generators
-from scene_envs.errors import InvalidInputError, SceneEnvsError
+from rewards.seeding import current_draw, other_draw, seeded_generators
+from scene_envs.errors import InvalidInputError, RewardError, RewardTimeoutError, SceneEnvsError, UnknownNameError
+from scene_envs.physics import PhysicsPool
 from scene_envs.scene import SceneBatch
+from scene_envs.scene_types import get_scene_type, register_scene_type
+from scene_envs.workers import START_UP, Process, WorkerFailure
 
 
 class IsolatedReward:
@@ -67,7 +75,7 @@ class IsolatedReward:
         self.seed = seed
         self.timeout, self.memory, self.workers = timeout, memory, workers
         self._reward = reward
-        self._worker: RewardProcess | None = None
+        self._worker: Process | None = None
         self._lock = threading.Lock()
         self._started()
 
@@ -83,16 +91,18 @@ class IsolatedReward:
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score in the worker; the batch may be on any device."""
         scenes = batch.tensor.detach().cpu().contiguous().numpy()
-        seed = self.seed if context.seed == 0 else context.seed
-        with self._lock:
-            message = ("score", replace(batch.scene_type), scenes, (context.prompts, seed, current_draw()))
-            body = self._started().ask(message, self.timeout)
-        return unpacked(body, batch.tensor.device)
+        facts = context.prompts, self.seed if context.seed == 0 else context.seed, current_draw()
+        body = self._ask("score", replace(batch.scene_type), scenes, facts)
+
+        def tensor(array: Any) -> Any:
+            return array if array is None else torch.from_numpy(np.array(array)).to(batch.tensor.device)
+
+        terms, flags = ({name: tensor(part) for name, part in body[key].items()} for key in ("terms", "object_flags"))
+        return RewardOutput(tensor(body["value"]), tensor(body["per_object"]), terms, tensor(body["valid"]), flags)
 
     def maximum(self, slots: int, free_slots: int) -> float | None:
         """The largest value that the reward declares; see :func:`rewards.base.declared_maximum`."""
-        with self._lock:
-            found: float | None = self._started().ask(("maximum", slots, free_slots), self.timeout)
+        found: float | None = self._ask("maximum", slots, free_slots)
         return found
 
     @property
@@ -109,17 +119,124 @@ class IsolatedReward:
             self._worker.stop()
             self._worker = None
 
-    def _started(self) -> RewardProcess:
-        if self._worker is None or not self._worker.alive:
-            self._worker = RewardProcess(self.name, self.timeout, self.memory)
+    def _ask(self, *message: Any) -> Any:
+        with self._lock:
+            return _answer(self._started(), self.name, message, self.timeout)
+
+    def _started(self) -> Process:
+        if self._worker is None or not self._worker.is_alive:
+            self._worker = _start(self.name, self.memory)
             try:
                 message = ("make", self._reward, allowed_targets(), allowed_files(), self.workers, self.seed)
-                facts: tuple[bool, bool, bool] = self._worker.ask(message, self.timeout)
+                facts: tuple[bool, bool, bool] = _answer(self._worker, self.name, message, self.timeout)
                 self.depends_on_batch, self.averages_objects, self.counts_objects = facts
             except BaseException:
                 self.close()
                 raise
         return self._worker
+
+
+def _start(name: str, memory: float) -> Process:
+    """A process for a reward that may allocate ``memory`` GiB beyond what it needs to start."""
+    threads = torch.get_num_threads()  # sums of floats depend on it
+    worker = Process(
+        f"{__name__}:RewardRunner",
+        (threads,),
+        memory=int(memory * 2**30),
+        environment={"PYTHONHASHSEED": "0"},
+        stdout=2,  # what a reward prints goes to stderr
+    )
+    _answer(worker, name)
+    return worker
+
+
+def _answer(worker: Process, name: str, message: Any = None, timeout: float = START_UP) -> Any:
+    """The answer to a message, or to the start; raises RewardError and what the reward's process raises."""
+    try:
+        if message is not None:
+            worker.send(message, timeout)
+        return worker.answer()
+    except WorkerFailure as failure:
+        if not failure.is_late:
+            raise RewardError(f"reward {name!r} {failure}") from None
+        raise RewardTimeoutError(
+            f"reward {name!r} took longer than reward_timeout={timeout:g} s; its process was ended"
+        ) from None
+
+
+class RewardRunner:
+    """Answers of the process of a reward.
+
+    Args:
+        threads: number of threads of torch.
+    """
+
+    def __init__(self, threads: int) -> None:
+        torch.set_num_threads(threads)
+        self.reward: Any = None
+        self.pool: PhysicsPool | None = None
+
+    def __call__(self, message: tuple[Any, ...]) -> Any:
+        """Call the method that the message names; raises InvalidInputError, UnknownNameError and RewardError alone."""
+        method, *arguments = message
+        try:
+            return getattr(self, method)(*arguments)
+        except MemoryError:
+            raise RewardError("the reward took more memory than reward_memory= allows") from None
+        except SceneEnvsError as error:
+            cause = error.__cause__
+            lacked = isinstance(cause, RuntimeError) and "allocate memory" in str(cause)
+            hint = "; reward_memory= allows more" if lacked or isinstance(cause, MemoryError) else ""
+            kind = type(error) if type(error) in (InvalidInputError, UnknownNameError) else RewardError
+            raise kind(f"{error}{hint}") from None
+        except BaseException as error:
+            raise RewardError(f"the reward raised {describe_error(error)}") from None
+
+    def make(self, reward: Any, targets: list[str], files: list[Any], workers: int, seed: int) -> tuple[bool, ...]:
+        """Make the reward, with generators seeded from the run's.
+
+        Returns whether it depends on the batch, averages objects and counts objects.
+        """
+        for target in targets:
+            allow_reward_targets(target)
+        for file in files:
+            allow_local_rewards(file)
+        with seeded_generators(seed):
+            self.reward = resolve_reward(reward)
+        for part in learned_parts(self.reward):
+            raise InvalidInputError(
+                f"reward {reward_name(part)!r} learns in the process of a run, but {reward_name(self.reward)!r} has "
+                "parts of other packages and runs in a process of its own; combine it with this package's rewards alone"
+            )
+        self.pool = PhysicsPool(workers=workers) if workers else None
+        return depends_on_batch(self.reward), averages_objects(self.reward), counts_objects(self.reward)
+
+    def maximum(self, slots: int, free_slots: int) -> float | None:
+        """The largest value that the reward declares."""
+        return declared_maximum(self.reward, slots, free_slots)
+
+    def describe(self, name: str) -> RewardInfo:
+        """The listing of a reward, whose plug-in is imported."""
+        return reward_info(name)
+
+    def score(self, scene_type: Any, scenes: Any, facts: tuple[Any, int, int]) -> dict[str, Any]:
+        """Score one batch; returns the output as arrays."""
+        prompts, seed, draw = facts
+        try:
+            known = get_scene_type(scene_type.name)
+        except SceneEnvsError:
+            known = register_scene_type(scene_type)
+        batch = SceneBatch(torch.from_numpy(scenes), known if known == scene_type else scene_type)
+        context = RewardContext(prompts=prompts, pool=self.pool, seed=seed)
+        with other_draw(draw):
+            output = evaluate_reward(self.reward, batch, context, strict=True)
+        return {
+            "value": output.value.cpu().numpy(),
+            "per_object": None if output.per_object is None else output.per_object.cpu().numpy(),
+            "terms": {name: term.cpu().numpy() for name, term in output.terms.items()},
+            "valid": output.is_valid.cpu().numpy(),
+            "object_flags": {name: flag.cpu().numpy() for name, flag in output.object_flags.items()},
+        }
 
 
 class SeededReward:
@@ -141,8 +258,6 @@ class SeededReward:
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score with the run's seed in the context."""
-        from rewards.evaluation import evaluate_reward
-
         return evaluate_reward(self.reward, batch, replace(context, seed=self.seed), strict=True)
 
     @property
@@ -191,17 +306,16 @@ def describe_rewards(
         timeout: seconds that an import may take.
         memory: GiB that an import may allocate.
     """
-    worker: RewardProcess | None = None
+    worker: Process | None = None
     try:
         for name in names:
             try:
                 if not is_foreign(name):
                     yield name, reward_info(name), ""
                     continue
-                if worker is None or not worker.alive:
-                    worker = RewardProcess(name, timeout, memory)
-                worker.name = name
-                yield name, worker.ask(("describe", name), timeout), ""
+                if worker is None or not worker.is_alive:
+                    worker = _start(name, memory)
+                yield name, _answer(worker, name, ("describe", name), timeout), ""
             except SceneEnvsError as error:
                 yield name, None, str(error)
     finally:
