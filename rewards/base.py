@@ -22,7 +22,7 @@ class RewardContext:
     Attributes:
         prompts: one per scene when the prior is conditional, else None.
         pool: worker processes for physics; None means compute in this process.
-        seed: for rewards that draw random numbers.
+        seed: seed for rewards that draw random numbers.
     """
 
     prompts: tuple[str, ...] | None = None
@@ -109,7 +109,7 @@ def declared_maximum(reward: object, slots: int, free_slots: int) -> float | Non
     """The largest value that a reward declares for scenes of this size, None where it declares no positive number.
 
     Args:
-        reward: its attribute ``maximum`` is a number, or a method that takes the two arguments below.
+        reward: reward with an attribute ``maximum``, a number or a method that takes the two arguments below.
         slots: slots per scene.
         free_slots: slots that fixed objects do not take.
 

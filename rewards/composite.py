@@ -124,7 +124,7 @@ class Gate:
     """A reward that counts only where another one reaches a threshold.
 
     Attributes:
-        reward: what is scored.
+        reward: reward to compute.
         condition: the reward that opens the gate.
         threshold: the gate is open where ``condition >= threshold``.
         otherwise: the value where it is closed.
@@ -175,7 +175,7 @@ class Clip:
     """A reward kept between two bounds.
 
     Attributes:
-        reward: what is scored.
+        reward: reward to compute.
         low: smallest value; null for no bound.
         high: largest value; null for no bound.
 

@@ -32,8 +32,8 @@ def check_reward(
     Args:
         reward: a name, mapping, function, class or reward.
         scene_type: the scene type to try it on.
-        context: what the reward gets; by default a prompt per scene and no worker pool.
-        seed: of the scenes it is tried on.
+        context: context for the reward; by default a prompt per scene and no worker pool.
+        seed: seed of the test scenes.
 
     Returns:
         What was checked, one sentence each. Scenes alone and in a batch are not compared where the reward declares

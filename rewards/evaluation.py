@@ -39,7 +39,7 @@ def evaluate_reward(
     Args:
         reward: a reward object, or a function of (batch, context); see :func:`rewards.resolve_reward` for names.
         batch: B scenes of N slots.
-        context: what the reward may use; an empty one by default.
+        context: context for the reward; an empty one by default.
         strict: raise on failure. Otherwise a reward that raises or breaks its contract gives NaN for every scene, all
             of them invalid, with the reason in ``problem`` and in one warning per reward and reason.
 

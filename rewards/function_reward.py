@@ -20,7 +20,7 @@ class FunctionReward:
     Args:
         function: takes ``(batch)`` or ``(batch, context)``, then keyword settings; returns (B,) numbers or a
             :class:`RewardOutput`.
-        name: its name in logs; the function's own by default.
+        name: name of the reward in logs; the function's own by default.
         **settings: keyword arguments passed on at every call.
 
     >>> FunctionReward(lambda batch: batch.counts, name="count")(SceneBatch.empty("dimsum_table", 2), RewardContext())

@@ -32,7 +32,7 @@ class PromptMatch:
     scenes. Scenes whose prompt is empty, or cannot be read, are invalid.
 
     Attributes:
-        prompt: in place of the prompts that the scenes were made for.
+        prompt: prompt to use instead of the prompts of the scenes.
 
     >>> reward = PromptMatch("A scene with a table and two cups.")
     >>> reward(SceneBatch.empty("dimsum_table", 1), RewardContext()).value
@@ -81,7 +81,7 @@ def claims_asked(
     """Claims that a reward called ``name`` compares each scene with; None where a prompt is empty or cannot be read.
 
     Args:
-        name: of the reward, for errors.
+        name: name of the reward in error messages.
         prompt: one text for all scenes, in place of ``prompts``.
         batch: B scenes.
         prompts: one text per scene.

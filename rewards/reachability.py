@@ -30,8 +30,8 @@ class Reachability:
 
     Attributes:
         sides: ``"above"``, ``"front"`` (the side of the scene type's camera, level) or both; one of them is enough.
-        opening: between the open fingers, m.
-        finger_length: of the fingers, m.
+        opening: distance between the open fingers, m.
+        finger_length: length of the fingers, m.
 
     >>> Reachability()(SceneBatch.empty("dimsum_table", 1), RewardContext()).value
     tensor([0.])

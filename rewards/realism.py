@@ -31,7 +31,7 @@ class Realism:
     Attributes:
         prior: name or path of the prior; that of the scene type's name when null.
         levels: number of timesteps at which the loss is taken: those of a chain of that many equally spaced steps.
-        seed: of the noise.
+        seed: seed of the noise.
     """
 
     name: ClassVar[str] = "realism"

@@ -32,7 +32,7 @@ class RewardInfo:
     """One line of a listing.
 
     Attributes:
-        name: what to write after ``reward=``.
+        name: name to write after ``reward=``.
         summary: first sentence of its docstring.
         parameters: settings and their defaults, as ``"name=default"``.
         source: the module that defines it.

@@ -26,7 +26,7 @@ class Relation:
     cannot be read are invalid.
 
     Attributes:
-        prompt: in place of the prompts that the scenes were made for.
+        prompt: prompt to use instead of the prompts of the scenes.
 
     >>> reward = Relation("A scene where a cup is on top of a plate.")
     >>> output = reward(SceneBatch.empty("dimsum_table", 1), RewardContext())

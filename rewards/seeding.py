@@ -25,7 +25,7 @@ def seeded_generators(seed: int, batch: SceneBatch | None = None) -> Iterator[No
     drawn.
 
     Args:
-        seed: of the run.
+        seed: seed of the run.
         batch: the scenes that are scored; None while the reward is made.
     """
     states = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002

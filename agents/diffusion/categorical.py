@@ -178,8 +178,8 @@ class CategoricalProcess:
         Args:
             x_t: (B, ...) int64 states at t.
             x0_probs: (B, ..., K) the denoiser's distribution of the data.
-            t: where the strides start, int or (B,).
-            previous: where they end, s; at 0 the result is ``x0_probs`` itself.
+            t: first timestep of each stride, int or (B,).
+            previous: last timestep s of each stride; at 0 the result is ``x0_probs`` itself.
 
         Returns:
             (B, ..., K + 1) probabilities, rows sum to one; differentiable in ``x0_probs``.

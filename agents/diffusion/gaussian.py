@@ -50,7 +50,7 @@ class GaussianProcess:
 
     Args:
         schedule: signal rates for t = 0..T.
-        prediction: what the network's output means (one of :data:`PREDICTIONS`).
+        prediction: parameterisation of the network's output (one of :data:`PREDICTIONS`).
         preconditioning: data moments, used by ``"edm"``.
 
     All timesteps ``t`` are int64 tensors of shape (B,) or (); chains run in float32.
@@ -150,8 +150,8 @@ class GaussianProcess:
         Args:
             x_t: (B, N, D).
             x0: (B, N, D) denoised scene.
-            t: where the stride starts.
-            previous: where it ends, s.
+            t: first timestep of the stride.
+            previous: last timestep s of the stride.
             residual: (D,) or () expected squared error of ``x0``; None takes ``x0`` as exact (Ho et al.). With
                 ``residual``, the variance at ``eta`` 1 is the optimal one of Bao et al. (2022), Theorem 1. The variance
                 that the error adds is scaled by the square of ``eta``, so that the chain at ``eta`` 0 stays

@@ -67,7 +67,7 @@ def unmasking_log_prob(masked: Tensor, chance: Tensor, unmasked: Tensor) -> Tens
     It depends on no parameter of a network; the masked slots of a scene have equal shares of it.
 
     Args:
-        masked, chance: as in :func:`draw_unmasked`.
+        masked, chance: the arguments of :func:`draw_unmasked`.
         unmasked: (B, N) bool, a subset of the masked slots.
 
     >>> masked, chance = torch.ones(1, 4, dtype=torch.bool), torch.full((1, 4), 0.5)

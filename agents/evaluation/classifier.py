@@ -53,7 +53,7 @@ def classifier_accuracy(
         real: real scenes; the two batches should share none.
         fake: samples of the same scene type. The larger batch is subsampled to the size of the smaller one.
         seeds: repetitions with other splits and weights.
-        seed: of the first repetition.
+        seed: seed of the first repetition.
         resolution: standard deviation of the noise (m, rad); (0, 0) compares at full precision.
         config: sizes of the parts, and how the classifier is trained; it trains on at most 50,000 objects.
 

@@ -41,7 +41,7 @@ def frechet_inception_distance(
         a: scenes.
         b: scenes, as many as in ``a`` for a fair number.
         weights: path of the state dict.
-        width: of the renders, pixels; they are then scaled to 299 x 299.
+        width: width of the renders in pixels; they are then scaled to 299 x 299.
         height: likewise.
         batch_size: images per forward pass.
 

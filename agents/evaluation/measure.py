@@ -102,7 +102,7 @@ def evaluate(
         reference: real scenes; None draws ``count`` scenes from the grammar of the prior's scene type.
         floor: other real scenes, see :func:`measure_samples`.
         num_steps: denoiser evaluations per sample.
-        seed: of the samples, and of the grammar when it is used.
+        seed: seed of the samples, and of the grammar if it is used.
         batch_size: scenes denoised at once.
         pool: worker processes for physics.
         ready: whether to project and settle as well.

@@ -30,7 +30,7 @@ class EvaluationInputs:
         real: real scenes.
         follow: makes scenes with the prior, one for each prompt; None for a prior that reads no prompts.
         pool: physics workers; None computes in this process.
-        seed: of classifiers and prompts.
+        seed: seed of the classifiers and prompts.
         fid_weights: path of the weights of an Inception-v3; empty for none.
         prompts: number of real scenes whose prompts the samples follow; None for all of them.
 

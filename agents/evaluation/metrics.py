@@ -66,7 +66,7 @@ def height_errors(batch: SceneBatch, supports: Sequence[Support] | None = None) 
 
     Args:
         batch: the scenes.
-        supports: where objects may rest; None takes the ones of the scene type.
+        supports: surfaces on which objects may rest; None takes those of the scene type.
 
     Returns:
         For each kind, a (K,) float tensor of absolute errors in m; K is the number of objects of that kind.

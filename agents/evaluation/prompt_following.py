@@ -64,7 +64,7 @@ def prompt_chance(batch: SceneBatch, prompts: Sequence[str], seed: int = 0) -> d
     Args:
         batch: B >= 2 real scenes.
         prompts: their own prompts, B.
-        seed: of the order in which prompts are handed on.
+        seed: seed of the permutation of the prompts.
 
     Returns:
         The shares of :func:`prompt_following` under ``chance_<name>``.

@@ -45,14 +45,14 @@ class RealScenes:
         """Held-out scenes, at most ``count`` in each of the two sets, and training scenes.
 
         Args:
-            scene_type: of the samples.
+            scene_type: scene type of the samples.
             count: scenes in ``reference`` and in ``floor``, at most.
             data: dataset folder of the training scenes, or several joined by commas for a prior of their union;
                 empty takes fresh scenes of the grammar, and no training scenes.
             heldout: dataset folder, or folders, of held-out scenes; empty takes the last scenes of ``data``, at most
                 half of it.
             training: training scenes, drawn at random.
-            seed: of the grammar and of the draw.
+            seed: seed of the grammar and of the draw.
 
         Raises:
             InvalidInputError: no folder, scenes of another type, fewer than four held-out scenes, numbers below 1.

@@ -46,8 +46,8 @@ def render_classifier_accuracy(
         real: real scenes; the two batches should share none.
         fake: samples of the same scene type. The larger batch is subsampled to the size of the smaller one.
         seeds: repetitions with other splits and weights.
-        seed: of the first repetition.
-        width: of the renders, pixels, at least 16.
+        seed: seed of the first repetition.
+        width: width of the renders in pixels, at least 16.
         height: likewise.
         config: sizes of the parts, and how the classifier is trained.
 

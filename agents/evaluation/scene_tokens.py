@@ -97,7 +97,7 @@ def blurred(
         batch: the scenes.
         translation: standard deviation per axis, m; a number, or a tensor that broadcasts to (B, N, 3).
         rotation: standard deviation of the rotation vector per axis, rad; likewise.
-        generator: of the noise.
+        generator: random generator of the noise.
     """
     shape = batch.translations.shape
     shift = translation * torch.randn(shape, generator=generator)

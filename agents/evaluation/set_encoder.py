@@ -37,7 +37,7 @@ class SetEncoder(nn.Module):
 
     Args:
         vocabulary: asset names known by name.
-        config: of the network; None takes the size of the shipped one.
+        config: sizes of the network; None takes those of the shipped one.
 
     >>> encoder = SetEncoder(("cafe_table", "teacup")).eval()
     >>> encoder.features(SceneBatch.empty("dimsum_table", 2)).shape
@@ -90,8 +90,8 @@ class SetEncoder(nn.Module):
         """Write weights (float16; mean and whitening float32), vocabulary and size to one ``.safetensors`` file.
 
         Args:
-            path: of the file.
-            note: how the encoder was made, kept in the file.
+            path: file to write.
+            note: a sentence on how the encoder was trained, kept in the file.
         """
         weights = {name: value.detach().contiguous() for name, value in self.state_dict().items()}
         weights = {name: value.half() if name.startswith("network.") else value for name, value in weights.items()}
@@ -104,7 +104,7 @@ class SetEncoder(nn.Module):
 
         Raises:
             InvalidInputError: no such file.
-            CorruptFileError: not a file written by :meth:`save`.
+            CorruptFileError: the file was not written by :meth:`save`.
         """
         return _load(str(SHIPPED if path is None else Path(path).resolve()))
 

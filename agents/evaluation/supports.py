@@ -37,7 +37,7 @@ class Container:
 
     Attributes:
         names: the hollow assets.
-        riders: what may lie in them.
+        riders: objects that may lie in them.
         reach: largest horizontal distance (m) between the frames.
         depth: largest height (m) of the rider's frame above the container's; the smallest is 1 cm.
 

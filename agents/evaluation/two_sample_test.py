@@ -24,7 +24,7 @@ class Accuracy:
     """Accuracy of a classifier that tells real scenes from samples; 0.5 is chance, 1 is always right.
 
     Attributes:
-        mean: over the seeds.
+        mean: mean over the seeds.
         std: population standard deviation over the seeds.
         per_seed: the accuracy of each seed on its held-out scenes.
 
@@ -56,7 +56,7 @@ class ClassifierConfig:
         patience: epochs without a better validation loss after which training stops.
         batch_size: scenes per step.
         learning_rate: largest rate of the one-cycle schedule of AdamW.
-        weight_decay: of AdamW.
+        weight_decay: weight decay of AdamW.
     """
 
     train_fraction: float = 0.5
@@ -124,7 +124,7 @@ def two_sample_accuracy(
         fake: number of samples.
         prepare: makes the classifier of a split.
         seeds: number of repetitions, each with a split, weights and order of its own.
-        seed: of the first repetition.
+        seed: seed of the first repetition.
         config: the protocol.
     """
     check_classes(real, fake, seeds)

@@ -54,7 +54,7 @@ class PlanResult:
 
     Attributes:
         best_state: the state with the highest objective.
-        best_value: its objective.
+        best_value: objective of the best scene.
         best_path: the actions that lead to it from the root.
         values: objective of every expansion in the order they were made; NaN where it failed.
         tree: the search tree, for planners that keep one.
@@ -89,7 +89,7 @@ class Candidate:
 
     Attributes:
         state: the problem's own immutable state.
-        value: its objective, in [0, 1]; NaN where it could not be scored.
+        value: objective of the state, in [0, 1]; NaN if it could not be scored.
         path: the actions that lead to it from the root.
     """
 
@@ -199,7 +199,7 @@ class Steered:
     Args:
         problem: the problem that is searched.
         planner: name of the planner that steers.
-        steering: as ``expand_batch`` takes it; may change between expansions.
+        steering: the argument of ``expand_batch``; may change between expansions.
 
     Raises:
         InvalidInputError: the expansions of ``problem`` cannot be steered.

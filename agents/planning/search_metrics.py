@@ -38,7 +38,7 @@ def search_metrics(
         searches: all plans.
         best_of: the baseline; None without one.
         firsts: the best of the first samples of each search, or the scene it started from; by the seed of the search.
-        seconds: of the search and of the baseline.
+        seconds: duration of the search and the baseline.
         stopped: why the run ended early; empty if it did not.
         spent: scenes generated.
         from_scenes: whether the searches started from given scenes.

@@ -52,7 +52,7 @@ class SearchOutcome:
         first: the best of the first ``branching`` samples of the best search, or the scene it started from; a batch of
             one.
         best: the best scene of each of ``searches``.
-        metrics: what ``metrics.json`` holds.
+        metrics: contents of ``metrics.json``.
     """
 
     search: PlanResult
@@ -87,7 +87,7 @@ def run_search(
         prior: a prior, or the name or path of one.
         objective: any reward: name, mapping, function or object.
         config: the settings; or give its fields as keywords.
-        scenes: what the searches start from, of the prior's scene type; None for fresh samples.
+        scenes: scenes of the prior's type from which the searches start; None for fresh samples.
         output: folder for ``curve.png``, ``before.png``, ``after.png``, ``best.safetensors``, ``metrics.json``,
             ``tree.json``, ``tree.html``, the journals, and ``config.yaml``, in which functions and objects are left
             out; None writes nothing.

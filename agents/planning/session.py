@@ -90,7 +90,7 @@ class Session:
     Args:
         problem: the environment.
         max_seconds: time after which nothing more is expanded, except the first round; None for no limit.
-        journal: of the rounds; None keeps none.
+        journal: record of the rounds; None keeps none.
 
     Attributes:
         stopped: ``"time"``, ``"interrupt"`` or ``"terminated"`` (SIGTERM); empty when the plans came to their end.

@@ -35,8 +35,8 @@ class Node:
         parent: the node this one was expanded from, None at the root.
         action: the action that led here, -1 at the root.
         path: actions from the root to this node.
-        actions: its legal actions, in the order they are expanded.
-        tried: how many of them were expanded or are reserved.
+        actions: legal actions of the state, in the order of expansion.
+        tried: number of actions that were expanded or are reserved.
         children: expanded actions and their nodes.
         open_children: children below which something can be selected.
         visits: evaluations backed up through this node.

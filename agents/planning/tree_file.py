@@ -24,9 +24,9 @@ class TreeNode:
     """One scene of a search.
 
     Attributes:
-        id: its place in the list of nodes; roots first, then in the order they were made.
+        id: index in the list of nodes; roots first, then in the order of expansion.
         parent: id of the node it was inpainted from; None for a root.
-        action: which child of its parent it is; None for a root.
+        action: index among the children of its parent; None for a root.
         depth: inpaintings since the root.
         value: Φ in [0, 1]; None where the objective could not score it.
         objective: the objective's own value; None where it could not be scored.
@@ -53,7 +53,7 @@ class SearchRecord:
     Attributes:
         settings: ``planner``, ``objective``, ``objective_scale`` (objective at Φ = 1) and ``nfe_per_scene``.
         searches: one mapping per search, the best first: ``seed``, ``root`` and ``best`` (ids).
-        nodes: of all searches.
+        nodes: nodes of all searches.
 
     >>> node = TreeNode(0, None, None, 0, 0.5, 2.0, 1, 0, (1, 2))
     >>> record = SearchRecord({"planner": "greedy"}, [{"seed": 0, "root": 0, "best": 0}], [node])
@@ -79,7 +79,7 @@ class SearchRecord:
             roots: a state per search, each with a seed of its own.
             states: all states that were made, in the order they were made.
             best: path of the best state, by seed; the best search first.
-            settings: as the attribute; ``nfe_per_scene`` is needed.
+            settings: settings of the search; must contain ``nfe_per_scene``.
         """
         rows: list[dict[str, Any]] = []
         ids: dict[tuple[int, tuple[int, ...]], int] = {}

@@ -28,11 +28,11 @@ class Card:
 
     Attributes:
         node: the scene.
-        column: its depth, counted from 0 at the first samples, or at the scene that the search started from.
+        column: depth of the node; the first samples, or the scene that the search started from, have depth 0.
         row: counted from 0; a first child is in the row of its parent.
         parent: index of the parent's card; None for a first sample.
-        number: which scene of its search it is, counted from 1.
-        frame: its place in the 3-D view, which draws its picture; None without one.
+        number: number of the scene in its search, counted from 1.
+        frame: index of the scene in the 3-D view, which draws its picture; None without one.
         on_path: whether it leads to the best scene.
     """
 
@@ -80,7 +80,7 @@ def write_tree_page(
         path: the HTML file.
         record: all scenes.
         scenes: a batch of one for each id of :func:`shown_nodes`.
-        metrics: what ``metrics.json`` holds.
+        metrics: contents of ``metrics.json``.
         returned: the scene that the search returned, if it is no node: a planner may change the best scene at the end.
     """
     from jinja2.utils import htmlsafe_json_dumps

@@ -24,7 +24,7 @@ class Algorithm(ABC, Generic[Credit]):
 
     Attributes:
         policy: the reverse chain of the prior in training.
-        loss: what is minimised.
+        loss: value to minimise.
     """
 
     policy: DenoisingPolicy

@@ -67,12 +67,12 @@ def measure_prior(
         prior: the prior.
         count: scenes.
         num_steps: denoiser evaluations per scene.
-        seed: of the samples; the same seed for two priors starts both from the same noise.
+        seed: seed of the samples; the same seed for two priors starts both from the same noise.
         pool: physics workers.
         prompts: one per scene, which the samples are then compared with; None for none.
         guidance: weight of classifier-free guidance.
         claim_guidance: strength of claim guidance.
-        slots: per sample; None means as trained.
+        slots: slots per sample; None takes those of training.
         reward: reward that the run trains with, as :func:`rewards.isolation.run_reward` gives it; None measures none.
     """
     from agents.post_training.guard import realism
@@ -139,7 +139,7 @@ def draw_gallery(batch: SceneBatch, path: Path, is_ready: Tensor | None = None) 
 
     Args:
         batch: the scenes.
-        path: where the picture goes.
+        path: image file to write.
         is_ready: (B, N) bool; if given, captions count these objects, and the other free objects are red.
     """
     images, captions = _drawn(batch, is_ready, _GALLERY)
@@ -151,7 +151,7 @@ def draw_side_by_side(measured: Mapping[str, Measured], path: Path, *, ready: bo
 
     Args:
         measured: samples of each prior from the same noise, by the name in the captions; three fit the page.
-        path: where the picture goes.
+        path: image file to write.
         ready: show the scenes after projection and settling; objects that are not simulation-ready are red.
     """
     drawn = [

@@ -38,7 +38,7 @@ class Discriminator:
     value.
 
     Args:
-        learning_rate: of AdamW.
+        learning_rate: learning rate of AdamW.
         steps: optimiser steps of an iteration.
         batch_size: real scenes, and samples, of a step.
         memory: latest samples that steps draw from.
@@ -96,7 +96,7 @@ class Discriminator:
 
         Args:
             real: real scenes; the first 1,024 are kept.
-            seed: of the weights and of all draws.
+            seed: seed of the weights and of all draws.
         """
         self._model = _Model(real[:_MOST_REAL].to("cpu"), seed, self.learning_rate)
 

@@ -35,7 +35,7 @@ class StepRow:
     Attributes:
         step: index in the step table.
         timestep: timestep at which the step starts.
-        std: its smallest sigma over random entries, normalised units.
+        std: smallest standard deviation of the step over random entries, normalised units.
         weight: weight in the policy gradient; 0 leaves the step out.
         gradient_norm: norm of this step's policy gradient alone; 0 when the step is left out.
     """
@@ -54,17 +54,17 @@ class DoctorReport:
     Attributes:
         log_ratio: largest |log p_now - log p_sampling|; exactly 0 when sampler and loss agree.
         steps: the sigma table.
-        reward_mean: over one batch.
-        reward_std: over one batch.
-        reward_min: over one batch.
-        reward_max: over one batch.
-        valid_fraction: of the batch.
-        policy_gradient_norm: of the score-function part.
-        pretraining_gradient_norm: of the regularisation, its coefficient included.
+        reward_mean: mean reward of one batch.
+        reward_std: standard deviation of the batch's rewards.
+        reward_min: smallest reward of the batch.
+        reward_max: largest reward of the batch.
+        valid_fraction: share of scenes in the batch that were scored.
+        policy_gradient_norm: gradient norm of the score-function part.
+        pretraining_gradient_norm: gradient norm of the regularisation, its coefficient included.
         sampling_seconds: one batch of scenes with its rewards.
         update_seconds: one update.
         iterations: iterations of the run, for the estimate of its duration.
-        advice: what to change, in words; empty when all is well.
+        advice: recommended changes in words; empty if none is needed.
     """
 
     log_ratio: float

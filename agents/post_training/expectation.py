@@ -20,7 +20,7 @@ class TrainedCopy(nn.Module):
 
     Args:
         prior: prior that is copied; it is not changed.
-        learning_rate: of AdamW.
+        learning_rate: learning rate of AdamW.
     """
 
     def __init__(self, prior: ScenePrior, learning_rate: float) -> None:
@@ -61,8 +61,8 @@ class Expectation(TrainedCopy):
     covariance of target and advantage is then left, as in a policy gradient with an exact baseline.
 
     Args:
-        prior: whose denoiser is copied.
-        learning_rate: of AdamW.
+        prior: prior from which the denoiser is copied.
+        learning_rate: learning rate of AdamW.
 
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior("dimsum_table", process="mixed")

@@ -24,7 +24,7 @@ class NFTLoss(ForwardProcessLoss):
     logits in the way that o_plus and o_minus combine outputs.
 
     Args:
-        prior, sampler, expectation, generator: as in :class:`ForwardProcessLoss`.
+        prior, sampler, expectation, generator: the arguments of :class:`ForwardProcessLoss`.
         beta: strength; smaller values step further from the sampling policy.
         clip: c, the advantage at which a sample is fully good or bad.
 
@@ -79,7 +79,7 @@ class AWMLoss(ForwardProcessLoss):
     :class:`NFTLoss` divided by the beta of :class:`NFTLoss`.
 
     Args:
-        prior, sampler, expectation, generator: as in :class:`ForwardProcessLoss`.
+        prior, sampler, expectation, generator: the arguments of :class:`ForwardProcessLoss`.
         beta: strength of the pull, above 1.
         clip: c, the largest advantage.
     """
@@ -119,8 +119,8 @@ class RewardWeightedLoss(ForwardProcessLoss):
     the output, and no sample repels it. Weights are bounded by ``largest``.
 
     Args:
-        prior, sampler, generator: as in :class:`ForwardProcessLoss`.
-        temperature: of the weights.
+        prior, sampler, generator: the arguments of :class:`ForwardProcessLoss`.
+        temperature: temperature of the weights.
         largest: largest weight.
     """
 

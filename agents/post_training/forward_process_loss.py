@@ -92,7 +92,7 @@ class ForwardProcessLoss(OwnSampleLoss):
             output: o of the denoiser in training.
             old: o_old of the sampling policy, a constant.
             target: training target of the denoiser's output for this noise.
-            advantage: of each entry's slot.
+            advantage: advantage of each entry's slot.
         """
 
     @abstractmethod

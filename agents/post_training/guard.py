@@ -59,8 +59,8 @@ class Guard:
         limit: largest ratio before the run counts as over-optimised; no checkpoint beyond it is kept.
         seed: seed of the fixed timesteps and noise.
         prompts: one prompt of each held-out scene; None measures without prompts.
-        samples: how to sample and measure; None measures the loss alone.
-        limits: by name, the largest excess of a figure of samples over that of the base prior.
+        samples: settings for sampling and measuring; None measures the loss alone.
+        limits: largest excess of each figure of samples over that of the base prior, by name.
         target: largest ratio of a checkpoint that is kept, if the run holds the ratio.
         learns: whether the reward learns during the run.
 
@@ -147,7 +147,7 @@ class Guard:
         """Measure ``prior``; the reading says whether it is the best so far.
 
         Args:
-            prior: with the weights that are evaluated and saved.
+            prior: prior with the weights that are evaluated and saved.
             iteration: number of the finished iteration.
             reward: mean over the batches since the check before.
             realism: further figures, kept with the reading.

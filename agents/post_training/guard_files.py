@@ -47,7 +47,7 @@ class GuardFiles:
     """Files of the guard in a run's folder; only the first process writes.
 
     Args:
-        config: of the run.
+        config: configuration of the run.
         base: name of the base prior; empty for a prior that was not loaded by name.
     """
 

@@ -27,7 +27,7 @@ class LearnedRewards:
 
     Args:
         reward: resolved reward of the run.
-        config: of the run.
+        config: configuration of the run.
     """
 
     def __init__(self, reward: Any, config: PostTrainConfig) -> None:
@@ -55,7 +55,7 @@ class LearnedRewards:
 
         Args:
             prior: the base prior.
-            slots: per sample.
+            slots: slots per sample.
             prompts: one for each of the ``FIRST_SAMPLES``; None without prompts.
         """
         samples = ProcessGroup.current().from_first(

@@ -81,7 +81,7 @@ class Regularisation:
         Args:
             prior: prior in training.
             real: real scenes of all processes.
-            base: as many samples of the base prior; None for any loss but the discriminative one.
+            base: an equal number of samples of the base prior; None for any loss but the discriminative one.
             generator: source of timesteps and noise (CPU).
             chunk: scenes per pass.
         """

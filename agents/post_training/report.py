@@ -31,7 +31,7 @@ class Tile:
     Attributes:
         label: name of the number.
         value: the number as text.
-        note: what the number is compared with.
+        note: the value that the number is compared with.
     """
 
     label: str
@@ -62,7 +62,7 @@ class Page:
 
     Attributes:
         title: heading of the page.
-        lead: what was done, in a sentence or two.
+        lead: a sentence or two on the run.
         tiles: headline numbers.
         sections: sections of the page, in order.
         settings: settings of the run, shown folded at the end.

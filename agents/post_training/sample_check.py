@@ -26,11 +26,11 @@ class SampleCheck:
 
     Attributes:
         real: real scenes that training never sees.
-        scorer: of the run's reward.
+        scorer: scorer of the run's reward.
         count: number of samples.
         num_steps: denoising steps per sample.
-        seed: of the noise.
-        slots: per sample.
+        seed: seed of the noise.
+        slots: slots per sample.
         prompts: one per sample; None without prompts.
         guidance: weight of classifier-free guidance.
         claim_guidance: strength of claim guidance.

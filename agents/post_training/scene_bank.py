@@ -108,7 +108,7 @@ class SceneBank:
             count: number of scenes; None for all.
             slots: largest number of objects that a prompt may ask for; ``""`` stands for a prompt that asks for more.
                 None allows any number.
-            scene_type: of the scenes; only needed with ``slots``.
+            scene_type: scene type of the scenes; only needed with ``slots``.
         """
         if self.prompts is None:
             return None
@@ -132,11 +132,11 @@ def kept_scenes(
     """The real scenes of a run, kept in its folder with the prompts of a dataset; the first process draws them.
 
     Args:
-        directory: of the run.
-        prior, seed, slots: as for :func:`real_scenes`.
+        directory: folder of the run.
+        prior, seed, slots: the arguments of :func:`real_scenes`.
         settings: source and number of the scenes.
         reuse: load the scenes that are already in the folder, as a resumed run does.
-        progress: how the drawing is shown, a style of :class:`~scene_envs.progress.Progress`.
+        progress: a style of :class:`~scene_envs.progress.Progress`.
     """
     path, texts, processes = directory / SCENES_NAME, directory / PROMPTS_NAME, ProcessGroup.current()
     if processes.is_first and not (reuse and path.exists()):
@@ -156,8 +156,8 @@ def kept_replay(
     """(R, N, D) normalised scenes that ``settings.replay`` names, kept in the run's folder; None without a replay.
 
     Args:
-        directory: of the run.
-        prior: whose scene type the scenes must have.
+        directory: folder of the run.
+        prior: prior of the scene type that the scenes must have.
         settings: settings that name the scenes.
         slots: slots of the real scenes; the replayed scenes get empty slots up to this number.
         reuse: load the scenes that are already in the folder, as a resumed run does.
@@ -193,13 +193,13 @@ def real_scenes(
     """``count`` real scenes of the prior's scene type, and the prompts of each if they have any.
 
     Args:
-        prior: whose scene type is wanted.
+        prior: prior of the wanted scene type.
         source: ``"grammar"``, or the directory of a dataset.
         count: number of scenes; a smaller dataset gives all it has.
-        seed: of the grammar, or of the choice of rows.
+        seed: seed of the grammar, or of the choice of rows.
         slots: smallest number of slots per scene; None takes as many as the prior was trained on. Real scenes keep all
             their slots, because a prior reads any number of slots.
-        progress: how the drawing is shown, a style of :class:`~scene_envs.progress.Progress`.
+        progress: a style of :class:`~scene_envs.progress.Progress`.
     """
     slots = max(prior.scene_type.slots, prior.config.slots if slots is None else slots)
     if source == "grammar":

@@ -52,9 +52,9 @@ class PostTrainResult:
     Attributes:
         prior: the best prior within the guard's limit; on disk in ``directory / "prior"``.
         history: one row per iteration.
-        metrics: what ``metrics.json`` holds.
+        metrics: contents of ``metrics.json``.
         directory: the run directory.
-        config: what was run; on disk in ``config.yaml``.
+        config: configuration of the run, also in ``config.yaml``.
     """
 
     prior: ScenePrior

@@ -48,7 +48,7 @@ def build_prior(
     Args:
         config: the run.
         raw: (M, N, D) scenes.
-        normalizer: of raw scenes.
+        normalizer: normaliser of raw scenes.
         prompts: prompts of every scene, from which a prior that reads them takes its vocabulary.
     """
     if config.prior:

@@ -23,7 +23,7 @@ class TrainingLog:
     """Log of a run; each row is written when it comes.
 
     Args:
-        directory: where ``log.csv`` goes.
+        directory: folder of ``log.csv``.
         also: the logger that gets the same rows, as :func:`agents.utils.loggers.make_logger` makes it.
     """
 

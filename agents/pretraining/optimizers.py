@@ -40,7 +40,7 @@ def build_optimizer(
 
     Args:
         name: ``"adamw"``, or ``"muon"`` for Muon on the matrices inside ``blocks`` and AdamW on the rest.
-        network: what is trained.
+        network: network to train.
         weight_decay: decoupled weight decay.
         text_rate: ``rate`` of the parameters under ``text_encoder``. At first, only a few percent of the loss depend on
             prompts. With steps as long as elsewhere, all words become alike before the network reads any of them.

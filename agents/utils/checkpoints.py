@@ -76,7 +76,7 @@ def check_tensors(module: nn.Module, tensors: Mapping[str, Tensor], path: str | 
 
     Args:
         module: the module to restore.
-        tensors: its state dict in the checkpoint.
+        tensors: state dict of the module in the checkpoint.
         path: the checkpoint, for the message.
 
     Raises:

@@ -35,7 +35,7 @@ class ProcessGroup:
 
     Attributes:
         rank: number of this process.
-        size: how many there are; 1 without a launcher.
+        size: number of processes; 1 without a launcher.
 
     >>> group = ProcessGroup(rank=1, size=2)
     >>> group.rows(6), group.is_first
@@ -50,7 +50,7 @@ class ProcessGroup:
         """The group that the launcher set up, joined on first use; without a launcher, this process alone.
 
         Args:
-            device: of the training; each process of ``"cuda"`` takes a GPU of its own.
+            device: training device; each process of ``"cuda"`` takes a GPU of its own.
             patience: seconds that a process waits for the others.
 
         Raises:

@@ -16,7 +16,7 @@ class WeightAverage:
     """Exponential moving average of a module's parameters.
 
     Args:
-        module: whose parameters are averaged.
+        module: module to average.
         decay: final decay.
         warm_up: updates after which the decay is one half, if the final decay is not reached before; 0 for the final
             decay from the first update on.
@@ -66,8 +66,8 @@ class AveragedWeights(Generic[Module]):
     """Context in which a module holds its averaged weights; at the end it gets its own weights back.
 
     Args:
-        module: whose parameters are exchanged.
-        average: of its parameters; None leaves them as they are.
+        module: module that takes part in the exchange.
+        average: average of the parameters; None leaves the module unchanged.
     """
 
     def __init__(self, module: Module, average: WeightAverage | None) -> None:
