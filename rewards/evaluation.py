@@ -26,8 +26,8 @@ from scene_envs.scene import SceneBatch
 logger = logging.getLogger(__name__)
 
 _warned: set[tuple[int, str]] = set()
-_MOST_WARNINGS = 256
-_MOST_TEXT = 300
+_MAX_WARNINGS = 256
+_MAX_TEXT = 300
 """Characters of a foreign error that a message repeats."""
 
 
@@ -119,7 +119,7 @@ def _text(error: BaseException) -> str:
         text = str(error)
     except BaseException:
         return "(its text cannot be read)"
-    return text if len(text) <= _MOST_TEXT else f"{text[:_MOST_TEXT]}... ({len(text)} characters)"
+    return text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}... ({len(text)} characters)"
 
 
 def _place(trace: TracebackType | None) -> str:
@@ -194,7 +194,7 @@ def _named(name: str, field: str, tensors: Any) -> Mapping[str, Any]:
 def _failed(reward: Any, batch: SceneBatch, problem: str) -> RewardOutput:
     key = (id(reward), problem)
     if key not in _warned:
-        if len(_warned) >= _MOST_WARNINGS:
+        if len(_warned) >= _MAX_WARNINGS:
             _warned.clear()
         _warned.add(key)
         logger.warning("%s. All %d scenes of this batch count as invalid.", problem.rstrip("."), len(batch))

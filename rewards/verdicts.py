@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from scene_envs.assets import Asset
     from scene_envs.physics import FeasibilityResult, PhysicsPool
 
-_MOST = 4096
+_MAX_VERDICTS = 4096
 """Scenes whose verdicts are kept, the latest ones."""
 
 _Verdict = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -52,7 +52,7 @@ def verdicts(batch: SceneBatch, limits: dict[str, float], pool: PhysicsPool | No
         if valid:
             _known[key] = verdict
             _known.move_to_end(key)
-    while len(_known) > _MOST:
+    while len(_known) > _MAX_VERDICTS:
         _known.popitem(last=False)
     feasible, depth, displacement, rotation = (
         torch.stack([verdict[column] for _, verdict in judged]) for column in range(4)

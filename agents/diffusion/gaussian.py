@@ -94,8 +94,7 @@ class GaussianProcess:
         return (x_t - alpha * mean) / (alpha**2 * std**2 + sigma**2).sqrt()
 
     def x0_from_output(self, x_t: Tensor, t: Tensor, output: Tensor, moments: Moments | None = None) -> Tensor:
-        """The denoised scene x_0 that a network output stands for.
-
+        """The denoised scene x_0 that follows from a network output.
         ``edm``: skip and output scaling of Karras et al. (2022), Table 1, in variance-preserving
         coordinates and with per-feature moments; ``epsilon``: predicted noise; ``v``: Salimans and Ho (2022).
 
@@ -133,7 +132,7 @@ class GaussianProcess:
     # -- reverse --------------------------------------------------------------------------------
 
     def check_stride(self, t: int, previous: int) -> None:
-        """Raise InvalidInputError where t -> s is not a stride down within 0..T."""
+        """Raise InvalidInputError unless 0 <= s < t <= T."""
         if not 0 <= previous < t <= self.schedule.num_timesteps:
             raise InvalidInputError(
                 f"the step {t} -> {previous} is not a stride down within 0..{self.schedule.num_timesteps}, "

@@ -51,10 +51,9 @@ def gaussian_log_prob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
     """Log-density of independent normals, summed over features; entries with std 0 are left out.
 
     Args:
-        x: (B, N, D) where it is evaluated.
-        mean: (B, N, D).
-        std: (N, D) or (B, N, D), not negative. An entry with std 0 is certain: it carries no probability and no
-            gradient.
+        x: (B, N, D) values at which the density is evaluated.
+        mean: (B, N, D) means.
+        std: (N, D) or (B, N, D) standard deviations. An entry with std 0 is certain and has no density or gradient.
 
     Returns:
         (B, N) nats, one sum per slot.
@@ -74,8 +73,8 @@ class GaussianStep(NamedTuple):
     """Independent normals.
 
     Attributes:
-        mean: (B, N, D).
-        std: (N, D), or (B, N, D); 0 marks a certain entry.
+        mean: (B, N, D) means.
+        std: (N, D) or (B, N, D) standard deviations; 0 marks a certain entry.
         denoised: (B, N, D) the denoiser's estimate of x_0, where it is known.
 
     >>> step = GaussianStep(torch.zeros(1, 1, 2), torch.tensor([[1.0, 0.0]]))
@@ -117,13 +116,13 @@ class GaussianStep(NamedTuple):
 class MixedStep(NamedTuple):
     """Normal poses and a categorical state per slot, independent given x_t and which slots are unmasked.
 
-    A state stands in the last K features of a slot as a one-hot vector; the mask token is all zeros.
+    The last K features of a slot are the one-hot vector of its state; the mask token is all zeros.
 
     Attributes:
-        mean: (B, N, P) of the pose.
-        pose_std: (N, P), or (B, N, P); 0 marks a certain entry.
-        probs: (B, N, K + 1) of the state, the mask token last.
-        random: (N,) bool, or (B, N), slots whose state is drawn; in the others the likeliest one is taken.
+        mean: (B, N, P) means of the pose.
+        pose_std: (N, P) or (B, N, P) standard deviations of the pose; 0 marks a certain entry.
+        probs: (B, N, K + 1) probabilities of the state, the mask token last.
+        random: (N,) or (B, N) bool, slots whose state is drawn; the other slots take the likeliest state.
         masked: (B, N) bool, masked slots that are unmasked together, so that their number is near the expected one
             (:mod:`agents.diffusion.unmasking`); None unmasks each slot independently.
         denoised: (B, N, P + K) the denoiser's estimate of x_0, categories by arg-max, where it is known.
@@ -156,9 +155,9 @@ class MixedStep(NamedTuple):
         """The step in which some slots are certain to be as in ``x`` (B, N, P + K).
 
         Args:
-            pose: (B, N) bool, where the pose is certain.
-            category: (B, N) bool, where the state is certain.
-            x: scenes.
+            pose: (B, N) bool, slots with a certain pose.
+            category: (B, N) bool, slots with a certain state.
+            x: scenes that give the certain values.
         """
         width = self.mean.shape[-1]
         certain = F.one_hot(state_of(x[..., width:]), self.probs.shape[-1]).to(self.probs)
@@ -246,7 +245,7 @@ def _shifted(mean: Tensor, shift: Tensor) -> Tensor:
 
 
 def _invert(cumulative: Tensor, uniform: Tensor) -> Tensor:
-    """(...) int64: where ``uniform`` (...) falls among the running sums (..., S) of weights."""
+    """(...) int64: index of the running sum (..., S) of weights in which ``uniform`` (...) falls."""
     below = cumulative < uniform.unsqueeze(-1) * cumulative[..., -1:]
     return below.sum(dim=-1).clamp(max=cumulative.shape[-1] - 1)
 

@@ -13,7 +13,7 @@ LOSS_WEIGHTINGS = ("none", "min_snr")
 """Weightings of the squared error by timestep; see :func:`loss_weights`."""
 
 MIN_SNR_GAMMA = 5.0
-"""Gamma of Hang et al. (2023), section 3.4: the signal-to-noise ratio at which the weight is cut."""
+"""Gamma of Hang et al. (2023), section 3.4: the largest signal-to-noise ratio in the weight."""
 
 
 def check_weighting(kind: str, prediction: str) -> None:

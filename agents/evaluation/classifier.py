@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from agents.evaluation.scene_tokens import SceneTokens, blurred, scene_tokens
 from agents.evaluation.set_network import SetNetwork
 from agents.evaluation.two_sample_test import (
-    FEWEST,
+    MIN_SCENES,
     Accuracy,
     ClassifierConfig,
     Forward,
@@ -26,7 +26,7 @@ from scene_envs.scene_distance import check_same_assets
 RESOLUTION = (1e-3, 1e-2)
 """Standard deviation (m, rad) of the noise that is added to both classes: the most that a feasible object may move."""
 
-MOST_OBJECTS = 50_000
+MAX_OBJECTS = 50_000
 """Most objects to train on, both classes together. Scenes of many objects cost more each, and fewer are needed."""
 
 
@@ -84,12 +84,12 @@ def classifier_accuracy(
 
         return network, forward
 
-    config = _affordable(config or ClassifierConfig(), tokens)
+    config = _with_fewer_scenes(config or ClassifierConfig(), tokens)
     return two_sample_accuracy(len(real), len(fake), prepare, seeds=seeds, seed=seed, config=config)
 
 
-def _affordable(config: ClassifierConfig, tokens: SceneTokens) -> ClassifierConfig:
-    """``config`` with ``most_train`` lowered so that the training scenes hold about ``MOST_OBJECTS`` at most."""
+def _with_fewer_scenes(config: ClassifierConfig, tokens: SceneTokens) -> ClassifierConfig:
+    """``config`` with ``max_train`` lowered so that the training scenes hold about ``MAX_OBJECTS`` at most."""
     per_scene = float(tokens.present.sum()) / len(tokens)
-    most = max(FEWEST, int(0.5 * MOST_OBJECTS / max(per_scene, 1.0)))
-    return replace(config, most_train=min(config.most_train, most))
+    most = max(MIN_SCENES, int(0.5 * MAX_OBJECTS / max(per_scene, 1.0)))
+    return replace(config, max_train=min(config.max_train, most))

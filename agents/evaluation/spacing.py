@@ -13,9 +13,9 @@ from scene_envs.scene_distance import check_same_assets
 
 SAME_HEIGHT = 0.02
 """Objects whose frames differ less in height (m) stand side by side."""
-FARTHEST = 0.5
+MAX_DISTANCE = 0.5
 """Larger distances (m) count as this one, so that places on other tables of a room do not outweigh neighbours."""
-FEWEST = 30
+MIN_DISTANCES = 30
 """Fewest distances of a pair of assets, in each of the two batches; rarer pairs are left out."""
 
 _CHUNK = 128
@@ -46,7 +46,7 @@ def spacing_wasserstein(batch: SceneBatch, reference: SceneBatch) -> float | Non
 
     check_same_assets(batch, reference)
     samples, real = _distances(batch), _distances(reference)
-    pairs = [pair for pair in real if min(len(real[pair]), len(samples.get(pair, ()))) >= FEWEST]
+    pairs = [pair for pair in real if min(len(real[pair]), len(samples.get(pair, ()))) >= MIN_DISTANCES]
     if not pairs:
         return None
     distances = [float(wasserstein_distance(samples[pair], real[pair])) for pair in pairs]
@@ -67,6 +67,6 @@ def _distances(batch: SceneBatch) -> Mapping[tuple[int, int], np.ndarray[tuple[i
             nearest = distance.masked_fill((categories != other)[:, None], torch.inf).amin(dim=-1)  # (B, N)
             there = nearest.isfinite()
             for asset in categories[there].unique().tolist():
-                values = nearest[there & (categories == asset)].clamp(max=FARTHEST)
+                values = nearest[there & (categories == asset)].clamp(max=MAX_DISTANCE)
                 found[asset, other].append(values.numpy())
     return {pair: np.concatenate(parts) for pair, parts in found.items()}

@@ -12,10 +12,10 @@ from torch.nn import functional as F
 
 from scene_envs.errors import InvalidInputError
 
-FEWEST = 20
+MIN_SCENES = 20
 """Fewest scenes of each class with which a classifier is trained."""
 
-_SURE = 5e-3
+_STOP_LOSS = 5e-3
 """Validation loss (nats) below which training stops: the classes are told apart."""
 
 
@@ -50,8 +50,8 @@ class ClassifierConfig:
     Attributes:
         train_fraction: share of the scenes of each class to train on.
         validation_fraction: share that decides when to stop; the rest is held out.
-        most_train: most scenes of each class to train on.
-        most_validation: most scenes of each class to decide on.
+        max_train: most scenes of each class to train on.
+        max_validation: most scenes of each class to decide on.
         epochs: most passes over the training part.
         patience: epochs without a better validation loss after which training stops.
         batch_size: scenes per step.
@@ -61,8 +61,8 @@ class ClassifierConfig:
 
     train_fraction: float = 0.5
     validation_fraction: float = 0.15
-    most_train: int = 1000
-    most_validation: int = 250
+    max_train: int = 1000
+    max_validation: int = 250
     epochs: int = 8
     patience: int = 3
     batch_size: int = 64
@@ -80,7 +80,7 @@ class ClassifierConfig:
                 f"train_fraction={self.train_fraction} and validation_fraction={self.validation_fraction} "
                 "leave nothing to hold out; their sum must be below 1"
             )
-        for name in ("most_train", "most_validation", "epochs", "patience", "batch_size"):
+        for name in ("max_train", "max_validation", "epochs", "patience", "batch_size"):
             if getattr(self, name) < 1:
                 raise InvalidInputError(f"{name} must be at least 1, got {getattr(self, name)}")
 
@@ -103,9 +103,9 @@ Prepare = Callable[[Split], tuple[nn.Module, Forward]]
 
 def check_classes(real: int, fake: int, seeds: int) -> None:
     """Raise InvalidInputError unless there are enough scenes of each class, and seeds."""
-    if min(real, fake) < FEWEST:
+    if min(real, fake) < MIN_SCENES:
         raise InvalidInputError(
-            f"a classifier needs at least {FEWEST} real scenes and samples each, got {real} and {fake}"
+            f"a classifier needs at least {MIN_SCENES} real scenes and samples each, got {real} and {fake}"
         )
     if seeds < 1:
         raise InvalidInputError(f"seeds must be at least 1, got {seeds}")
@@ -144,8 +144,8 @@ def two_sample_accuracy(
 def _split(real: int, fake: int, config: ClassifierConfig) -> Split:
     count = min(real, fake)
     rows = [torch.randperm(real)[:count], real + torch.randperm(fake)[:count]]
-    train = min(round(config.train_fraction * count), config.most_train)
-    end = train + max(1, min(round(config.validation_fraction * count), config.most_validation))
+    train = min(round(config.train_fraction * count), config.max_train)
+    end = train + max(1, min(round(config.validation_fraction * count), config.max_validation))
     parts = (slice(train), slice(train, end), slice(end, None))
     return Split(*(torch.cat([of_class[part] for of_class in rows]) for part in parts))
 
@@ -171,7 +171,7 @@ def _train(network: nn.Module, forward: Forward, labels: Tensor, split: Split, c
         if value < best:
             best, since = value, 0
             best_state = {name: tensor.clone() for name, tensor in network.state_dict().items()}
-        if since >= config.patience or value < _SURE:
+        if since >= config.patience or value < _STOP_LOSS:
             break
     network.load_state_dict(best_state)
 

@@ -1,4 +1,4 @@
-"""Recorder of half-denoised scenes at chosen steps of the denoising, the stops."""
+"""Recorder of half-denoised scenes at given steps of the denoising, the stops."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Branches:
     Args:
         stops: shares of the denoising steps, increasing, each in (0, 1).
         begin: index of the stop at which the scenes begin; -1 for noise.
-        x: (B, N, D) the scenes at that stop; None for noise.
-        values: Φ (B,) of scenes.
+        x: (B, N, D) scenes at that stop; None for noise.
+        values: function from scenes to their values Φ (B,).
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Ledger of a plan: its expansions, its remaining budget and its best state so far."""
+"""The budget of a search and its best state so far, and the protocol of the trees that planners search."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ Progress = Callable[[int, float], None]
 
 
 class SearchStoppedError(SceneEnvsError):
-    """A search environment expands nothing more: the time is over, or the user interrupted.
+    """Raised when a search must end, because of its time limit or an interrupt.
 
-    Planners built on a :class:`Ledger` return their best state. If another planner does not catch this error, the run
-    that started the planner keeps the best state that it saw.
+    Planners built on a :class:`SearchBudget` return their best state. If another planner does not catch this error, the
+    run that started the planner keeps the best state that it saw.
     """
 
 
@@ -55,10 +55,10 @@ class PlanResult:
     Attributes:
         best_state: the state with the highest objective.
         best_value: objective of the best scene.
-        best_path: the actions that lead to it from the root.
-        values: objective of every expansion in the order they were made; NaN where it failed.
-        tree: the search tree, for planners that keep one.
-        start: objective of the root where it may be the best scene; NaN otherwise.
+        best_path: actions from the root to the best state.
+        values: objective of every expansion, in order; NaN for a failed one.
+        tree: search tree; None for planners without one.
+        start: objective of the root if it may be the best scene; NaN otherwise.
     """
 
     best_state: Any
@@ -90,7 +90,7 @@ class Candidate:
     Attributes:
         state: the problem's own immutable state.
         value: objective of the state, in [0, 1]; NaN if it could not be scored.
-        path: the actions that lead to it from the root.
+        path: actions from the root to the state.
     """
 
     state: Any
@@ -99,7 +99,7 @@ class Candidate:
 
     @property
     def valid(self) -> bool:
-        """Whether it has a value."""
+        """Whether the state has a value."""
         return math.isfinite(self.value)
 
     @property
@@ -109,7 +109,7 @@ class Candidate:
 
 
 Member = tuple[Candidate, Sequence[int]]
-"""A candidate and the actions it has left."""
+"""A candidate and its remaining actions."""
 
 
 def best_different(pool: Sequence[Member], count: int) -> list[Member]:
@@ -123,16 +123,15 @@ def best_different(pool: Sequence[Member], count: int) -> list[Member]:
     return kept
 
 
-class Ledger:
-    """Common part of the planners: spends a budget of expansions on a problem and records the results.
-
+class SearchBudget:
+    """Budget of expansions of a planner, and a record of their results.
     :attr:`left` is 0 when the budget is spent, when a state of value 1 (the largest value) was found, or when the
     problem stops the search.
 
     Args:
-        problem: the problem that is searched.
-        budget: number of expansions.
-        progress: called after every round.
+        problem: problem to search.
+        budget: largest number of expansions.
+        progress: function to call after every round.
 
     Raises:
         InvalidInputError: the budget is below 1.
@@ -151,7 +150,7 @@ class Ledger:
 
     @property
     def left(self) -> int:
-        """Expansions that may still be made."""
+        """Number of expansions that may still be made."""
         return 0 if self._stopped or self.best.value >= 1.0 else self.budget - len(self.values)
 
     def generator(self, seed: int) -> np.random.Generator:
@@ -159,7 +158,7 @@ class Ledger:
         return np.random.default_rng([seed, getattr(self.root.state, "seed", 0)])
 
     def actions(self, candidate: Candidate) -> Sequence[int]:
-        """Legal actions of a candidate."""
+        """Legal actions of ``candidate``."""
         return self.problem.legal_actions(candidate.state)
 
     def expand(self, pairs: Sequence[tuple[Candidate, int]]) -> list[Candidate]:
@@ -193,11 +192,10 @@ class Ledger:
         return PlanResult(self.best.state, self.best.value, self.best.path, self.values, tree, self.root.value)
 
 
-class Steered:
-    """A problem whose expansions are steered.
-
+class SteeredProblem:
+    """A search problem with steered expansions.
     Args:
-        problem: the problem that is searched.
+        problem: problem to search.
         planner: name of the planner that steers.
         steering: the argument of ``expand_batch``; may change between expansions.
 

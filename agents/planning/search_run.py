@@ -48,7 +48,7 @@ class SearchOutcome:
         searches: the plans of all ``count`` searches that found a scene. The best is first; if the searches started
             from scenes, the plans are in the order of these scenes. With more than ``side_by_side`` searches, the plans
             have no trees.
-        best_of: best of as many independent samples, the baseline at equal NFE; None without one.
+        best_of: plan of the baseline, the best of independent samples at equal NFE; None without one.
         first: the best of the first ``branching`` samples of the best search, or the scene it started from; a batch of
             one.
         best: the best scene of each of ``searches``.
@@ -73,25 +73,24 @@ def run_search(
     progress: Progress | None = None,
     **settings: Any,
 ) -> SearchOutcome:
-    """Search for scenes that score high, starting from nothing but the prior, or from given scenes.
-
+    """Search for scenes that score high, starting from samples of the prior or from given scenes.
     The root is the scene with only fixed welded objects, so its children are fresh samples. The planner then
     regenerates the objects that the objective blames (Pfaff et al. 2025, inference-time search). With ``scenes`` there
     is one search for each scene, up to ``count``. It regenerates the blamed objects of that scene, and its result
-    scores no less than the scene. The same seed and settings give the same scenes. An interrupt (Ctrl-C, SIGTERM) ends
-    the search with the best scene so far, as does ``max_seconds``. With an output folder, the same call resumes a
-    search that was killed or has ended; the budget may then be larger. If there are more than ``side_by_side``
-    searches, the folder always has the scenes of the finished ones.
+    scores no less than the scene. The same seed and settings give the same scenes. An interrupt (Ctrl-C, SIGTERM) or
+    ``max_seconds`` ends the search with the best scene so far. With an output folder, the same call resumes a search
+    that was killed or has ended; the budget may then be larger. If there are more than ``side_by_side`` searches, the
+    folder always has the scenes of the finished ones.
 
     Args:
         prior: a prior, or the name or path of one.
-        objective: any reward: name, mapping, function or object.
-        config: the settings; or give its fields as keywords.
+        objective: a reward, given as a name, mapping, function or object.
+        config: settings of the search; None makes them from the keywords.
         scenes: scenes of the prior's type from which the searches start; None for fresh samples.
         output: folder for ``curve.png``, ``before.png``, ``after.png``, ``best.safetensors``, ``metrics.json``,
             ``tree.json``, ``tree.html``, the journals, and ``config.yaml``, in which functions and objects are left
             out; None writes nothing.
-        progress: told of every round.
+        progress: function to call after every round.
         **settings: fields of :class:`SearchConfig`.
 
     Raises:
@@ -170,7 +169,7 @@ def _search(
     if not any(math.isfinite(plan.best_value) for plan in searches):
         which = f"the first {config.branching} samples of the prior" if starts is None else "the scenes of the search"
         raise SceneEnvsError(
-            f"the search was interrupted before its first {config.branching} scenes were there; call it again"
+            f"the search was interrupted before its first {config.branching} scenes were made; call it again"
             if stopped and not spent
             else f"the objective {objective!r} could not score any of {which}; the log above says why"
         )
@@ -247,7 +246,7 @@ class _Run:
         session = Session(env, max_seconds=max_seconds, journal=journal)
         title, total = name.split("_")[0], budget * (config.count or 1 if name.startswith("search") else 1)
         before = part.start * budget
-        told = None if progress is None else lambda done, best: progress(title, before + done, total, best)
+        report = None if progress is None else lambda done, best: progress(title, before + done, total, best)
         try:
             empty = SceneBatch.empty(self.prior.scene_type, 1, env.problem.slots)
             roots = []
@@ -255,7 +254,7 @@ class _Run:
                 root = empty if self.starts is None else self.starts[search : search + 1]
                 env.reset(seed=config.seed + search, options={"scene": root})
                 roots.append(env.clone_state())
-            plans = session.run(planner, roots, budget, told, root_counts=self.starts is not None)
+            plans = session.run(planner, roots, budget, report, root_counts=self.starts is not None)
             return env, session, plans
         finally:
             env.close()

@@ -32,15 +32,15 @@ class Node:
     Attributes:
         state: the problem's own immutable state.
         value: objective of this state, in [0, 1]; None for a root that was never evaluated.
-        parent: the node this one was expanded from, None at the root.
-        action: the action that led here, -1 at the root.
+        parent: node from which this one was expanded, None at the root.
+        action: action that led to this node, -1 at the root.
         path: actions from the root to this node.
         actions: legal actions of the state, in the order of expansion.
         tried: number of actions that were expanded or are reserved.
         children: expanded actions and their nodes.
         open_children: children below which something can be selected.
         visits: evaluations backed up through this node.
-        total: sum of the values backed up.
+        total: sum of the values that were backed up.
         pending: virtual visits of expansions that are selected and not yet evaluated.
     """
 
@@ -85,12 +85,12 @@ class Tree:
     """A UCT tree over opaque states. An expansion costs the comparison of the children of each node on its path.
 
     Args:
-        root: state the search starts from.
+        root: state from which the search starts.
         actions: legal actions of the root.
         exploration: weight of the UCB1 bound.
         children: number of children that a node gets before the search goes below them; None for all its actions.
         widening: progressive widening (Coulom 2007; Chaslot et al. 2008): a node of n visits may have n^widening
-            children where that is more than ``children``; 0 for no widening.
+            children if that is more than ``children``; 0 for no widening.
 
     >>> tree = Tree("root", [0, 1])
     >>> node, action = tree.select()

@@ -1,4 +1,4 @@
-"""Search tree on disk: every scene of a search with its parent, value and cost, in ``tree.json``."""
+"""Search tree in ``tree.json``: every scene of a search with its parent, value and cost."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ class TreeNode:
 
     Attributes:
         id: index in the list of nodes; roots first, then in the order of expansion.
-        parent: id of the node it was inpainted from; None for a root.
+        parent: id of the node from which it was inpainted; None for a root.
         action: index among the children of its parent; None for a root.
-        depth: inpaintings since the root.
-        value: Φ in [0, 1]; None where the objective could not score it.
-        objective: the objective's own value; None where it could not be scored.
-        visits: scored scenes at and below this node.
-        nfe: denoiser evaluations of all searches of the run up to this scene, its own included.
+        depth: number of inpaintings since the root.
+        value: Φ in [0, 1]; None if the objective could not score the scene.
+        objective: raw objective; None if the scene could not be scored.
+        visits: number of scored scenes at and below this node.
+        nfe: denoiser evaluations of all searches of the run up to and including this scene.
         mask: slots that its children regenerate.
     """
 
@@ -77,7 +77,7 @@ class SearchRecord:
 
         Args:
             roots: a state per search, each with a seed of its own.
-            states: all states that were made, in the order they were made.
+            states: all expanded states, in order.
             best: path of the best state, by seed; the best search first.
             settings: settings of the search; must contain ``nfe_per_scene``.
         """

@@ -11,7 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from agents.planning.branches import Branches
-from agents.planning.ledger import Candidate, Ledger, PlanResult, Progress, Searchable, Steered
+from agents.planning.ledger import Candidate, PlanResult, Progress, Searchable, SearchBudget, SteeredProblem
 from agents.planning.registry import PlannerSettings, check_at_least, register_planner
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
@@ -87,8 +87,8 @@ class TreeOverStepsPlanner(PlannerSettings):
         Raises:
             InvalidInputError: the expansions of ``problem`` cannot be steered.
         """
-        steered = Steered(problem, self.name)
-        ledger = Ledger(steered, budget, progress)
+        steered = SteeredProblem(problem, self.name)
+        ledger = SearchBudget(steered, budget, progress)
         state, actions, best = ledger.root, ledger.actions(ledger.root), None
         tree = _Stop(-1)
         while ledger.left and actions:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from agents.planning.ledger import Candidate, Ledger, PlanResult, Progress, Searchable
+from agents.planning.ledger import Candidate, PlanResult, Progress, Searchable, SearchBudget
 from agents.planning.registry import PlannerSettings, check_at_least, register_planner
 from agents.planning.tree import Node, Tree
 
@@ -45,7 +45,7 @@ class UCTPlanner(PlannerSettings):
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions on the tree below the problem's current state."""
-        ledger = Ledger(problem, budget, progress)
+        ledger = SearchBudget(problem, budget, progress)
         tree = Tree(ledger.root.state, ledger.actions(ledger.root), self.exploration, self.children, self.widening)
         seen = {ledger.root.fingerprint}
         while ledger.left:

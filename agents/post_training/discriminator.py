@@ -22,7 +22,7 @@ from scene_envs.scene import SceneBatch
 
 logger = logging.getLogger(__name__)
 
-_MOST_REAL = 1024
+_MAX_REAL_SCENES = 1024
 """Real scenes that are kept."""
 
 
@@ -98,7 +98,7 @@ class Discriminator:
             real: real scenes; the first 1,024 are kept.
             seed: seed of the weights and of all draws.
         """
-        self._model = _Model(real[:_MOST_REAL].to("cpu"), seed, self.learning_rate)
+        self._model = _Model(real[:_MAX_REAL_SCENES].to("cpu"), seed, self.learning_rate)
 
     def learn(self, samples: SceneBatch, steps: int | None = None) -> None:
         """Keep ``samples`` among the latest ones, and take optimiser steps.

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
     from agents.post_training.rollouts import Rollout
 
-LOUD, QUIET = 30.0, 1 / 30.0
+MAX_RATIO, MIN_RATIO = 30.0, 1 / 30.0
 """Ratios of policy to regularisation gradient norm beyond which one of the two gradients dominates."""
-DOMINANT = 0.7
+MAX_STEP_SHARE = 0.7
 """Share of the squared policy gradient beyond which one step dominates the others."""
 
 
@@ -190,13 +190,13 @@ def _advice(report: DoctorReport, config: PostTrainConfig) -> list[str]:
         )
     weight = config.regularisation.pretraining_weight
     if weight > 0 and report.policy_gradient_norm > 0:
-        if report.gradient_ratio < QUIET:
+        if report.gradient_ratio < MIN_RATIO:
             advice.append(
                 f"Regularisation drowns the policy gradient (ratio {report.gradient_ratio:.2g}): "
                 f"lower regularisation.weight from {weight:g}, or change "
                 "algorithm.log_prob_reduction."
             )
-        if report.gradient_ratio > LOUD:
+        if report.gradient_ratio > MAX_RATIO:
             advice.append(
                 f"The policy gradient drowns the regularisation (ratio {report.gradient_ratio:.2g}): "
                 f"raise regularisation.weight from {weight:g}, or expect the guard to stop you."
@@ -205,7 +205,7 @@ def _advice(report: DoctorReport, config: PostTrainConfig) -> list[str]:
         return advice
     worst = max(report.steps, key=lambda row: row.gradient_norm)
     total = sum(row.gradient_norm**2 for row in report.steps)
-    if total > 0 and worst.gradient_norm**2 > DOMINANT * total and sum(row.weight > 0 for row in report.steps) > 2:
+    if total > 0 and worst.gradient_norm**2 > MAX_STEP_SHARE * total and sum(row.weight > 0 for row in report.steps) > 2:
         advice.append(
             f"Step {worst.step} (sigma {worst.std:.3g}) alone is {worst.gradient_norm**2 / total:.0%} of the squared "
             f"policy gradient: raise algorithm.min_std or set algorithm.step_weighting=std."

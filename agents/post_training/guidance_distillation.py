@@ -25,9 +25,9 @@ from agents.utils.process_group import ProcessGroup
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import POSE_FEATURES, TRANSLATION
 
-_LEAST = 1e-4
+_MIN_STD = 1e-4
 """Least standard deviation of a denoised feature in the loss, normalised."""
-_LEAST_METRES = 1e-6
+_MIN_METRES = 1e-6
 """Least standard deviation of a denoised position, m, that moves are compared with."""
 
 
@@ -109,7 +109,7 @@ class GuidanceDistillationLoss(PlainLoss):
         levels, rows = t.unique(return_inverse=True)
         process, residual = self.prior.process, self.prior.residual
         stds = torch.stack([process.estimate(int(level), int(level) - 1, residual)[1] for level in levels])
-        return stds[:, :POSE_FEATURES].to(like).clamp(min=_LEAST)[rows][:, None]
+        return stds[:, :POSE_FEATURES].to(like).clamp(min=_MIN_STD)[rows][:, None]
 
 
 class GuidanceDistillation(AveragedSampler):
@@ -221,7 +221,7 @@ class GuidanceDistillation(AveragedSampler):
         moves = guidance(step, len(self.policy), lambda: scenes, std)
         assert moves is not None
         moves = moves.to(x) * movable[..., None]
-        far = (moves / std.to(x).clamp(min=_LEAST_METRES)).norm(dim=-1, keepdim=True)
+        far = (moves / std.to(x).clamp(min=_MIN_METRES)).norm(dim=-1, keepdim=True)
         target = denoised[..., :POSE_FEATURES].clone()
         scale = self.sampler.normalizer.scale[TRANSLATION].to(x)
         target[..., TRANSLATION] += scale * moves * (self.settings.clip / far.clamp(min=self.settings.clip))

@@ -41,7 +41,7 @@ from rewards import reward_label
 from scene_envs.errors import TrainingError
 from scene_envs.folders import claimed
 
-_MOST_ROLLBACKS = 3
+_MAX_ROLLBACKS = 3
 """Number of returns to the best checkpoint that a run may make; one more ends it."""
 
 
@@ -236,7 +236,7 @@ class PostTrainer:
     @property
     def _stopped(self) -> bool:
         if self.config.guard.action == "rollback":
-            return self.rollbacks > _MOST_ROLLBACKS
+            return self.rollbacks > _MAX_ROLLBACKS
         return self.config.guard.action == "stop" and self.guard.over_limit_at is not None
 
     def _check(self, rollout: Rollout, *, sample: bool) -> None:

@@ -57,8 +57,7 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
         content, written = content[:-_TRAILER], content[-64:].decode(errors="replace")
         if hashlib.sha256(content).hexdigest() != written:
             raise CorruptFileError(
-                f"{str(path)!r} is damaged: its contents are not what was written (checksum); delete it to start the "
-                "run anew"
+                f"{str(path)!r} is damaged (checksum of another content); delete it to start the run anew"
             )
     try:
         state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
@@ -72,21 +71,20 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def check_tensors(module: nn.Module, tensors: Mapping[str, Tensor], path: str | os.PathLike[str]) -> None:
-    """Refuse weights of a checkpoint whose names and shapes are not those of ``module``.
-
+    """Raise unless the weights of a checkpoint have the names and shapes of those of ``module``.
     Args:
         module: the module to restore.
         tensors: state dict of the module in the checkpoint.
-        path: the checkpoint, for the message.
+        path: file of the checkpoint, for the message.
 
     Raises:
-        InvalidInputError: a tensor is missing, unknown or of another shape, as in runs that an earlier version began.
+        InvalidInputError: a tensor is missing, unknown or of another shape.
     """
     wanted, found = ({name: x.shape for name, x in each.items()} for each in (module.state_dict(), tensors))
     differing = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
     if differing:
         raise InvalidInputError(
-            f"{str(path)!r} cannot be resumed: {len(differing)} of its tensors are not those of the network here, the "
-            f"first {differing[0]!r}; an earlier version of SceneEnvs or another prior began the run: go on with that "
+            f"{str(path)!r} cannot be resumed: {len(differing)} of its tensors are not those of this network, the "
+            f"first {differing[0]!r}; another prior or another version of SceneEnvs began the run: resume it with that "
             "one, or give another output to start anew"
         )

@@ -26,7 +26,7 @@ class RunLogger:
         """One row of figures after ``step`` steps or iterations."""
 
     def close(self) -> None:
-        """Write what is left; nothing is logged after it."""
+        """Write the remaining rows and end the log."""
 
 
 class TensorBoardRunLogger(RunLogger):

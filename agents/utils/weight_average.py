@@ -36,7 +36,7 @@ class WeightAverage:
 
     @torch.no_grad()
     def update(self, module: nn.Module) -> float:
-        """Move towards ``module``; returns the decay that was used."""
+        """Move the averages towards ``module``; returns the decay of this update."""
         self.updates += 1
         decay = min(self.decay, self.updates / (self.updates + self.warm_up))
         named = dict(module.named_parameters())
@@ -63,7 +63,7 @@ class WeightAverage:
 
 
 class AveragedWeights(Generic[Module]):
-    """Context in which a module holds its averaged weights; at the end it gets its own weights back.
+    """Context in which a module has its averaged weights; at the end it gets its own weights back.
 
     Args:
         module: module that takes part in the exchange.
