@@ -1,4 +1,4 @@
-"""Evaluation of rewards: every output is checked, and a failure makes scenes invalid."""
+"""Evaluation of rewards: checks of their outputs, and invalid scenes after failures."""
 
 from __future__ import annotations
 
@@ -28,20 +28,19 @@ logger = logging.getLogger(__name__)
 _warned: set[tuple[int, str]] = set()
 _MAX_WARNINGS = 256
 _MAX_TEXT = 300
-"""Characters of a foreign error that a message repeats."""
+"""Number of characters of a foreign error that a message repeats."""
 
 
 def evaluate_reward(
     reward: Any, batch: SceneBatch, context: RewardContext | None = None, *, strict: bool = False
 ) -> RewardOutput:
-    """Score ``batch`` and check what comes back against the contract.
-
+    """Score ``batch`` and check the output against the contract.
     Args:
         reward: a reward object, or a function of (batch, context); see :func:`rewards.resolve_reward` for names.
         batch: B scenes of N slots.
         context: context for the reward; an empty one by default.
-        strict: raise on failure. Otherwise a reward that raises or breaks its contract gives NaN for every scene, all
-            of them invalid, with the reason in ``problem`` and in one warning per reward and reason.
+        strict: whether to raise on failure. Otherwise, if a reward raises or breaks its contract, all scenes are
+            invalid with value NaN, and the reason is in ``problem`` and in one warning per reward and reason.
 
     Returns:
         float32 values, credits and terms, and a bool ``valid`` (B,) that also excludes rows that are not finite.
@@ -61,8 +60,7 @@ def evaluate_reward(
 
 
 def reward_scorer(reward: Any) -> SceneScorer:
-    """``reward`` as a function that environments call; the entry point ``scene_envs.resolvers`` names this maker.
-
+    """``reward`` as a function that environments call; the entry point ``scene_envs.resolvers`` names this function.
     Args:
         reward: a name, mapping, function, class or reward; see :func:`rewards.resolve_reward`.
 
@@ -96,7 +94,7 @@ def _evaluate(reward: Any, batch: SceneBatch, context: RewardContext) -> RewardO
     except BaseException as error:
         raise RewardError(f"reward {name!r} raised {describe_error(error)}{_place(error.__traceback__)}") from error
     finally:
-        if os.getpid() != process:  # a copy of this process that the reward forked: it must not go on with the run
+        if os.getpid() != process:  # the reward forked this copy of the process, which must not continue the run
             os._exit(0)
     if batch.tensor._version != version or not (own or torch.equal(given.tensor, batch.tensor)):
         raise RewardError(f"reward {name!r} changed the scenes it was given; work on a clone of batch.tensor")
@@ -104,13 +102,12 @@ def _evaluate(reward: Any, batch: SceneBatch, context: RewardContext) -> RewardO
 
 
 def describe_error(error: BaseException) -> str:
-    """Type and text of an error of foreign code, of bounded length whatever its ``__str__`` does.
-
+    """Type and text of an error of foreign code, of bounded length.
     >>> describe_error(ValueError("no")), len(describe_error(ValueError("x" * 10**6))) < 400
     ('ValueError: no', True)
     """
     text = _text(error)
-    name = type.__dict__["__name__"].__get__(type(error))  # whatever its metaclass says
+    name = type.__dict__["__name__"].__get__(type(error))  # a metaclass may override ``__name__``
     return f"{name}: {text}" if text else str(name)
 
 
@@ -123,7 +120,7 @@ def _text(error: BaseException) -> str:
 
 
 def _place(trace: TracebackType | None) -> str:
-    """``" (my_rewards.py, line 12)"``: the innermost line of foreign code, empty where there is none."""
+    """Innermost line of foreign code, such as ``" (my_rewards.py, line 12)"``; empty if there is none."""
     found = ""
     package = Path(__file__).parent
     while trace is not None:

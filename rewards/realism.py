@@ -29,8 +29,8 @@ class Realism:
     objects are missing is invalid.
 
     Attributes:
-        prior: name or path of the prior; that of the scene type's name when null.
-        levels: number of timesteps at which the loss is taken: those of a chain of that many equally spaced steps.
+        prior: name or path of the prior; null takes the one with the name of the scene type.
+        levels: number of timesteps at which the loss is taken, those of a chain of equally spaced steps.
         seed: seed of the noise.
     """
 

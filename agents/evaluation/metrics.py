@@ -1,4 +1,4 @@
-"""Distances of scenes from a reference: counts, categories, heights, overlaps. Pure functions, no simulator."""
+"""Distances of scenes from a reference without a simulator: counts, categories, heights."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scene_envs.scene import SceneBatch
 from scene_envs.scene_distance import check_same_assets
 
 KL_EPS = 1e-6
-"""Probability added to every category before renormalising, so that a category never sampled gives no infinite KL."""
+"""Probability added to every category before renormalising, so that the KL is finite if a category is never sampled."""
 
 _CHUNK = 128
 """Scenes whose pairs of objects are in memory together."""
@@ -65,7 +65,7 @@ def height_errors(batch: SceneBatch, supports: Sequence[Support] | None = None) 
     container, see :data:`~agents.evaluation.supports.CONTAINERS`, are left out.
 
     Args:
-        batch: the scenes.
+        batch: scenes to measure.
         supports: surfaces on which objects may rest; None takes those of the scene type.
 
     Returns:
@@ -122,9 +122,7 @@ def _height_gap(batch: SceneBatch, support: Support) -> Tensor:
 
 
 def _near(batch: SceneBatch, names: Sequence[str], reach: float) -> Tensor:
-    """(B, N, N) bool at [b, i, j]: j is another object than i, one of the assets ``names``, and within ``reach`` of i
-    horizontally.
-    """
+    """(B, N, N) bool at [b, i, j]: object j is not i, is one of the assets ``names``, and is within ``reach`` of i."""
     xy = batch.translations[..., :2].double()
     near = (xy.unsqueeze(2) - xy.unsqueeze(1)).norm(dim=-1) <= reach
     near.diagonal(dim1=1, dim2=2).fill_(False)

@@ -1,4 +1,4 @@
-"""Protocol of the classifier two-sample test: split, train with early stopping, score on held-out scenes, repeat."""
+"""Classifier two-sample test: split, training with early stopping, score on held-out scenes, repetitions."""
 
 from __future__ import annotations
 
@@ -13,20 +13,19 @@ from torch.nn import functional as F
 from scene_envs.errors import InvalidInputError
 
 MIN_SCENES = 20
-"""Fewest scenes of each class with which a classifier is trained."""
+"""Smallest number of scenes of each class with which a classifier is trained."""
 
 _STOP_LOSS = 5e-3
-"""Validation loss (nats) below which training stops: the classes are told apart."""
+"""Validation loss (nats) below which training stops, because the classifier separates the classes."""
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Accuracy of a classifier that tells real scenes from samples; 0.5 is chance, 1 is always right.
-
+    """Accuracy of a classifier of real scenes and samples; 0.5 is chance, 1 is always right.
     Attributes:
         mean: mean over the seeds.
         std: population standard deviation over the seeds.
-        per_seed: the accuracy of each seed on its held-out scenes.
+        per_seed: accuracy of each seed on its held-out scenes.
 
     >>> Accuracy.of([0.5, 0.75])
     Accuracy(mean=0.625, std=0.125, per_seed=(0.5, 0.75))
@@ -48,14 +47,14 @@ class ClassifierConfig:
     """Settings of the training and test of a classifier.
 
     Attributes:
-        train_fraction: share of the scenes of each class to train on.
-        validation_fraction: share that decides when to stop; the rest is held out.
-        max_train: most scenes of each class to train on.
-        max_validation: most scenes of each class to decide on.
-        epochs: most passes over the training part.
-        patience: epochs without a better validation loss after which training stops.
-        batch_size: scenes per step.
-        learning_rate: largest rate of the one-cycle schedule of AdamW.
+        train_fraction: share of training scenes in each class.
+        validation_fraction: share of validation scenes, which decide when training stops; the rest is held out.
+        max_train: largest number of training scenes of each class.
+        max_validation: largest number of validation scenes of each class.
+        epochs: largest number of passes over the training part.
+        patience: number of epochs without a better validation loss after which training stops.
+        batch_size: number of scenes per step.
+        learning_rate: largest learning rate of the one-cycle schedule of AdamW.
         weight_decay: weight decay of AdamW.
     """
 
@@ -122,10 +121,10 @@ def two_sample_accuracy(
     Args:
         real: number of real scenes.
         fake: number of samples.
-        prepare: makes the classifier of a split.
+        prepare: function that makes the classifier of a split.
         seeds: number of repetitions, each with a split, weights and order of its own.
         seed: seed of the first repetition.
-        config: the protocol.
+        config: settings of the training and test.
     """
     check_classes(real, fake, seeds)
     labels = torch.cat([torch.ones(real), torch.zeros(fake)])

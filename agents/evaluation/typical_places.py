@@ -1,4 +1,4 @@
-"""Typical places of objects in real scenes: the scale on which learned measures read poses."""
+"""Typical places of objects in real scenes, by which learned measures standardise poses."""
 
 from __future__ import annotations
 

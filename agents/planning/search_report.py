@@ -60,8 +60,8 @@ def draw_scene(scene: SceneBatch, state: Any, path: Path, *, width: int = 640, h
         scene: a batch of one.
         state: search state of the scene; ``value``, ``objective`` and ``mask`` (N,) are read.
         path: image file to write.
-        width: pixels.
-        height: pixels.
+        width: width of the picture in pixels.
+        height: height of the picture in pixels.
     """
     from scene_envs.render import gallery, render
 
