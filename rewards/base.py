@@ -94,6 +94,7 @@ def averages_objects(*rewards: object) -> bool:
 
 def counts_objects(*rewards: object) -> bool:
     """Whether one of ``rewards`` depends on which objects a scene has, and not on their poses.
+
     The credit of such objects does not depend on their poses. Algorithms with credit per object therefore give the
     advantage of the scene to the categories.
 
@@ -105,6 +106,7 @@ def counts_objects(*rewards: object) -> bool:
 
 def declared_maximum(reward: object, slots: int, free_slots: int) -> float | None:
     """The largest value that a reward declares for scenes of this size; None if it declares no positive number.
+
     Args:
         reward: reward with an attribute ``maximum``, a number or a method that takes the two arguments below.
         slots: number of slots per scene.

@@ -91,6 +91,7 @@ class WeightedSum:
 @register_reward("product")
 class Product:
     """Product of rewards; 0 if one of them is 0.
+
     Args:
         rewards: parts of the reward.
 

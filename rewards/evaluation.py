@@ -35,6 +35,7 @@ def evaluate_reward(
     reward: Any, batch: SceneBatch, context: RewardContext | None = None, *, strict: bool = False
 ) -> RewardOutput:
     """Score ``batch`` and check the output against the contract.
+
     Args:
         reward: a reward object, or a function of (batch, context); see :func:`rewards.resolve_reward` for names.
         batch: B scenes of N slots.
@@ -61,6 +62,7 @@ def evaluate_reward(
 
 def reward_scorer(reward: Any) -> SceneScorer:
     """``reward`` as a function that environments call; the entry point ``scene_envs.resolvers`` names this function.
+
     Args:
         reward: a name, mapping, function, class or reward; see :func:`rewards.resolve_reward`.
 
@@ -103,6 +105,7 @@ def _evaluate(reward: Any, batch: SceneBatch, context: RewardContext) -> RewardO
 
 def describe_error(error: BaseException) -> str:
     """Type and text of an error of foreign code, of bounded length.
+
     >>> describe_error(ValueError("no")), len(describe_error(ValueError("x" * 10**6))) < 400
     ('ValueError: no', True)
     """

@@ -15,6 +15,7 @@ from scene_envs.scene import SceneBatch
 @dataclass(frozen=True)
 class FeasibleShare(FeasibleObjects):
     """Share of the free objects that are in the workspace, overlap nothing and do not move; from 0 to 1.
+
     Definition and settings are those of ``feasible_objects``. A scene without free objects scores 0, so that emptying a
     scene gains nothing. Generated welded objects, such as the tables of rooms, do not change the value. They get credit
     for not overlapping each other.

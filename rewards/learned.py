@@ -10,6 +10,7 @@ from scene_envs.scene import SceneBatch
 @runtime_checkable
 class LearnedReward(Protocol):
     """A reward whose scores change during a run, because it learns from real scenes and from samples.
+
     ``post-train`` calls :meth:`begin` once, then :meth:`learn` with samples of the base prior and with the scenes of
     every iteration after they were scored. The state is part of the run's checkpoint. All processes of a run call both
     with the same scenes, so they have the same model.
@@ -30,6 +31,7 @@ class LearnedReward(Protocol):
 
 def learned_parts(reward: Any) -> list[LearnedReward]:
     """The rewards that learn, among a reward and the parts of a composite; in a fixed order.
+
     >>> from rewards import resolve_reward
     >>> learned_parts(resolve_reward("object_count"))
     []

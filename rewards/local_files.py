@@ -18,6 +18,7 @@ _allowed: set[Path] = set()
 
 def is_local(reward: Any) -> bool:
     """Whether a name of a reward names a function or class in a file.
+
     >>> is_local("./my_rewards.py:clutter"), is_local("clutter")
     (True, False)
     """

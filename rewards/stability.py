@@ -18,6 +18,7 @@ from scene_envs.scene import SceneBatch
 @dataclass(frozen=True)
 class Stability:
     """Stillness of the free objects under gravity: their mean score, from 0 to 1 (at rest).
+
     An object that moves by d and turns by a scores ``exp(-(d / scale + a / scale_rotation))``. Objects deeper than
     ``max_penetration`` in others are removed before the simulation, as for ``feasible_objects``, and score 0. Objects
     outside the workspace also score 0. A scene without free objects scores 0.

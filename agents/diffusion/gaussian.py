@@ -95,6 +95,7 @@ class GaussianProcess:
 
     def x0_from_output(self, x_t: Tensor, t: Tensor, output: Tensor, moments: Moments | None = None) -> Tensor:
         """The denoised scene x_0 that follows from a network output.
+
         ``edm``: skip and output scaling of Karras et al. (2022), Table 1, in variance-preserving
         coordinates and with per-feature moments; ``epsilon``: predicted noise; ``v``: Salimans and Ho (2022).
 

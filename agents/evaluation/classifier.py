@@ -40,6 +40,7 @@ def classifier_accuracy(
     config: ClassifierConfig | None = None,
 ) -> Accuracy:
     """Accuracy, on held-out scenes, of a classifier trained to separate real scenes from samples.
+
     A set transformer reads the objects of a scene: categories, poses standardised per asset, Fourier features of the
     translation, and offsets and gaps to the nearest neighbours, standardised per pair of assets. Means and standard
     deviations are those of the real training part. Welded objects are treated like other objects; the result does not

@@ -35,6 +35,7 @@ _WAVES = 12
 @dataclass(frozen=True)
 class Neighbors:
     """The nearest scene to each of B scenes.
+
     Attributes:
         distance: (B,) m, distance to the nearest scene; see :func:`scene_envs.scene_distance.scene_distances`.
         index: (B,) int64, index of the nearest scene.

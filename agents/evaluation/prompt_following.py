@@ -59,6 +59,7 @@ def prompt_following(batch: SceneBatch, prompts: Sequence[str]) -> dict[str, flo
 
 def prompt_chance(batch: SceneBatch, prompts: Sequence[str], seed: int = 0) -> dict[str, float]:
     """Score by chance, in which each scene is checked against the prompt of another.
+
     Args:
         batch: B >= 2 real scenes.
         prompts: B prompts of these scenes.

@@ -37,6 +37,7 @@ def render_classifier_accuracy(
     config: ClassifierConfig | None = None,
 ) -> Accuracy:
     """Accuracy, on held-out scenes, of a CNN trained to separate renders of real scenes from renders of samples.
+
     The renders are semantic: one class per asset, seen by the camera of the scene type. The protocol is that of
     :func:`~agents.evaluation.classifier.classifier_accuracy`. A render cannot show millimetres: at the default size a
     pixel of a table is about 2 cm wide.

@@ -101,6 +101,7 @@ class SetEncoder(nn.Module):
     @classmethod
     def load(cls, path: str | os.PathLike[str] | None = None) -> SetEncoder:
         """The encoder in ``path``, frozen and in evaluation mode; None takes the shipped one.
+
         Raises:
             InvalidInputError: the file does not exist.
             CorruptFileError: the file was not written by :meth:`save`.

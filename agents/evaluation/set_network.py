@@ -121,6 +121,7 @@ class _ObjectEncoder(nn.Module):
 
 class ObjectNetwork(_ObjectEncoder):
     """Network with one logit for each object of a scene, from its neighbours, and from all objects if ``blocks`` > 0.
+
     ``outputs`` and ``dropout`` of the config are not read.
 
     >>> network = ObjectNetwork(SetNetworkConfig(features=5, categories=4, outputs=1))
@@ -143,6 +144,7 @@ class ObjectNetwork(_ObjectEncoder):
 
 class SetNetwork(_ObjectEncoder):
     """Network with ``outputs`` numbers for a scene, invariant to the order of objects and to padding.
+
     The tokens of the objects are pooled by attention, mean, maximum and a scaled sum.
 
     >>> network = SetNetwork(SetNetworkConfig(features=5, categories=4, outputs=2)).eval()

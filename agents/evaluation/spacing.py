@@ -23,6 +23,7 @@ _CHUNK = 128
 
 def spacing_wasserstein(batch: SceneBatch, reference: SceneBatch) -> float | None:
     """Distance of the distributions of distances between neighbours from those of real scenes, m.
+
     For each ordered pair of assets (a, b), the horizontal distances from the free objects a to the nearest free object
     b at the same height form a distribution. The figure is the Wasserstein-1 distance of samples and reference, as a
     mean over the pairs, weighted by their number of distances in the reference. It shows whether objects are pushed

@@ -22,6 +22,7 @@ _STOP_LOSS = 5e-3
 @dataclass(frozen=True)
 class Accuracy:
     """Accuracy of a classifier of real scenes and samples; 0.5 is chance, 1 is always right.
+
     Attributes:
         mean: mean over the seeds.
         std: population standard deviation over the seeds.

@@ -12,6 +12,7 @@ from agents.planning.registry import PlannerSettings, check_at_least, register_p
 @dataclass(frozen=True)
 class BestOfPlanner(PlannerSettings):
     """Best of N independent samples: expands every action of the root once, in order, and nothing else.
+
     This is the baseline of a search at equal NFE. The root needs at least ``budget`` actions. If the problem seeds
     children by their path, the first samples are the same as with any other planner.
 

@@ -38,6 +38,7 @@ def systematic(weights: np.ndarray, uniform: float) -> np.ndarray:
 
 class Particles:
     """Resampler of groups of particles; a group is the children of one parent that are denoised in one batch.
+
     At ``resamplings`` steps, each group is resampled with the weights exp(strength * (value - value at the last
     resampling)). The product of the weights of a path is then exp(strength * last value) (Singhal et al. 2025,
     difference potential).

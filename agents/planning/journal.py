@@ -26,6 +26,7 @@ _HEAD = struct.Struct("<II")
 
 class Journal:
     """A file of records: the settings of the search, then the states of every round, in order.
+
     A record that was being written when the process was killed is dropped.
 
     Args:
@@ -54,6 +55,7 @@ class Journal:
 
     def take(self, pairs: Sequence[tuple[SearchState, int]]) -> list[SearchState]:
         """The states that an earlier run made for the first of ``pairs``; as many as the file still has.
+
         Raises:
             InvalidInputError: the earlier run made states of other pairs.
         """

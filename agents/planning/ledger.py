@@ -125,6 +125,7 @@ def best_different(pool: Sequence[Member], count: int) -> list[Member]:
 
 class SearchBudget:
     """Budget of expansions of a planner, and a record of their results.
+
     :attr:`left` is 0 when the budget is spent, when a state of value 1 (the largest value) was found, or when the
     problem stops the search.
 
@@ -194,6 +195,7 @@ class SearchBudget:
 
 class SteeredProblem:
     """A search problem with steered expansions.
+
     Args:
         problem: problem to search.
         planner: name of the planner that steers.

@@ -74,6 +74,7 @@ def run_search(
     **settings: Any,
 ) -> SearchOutcome:
     """Search for scenes that score high, starting from samples of the prior or from given scenes.
+
     The root is the scene with only fixed welded objects, so its children are fresh samples. The planner then
     regenerates the objects that the objective blames (Pfaff et al. 2025, inference-time search). With ``scenes`` there
     is one search for each scene, up to ``count``. It regenerates the blamed objects of that scene, and its result

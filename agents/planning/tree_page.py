@@ -75,6 +75,7 @@ def write_tree_page(
     returned: SceneBatch | None = None,
 ) -> Path:
     """Write the page of the first search of ``record``, which works offline and without other files.
+
     Args:
         path: HTML file to write.
         record: record of all scenes.

@@ -14,7 +14,7 @@ from agents.utils.weight_average import WeightAverage
 
 
 class AveragedSampler(Algorithm[TensorDict]):
-    """An algorithm that samples with a separate copy of the prior, whose weights are also evaluated and saved.
+    """Algorithm that samples with a separate copy of the prior, whose weights are also evaluated and saved.
 
     After each batch the copy moves towards the prior in training.
 

@@ -26,7 +26,7 @@ def draw_curve(
         path: image file to write.
         reward_name: label of the upper axis.
         limit: limit of the guard's loss, drawn as a line.
-        beyond: iteration from which the run is over-optimised; shaded from there.
+        beyond: iteration from which the run is over-optimised; the picture is shaded from there.
         highest: largest possible reward, which bounds the band of the standard deviation; None for no bound.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -33,7 +33,7 @@ def run_demo(
     recipes: Mapping[str, PostTrainConfig] | None = None,
     prior: ScenePrior | None = None,
 ) -> dict[str, Any]:
-    """Post-train a prior in two ways side by side, measure all three priors on fresh samples, and write the report.
+    """Post-train a prior in two ways, measure all three priors on fresh samples, and write the report.
 
     All priors start from the same noise, and every sample is measured. Physics decides which objects are
     simulation-ready.
@@ -43,7 +43,7 @@ def run_demo(
             ``feasible``, which ``prior=`` loads. An interrupted demonstration is resumed.
         seed: seed of training, from which the seed of the measured samples is derived.
         workers: physics worker processes, of both runs together while they train.
-        scenes: fresh samples measured of each prior.
+        scenes: number of fresh samples of each prior.
         num_steps: denoiser evaluations per measured sample.
         recipes: the runs by name, in place of ``configs/recipe/demo_clutter.yaml`` and ``demo_feasible.yaml``.
         prior: prior to start from, in place of the one that the recipes name.

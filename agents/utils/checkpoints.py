@@ -72,6 +72,7 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 def check_tensors(module: nn.Module, tensors: Mapping[str, Tensor], path: str | os.PathLike[str]) -> None:
     """Raise unless the weights of a checkpoint have the names and shapes of those of ``module``.
+
     Args:
         module: the module to restore.
         tensors: state dict of the module in the checkpoint.
@@ -85,6 +86,6 @@ def check_tensors(module: nn.Module, tensors: Mapping[str, Tensor], path: str | 
     if differing:
         raise InvalidInputError(
             f"{str(path)!r} cannot be resumed: {len(differing)} of its tensors are not those of this network, the "
-            f"first {differing[0]!r}; another prior or another version of SceneEnvs began the run: resume it with that "
-            "one, or give another output to start anew"
+            f"first {differing[0]!r}; another prior or an earlier version of SceneEnvs began the run: resume it with "
+            "that one, or give another output to start anew"
         )

@@ -9,6 +9,7 @@ from scene_envs.errors import InvalidInputError
 
 def check_device(name: str) -> None:
     """Raise unless torch knows the device and this machine has it.
+
     Raises:
         InvalidInputError: the device cannot be used; the message says which would work.
 
