@@ -309,7 +309,6 @@ def _reward_figures(
     return {**_mean("reward", output), "reward_invalid": float((~output.is_valid).sum())}
 
 
-
 def _mean(name: str, output: RewardOutput) -> dict[str, float]:
     """Mean and standard error of a reward over its valid scenes; empty without any."""
     value = output.value[output.is_valid].double()

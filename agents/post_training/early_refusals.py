@@ -1,4 +1,4 @@
-"""Checks that refuse a post-training run that cannot learn, before anything is sampled."""
+"""Checks before the first sample that a post-training run can learn."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scene_envs.errors import InvalidInputError, TrainingError
 from scene_envs.scene import SceneBatch
 
 _PROBED = 2
-"""Real scenes on which the reward and the mask of a run are tried."""
+"""Number of real scenes on which the reward and the mask of a run are tried."""
 _PROBED_WITH_PROMPTS = 8
 """The same number in a run that uses the prompts of its real scenes."""
 
@@ -31,8 +31,8 @@ def check_it_can_learn(learner: Learner, real: SceneBatch, prompts: PromptSets |
         prompts: prompts of each real scene; None for a prior that reads no prompts.
 
     Raises:
-        InvalidInputError: credit per object is asked of a reward that gives none, or the mask cannot be made, or leaves
-            nothing to regenerate in any scene, or the guard has a limit of stacks for assets without geometry.
+        InvalidInputError: the run needs credit per object and the reward gives none, or the mask cannot be made or
+            leaves nothing to regenerate in any scene, or the guard has a limit of stacks for assets without geometry.
         TrainingError: the reward scores none of the real scenes.
     """
     config, scene_type = learner.config, learner.prior.scene_type

@@ -1,4 +1,4 @@
-"""Copies of a denoiser that are trained beside it, such as one that learns the mean target of own samples."""
+"""Trained copies of a denoiser, such as one that learns the mean target of own samples."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class TrainedCopy(nn.Module):
     """Copy of a prior with an optimiser of its own, for the parameters that the prior trains.
 
     Args:
-        prior: prior that is copied; it is not changed.
+        prior: prior to copy; it is not changed.
         learning_rate: learning rate of AdamW.
     """
 
@@ -42,7 +42,7 @@ class TrainedCopy(nn.Module):
         self.optimizer.state.clear()
 
     def state(self) -> dict[str, Any]:
-        """For a checkpoint."""
+        """State for a checkpoint."""
         return {"weights": self.prior.state_dict(), "optimizer": self.optimizer.state_dict()}
 
     def restore(self, state: dict[str, Any]) -> None:

@@ -50,7 +50,7 @@ class NFTLoss(ForwardProcessLoss):
         generator: Generator | None = None,
     ) -> None:
         super().__init__(prior, sampler, expectation=expectation, generator=generator)
-        _positive(beta=beta, clip=clip)
+        _require_positive(beta=beta, clip=clip)
         self.beta, self.clip = beta, clip
 
     def continuous_loss(self, output: Tensor, old: Tensor, target: Tensor, advantage: Tensor) -> Tensor:
@@ -95,7 +95,7 @@ class AWMLoss(ForwardProcessLoss):
         generator: Generator | None = None,
     ) -> None:
         super().__init__(prior, sampler, expectation=expectation, generator=generator)
-        _positive(clip=clip)
+        _require_positive(clip=clip)
         if not beta > 1:
             raise InvalidInputError(f"beta={beta} must be above 1: below, a bad sample pushes without bound")
         self.beta, self.clip = beta, clip
@@ -134,7 +134,7 @@ class RewardWeightedLoss(ForwardProcessLoss):
         generator: Generator | None = None,
     ) -> None:
         super().__init__(prior, sampler, generator=generator)
-        _positive(temperature=temperature, largest=largest)
+        _require_positive(temperature=temperature, largest=largest)
         self.temperature, self.largest = temperature, largest
 
     def continuous_loss(self, output: Tensor, old: Tensor, target: Tensor, advantage: Tensor) -> Tensor:
@@ -154,7 +154,7 @@ def _cross_entropy(logits: Tensor, category: Tensor) -> Tensor:
     return F.cross_entropy(logits.flatten(0, 1), category.flatten(), reduction="none").view(category.shape)
 
 
-def _positive(**values: float) -> None:
+def _require_positive(**values: float) -> None:
     for name, value in values.items():
         if not value > 0:
             raise InvalidInputError(f"{name}={value} must be positive")

@@ -1,4 +1,4 @@
-"""Guard of a run and its files: the best prior, and the samples that the report shows."""
+"""Guard of a run and its files: the best prior, and the samples in the report."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from agents.priors.base import ScenePrior
 from agents.utils.process_group import ProcessGroup
 
 _PICTURED = 6
-"""Samples of the guard that are kept for the report."""
+"""Number of the guard's samples that are kept for the report."""
 
 
 def make_guard(config: PostTrainConfig, learner: Learner, scenes: SceneBank) -> Guard:
@@ -79,11 +79,11 @@ class GuardFiles:
             if prior.adapter is not None:
                 writing("the adapter", lambda: save_adapter(prior, self.directory))
 
-    def best(self, beside: ScenePrior | None = None) -> ScenePrior:
-        """The prior that was kept last; if ``beside`` has an adapter, a copy of ``beside`` with the kept adapter."""
+    def best(self, trained: ScenePrior | None = None) -> ScenePrior:
+        """The prior that was kept last; if ``trained`` has an adapter, a copy of ``trained`` with the kept adapter."""
         self._processes.wait()  # until it is written
-        if beside is not None and beside.adapter is not None:
-            return with_adapter_of(beside, self.directory)
+        if trained is not None and trained.adapter is not None:
+            return with_adapter_of(trained, self.directory)
         return ScenePrior.load(self.directory / "prior")
 
     def picture(self, guard: Guard, reading: GuardReading) -> None:

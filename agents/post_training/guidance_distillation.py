@@ -26,20 +26,20 @@ from scene_envs.errors import InvalidInputError
 from scene_envs.scene import POSE_FEATURES, TRANSLATION
 
 _MIN_STD = 1e-4
-"""Least standard deviation of a denoised feature in the loss, normalised."""
+"""Smallest standard deviation of a denoised feature in the loss, normalised."""
 _MIN_METRES = 1e-6
-"""Least standard deviation of a denoised position, m, that moves are compared with."""
+"""Smallest standard deviation of a denoised position, m, with which moves are compared."""
 
 
 class GuidanceDistillationLoss(PlainLoss):
     """Squared difference of denoised poses from a teacher's, divided by the variance of the denoiser's error.
 
     For one reverse step, the loss of an entry is an upper bound of twice the KL divergence of the prior's step from the
-    teacher's: both are normal with the same variance, which the error of the denoised entry is a part of.
+    teacher's: both are normal with the same variance, which includes the error of the denoised entry.
 
     Accepted keys (``set_keys``):
         scene: (B, N, D) float, scenes x_t of a chain. Default ``"scene"``.
-        timestep: (B,) or (B, 1) int64, their timesteps. Default ``"timestep"``.
+        timestep: (B,) or (B, 1) int64, timesteps of these scenes. Default ``"timestep"``.
         denoised: (B, N, 12) float, the teacher's estimate of the normalised poses of x_0. Default ``"denoised"``.
         trained: (B, N) bool, optional, slots whose poses are trained; without it, all. Default ``"trained"``.
         text, text_mask: (B, L, W) tokens and (B, L) their mask, optional. Default ``"text"`` and ``"text_mask"``.
@@ -118,9 +118,9 @@ class GuidanceDistillation(AveragedSampler):
     The sampling policy, a slower copy of the prior, samples a batch of scenes without physics guidance. At random steps
     of these chains, :class:`~agents.priors.physics_guidance.PhysicsGuidance` corrects the scenes that the copy
     denoises, and the prior is trained to denoise the same x_t to the corrected poses. The states come from the policy
-    itself, as in DAgger (Ross et al. 2011), so the prior learns to correct the errors that it makes. The gradient ends
-    where the guidance has nothing left to correct. Rotations are held at what the copy denoises, and categories get no
-    gradient. The reward is reported only.
+    itself, as in DAgger (Ross et al. 2011), so the prior learns to correct its own errors. The gradient vanishes where
+    the guidance has nothing to correct. Rotations are held at those that the copy denoises, and categories get no
+    gradient. The reward is only reported.
 
     Args:
         settings: settings of the algorithm.
@@ -150,10 +150,10 @@ class GuidanceDistillation(AveragedSampler):
         self._stds = [position_std(self.sampler, step, table) for step in range(len(policy))]
         self.steps = [step for step, std in enumerate(self._stds) if PhysicsGuidance.acts(std)]
         if not self.steps:
-            least = 1e3 * float(self._stds[-1][:2].max())
+            error = 1e3 * float(self._stds[-1][:2].max())
             raise InvalidInputError(
                 f"algorithm={settings.name} has nothing to learn: physics guidance acts once horizontal positions are "
-                f"known to 3 cm, and the error of this prior is {least:.0f} mm at the last of num_steps={len(policy)} "
+                f"known to 3 cm, and the error of this prior is {error:.0f} mm at the last of num_steps={len(policy)} "
                 "steps; pretrain the prior for longer"
             )
 

@@ -14,9 +14,9 @@ from rewards.statistics import fit_statistics, has_open_statistics, load_statist
 from scene_envs.scene import SceneBatch
 
 FIRST_SAMPLES = 128
-"""Samples of the base prior that a reward learns from before the first iteration."""
+"""Number of samples of the base prior from which a reward learns before the first iteration."""
 FIRST_STEPS = 150
-"""Optimiser steps on these samples."""
+"""Number of optimiser steps on these samples."""
 
 
 class LearnedRewards:
@@ -54,9 +54,9 @@ class LearnedRewards:
         """Train the parts on samples of the base prior, before they score the first batch, and fix statistics.
 
         Args:
-            prior: the base prior.
+            prior: base prior.
             slots: slots per sample.
-            prompts: one for each of the ``FIRST_SAMPLES``; None without prompts.
+            prompts: one prompt for each of the ``FIRST_SAMPLES``; None without prompts.
         """
         samples = ProcessGroup.current().from_first(
             lambda: prior.sample(

@@ -43,11 +43,11 @@ class OwnSampleLoss(PlainLoss):
             only the other entries have a loss. Default ``"observed"``.
 
     Args:
-        prior: noises the scenes.
+        prior: prior that noises the scenes.
         generator: source of timesteps, noise and observed entries (CPU); None for torch's own.
 
     Returns (``forward``): ``loss_objective`` (), the loss of the prior in training, and ``loss_expectation`` (), the
-        loss of a copy that is trained beside it. Each is 0 if the scenes do not train that model.
+        loss of a trained copy of it. Each is 0 if the scenes do not train that model.
     """
 
     @dataclass

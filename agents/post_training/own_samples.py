@@ -19,7 +19,7 @@ from agents.utils.process_group import ProcessGroup, gather_rows
 
 
 class OwnSampleAlgorithm(AveragedSampler):
-    """An algorithm that trains on the finished scenes of an averaged sampler.
+    """Algorithm that trains on the finished scenes of an averaged sampler.
 
     Args:
         policy: policy that is optimised.
@@ -27,7 +27,7 @@ class OwnSampleAlgorithm(AveragedSampler):
         sampler_decay: decay, per :meth:`WeightAverage.update`, of the weight average that samples.
 
     Attributes:
-        copy: a copy of the denoiser that is trained on the samples, with ``loss_expectation``; None for none.
+        copy: copy of the denoiser that is trained on the samples with ``loss_expectation``; None for none.
     """
 
     loss: OwnSampleLoss
@@ -39,7 +39,7 @@ class OwnSampleAlgorithm(AveragedSampler):
 
     @abstractmethod
     def advantage(self, rollout: Rollout) -> TensorDict:
-        """The tensors that the loss reads in addition to the scenes, by key."""
+        """Tensors that the loss reads in addition to the scenes, by key."""
 
     def measure(self, result: TensorDict) -> dict[str, float]:
         """Figures of a part of the batch, from ``result``, the loss of this part."""

@@ -16,7 +16,7 @@ class Picture:
     """An image of the page.
 
     Attributes:
-        path: PNG file; its bytes go into the page.
+        path: PNG file that is embedded in the page.
         caption: one line below the image.
     """
 
@@ -41,7 +41,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class Section:
-    """A heading with text, pictures (two stand side by side) and a table.
+    """A heading with text, pictures (in two columns) and a table.
 
     Attributes:
         title: heading.

@@ -25,7 +25,7 @@ from scene_envs.scene_types import SceneType
 _WITHHELD = 0.1
 """Share of real scenes whose prompt is withheld, as in pretraining."""
 _DRAWN = 64
-"""Scenes of the grammar between two updates of the progress."""
+"""Number of scenes of the grammar between two updates of the progress."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ class PromptedScenes:
     """Normalised scenes and one prompt for each.
 
     Attributes:
-        scenes: (M, N, D).
-        prompts: one per scene, ``""`` for a scene without one; None for a prior that reads no prompts.
+        scenes: (M, N, D) normalised scenes.
+        prompts: one prompt per scene, ``""`` for a scene without one; None for a prior that reads no prompts.
     """
 
     scenes: Tensor
@@ -52,8 +52,8 @@ class SceneBank:
     """Normalised real scenes, in a fixed split into training scenes and held-out scenes.
 
     Attributes:
-        train: (M, N, D) for the regularisation.
-        heldout: (K, N, D) for the guard.
+        train: (M, N, D) scenes for the regularisation.
+        heldout: (K, N, D) scenes for the guard.
         prompts: all prompts of a scene by its index, with held-out scenes after training scenes; None without prompts.
         replay: (R, N, D) further scenes for the regularisation; None for none.
         replay_share: share of a batch that is taken from ``replay``.

@@ -1,4 +1,4 @@
-"""Post-training loop: sample scenes, score them, update the prior, check the guard."""
+"""Post-training loop: sampling, scores, updates of the prior, and checks of the guard."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ _MAX_ROLLBACKS = 3
 
 @dataclass(frozen=True)
 class PostTrainResult:
-    """A finished run.
+    """Result of a finished run.
 
     Attributes:
-        prior: the best prior within the guard's limit; on disk in ``directory / "prior"``.
-        history: one row per iteration.
+        prior: best prior within the guard's limit, also in ``directory / "prior"``.
+        history: one row of the log per iteration.
         metrics: contents of ``metrics.json``.
-        directory: the run directory.
+        directory: folder of the run.
         config: configuration of the run, also in ``config.yaml``.
     """
 
@@ -71,8 +71,8 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> P
     process writes files.
 
     Args:
-        config: the run.
-        prior: the prior itself, in place of the one that ``config.prior`` names; it is not changed.
+        config: configuration of the run.
+        prior: prior to start from, instead of the one that ``config.prior`` names; it is not changed.
 
     Raises:
         TrainingError: a gradient or a value of the prior is not finite, no reward was valid for too long, the disk is
@@ -105,8 +105,8 @@ class PostTrainer:
     """One run: its loop, its guard and its files.
 
     Args:
-        config: the run.
-        prior: prior to start from, in place of the one that ``config.prior`` names.
+        config: configuration of the run.
+        prior: prior to start from, instead of the one that ``config.prior`` names.
     """
 
     guard: Guard
@@ -177,7 +177,7 @@ class PostTrainer:
         return self._finish()
 
     def prepare(self, *, reuse_scenes: bool = False) -> None:
-        """Draw the real scenes, or reuse those kept beside a run that is resumed, and make the guard."""
+        """Draw the real scenes, or reuse those in the folder of a resumed run, and make the guard."""
         config, seed, slots = self.config, stream_seed(self.config.seed, "bank"), self.learner.slots
         shown = config.logger.progress if self.processes.is_first else "none"
         batch = kept_scenes(
