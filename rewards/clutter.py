@@ -116,7 +116,6 @@ class _Lines:
 
     @property
     def area(self) -> float:
-        """Area of the surface, m^2."""
         return float((self.high - self.low).sum()) * self.step
 
     def shares(self, outlines: list[Array]) -> Array:

@@ -1,4 +1,4 @@
-"""Unmasking of absorbing chains: how many slots a step unmasks, and how their categories are drawn.
+"""Unmasking of absorbing chains: the number of slots that a step unmasks, and the draws of their categories.
 
 Slots that are unmasked in the same step are drawn independently, so scenes can get too many objects of a kind. Two
 remedies leave the distribution of each slot unchanged. The number of slots that a step unmasks differs from its

@@ -97,7 +97,6 @@ def out_of_workspace_rate(batch: SceneBatch) -> float:
 
 
 def _chunk_errors(batch: SceneBatch, supports: Sequence[Support]) -> list[tuple[str, Tensor]]:
-    """The errors (K,) of each support's objects."""
     gaps = torch.stack([_height_gap(batch, support) for support in supports])  # (S, B, N)
     catch = torch.tensor([support.catch for support in supports]).to(gaps)[:, None, None]
     nearest = (gaps - 1.0 * ((gaps <= catch) & (catch > 0))).argmin(dim=0)
@@ -130,7 +129,6 @@ def _near(batch: SceneBatch, names: Sequence[str], reach: float) -> Tensor:
 
 
 def _contained(batch: SceneBatch, containers: Sequence[Container] = CONTAINERS) -> Tensor:
-    """(B, N) bool: the object lies in a container."""
     z = batch.translations[..., 2].double()
     rise = z.unsqueeze(2) - z.unsqueeze(1)  # (B, rider, container)
     inside = torch.zeros_like(batch.is_empty)

@@ -138,7 +138,6 @@ def _read(folder: str, scene_type: SceneType) -> Tensor:
 
 
 def _distinct(tensor: Tensor) -> Tensor:
-    """Each scene once."""
     _, first = np.unique(_keys(tensor), return_index=True)
     return tensor[torch.from_numpy(np.sort(first))]
 

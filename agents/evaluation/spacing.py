@@ -1,4 +1,4 @@
-"""Spacing of objects: how far apart objects of two assets stand, compared with real scenes."""
+"""Spacing of objects: distances between neighbours, compared with real scenes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stacks: how many objects stand on one another, compared with real scenes."""
+"""Heights of stacks of objects, compared with real scenes."""
 
 from __future__ import annotations
 

@@ -8,13 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from agents.configuration.tree import build
 from agents.planning.ledger import PlanResult, Progress, Searchable, SteeredProblem
-from agents.planning.registry import (
-    PlannerSettings,
-    check_at_least,
-    list_planners,
-    planner_settings,
-    register_planner,
-)
+from agents.planning.registry import PlannerSettings, check_at_least, list_planners, planner_settings, register_planner
 from scene_envs.errors import InvalidInputError, unknown_name
 
 if TYPE_CHECKING:
@@ -73,7 +67,6 @@ class GradientPlanner(PlannerSettings):
         return self._guided().make(self.children or 1).plan(steered, budget, progress)
 
     def _guided(self) -> PlannerSettings:
-        """The other planner."""
         keys = {"name": self.planner} if isinstance(self.planner, str) else self.planner
         if not isinstance(keys, Mapping) or not isinstance(keys.get("name"), str):
             raise InvalidInputError(

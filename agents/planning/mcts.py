@@ -99,7 +99,6 @@ def _close(node: _Node) -> None:
 
 
 def _is_done(state: object) -> bool:
-    """Whether nothing is masked in ``state``."""
     mask = getattr(state, "mask", None)
     return mask is not None and not bool(mask.any())
 

@@ -45,9 +45,7 @@ class PlannerSettings:
 
 _SHIPPED = ("beam", "best_of", "evolution", "feynman_kac", "gradient", "greedy", "mcts", "tree_over_steps", "uct")
 _PLANNERS: Registry[type[PlannerSettings]] = Registry(
-    "planner",
-    ENTRY_POINT_GROUP,
-    modules={name: f"agents.planning.{name}" for name in _SHIPPED},
+    "planner", ENTRY_POINT_GROUP, modules={name: f"agents.planning.{name}" for name in _SHIPPED}
 )
 Settings = TypeVar("Settings", bound=type[PlannerSettings])
 

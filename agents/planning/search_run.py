@@ -149,8 +149,8 @@ def _search(
             searches.sort(key=loss_of)
         for lane in session.lanes:
             if starts is not None or lane.first:
-                first = max(lane.first[: config.branching], key=_value_of) if starts is None else lane.root
-                firsts[lane.root.seed] = first
+                new = lane.first[: config.branching] if starts is None else [lane.root]
+                firsts[lane.root.seed] = max(new, key=lambda state: state.value if state.valid else -1.0)
         if folder is not None and len(parts) > 1 and searches:
             _scenes(env, searches).save(folder / "best.safetensors")
         if stopped:
@@ -262,7 +262,6 @@ class _Run:
 
 
 def _scenes(env: SearchEnv, plans: Sequence[PlanResult]) -> SceneBatch:
-    """The best scenes of plans."""
     return SceneBatch.concatenate([env.scene(plan.best_state) for plan in plans])
 
 
@@ -274,10 +273,6 @@ def _fitting(scenes: SceneBatch, prior: Any, slots: int | None) -> SceneBatch:
             f"{scenes.scene_type.name!r}; give a prior of that type"
         )
     return scenes.with_slots(max(prior.scene_type.slots, scenes.tensor.shape[1]) if slots is None else slots)
-
-
-def _value_of(state: SearchState) -> float:
-    return state.value if state.valid else -1.0
 
 
 def _write(outcome: SearchOutcome, config: SearchConfig, best: SceneBatch, first: SearchState, output: Path) -> None:

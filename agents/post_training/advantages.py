@@ -81,8 +81,8 @@ def sibling_advantages(reward: Tensor, valid: Tensor, siblings: int) -> Tensor:
     others = (grouped.sum(dim=1, keepdim=True) - grouped) / (count - 1).clamp(min=1)
     difference = ((grouped - others) * present * (count > 1)).view_as(reward)
     taken = (present & (count > 1)).view_as(reward)
-    everywhere = gather_rows(difference)[gather_rows(taken)]
-    scale = everywhere.square().mean().sqrt() if len(everywhere) else everywhere.new_zeros(())
+    all_differences = gather_rows(difference)[gather_rows(taken)]
+    scale = all_differences.square().mean().sqrt() if len(all_differences) else all_differences.new_zeros(())
     return (difference / scale if scale > _MIN_STD else torch.zeros_like(difference)).float()
 
 

@@ -145,7 +145,7 @@ def _examine(trainer: PostTrainer) -> DoctorReport:
 
 
 def _step_rows(learner: Learner, rollout: Rollout, advantage: Any) -> tuple[list[StepRow], float]:
-    """The sigma table, and the largest log-ratio over the steps in the gradient; nothing without such steps."""
+    """Rows of the steps, and the largest log-ratio over the steps in the gradient; no rows unless the loss is DDPO."""
     loss = learner.algorithm.loss
     rows: list[StepRow] = []
     largest = 0.0

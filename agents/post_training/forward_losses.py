@@ -150,7 +150,6 @@ class RewardWeightedLoss(ForwardProcessLoss):
 
 
 def _cross_entropy(logits: Tensor, category: Tensor) -> Tensor:
-    """(B, N) cross-entropies of (B, N, K) logits."""
     return F.cross_entropy(logits.flatten(0, 1), category.flatten(), reduction="none").view(category.shape)
 
 

@@ -1,4 +1,4 @@
-"""Guidance distillation: a prior learns to place objects as physics guidance places them."""
+"""Guidance distillation: training of a prior to place objects as physics guidance does."""
 
 from __future__ import annotations
 

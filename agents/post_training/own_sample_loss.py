@@ -26,7 +26,7 @@ class PlainLoss(LossModule):
         return False
 
     def _forward_value_estimator_keys(self, **kwargs: object) -> None:
-        """Does nothing: there is no value estimator."""
+        """Do nothing, because there is no value estimator."""
 
 
 class OwnSampleLoss(PlainLoss):

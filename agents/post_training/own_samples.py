@@ -1,4 +1,4 @@
-"""Base class of algorithms that train on their own finished samples, noised anew for every update."""
+"""Base class of algorithms that train on their own finished samples, noised again for every update."""
 
 from __future__ import annotations
 

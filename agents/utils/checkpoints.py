@@ -1,4 +1,4 @@
-"""Checkpoints on disk: written whole or not at all, and read without running code in the file."""
+"""Checkpoints on disk, written atomically and read without running code in the file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Meanings of the fields of dataclasses, as their docstrings give them."""
+"""Meanings of the fields of dataclasses, read from their docstrings."""
 
 from __future__ import annotations
 
