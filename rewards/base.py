@@ -20,9 +20,9 @@ class RewardContext:
     """Inputs of a reward besides the scenes.
 
     Attributes:
-        prompts: one per scene when the prior is conditional, else None.
-        pool: worker processes for physics; None means compute in this process.
-        seed: for rewards that draw random numbers.
+        prompts: one prompt per scene if the prior is conditional, else None.
+        pool: worker processes for physics; None computes in this process.
+        seed: seed for rewards that draw random numbers.
     """
 
     prompts: tuple[str, ...] | None = None
@@ -36,12 +36,12 @@ class RewardOutput:
 
     Attributes:
         value: (B,) float, larger is better; ignored where ``valid`` is False.
-        per_object: (B, N) float credit per slot, or None.
-        terms: named (B,) floats worth logging.
-        valid: (B,) bool, or None when every row is valid. Invalid rows are left out of all statistics.
-        object_flags: named (B, N) bools, such as ``"feasible"``. ``"judged"`` marks the slots to which a mean over
+        per_object: (B, N) float, credit per slot, or None.
+        terms: (B,) floats for the log, by name.
+        valid: (B,) bool, or None if every row is valid. Invalid rows are left out of all statistics.
+        object_flags: (B, N) bools by name, such as ``"feasible"``. ``"judged"`` marks the slots to which a mean over
             objects gives credit; without this flag, they are the free objects.
-        problem: why the whole batch is invalid when the reward raised or broke its contract, else empty.
+        problem: reason why the whole batch is invalid if the reward raised or broke its contract, else empty.
     """
 
     value: Tensor
@@ -84,8 +84,7 @@ def depends_on_batch(*rewards: object) -> bool:
 def averages_objects(*rewards: object) -> bool:
     """Whether each of ``rewards`` is a mean over the objects of a scene, not a sum.
 
-    In a sum, an empty slot contributes its credit, which is 0. A mean is taken over the objects alone: an empty slot is
-    no part of it, so an empty slot has no credit at all, not even a credit of 0.
+    In a sum, an empty slot has credit 0. A mean is taken over the objects alone, so an empty slot has no credit.
 
     >>> averages_objects(lambda batch: batch.counts)
     False
@@ -94,7 +93,7 @@ def averages_objects(*rewards: object) -> bool:
 
 
 def counts_objects(*rewards: object) -> bool:
-    """Whether one of ``rewards`` depends on which objects a scene has, wherever they are.
+    """Whether one of ``rewards`` depends on which objects a scene has, and not on their poses.
 
     The credit of such objects does not depend on their poses. Algorithms with credit per object therefore give the
     advantage of the scene to the categories.
@@ -106,12 +105,12 @@ def counts_objects(*rewards: object) -> bool:
 
 
 def declared_maximum(reward: object, slots: int, free_slots: int) -> float | None:
-    """The largest value that a reward declares for scenes of this size, None where it declares no positive number.
+    """The largest value that a reward declares for scenes of this size; None if it declares no positive number.
 
     Args:
-        reward: its attribute ``maximum`` is a number, or a method that takes the two arguments below.
-        slots: slots per scene.
-        free_slots: slots that fixed objects do not take.
+        reward: reward with an attribute ``maximum``, a number or a method that takes the two arguments below.
+        slots: number of slots per scene.
+        free_slots: number of slots without fixed objects.
 
     >>> class Share:
     ...     maximum = 1.0

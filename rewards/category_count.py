@@ -1,4 +1,4 @@
-"""Reward: number of objects of some assets or groups, such as edible things."""
+"""Reward: number of objects of some assets or groups, such as edible objects."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class CategoryCount:
     """Number of objects in the workspace that belong to the named assets or groups.
 
     Attributes:
-        assets: one or several of asset names ("teacup"), display names ("steamer lid") and groups ("edible").
+        assets: one or several asset names ("teacup"), display names ("steamer lid") and groups ("edible").
 
     >>> reward = CategoryCount("furniture")
     >>> reward(SceneBatch.empty("dimsum_table", 1), RewardContext()).value

@@ -32,7 +32,7 @@ class Clutter:
     overlap, the surface is covered once.
 
     Attributes:
-        lines: lines along which each surface is measured; the more, the more exact.
+        lines: number of lines along which each surface is measured; more lines are more exact.
 
     >>> Clutter()(SceneBatch.empty("dimsum_table", 1), RewardContext()).value
     tensor([0.])
@@ -46,15 +46,15 @@ class Clutter:
             raise InvalidInputError(f"clutter: lines={self.lines} must be at least 1")
 
     def maximum(self, slots: int, free_slots: int) -> float:
-        """The largest value: all is covered."""
+        """The largest value, of fully covered surfaces."""
         return 1.0
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Measure covered lengths along parallel lines over each surface.
 
-        ``per_object`` (B, N) is the share that an object covers; where several cover a place it is split between them,
-        so that credits add up to the value. Terms: ``covered_area`` and ``surface_area`` (m^2), and ``volume_share``,
-        the volume of the free objects in the workspace over that of the workspace.
+        ``per_object`` (B, N) is the share that an object covers; if several objects cover a place, it is split between
+        them, so that credits add up to the value. Terms: ``covered_area`` and ``surface_area`` (m^2), and
+        ``volume_share``, the volume of the free objects in the workspace over that of the workspace.
         """
         from scene_envs.datasets.prompts import scene_facts
 
@@ -92,13 +92,13 @@ class Clutter:
 
 @dataclass(frozen=True)
 class _Lines:
-    """M parallel lines over a surface, all at equal distances.
+    """M parallel lines over a surface, at equal distances.
 
     Attributes:
-        y: (M,) m.
+        y: (M,) positions of the lines, m.
         step: distance of two lines, m.
-        low: (M,) where the surface begins along each line, m.
-        high: (M,) where it ends.
+        low: (M,) start of the surface along each line, m.
+        high: (M,) end of the surface along each line, m.
     """
 
     y: Array
@@ -116,11 +116,10 @@ class _Lines:
 
     @property
     def area(self) -> float:
-        """Area of the surface, m^2."""
         return float((self.high - self.low).sum()) * self.step
 
     def shares(self, outlines: list[Array]) -> Array:
-        """(n,) m^2 of the surface under each outline (3, V); places under several are split between these."""
+        """(n,) m^2 of the surface under each outline (3, V); places under several outlines are split between these."""
         if not outlines:
             return np.zeros(0)
         chords = np.stack([np.stack(_chords(corners, self.y)) for corners in outlines])  # (n, 2, M)
@@ -133,9 +132,9 @@ class _Lines:
 
 
 def _chords(corners: Array, y: Array) -> tuple[Array, Array]:
-    """Where lines at heights ``y`` (M,) enter and leave the convex outline of ``corners`` (3, V) from above, (M,) each.
+    """(M,) start and (M,) end of lines at ``y`` (M,) within the convex outline of ``corners`` (3, V) from above.
 
-    A line that misses the outline enters at infinity and leaves at minus infinity.
+    A line that misses the outline starts at infinity and ends at minus infinity.
     """
     from scipy.spatial import ConvexHull
 

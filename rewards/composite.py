@@ -1,7 +1,7 @@
 """Composite rewards: weighted sum, product, gate, clip.
 
 Every part may be a name, a mapping, a function or a reward. A scene is valid when every part could score it.
-A composite depends on the batch as soon as a part does. A part's value is a term under the part's name, and its own
+A composite depends on the batch if a part does. A part's value is a term under the part's name, and its own
 terms follow as ``"<part>.<term>"``.
 """
 
@@ -38,7 +38,7 @@ class WeightedSum:
     same weights in the credits as in the value. A slot is judged where every part judges it.
 
     Args:
-        rewards: the parts.
+        rewards: parts of the reward.
         weights: one number per part; all 1 by default.
         offset: number that is added to the sum, such as one that lifts an objective of a search above 0.
 
@@ -93,10 +93,10 @@ class WeightedSum:
 
 @register_reward("product")
 class Product:
-    """Product of rewards; 0 as soon as one of them is 0.
+    """Product of rewards; 0 if one of them is 0.
 
     Args:
-        rewards: the parts.
+        rewards: parts of the reward.
 
     >>> Product(["object_count"])(SceneBatch.empty("dimsum_table", 1), RewardContext()).value
     tensor([1.])
@@ -127,10 +127,10 @@ class Gate:
     """A reward that counts only where another one reaches a threshold.
 
     Attributes:
-        reward: what is scored.
-        condition: the reward that opens the gate.
-        threshold: the gate is open where ``condition >= threshold``.
-        otherwise: the value where it is closed.
+        reward: reward to compute.
+        condition: reward that opens the gate.
+        threshold: smallest value of ``condition`` at which the gate is open.
+        otherwise: value of scenes with a closed gate.
 
     >>> gate = Gate("object_count", condition="object_count", threshold=2.0, otherwise=-1.0)
     >>> gate(SceneBatch.empty("dimsum_table", 1), RewardContext()).value
@@ -178,7 +178,7 @@ class Clip:
     """A reward kept between two bounds.
 
     Attributes:
-        reward: what is scored.
+        reward: reward to compute.
         low: smallest value; null for no bound.
         high: largest value; null for no bound.
 
@@ -235,7 +235,7 @@ def _resolve_parts(name: str, rewards: Sequence[Any]) -> tuple[Reward, ...]:
 
 
 def _score_parts(parts: Sequence[Reward], batch: SceneBatch, context: RewardContext) -> dict[str, RewardOutput]:
-    """Each part's checked output, under its name; a name that comes again gets a number."""
+    """The checked output of each part, under its name; repeated names get a number."""
     outputs: dict[str, RewardOutput] = {}
     for part in parts:
         name = label = reward_name(part)

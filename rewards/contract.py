@@ -1,4 +1,4 @@
-"""Public check of the reward contract, for the tests of reward authors."""
+"""Check of the reward contract, for the tests of reward authors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
 TOLERANCE = 1e-4
-"""Values may differ by this, relative to max(1, |value|), where the contract says that they are equal."""
+"""Largest difference, relative to max(1, |value|), of values that the contract requires to be equal."""
 
 Check = Callable[["_Subject"], None]
 
@@ -31,17 +31,17 @@ def check_reward(
 
     Args:
         reward: a name, mapping, function, class or reward.
-        scene_type: the scene type to try it on.
-        context: what the reward gets; by default a prompt per scene and no worker pool.
-        seed: of the scenes it is tried on.
+        scene_type: scene type of the test scenes.
+        context: context for the reward; by default a prompt per scene and no worker pool.
+        seed: seed of the test scenes.
 
     Returns:
-        What was checked, one sentence each. Scenes alone and in a batch are not compared where the reward declares
+        One sentence per checked clause. Scenes alone and in a batch are not compared if the reward declares
         ``depends_on_batch = True``.
 
     Raises:
-        RewardError: one line per broken clause, each saying what was found and what would be right. After a clause in
-            which the reward took too long, no further clauses are tried.
+        RewardError: the reward breaks a clause; the message has one line per broken clause. After a clause in which the
+            reward took too long, no further clauses are tried.
 
     >>> check_reward("object_count")[0]
     'scores scenes that hold nothing but welded objects'
@@ -65,7 +65,7 @@ def check_reward(
 
 
 class _Subject:
-    """The reward under test and the scenes it is tried on."""
+    """The reward under test and its test scenes."""
 
     def __init__(self, reward: Any, scene_type: SceneType, context: RewardContext | None, seed: int) -> None:
         self.reward = reward
@@ -78,7 +78,7 @@ class _Subject:
 
     def score(self, batch: SceneBatch) -> RewardOutput:
         self._calls += 1
-        forget_verdicts()  # verdicts kept from an earlier call would prove nothing
+        forget_verdicts()  # each call must simulate anew
         context = self.given_context
         if context is None:
             counts = batch.counts.tolist()
@@ -94,7 +94,7 @@ class _Subject:
 
 
 def random_scenes(scene_type: SceneType, count: int, generator: Generator) -> SceneBatch:
-    """``count`` scenes of free objects strewn at random, from none to all slots taken; they overlap and float."""
+    """``count`` scenes of free, overlapping objects at random poses, from no slot to all slots taken."""
     fixed, slots = len(scene_type.fixed), scene_type.slots
     low, high = (torch.tensor(corner) for corner in scene_type.workspace)
     batch = SceneBatch.empty(scene_type, count)
@@ -162,7 +162,7 @@ def _rows(output: RewardOutput, rows: list[int]) -> RewardOutput:
 
 def _require_some_valid(output: RewardOutput, what: str) -> None:
     if not bool(output.is_valid.any()):
-        raise RewardError(f"Every row is invalid on {what} (values {_short(output.value)}); score at least some")
+        raise RewardError(f"Every row is invalid on {what} (values {_short(output.value)}); score at least one")
 
 
 def _require_equal(expected: RewardOutput, found: RewardOutput, what: str) -> None:

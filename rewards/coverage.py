@@ -23,7 +23,7 @@ class Coverage:
     that their mean over the batch is the coverage. Only objects in the workspace count.
 
     Attributes:
-        cells: of the grid along x, y and z.
+        cells: number of grid cells along x, y and z.
 
     >>> Coverage()(SceneBatch.empty("dimsum_table", 2), RewardContext()).value
     tensor([0., 0.])

@@ -1,4 +1,4 @@
-"""Evaluation of rewards: every output is checked, and a failure makes scenes invalid."""
+"""Evaluation of rewards: checks of their outputs, and invalid scenes after failures."""
 
 from __future__ import annotations
 
@@ -33,22 +33,22 @@ from scene_envs.scene import SceneBatch
 logger = logging.getLogger(__name__)
 
 _warned: set[tuple[int, str]] = set()
-_MOST_WARNINGS = 256
-_MOST_TEXT = 300
-"""Characters of a foreign error that a message repeats."""
+_MAX_WARNINGS = 256
+_MAX_TEXT = 300
+"""Number of characters of a foreign error that a message repeats."""
 
 
 def evaluate_reward(
     reward: Any, batch: SceneBatch, context: RewardContext | None = None, *, strict: bool = False
 ) -> RewardOutput:
-    """Score ``batch`` and check what comes back against the contract.
+    """Score ``batch`` and check the output against the contract.
 
     Args:
         reward: a reward object, or a function of (batch, context); see :func:`rewards.resolve_reward` for names.
         batch: B scenes of N slots.
-        context: what the reward may use; an empty one by default.
-        strict: raise on failure. Otherwise a reward that raises or breaks its contract gives NaN for every scene, all
-            of them invalid, with the reason in ``problem`` and in one warning per reward and reason.
+        context: context for the reward; an empty one by default.
+        strict: whether to raise on failure. Otherwise, if a reward raises or breaks its contract, all scenes are
+            invalid with value NaN, and the reason is in ``problem`` and in one warning per reward and reason.
 
     Returns:
         float32 values, credits and terms, and a bool ``valid`` (B,) that also excludes rows that are not finite.
@@ -68,7 +68,7 @@ def evaluate_reward(
 
 
 def reward_scorer(reward: Any) -> SceneScorer:
-    """``reward`` as a function that environments call; the entry point ``scene_envs.resolvers`` names this maker.
+    """``reward`` as a function that environments call; the entry point ``scene_envs.resolvers`` names this function.
 
     Args:
         reward: a name, mapping, function, class or reward; see :func:`rewards.resolve_reward`.
@@ -104,7 +104,7 @@ def _evaluate(reward: Any, batch: SceneBatch, context: RewardContext) -> RewardO
     except BaseException as error:
         raise RewardError(f"reward {name!r} raised {describe_error(error)}{_place(error.__traceback__)}") from error
     finally:
-        if os.getpid() != process:  # a copy of this process that the reward forked: it must not go on with the run
+        if os.getpid() != process:  # the reward forked this copy of the process, which must not continue the run
             os._exit(0)
     if batch.tensor._version != version or not (own or torch.equal(given.tensor, batch.tensor)):
         raise RewardError(f"reward {name!r} changed the scenes it was given; work on a clone of batch.tensor")
@@ -112,13 +112,13 @@ def _evaluate(reward: Any, batch: SceneBatch, context: RewardContext) -> RewardO
 
 
 def describe_error(error: BaseException) -> str:
-    """Type and text of an error of foreign code, of bounded length whatever its ``__str__`` does.
+    """Type and text of an error of foreign code, of bounded length.
 
     >>> describe_error(ValueError("no")), len(describe_error(ValueError("x" * 10**6))) < 400
     ('ValueError: no', True)
     """
     text = _text(error)
-    name = type.__dict__["__name__"].__get__(type(error))  # whatever its metaclass says
+    name = type.__dict__["__name__"].__get__(type(error))  # a metaclass may override ``__name__``
     return f"{name}: {text}" if text else str(name)
 
 
@@ -127,11 +127,11 @@ def _text(error: BaseException) -> str:
         text = str(error)
     except BaseException:
         return "(its text cannot be read)"
-    return text if len(text) <= _MOST_TEXT else f"{text[:_MOST_TEXT]}... ({len(text)} characters)"
+    return text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}... ({len(text)} characters)"
 
 
 def _place(trace: TracebackType | None) -> str:
-    """``" (my_rewards.py, line 12)"``: the innermost line of foreign code, empty where there is none."""
+    """Innermost line of foreign code, such as ``" (my_rewards.py, line 12)"``; empty if there is none."""
     found = ""
     package = Path(__file__).parent
     while trace is not None:
@@ -202,7 +202,7 @@ def _named(name: str, field: str, tensors: Any) -> Mapping[str, Any]:
 def _failed(reward: Any, batch: SceneBatch, problem: str) -> RewardOutput:
     key = (id(reward), problem)
     if key not in _warned:
-        if len(_warned) >= _MOST_WARNINGS:
+        if len(_warned) >= _MAX_WARNINGS:
             _warned.clear()
         _warned.add(key)
         logger.warning("%s. All %d scenes of this batch count as invalid.", problem.rstrip("."), len(batch))

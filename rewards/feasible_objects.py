@@ -11,13 +11,15 @@ from rewards.verdicts import verdicts
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
+_LIMITS = ("max_penetration", "max_displacement", "max_rotation", "duration")
+
 
 @register_reward("feasible_objects")
 @dataclass(frozen=True)
 class FeasibleObjects:
     """Number of free objects in the workspace that neither penetrate another object nor move when simulated.
 
-    An object is feasible when its frame is in the workspace, it overlaps no other object by more than
+    An object is feasible if its frame is in the workspace, it overlaps no other object by more than
     ``max_penetration`` and, with the penetrating objects removed, it moves and turns by at most the limits in
     simulation. Welded objects are not counted.
 
@@ -35,7 +37,7 @@ class FeasibleObjects:
     duration: float = 0.1
 
     def __post_init__(self) -> None:
-        for setting in ("max_penetration", "max_displacement", "max_rotation", "duration"):
+        for setting in _LIMITS:
             if not getattr(self, setting) > 0:
                 raise InvalidInputError(f"{self.name}: {setting}={getattr(self, setting)} must be positive")
 
@@ -50,13 +52,7 @@ class FeasibleObjects:
         the deepest overlap. ``object_flags["feasible"]`` (B, N) marks the objects that count, ``per_object`` likewise.
         """
         device = batch.tensor.device
-        limits = {
-            "max_penetration": self.max_penetration,
-            "max_displacement": self.max_displacement,
-            "max_rotation": self.max_rotation,
-            "duration": self.duration,
-        }
-        result = verdicts(batch, limits, context.pool)
+        result = verdicts(batch, {limit: getattr(self, limit) for limit in _LIMITS}, context.pool)
         feasible = result.feasible.to(device)
         count = feasible.sum(dim=-1).float()
         free = batch.is_free.sum(dim=-1).float()

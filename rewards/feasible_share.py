@@ -14,7 +14,7 @@ from scene_envs.scene import SceneBatch
 @register_reward("feasible_share")
 @dataclass(frozen=True)
 class FeasibleShare(FeasibleObjects):
-    """Share of the free objects that are in the workspace, overlap nothing and stay where they are; from 0 to 1.
+    """Share of the free objects that are in the workspace, overlap nothing and do not move; from 0 to 1.
 
     Definition and settings are those of ``feasible_objects``. A scene without free objects scores 0, so that emptying a
     scene gains nothing. Generated welded objects, such as the tables of rooms, do not change the value. They get credit
@@ -31,7 +31,7 @@ class FeasibleShare(FeasibleObjects):
     averages_objects: ClassVar[bool] = True
 
     def maximum(self, slots: int, free_slots: int) -> float:
-        """The largest value: all are feasible."""
+        """The largest value, of scenes with only feasible objects."""
         return 1.0
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
@@ -49,11 +49,7 @@ class FeasibleShare(FeasibleObjects):
         apart = furniture_overlap(batch, pool=context.pool).to(furniture.device) <= self.max_penetration
         flags = {**output.object_flags, "judged": batch.is_free | furniture}
         free = output.terms["free_objects"]
-        terms = {
-            "free_objects": free,
-            "feasible_objects": output.value,
-            "deepest_mm": output.terms["deepest_mm"],
-        }
+        terms = {"free_objects": free, "feasible_objects": output.value, "deepest_mm": output.terms["deepest_mm"]}
         return replace(
             output,
             value=output.value / free.clamp(min=1),

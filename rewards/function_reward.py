@@ -1,4 +1,4 @@
-"""Bare functions as rewards: which arguments they take, and what they may return."""
+"""Bare functions as rewards."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class FunctionReward:
     """A bare function as a reward.
 
     Args:
-        function: takes ``(batch)`` or ``(batch, context)``, then keyword settings; returns (B,) numbers or a
+        function: function of ``(batch)`` or ``(batch, context)`` and keyword settings, which returns (B,) numbers or a
             :class:`RewardOutput`.
-        name: its name in logs; the function's own by default.
-        **settings: keyword arguments passed on at every call.
+        name: name of the reward in logs; the function's own by default.
+        **settings: keyword arguments of every call.
 
     >>> FunctionReward(lambda batch: batch.counts, name="count")(SceneBatch.empty("dimsum_table", 2), RewardContext())
     RewardOutput(value=tensor([1., 1.]), per_object=None, terms={}, valid=None, object_flags={}, problem='')
@@ -53,7 +53,7 @@ def as_output(result: Any) -> Any:
 
 
 def _accepts(function: Callable[..., Any], count: int, settings: Mapping[str, Any], name: str) -> bool:
-    """Whether ``function`` takes ``count`` positional arguments beside ``settings``; if not, it must take one fewer."""
+    """Whether ``function`` takes ``count`` positional arguments and ``settings``; if not, it must take one fewer."""
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):

@@ -9,7 +9,7 @@ from scene_envs.scene import SceneBatch
 
 @runtime_checkable
 class LearnedReward(Protocol):
-    """A reward whose scores change while a run goes on, because it learns from real scenes and from samples.
+    """A reward whose scores change during a run, because it learns from real scenes and from samples.
 
     ``post-train`` calls :meth:`begin` once, then :meth:`learn` with samples of the base prior and with the scenes of
     every iteration after they were scored. The state is part of the run's checkpoint. All processes of a run call both
@@ -20,17 +20,17 @@ class LearnedReward(Protocol):
         """Forget everything, and take ``real`` as the real scenes."""
 
     def learn(self, samples: SceneBatch, steps: int | None = None) -> None:
-        """Learn from ``samples``, which the prior in training has made; ``steps`` are of the optimiser."""
+        """Take ``steps`` optimiser steps on ``samples`` of the prior in training."""
 
     def state_dict(self) -> dict[str, Any]:
-        """For a checkpoint."""
+        """State for a checkpoint."""
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Inverse of :meth:`state_dict`, after :meth:`begin`."""
 
 
 def learned_parts(reward: Any) -> list[LearnedReward]:
-    """The rewards that learn, out of a reward and the parts of a composite; in a fixed order.
+    """The rewards that learn, among a reward and the parts of a composite; in a fixed order.
 
     >>> from rewards import resolve_reward
     >>> learned_parts(resolve_reward("object_count"))

@@ -17,7 +17,7 @@ _allowed: set[Path] = set()
 
 
 def is_local(reward: Any) -> bool:
-    """Whether a name of a reward is that of a function or class in a file.
+    """Whether a name of a reward names a function or class in a file.
 
     >>> is_local("./my_rewards.py:clutter"), is_local("clutter")
     (True, False)
@@ -57,7 +57,7 @@ def load_local(reward: str) -> Callable[..., Any]:
     """The function or class that ``PATH.py:NAME`` names; runs the file once per process.
 
     Raises:
-        InvalidInputError: the file was not allowed, is not there, or has nothing of that name that can be called.
+        InvalidInputError: the file was not allowed, does not exist, or has no callable of that name.
         RewardError: the file cannot be run.
     """
     match = _LOCAL.fullmatch(reward)

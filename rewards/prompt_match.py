@@ -25,14 +25,14 @@ logger = logging.getLogger(__name__)
 @register_reward("prompt_match")
 @dataclass(frozen=True)
 class PromptMatch:
-    """How well a scene matches its prompt: mean score of the claims, from 0 to 1; 1 exactly when all hold.
+    """Match of a scene and its prompt: mean score of the claims, from 0 to 1; 1 exactly if all hold.
 
     A false claim about a number scores the smaller number over the larger one; a false relation scores a quarter for
-    each of its two things that is present. The prompt is the one that the scene was made for, or ``prompt`` for all
-    scenes. Scenes whose prompt is empty, or cannot be read, are invalid.
+    each of its two objects that is present. The prompt is the one that the scene was made for, or ``prompt`` for all
+    scenes. Scenes with an empty or unreadable prompt are invalid.
 
     Attributes:
-        prompt: in place of the prompts that the scenes were made for.
+        prompt: prompt to use instead of the prompts of the scenes.
 
     >>> reward = PromptMatch("A scene with a table and two cups.")
     >>> reward(SceneBatch.empty("dimsum_table", 1), RewardContext()).value
@@ -52,7 +52,7 @@ class PromptMatch:
         Terms: ``all_claims_hold``, 1 or 0; ``claims_hold``, the share of the claims that hold.
 
         Raises:
-            InvalidInputError: no prompt is given, not one per scene, or ``prompt`` cannot be read.
+            InvalidInputError: there is no prompt, there is not one per scene, or ``prompt`` cannot be read.
         """
         from scene_envs.datasets.prompts import scene_facts
 
@@ -81,13 +81,13 @@ def claims_asked(
     """Claims that a reward called ``name`` compares each scene with; None where a prompt is empty or cannot be read.
 
     Args:
-        name: of the reward, for errors.
-        prompt: one text for all scenes, in place of ``prompts``.
+        name: name of the reward in error messages.
+        prompt: one text for all scenes, used instead of ``prompts``.
         batch: B scenes.
         prompts: one text per scene.
 
     Raises:
-        InvalidInputError: no prompt is given, not one per scene, or ``prompt`` cannot be read.
+        InvalidInputError: there is no prompt, there is not one per scene, or ``prompt`` cannot be read.
     """
     from scene_envs.datasets.prompts import parse_prompt
 
@@ -95,7 +95,7 @@ def claims_asked(
         return [parse_prompt(prompt, batch.scene_type)] * len(batch)
     if prompts is None:
         raise InvalidInputError(
-            f"{name} has no prompt to compare with: give prompt= to what makes the scenes, or "
+            f"{name} has no prompt to compare with: give prompt= to the command or environment, or "
             f"reward='{{name: {name}, prompt: A scene with 12 objects}}'"
         )
     if len(prompts) != len(batch):
@@ -105,7 +105,7 @@ def claims_asked(
 
 @lru_cache(maxsize=4096)
 def _claims(prompt: str, scene_type: SceneType) -> PromptFacts | None:
-    """The claims of a prompt, read once; a prompt that cannot be read is warned about."""
+    """The claims of a prompt, read once; None with a warning if the prompt cannot be read."""
     from scene_envs.datasets.prompts import parse_prompt
 
     if not prompt.strip():

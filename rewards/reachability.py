@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from scene_envs.physics.grasping import Gripper
 
 SIDES = ("above", "front")
-"""Directions from which the gripper may come: straight from above, or level from the viewer's side of the scene."""
+"""Directions of the gripper: straight from above, or level from the viewer's side of the scene."""
 
 
 @register_reward("reachability")
@@ -29,9 +29,9 @@ class Reachability:
     would take too long.
 
     Attributes:
-        sides: ``"above"``, ``"front"`` (the side of the scene type's camera, level) or both; one of them is enough.
-        opening: between the open fingers, m.
-        finger_length: of the fingers, m.
+        sides: ``"above"``, ``"front"`` (the side of the scene type's camera, level) or both; one side is enough.
+        opening: distance between the open fingers, m.
+        finger_length: length of the fingers, m.
 
     >>> Reachability()(SceneBatch.empty("dimsum_table", 1), RewardContext()).value
     tensor([0.])
@@ -54,13 +54,13 @@ class Reachability:
         self._gripper()
 
     def maximum(self, slots: int, free_slots: int) -> float:
-        """The largest value: all are within reach."""
+        """The largest value, if all objects are within reach."""
         return 1.0
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
-        """Try the gripper at each object. ``per_object`` (B, N) and the flag ``reachable`` are 1 where it is reached.
+        """Try the gripper at each object. ``per_object`` (B, N) and the flag ``reachable`` mark the reached objects.
 
-        Terms: ``free_objects``, ``reachable_objects``, and ``from_<side>``, how many are reached from each side.
+        Terms: ``free_objects``, ``reachable_objects``, and ``from_<side>``, the number reached from each side.
         """
         from scene_envs.datasets.prompts import viewer_axes
         from scene_envs.physics.grasping import reachable

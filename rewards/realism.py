@@ -29,9 +29,9 @@ class Realism:
     objects are missing is invalid.
 
     Attributes:
-        prior: name or path of the prior; that of the scene type's name when null.
-        levels: number of timesteps at which the loss is taken: those of a chain of that many equally spaced steps.
-        seed: of the noise.
+        prior: name or path of the prior; null takes the one with the name of the scene type.
+        levels: number of timesteps at which the loss is taken, those of a chain of equally spaced steps.
+        seed: seed of the noise.
     """
 
     name: ClassVar[str] = "realism"

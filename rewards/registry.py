@@ -1,4 +1,4 @@
-"""Reward registry: names by decorator, by entry point of installed packages, and by mapping in a configuration."""
+"""Registry of rewards, by decorator, by entry point of installed packages, and by mapping in a configuration."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from scene_envs.plugins import PluginError, load_plugin
 from scene_envs.registry import Registry
 
 ENTRY_POINT_GROUP = "scene_envs.rewards"
-"""Packages offer rewards under this entry-point group; the entry's name is the reward's name."""
+"""Entry-point group under which packages register rewards; the entry's name is the reward's name."""
 
 Maker = TypeVar("Maker", bound=Callable[..., Any])
 
@@ -29,13 +29,13 @@ _allowed_targets: list[str] = ["rewards"]
 
 @dataclass(frozen=True)
 class RewardInfo:
-    """One line of a listing.
+    """One line of a list of rewards.
 
     Attributes:
-        name: what to write after ``reward=``.
-        summary: first sentence of its docstring.
+        name: name to write after ``reward=``.
+        summary: first sentence of the reward's docstring.
         parameters: settings and their defaults, as ``"name=default"``.
-        source: the module that defines it.
+        source: module that defines the reward.
     """
 
     name: str
@@ -47,11 +47,11 @@ class RewardInfo:
 def register_reward(name: str) -> Callable[[Maker], Maker]:
     """Make a reward available under ``name`` to RL, search and the command line.
 
-    Decorates a reward class (built with the settings given beside its name), or a function taking ``(batch)`` or
-    ``(batch, context)`` and returning (B,) numbers or a :class:`RewardOutput`.
+    Decorates a reward class, which is built with the settings of the reward, or a function of ``(batch)`` or
+    ``(batch, context)`` that returns (B,) numbers or a :class:`RewardOutput`.
 
     Raises:
-        InvalidInputError: the name is taken by another reward, or what is decorated cannot be called.
+        InvalidInputError: the name is taken by another reward, or the decorated object is not callable.
 
     >>> @register_reward("doctest_low")
     ... def low(batch, context):
@@ -97,9 +97,9 @@ def make_reward(name: str, **settings: Any) -> Reward:
     """The reward called ``name``, built with ``settings``.
 
     Raises:
-        UnknownNameError: no such reward; the nearest known name is offered.
+        UnknownNameError: no reward has that name; the message gives the nearest known one.
         InvalidInputError: the reward does not take these settings.
-        RewardError: the plug-in that offers it cannot be imported.
+        RewardError: the reward's plug-in cannot be imported.
     """
     return _build(_find(name), name, settings)
 
@@ -107,8 +107,8 @@ def make_reward(name: str, **settings: Any) -> Reward:
 def allow_reward_targets(package: str) -> None:
     """Let ``{"_target_": "<package>.…"}`` mappings name classes and functions defined in ``package``.
 
-    The packages of installed plug-ins and ``rewards`` itself are allowed already. Anything else is refused, so that
-    a config file from elsewhere cannot run code of its choice.
+    The packages of installed plug-ins and ``rewards`` itself are always allowed. Other packages are refused, so that an
+    untrusted config file cannot run code of its choice.
     """
     if not all(part.isidentifier() for part in package.split(".")):
         raise InvalidInputError(f"{package!r} is not a package name; give one such as 'my_package'")
@@ -117,11 +117,11 @@ def allow_reward_targets(package: str) -> None:
 
 
 def resolve_reward(reward: Any) -> Reward:
-    """A reward object from whatever names one.
+    """The reward object that ``reward`` describes.
 
     Args:
         reward: a registered name; a mapping ``{"name": …, **settings}`` or ``{"_target_": "package.Class", …}``;
-            a function; a reward class; or a reward, which comes back as it is.
+            a function; a reward class; or a reward, which is returned unchanged.
 
     >>> resolve_reward({"name": "clip", "reward": "object_count", "high": 20.0})
     Clip(reward=ObjectCount(), low=None, high=20.0)
@@ -137,7 +137,8 @@ def resolve_reward(reward: Any) -> Reward:
         )
     if inspect.isclass(reward):
         return _build(reward, reward.__name__, {})
-    if inspect.isroutine(reward) or not _is_reward_object(reward):
+    # a reward object is of a class that defines ``__call__`` in Python, unlike a partial or a builtin
+    if inspect.isroutine(reward) or not inspect.isfunction(getattr(type(reward), "__call__", None)):  # noqa: B004
         return FunctionReward(reward)
     return reward  # type: ignore[no-any-return]
 
@@ -172,12 +173,12 @@ def allowed_targets() -> list[str]:
 
 
 def registered_module(name: str) -> str | None:
-    """The module of the reward registered under ``name`` in this process, None where there is none."""
+    """The module of the reward registered under ``name`` in this process; None if there is none."""
     return getattr(_REWARDS.get(name), "__module__", None)
 
 
 def plugin_module(name: str) -> str | None:
-    """The module of the installed plug-in that offers ``name``, without an import; None where there is none."""
+    """The module of the installed plug-in that has ``name``, without an import; None if there is none."""
     point = _REWARDS.points().get(name)
     return None if point is None else point.module
 
@@ -271,8 +272,3 @@ def _build(maker: Callable[..., Any], name: str, settings: dict[str, Any]) -> Re
 
 def _origin(maker: Any) -> str:
     return f"{maker.__module__}.{getattr(maker, '__qualname__', type(maker).__qualname__)}"
-
-
-def _is_reward_object(reward: Any) -> bool:
-    """Whether it is an object of a class that defines ``__call__`` in Python (not a partial or a builtin)."""
-    return inspect.isfunction(getattr(type(reward), "__call__", None))  # noqa: B004

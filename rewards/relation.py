@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 @register_reward("relation")
 @dataclass(frozen=True)
 class Relation:
-    """How well a scene matches the relations of its prompt: their mean score; 1 when all hold, or none is claimed.
+    """Match of a scene and the relations of its prompt: their mean score; 1 if all hold, or none is claimed.
 
-    A relation places a thing by another thing or a place: on, in, beside, to the left, right, front or back. Each
-    relation scores as in ``prompt_match``, which also scores numbers of objects. Scenes whose prompt is empty or
-    cannot be read are invalid.
+    A relation gives the place of an object relative to another object or to the scene: on, in, beside, to the left,
+    right, front or back. Each relation scores as in ``prompt_match``, which also scores numbers of objects. Scenes with
+    an empty or unreadable prompt are invalid.
 
     Attributes:
-        prompt: in place of the prompts that the scenes were made for.
+        prompt: prompt to use instead of the prompts of the scenes.
 
     >>> reward = Relation("A scene where a cup is on top of a plate.")
     >>> output = reward(SceneBatch.empty("dimsum_table", 1), RewardContext())
@@ -46,10 +46,10 @@ class Relation:
 
         Terms: ``relations``, the number of claimed relations; ``relations_hold``, the share of them that holds (1 if
         there are none). ``per_object`` (B, N): the score of each relation is divided by the number of relations and
-        shared equally among the objects that the relation is about.
+        shared equally among the objects in the relation.
 
         Raises:
-            InvalidInputError: no prompt is given, not one per scene, or ``prompt`` cannot be read.
+            InvalidInputError: there is no prompt, there is not one per scene, or ``prompt`` cannot be read.
         """
         from scene_envs.datasets.prompts import NameCount, ObjectCount, scene_facts
 

@@ -18,15 +18,14 @@ _local = threading.local()
 
 @contextmanager
 def seeded_generators(seed: int, batch: SceneBatch | None = None) -> Iterator[None]:
-    """Context in which the generators of torch (CPU), NumPy and Python start from a seed of their own.
+    """Context in which the generators of torch (CPU), NumPy and Python have a seed that depends on the scenes.
 
-    That seed depends only on ``seed``, the scenes and :func:`current_draw`. The same scenes get the same numbers in
-    every call, in every process, and after a run is resumed. Afterwards the generators go on as if nothing had been
-    drawn.
+    The seed depends only on ``seed``, the scenes and :func:`current_draw`, so the same scenes get the same numbers in
+    every call, in every process, and after a run is resumed. Afterwards the generators have their earlier states.
 
     Args:
-        seed: of the run.
-        batch: the scenes that are scored; None while the reward is made.
+        seed: seed of the run.
+        batch: scenes that are scored; None while the reward is made.
     """
     states = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
     scenes = b"" if batch is None else batch.tensor.detach().cpu().contiguous().numpy().tobytes()
@@ -46,7 +45,7 @@ def seeded_generators(seed: int, batch: SceneBatch | None = None) -> Iterator[No
 
 @contextmanager
 def other_draw(number: int) -> Iterator[None]:
-    """Context in which rewards get other random numbers; each ``number`` has its own stream, and 0 is the usual one."""
+    """Context in which rewards draw from the stream ``number`` of random numbers; the default stream is 0."""
     before = current_draw()
     _local.draw = number
     try:
@@ -56,5 +55,5 @@ def other_draw(number: int) -> Iterator[None]:
 
 
 def current_draw() -> int:
-    """The stream of random numbers that this thread's rewards get."""
+    """Number of the stream of random numbers of this thread's rewards."""
     return int(getattr(_local, "draw", 0))

@@ -17,7 +17,7 @@ from scene_envs.scene import SceneBatch
 @register_reward("stability")
 @dataclass(frozen=True)
 class Stability:
-    """How still the free objects stay under gravity: their mean score, from 0 to 1 (at rest).
+    """Stillness of the free objects under gravity: their mean score, from 0 to 1 (at rest).
 
     An object that moves by d and turns by a scores ``exp(-(d / scale + a / scale_rotation))``. Objects deeper than
     ``max_penetration`` in others are removed before the simulation, as for ``feasible_objects``, and score 0. Objects
@@ -43,7 +43,7 @@ class Stability:
                 raise InvalidInputError(f"stability: {setting}={getattr(self, setting)} must be positive")
 
     def maximum(self, slots: int, free_slots: int) -> float:
-        """The largest value: all are at rest."""
+        """The largest value, if all objects are at rest."""
         return 1.0
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:

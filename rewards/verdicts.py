@@ -1,4 +1,4 @@
-"""Verdicts of feasibility that several rewards share: the same scene is simulated once."""
+"""Cache of feasibility verdicts, so that several rewards simulate the same scene once."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from scene_envs.assets import Asset
     from scene_envs.physics import FeasibilityResult, PhysicsPool
 
-_MOST = 4096
-"""Scenes whose verdicts are kept, the latest ones."""
+_MAX_VERDICTS = 4096
+"""Number of scenes whose verdicts are kept, the latest ones."""
 
 _Verdict = tuple[Tensor, Tensor, Tensor, Tensor]
 """feasible, depth, displacement, rotation of one scene, (N,) each."""
 _known: OrderedDict[bytes, _Verdict] = OrderedDict()
 _assets: dict[tuple[int, ...], tuple[Asset, ...]] = {}
-"""Assets whose ids are in keys; while they are held, no other object has such an id."""
+"""Assets whose ids are in keys; keeping them alive ensures that no other object gets their ids."""
 
 
 def verdicts(batch: SceneBatch, limits: dict[str, float], pool: PhysicsPool | None) -> FeasibilityResult:
@@ -52,7 +52,7 @@ def verdicts(batch: SceneBatch, limits: dict[str, float], pool: PhysicsPool | No
         if valid:
             _known[key] = verdict
             _known.move_to_end(key)
-    while len(_known) > _MOST:
+    while len(_known) > _MAX_VERDICTS:
         _known.popitem(last=False)
     feasible, depth, displacement, rotation = (
         torch.stack([verdict[column] for _, verdict in judged]) for column in range(4)
@@ -62,13 +62,13 @@ def verdicts(batch: SceneBatch, limits: dict[str, float], pool: PhysicsPool | No
 
 
 def forget_verdicts() -> None:
-    """Let every scene be judged anew."""
+    """Clear the cache."""
     _known.clear()
     _assets.clear()
 
 
 def _keys(batch: SceneBatch, limits: dict[str, float]) -> list[bytes]:
-    """One digest per scene of all that its verdict depends on."""
+    """One digest per scene, of all inputs of its verdict."""
     assets = batch.scene_type.library.assets  # other objects once a file of a model has changed
     models = tuple(map(id, assets))
     _assets[models] = assets

@@ -3,8 +3,8 @@
 All three kernels are of one family that is closed under composition, so that strides of any length have posteriors in
 closed form and few-step chains have exact log-probabilities. From s to t a category
 
-    is kept with probability k, is absorbed by the mask token with probability m,
-    and is replaced by a uniformly drawn category with the rest, 1 - k - m.
+    is kept with probability k, is replaced by the mask token with probability m,
+    and is replaced by a uniformly drawn category with probability 1 - k - m.
 """
 
 from __future__ import annotations
@@ -69,17 +69,17 @@ def _mask_and_replace(num_timesteps: int) -> tuple[Tensor, Tensor]:
 
 
 def _early_absorbing(num_timesteps: int) -> tuple[Tensor, Tensor]:
-    """Absorbing from T/2 on: a reverse chain decides categories first, and then positions from coarse to fine."""
+    """Absorbing from T/2 on, so that a reverse chain draws all categories in its first half."""
     u = torch.linspace(0, 1, num_timesteps + 1, dtype=torch.float64)
     mask = torch.maximum(1e-5 * u, (u - 0.5) / 0.5)
     return 1.0 - mask, mask
 
 
 def _squared_absorbing(num_timesteps: int) -> tuple[Tensor, Tensor]:
-    """The kernel ``early_absorbing`` with a quadratic schedule: the last categories are decided one at a time.
+    """The kernel ``early_absorbing`` with a quadratic schedule, which unmasks the last categories one at a time.
 
-    Categories that are decided in the same step do not depend on each other, so that counts come out inexactly. So only
-    few categories should be left for the last of these steps, as with the cosine of MaskGIT (Chang et al. 2022).
+    Categories that are unmasked in the same step are drawn independently, which makes counts inexact. Few categories
+    should therefore be left for the last of these steps, as with the cosine of MaskGIT (Chang et al. 2022).
     """
     u = torch.linspace(0, 1, num_timesteps + 1, dtype=torch.float64)
     mask = torch.maximum(1e-5 * u, ((u - 0.5) / 0.5).clamp(min=0.0) ** 2)
@@ -111,7 +111,7 @@ class CategoricalProcess:
 
     Args:
         schedule: cumulative rates.
-        categories: K.
+        categories: number K of categories.
 
     >>> process = CategoricalProcess(make_categorical_schedule("absorbing", 4), 3)
     >>> process.marginal(torch.tensor([1]), torch.tensor([2]))
@@ -163,9 +163,9 @@ class CategoricalProcess:
 
     def prior(self) -> Tensor:
         """(K + 1,) distribution of x_T: the marginal of uniformly drawn data."""
-        keep, mask = self.schedule.keep[-1], self.schedule.mask[-1]
+        mask = self.schedule.mask[-1]
         spread = torch.full((self.categories,), float(1.0 - mask) / self.categories)
-        return torch.cat([spread, mask.float().reshape(1)]) + 0.0 * keep.float()
+        return torch.cat([spread, mask.float().reshape(1)])
 
     # -- reverse --------------------------------------------------------------------------------
 
@@ -176,10 +176,10 @@ class CategoricalProcess:
         The cost is linear in K. An x_0 that cannot lead to x_t has weight 0.
 
         Args:
-            x_t: (B, ...) int64 states at t.
+            x_t: (B, ...) int64, states at t.
             x0_probs: (B, ..., K) the denoiser's distribution of the data.
-            t: where the strides start, int or (B,).
-            previous: where they end, s; at 0 the result is ``x0_probs`` itself.
+            t: first timestep of each stride, int or (B,).
+            previous: last timestep s of each stride; at 0 the result is ``x0_probs`` itself.
 
         Returns:
             (B, ..., K + 1) probabilities, rows sum to one; differentiable in ``x0_probs``.
@@ -219,7 +219,7 @@ class CategoricalProcess:
             x0: (B, ...) data.
             x_t: (B, ...) states at t.
             t: (B,) timesteps, 1..T.
-            logits: (B, ..., K) of x_0.
+            logits: (B, ..., K) logits of x_0.
             auxiliary: weight of the cross-entropy of x_0 (Austin et al. 2021, Eq. 5; the paper's is 5e-4).
         """
         log_x0 = F.log_softmax(logits, dim=-1)

@@ -50,7 +50,7 @@ class GaussianProcess:
 
     Args:
         schedule: signal rates for t = 0..T.
-        prediction: what the network's output means (one of :data:`PREDICTIONS`).
+        prediction: parameterisation of the network's output (one of :data:`PREDICTIONS`).
         preconditioning: data moments, used by ``"edm"``.
 
     All timesteps ``t`` are int64 tensors of shape (B,) or (); chains run in float32.
@@ -94,7 +94,7 @@ class GaussianProcess:
         return (x_t - alpha * mean) / (alpha**2 * std**2 + sigma**2).sqrt()
 
     def x0_from_output(self, x_t: Tensor, t: Tensor, output: Tensor, moments: Moments | None = None) -> Tensor:
-        """The denoised scene x_0 that a network output stands for.
+        """The denoised scene x_0 that follows from a network output.
 
         ``edm``: skip and output scaling of Karras et al. (2022), Table 1, in variance-preserving
         coordinates and with per-feature moments; ``epsilon``: predicted noise; ``v``: Salimans and Ho (2022).
@@ -133,7 +133,7 @@ class GaussianProcess:
     # -- reverse --------------------------------------------------------------------------------
 
     def check_stride(self, t: int, previous: int) -> None:
-        """Raise InvalidInputError where t -> s is not a stride down within 0..T."""
+        """Raise InvalidInputError unless 0 <= s < t <= T."""
         if not 0 <= previous < t <= self.schedule.num_timesteps:
             raise InvalidInputError(
                 f"the step {t} -> {previous} is not a stride down within 0..{self.schedule.num_timesteps}, "
@@ -150,8 +150,8 @@ class GaussianProcess:
         Args:
             x_t: (B, N, D).
             x0: (B, N, D) denoised scene.
-            t: where the stride starts.
-            previous: where it ends, s.
+            t: first timestep of the stride.
+            previous: last timestep s of the stride.
             residual: (D,) or () expected squared error of ``x0``; None takes ``x0`` as exact (Ho et al.). With
                 ``residual``, the variance at ``eta`` 1 is the optimal one of Bao et al. (2022), Theorem 1. The variance
                 that the error adds is scaled by the square of ``eta``, so that the chain at ``eta`` 0 stays

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from agents.diffusion.categorical import CategoricalProcess
 
-_MET = 20
-"""Least number of slots of a category from which its own moments are taken."""
+_MIN_SLOTS = 20
+"""Smallest number of slots of a category from which its own moments are taken."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class CategoryMoments:
     """Moments of normalised poses, category by category; the last of the K categories is *empty*.
 
     Attributes:
-        share: (K,) how often each category is met in a slot; sums to 1.
+        share: (K,) frequency of each category among slots; sums to 1.
         mean: (K, D).
         std: (K, D), floored away from zero.
     """
@@ -32,8 +32,8 @@ class CategoryMoments:
     def fit(cls, poses: Tensor, categories: Tensor, count: int, floor: float = 1e-3) -> CategoryMoments:
         """Moments of poses (M, D) whose categories are (M,) in 0..``count`` - 1.
 
-        A category met fewer than 20 times takes the moments of all objects: a standard deviation estimated too small
-        would blow up the targets of poses far from the mean. *Empty* has the mean of all objects and the standard
+        A category with fewer than 20 slots takes the moments of all objects, because too small a standard deviation
+        makes the targets of poses far from the mean very large. *Empty* has the mean of all objects and the standard
         deviation ``floor``.
         """
         poses = poses.double()
@@ -42,7 +42,7 @@ class CategoryMoments:
         std[-1] = 0.0
         for category in range(count - 1):
             own = poses[categories == category]
-            if len(own) >= _MET:
+            if len(own) >= _MIN_SLOTS:
                 mean[category], std[category] = own.mean(dim=0), own.std(dim=0)
         share = torch.bincount(categories, minlength=count).double() + 1e-3
         return cls((share / share.sum()).float(), mean.float(), std.clamp(min=floor).float())
@@ -74,7 +74,7 @@ class Preconditioning:
     Attributes:
         mean: (D,) mean.
         std: (D,) standard deviation, floored away from zero.
-        by_category: the same for every category; None where the process does not tell them apart.
+        by_category: moments of each category; None if the process scales all categories alike.
     """
 
     mean: Tensor
@@ -109,5 +109,5 @@ class Preconditioning:
         mean, std = (torch.tensor(state[key], dtype=torch.float32) for key in ("mean", "std"))
         known = [mean, std, *([] if by_category is None else (by_category.share, by_category.mean, by_category.std))]
         if mean.shape != std.shape or mean.ndim != 1 or not all(bool(torch.isfinite(part).all()) for part in known):
-            raise ValueError("the moments of the preconditioning are not as many finite numbers")
+            raise ValueError("the moments of the preconditioning must be finite numbers, one mean and std per feature")
         return cls(mean, std, by_category)

@@ -12,13 +12,13 @@ from torch import Tensor
 class ResidualVariance:
     """Mean squared error of the denoised scene, E (x_0 - x_0_hat(x_t))^2, per noise level and feature.
 
-    A chain that replaces x_0 by its estimate loses this much variance: with 25 strides of an exact
-    denoiser of Gaussian data a fifth of the standard deviation is missing. Adding it back gives the optimal
-    reverse variance of Bao et al. (Analytic-DPM, 2022), Theorem 1, here per feature.
+    A chain that replaces x_0 by its estimate loses this much variance; with 25 strides of an exact denoiser of Gaussian
+    data, a fifth of the standard deviation. Adding it back gives the optimal reverse variance of Bao et al.
+    (Analytic-DPM, 2022), Theorem 1, here per feature.
 
     Attributes:
-        timesteps: (G,) int64, increasing.
-        variance: (G, D) float32.
+        timesteps: (G,) int64, the measured timesteps, increasing.
+        variance: (G, D) float32, mean squared errors at these timesteps.
 
     >>> residual = ResidualVariance(torch.tensor([1, 3]), torch.tensor([[1.0], [4.0]]))
     >>> residual.at(2)
@@ -29,7 +29,7 @@ class ResidualVariance:
     variance: Tensor
 
     def at(self, t: int) -> Tensor:
-        """(D,) at timestep ``t``, geometric between the measured levels."""
+        """(D,) error at timestep ``t``, interpolated geometrically between the measured levels."""
         upper = int(torch.searchsorted(self.timesteps, t).clamp(max=len(self.timesteps) - 1))
         lower = max(0, upper - 1)
         span = int(self.timesteps[upper] - self.timesteps[lower])

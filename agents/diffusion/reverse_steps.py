@@ -109,7 +109,7 @@ class GaussianStep(NamedTuple):
 class MixedStep(NamedTuple):
     """Normal poses and a categorical state per slot, independent given x_t and which slots are unmasked.
 
-    A state stands in the last K features of a slot as a one-hot vector; the mask token is all zeros.
+    The last K features of a slot are the one-hot vector of its state; the mask token is all zeros.
 
     Attributes:
         mean: (B, N, P) of the pose.
@@ -209,7 +209,7 @@ def _shifted(mean: Tensor, shift: Tensor) -> Tensor:
 
 
 def _invert(cumulative: Tensor, uniform: Tensor) -> Tensor:
-    """(...) int64: where ``uniform`` (...) falls among the running sums (..., S) of weights."""
+    """(...) int64: index of the running sum (..., S) of weights in which ``uniform`` (...) falls."""
     below = cumulative < uniform.unsqueeze(-1) * cumulative[..., -1:]
     return below.sum(dim=-1).clamp(max=cumulative.shape[-1] - 1)
 

@@ -1,4 +1,4 @@
-"""Explicit reverse steps: pairs of timesteps (t, t_prev) of a chain."""
+"""Step tables: the pairs of timesteps (t, t_prev) of a reverse chain."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class StepTable:
 
     Attributes:
         timesteps: (S,) int64, strictly decreasing, within 1..T.
-        previous: (S,) int64, where each step lands; the last is 0, clean data.
+        previous: (S,) int64, timestep at which each step ends; the last is 0, clean data.
 
     >>> table = StepTable.spaced(1000, 4)
     >>> table.timesteps.tolist(), table.previous.tolist()
@@ -47,8 +47,8 @@ class StepTable:
         from 0.
 
         Args:
-            num_timesteps: T of the schedule.
-            num_steps: S; need not divide T.
+            num_timesteps: number T of timesteps of the schedule.
+            num_steps: number S of steps; need not divide T.
 
         Raises:
             InvalidInputError: ``num_steps`` is not a whole number in 1..T.
@@ -65,16 +65,15 @@ class StepTable:
 
     @classmethod
     def gradual(cls, masked: Tensor, slots: int, num_steps: int) -> StepTable:
-        """``num_steps`` steps, of which the first ones decide about one slot each.
+        """``num_steps`` steps, the first of which unmask about one slot each.
 
-        Slots that are unmasked in one step do not know each other's categories. The categories of the first slots
-        determine the kind of scene, so these slots are decided one after the other. As many steps as ``num_steps``
-        exceeds 25, but at most half of all steps, decide about one slot each. The other steps are evenly spaced.
+        The first k = min(num_steps // 2, num_steps - 25) steps unmask about one slot each; the rest are evenly spaced.
+        Slots that are unmasked in one step are drawn independently, and the first slots determine the kind of scene.
 
         Args:
-            masked: (T + 1,) share of masked slots at each timestep, non-decreasing, as of an absorbing chain.
-            slots: N of a scene.
-            num_steps: S, from 1 to T.
+            masked: (T + 1,) share of masked slots at each timestep of an absorbing chain, non-decreasing.
+            slots: number N of slots of a scene.
+            num_steps: number S of steps, from 1 to T.
 
         >>> StepTable.gradual(torch.linspace(0, 1, 1001), 100, 30).timesteps[:8].tolist()
         [1000, 990, 980, 971, 961, 951, 911, 872]
@@ -93,11 +92,11 @@ class StepTable:
 
     @classmethod
     def from_timesteps(cls, timesteps: Sequence[int], num_timesteps: int | None = None) -> StepTable:
-        """From the timesteps alone, in decreasing order; the last step lands on 0.
+        """Table of timesteps in decreasing order; the last step ends at 0.
 
         Args:
-            timesteps: such as another library's, in 1..T.
-            num_timesteps: T, to check the timesteps against; a process later refuses timesteps above its own T.
+            timesteps: timesteps in 1..T, such as those of another library.
+            num_timesteps: T, against which the timesteps are checked; a process refuses timesteps above its own T.
 
         Raises:
             InvalidInputError: the timesteps are not in decreasing order, or outside 1..T.

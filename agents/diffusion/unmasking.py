@@ -1,9 +1,9 @@
-"""Unmasking of absorbing chains: how many slots a step unmasks, and how their categories are drawn.
+"""Unmasking of absorbing chains: the number of slots that a step unmasks, and the draws of their categories.
 
-Slots that are unmasked in the same step do not know each other's categories, so scenes get too many objects of a kind.
-Two remedies leave the distribution of each slot as it is. The number of slots that a step unmasks differs from its
+Slots that are unmasked in the same step are drawn independently, so scenes can get too many objects of a kind. Two
+remedies leave the distribution of each slot unchanged. The number of slots that a step unmasks differs from its
 expectation by less than one (:func:`draw_unmasked`). The kinds of objects whose number a prompt gives are drawn by
-systematic sampling (:func:`systematic`), so the number of each differs little from its expectation as well.
+systematic sampling (:func:`systematic`), so the number of each also differs little from its expectation.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ def draw_unmasked(masked: Tensor, chance: Tensor, uniform: Tensor) -> Tensor:
     ranks choose the slots, and the minimum decides the rounding.
 
     Args:
-        masked: (B, N) bool.
-        chance: (B, N) of a masked slot to be unmasked, the same for all of a scene.
+        masked: (B, N) bool, the masked slots.
+        chance: (B, N) probability that a masked slot is unmasked, equal for all slots of a scene.
         uniform: (B, N) independent numbers, uniform on [0, 1).
 
     >>> masked = torch.tensor([[True, True, False, True, True]])
@@ -48,7 +48,7 @@ def systematic(unmasked: Tensor, uniform: Tensor) -> Tensor:
     is uniform. Slots of equal probabilities p take a category p k times, rounded down or up.
 
     Args:
-        unmasked: (B, N) bool.
+        unmasked: (B, N) bool, the slots that a step unmasks.
         uniform: (B, N) float64, independent and uniform on [0, 1); slots that are not unmasked keep theirs.
 
     >>> unmasked = torch.tensor([[True, True, False, True, True]])
@@ -67,7 +67,7 @@ def unmasking_log_prob(masked: Tensor, chance: Tensor, unmasked: Tensor) -> Tens
     It depends on no parameter of a network; the masked slots of a scene have equal shares of it.
 
     Args:
-        masked, chance: as in :func:`draw_unmasked`.
+        masked, chance: the arguments of :func:`draw_unmasked`.
         unmasked: (B, N) bool, a subset of the masked slots.
 
     >>> masked, chance = torch.ones(1, 4, dtype=torch.bool), torch.full((1, 4), 0.5)
@@ -84,5 +84,5 @@ def unmasking_log_prob(masked: Tensor, chance: Tensor, unmasked: Tensor) -> Tens
 
 
 def _expected(masked: Tensor, chance: Tensor) -> tuple[Tensor, Tensor]:
-    """(B,) masked slots, and how many of them are to be unmasked on average, float64."""
+    """(B,) numbers of masked slots, and (B,) expected numbers of slots to unmask, float64."""
     return masked.sum(dim=-1).double(), torch.where(masked, chance.double(), 0.0).sum(dim=-1)

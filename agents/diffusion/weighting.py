@@ -13,7 +13,7 @@ LOSS_WEIGHTINGS = ("none", "min_snr")
 """Weightings of the squared error by timestep; see :func:`loss_weights`."""
 
 MIN_SNR_GAMMA = 5.0
-"""Gamma of Hang et al. (2023), section 3.4: the signal-to-noise ratio at which the weight is cut."""
+"""Gamma of Hang et al. (2023), section 3.4: the largest signal-to-noise ratio in the weight."""
 
 
 def check_weighting(kind: str, prediction: str) -> None:
@@ -44,14 +44,14 @@ def loss_weights(
     min(SNR, gamma) / SNR and min(SNR, gamma) / (SNR + 1).
 
     Args:
-        schedule: of the process.
+        schedule: noise schedule.
         t: (B,) int64 in 1..T.
-        prediction: what the network predicts.
+        prediction: one of :data:`~agents.diffusion.gaussian.PREDICTIONS`.
         kind: one of :data:`LOSS_WEIGHTINGS`.
-        gamma: where the ratio is cut.
+        gamma: largest signal-to-noise ratio in the weight.
 
     Raises:
-        UnknownNameError, InvalidInputError: as :func:`check_weighting`.
+        UnknownNameError, InvalidInputError: the errors of :func:`check_weighting`.
 
     >>> from agents.diffusion.schedules import make_schedule
     >>> loss_weights(make_schedule("linear"), torch.tensor([1, 1000]), "x0", "min_snr").tolist()[0]

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from agents.evaluation.scene_tokens import SceneTokens, blurred, scene_tokens
 from agents.evaluation.set_network import SetNetwork
 from agents.evaluation.two_sample_test import (
-    FEWEST,
+    MIN_SCENES,
     Accuracy,
     ClassifierConfig,
     Forward,
@@ -24,10 +24,10 @@ from scene_envs.scene import SceneBatch
 from scene_envs.scene_distance import check_same_assets
 
 RESOLUTION = (1e-3, 1e-2)
-"""Standard deviation (m, rad) of the noise that is added to both classes: the most that a feasible object may move."""
+"""Standard deviation (m, rad) of the noise that is added to both classes: the largest motion of a feasible object."""
 
-MOST_OBJECTS = 50_000
-"""Most objects to train on, both classes together. Scenes of many objects cost more each, and fewer are needed."""
+MAX_OBJECTS = 50_000
+"""Largest number of objects to train on, both classes together; scenes of many objects cost more, and fewer suffice."""
 
 
 def classifier_accuracy(
@@ -39,12 +39,12 @@ def classifier_accuracy(
     resolution: tuple[float, float] = RESOLUTION,
     config: ClassifierConfig | None = None,
 ) -> Accuracy:
-    """Accuracy, on held-out scenes, of a classifier trained to tell real scenes from samples.
+    """Accuracy, on held-out scenes, of a classifier trained to separate real scenes from samples.
 
     A set transformer reads the objects of a scene: categories, poses standardised per asset, Fourier features of the
     translation, and offsets and gaps to the nearest neighbours, standardised per pair of assets. Means and standard
-    deviations are those of the real training part. Welded objects are treated as all others; the result does not depend
-    on empty slots or on the order of slots.
+    deviations are those of the real training part. Welded objects are treated like other objects; the result does not
+    depend on empty slots or on the order of slots.
 
     Samples contain noise that grammar scenes do not have. At full precision this noise alone would identify the samples
     of every prior. Gaussian noise of the ``resolution`` is therefore added once to both classes.
@@ -52,16 +52,17 @@ def classifier_accuracy(
     Args:
         real: real scenes; the two batches should share none.
         fake: samples of the same scene type. The larger batch is subsampled to the size of the smaller one.
-        seeds: repetitions with other splits and weights.
-        seed: of the first repetition.
+        seeds: number of repetitions with other splits and weights.
+        seed: seed of the first repetition.
         resolution: standard deviation of the noise (m, rad); (0, 0) compares at full precision.
-        config: sizes of the parts, and how the classifier is trained; it trains on at most 50,000 objects.
+        config: settings of the training and test; the classifier trains on at most 50,000 objects.
 
     Returns:
         Accuracy as a fraction; 0.5 is chance.
 
     Raises:
-        InvalidInputError: other scene types, fewer than 20 scenes in one batch, no seeds, a negative resolution.
+        InvalidInputError: the scene types differ, a batch has fewer than 20 scenes, ``seeds`` is below 1, or the
+            resolution is negative.
     """
     check_same_assets(real, fake)
     if min(resolution) < 0:
@@ -84,12 +85,12 @@ def classifier_accuracy(
 
         return network, forward
 
-    config = _affordable(config or ClassifierConfig(), tokens)
+    config = _with_fewer_scenes(config or ClassifierConfig(), tokens)
     return two_sample_accuracy(len(real), len(fake), prepare, seeds=seeds, seed=seed, config=config)
 
 
-def _affordable(config: ClassifierConfig, tokens: SceneTokens) -> ClassifierConfig:
-    """``config`` with ``most_train`` lowered so that the training scenes hold about ``MOST_OBJECTS`` at most."""
+def _with_fewer_scenes(config: ClassifierConfig, tokens: SceneTokens) -> ClassifierConfig:
+    """``config`` with ``max_train`` lowered so that the training scenes hold about ``MAX_OBJECTS`` at most."""
     per_scene = float(tokens.present.sum()) / len(tokens)
-    most = max(FEWEST, int(0.5 * MOST_OBJECTS / max(per_scene, 1.0)))
-    return replace(config, most_train=min(config.most_train, most))
+    largest = max(MIN_SCENES, int(0.5 * MAX_OBJECTS / max(per_scene, 1.0)))
+    return replace(config, max_train=min(config.max_train, largest))

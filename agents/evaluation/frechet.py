@@ -19,18 +19,18 @@ def frechet_scene_distance(a: SceneBatch, b: SceneBatch, *, encoder: SetEncoder 
 
     The formula is that of Heusel et al. (2017). The features are not those of Inception, so the distance is comparable
     only with other FSDs of the same encoder. It is biased upwards by about 1 / scenes: compare sets of equal size, and
-    print the distance between two sets of real scenes of that size beside it.
+    report the distance between two sets of real scenes of that size as well.
 
     Args:
         a: scenes.
         b: scenes of the same type, or of another one; categories are matched by asset name.
-        encoder: the features; None takes the shipped encoder.
+        encoder: encoder of the features; None takes the shipped one.
 
     Returns:
         The distance, at least 0, in units of the encoder's whitened features.
 
     Raises:
-        InvalidInputError: fewer than two scenes in one batch.
+        InvalidInputError: a batch has fewer than two scenes.
     """
     from agents.evaluation.set_encoder import SetEncoder
 
@@ -53,14 +53,14 @@ def feature_distance(a: ArrayLike, b: ArrayLike) -> float:
 def gaussian_distance(mean_a: ArrayLike, cov_a: ArrayLike, mean_b: ArrayLike, cov_b: ArrayLike) -> float:
     """Squared 2-Wasserstein distance of two Gaussians (Dowson and Landau 1982).
 
-    ``|m_a - m_b|² + tr(S_a + S_b - 2 (S_a^½ S_b S_a^½)^½)``, by symmetric eigendecompositions, which also take
+    ``|m_a - m_b|² + tr(S_a + S_b - 2 (S_a^½ S_b S_a^½)^½)``, by symmetric eigendecompositions, which also work for
     singular covariances.
 
     Args:
-        mean_a: (F,).
-        cov_a: (F, F), symmetric and positive semi-definite.
-        mean_b: (F,).
-        cov_b: (F, F).
+        mean_a: (F,) mean of the first Gaussian.
+        cov_a: (F, F) covariance of the first Gaussian, symmetric and positive semi-definite.
+        mean_b: (F,) mean of the second Gaussian.
+        cov_b: (F, F) covariance of the second Gaussian.
 
     >>> gaussian_distance([0.0], [[1.0]], [3.0], [[4.0]])
     10.0

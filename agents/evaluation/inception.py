@@ -39,18 +39,18 @@ def frechet_inception_distance(
 
     Args:
         a: scenes.
-        b: scenes, as many as in ``a`` for a fair number.
+        b: scenes, ideally as many as in ``a``.
         weights: path of the state dict.
-        width: of the renders, pixels; they are then scaled to 299 x 299.
-        height: likewise.
-        batch_size: images per forward pass.
+        width: width of the renders in pixels; they are then scaled to 299 x 299.
+        height: height of the renders in pixels.
+        batch_size: number of images per forward pass.
 
     Returns:
         The distance, at least 0.
 
     Raises:
         MissingDependencyError: torchvision or PyBullet is not installed.
-        InvalidInputError: no such file, or fewer than two scenes in one batch.
+        InvalidInputError: the file does not exist, or a batch has fewer than two scenes.
         CorruptFileError: the file is not a state dict of such a network.
     """
     network = load_inception(weights)
@@ -105,7 +105,7 @@ class _Pooling(nn.Module):
 
 
 def _pool_like_tensorflow(network: nn.Module) -> None:
-    """Pool as the 2015 network does: by averages that leave out the padding, and by a maximum in the last block."""
+    """Pool as the 2015 network does: averages leave out the padding, and the last block takes maxima."""
     for name in ("5b", "5c", "5d", "6b", "6c", "6d", "6e", "7b", "7c"):
         setattr(network, f"Mixed_{name}", _Pooling(getattr(network, f"Mixed_{name}"), maximum=name == "7c"))
 
@@ -121,7 +121,7 @@ def _read_state(path: Path) -> dict[str, Tensor]:
     except Exception as error:  # torch's own message advises to run the code in the file
         raise CorruptFileError(f"{str(path)!r} cannot be read as a state dict ({type(error).__name__})") from error
     if not isinstance(state, dict) or "fc.weight" not in state:
-        raise CorruptFileError(f"{str(path)!r} is no state dict of an Inception-v3: it lacks 'fc.weight'")
+        raise CorruptFileError(f"{str(path)!r} is not a state dict of an Inception-v3: it lacks 'fc.weight'")
     return state
 
 

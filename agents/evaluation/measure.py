@@ -1,4 +1,4 @@
-"""Evaluation of scenes as one flat dict of figures, for model cards, reports and the command line."""
+"""Evaluation of scenes: a flat dict of figures for model cards, reports and the command line."""
 
 from __future__ import annotations
 
@@ -50,24 +50,24 @@ def measure_samples(
 ) -> dict[str, float]:
     """Measure scenes against reference scenes.
 
-    Objects include welded ones, *free* objects do not. A figure without data (no stack in any scene, say) is left
-    out. Scenes whose physics failed are left out of the figures of that computation; they are counted in
-    ``invalid_fraction`` or ``ready_invalid_fraction``.
+    Objects include welded ones, *free* objects do not. A figure without data, such as the height of stacks in scenes
+    without stacks, is left out. Scenes whose physics failed are left out of the figures of that computation; they are
+    counted in ``invalid_fraction`` or ``ready_invalid_fraction``.
 
     Args:
-        batch: the scenes to measure.
+        batch: scenes to measure.
         reference: real scenes of the same type.
-        floor: other real scenes; each figure is measured on them too and returned as ``floor_<name>``. A perfect
-            sampler would score these figures.
+        floor: other real scenes; each figure is also measured on them and returned as ``floor_<name>``, the figure of a
+            perfect sampler.
         pool: worker processes for physics; None computes in this process.
-        ready: whether to project and settle as well, the slowest part.
+        ready: whether to also project and settle the scenes, which takes the longest.
 
     Returns:
         The figures of :func:`layout_figures`, of :func:`~agents.evaluation.physics_figures.physics_figures` and, with
-        ``ready``, of :func:`~agents.evaluation.physics_figures.ready_figures`; docs/evaluation.md says what each is.
+        ``ready``, of :func:`~agents.evaluation.physics_figures.ready_figures`; docs/evaluation.md describes each.
 
     Raises:
-        InvalidInputError: no scenes, or scenes of another type than the reference.
+        InvalidInputError: there are no scenes, or they are of another type than the reference.
     """
     if not len(batch) or not len(reference):
         raise InvalidInputError(f"cannot measure {len(batch)} scenes against {len(reference)}: both need at least one")
@@ -102,10 +102,10 @@ def evaluate(
         reference: real scenes; None draws ``count`` scenes from the grammar of the prior's scene type.
         floor: other real scenes, see :func:`measure_samples`.
         num_steps: denoiser evaluations per sample.
-        seed: of the samples, and of the grammar when it is used.
-        batch_size: scenes denoised at once.
-        pool: worker processes for physics.
-        ready: whether to project and settle as well.
+        seed: seed of the samples, and of the grammar if it is used.
+        batch_size: number of scenes denoised at once.
+        pool: worker processes for physics; None computes in this process.
+        ready: whether to also project and settle the samples.
 
     Returns:
         The figures of :func:`measure_samples`, and ``num_steps``.
@@ -119,7 +119,7 @@ def evaluate(
 
 
 def grammar_scenes(scene_type: str | SceneType, count: int, seed: int = 0) -> SceneBatch:
-    """``count`` scenes straight from the grammar of a scene type, the same ones for the same seed."""
+    """``count`` scenes of the grammar of a scene type, the same for the same seed."""
     from scene_envs.grammars import get_grammar
 
     return get_grammar(scene_type).sample(np.random.default_rng(seed), count)

@@ -28,9 +28,9 @@ class EvaluationInputs:
     Attributes:
         samples: raw samples of a prior.
         real: real scenes.
-        follow: makes scenes with the prior, one for each prompt; None for a prior that reads no prompts.
+        follow: function that samples a scene of the prior for each prompt; None for a prior that reads no prompts.
         pool: physics workers; None computes in this process.
-        seed: of classifiers and prompts.
+        seed: seed of the classifiers and prompts.
         fid_weights: path of the weights of an Inception-v3; empty for none.
         prompts: number of real scenes whose prompts the samples follow; None for all of them.
 
@@ -61,8 +61,8 @@ def compute_measure(name: str, inputs: EvaluationInputs) -> Figures:
     return MEASURES[name](inputs)
 
 
-def _beside_floor(measure: Callable[[SceneBatch], Figures], inputs: EvaluationInputs) -> Figures:
-    """Figures of the samples, and of other real scenes as floor."""
+def _with_floor(measure: Callable[[SceneBatch], Figures], inputs: EvaluationInputs) -> Figures:
+    """Figures of the samples, and the same figures of other real scenes as floor."""
     real = {FLOOR_PREFIX + name: value for name, value in measure(inputs.real.floor).items()}
     return {**measure(inputs.samples), **real}
 
@@ -74,7 +74,7 @@ def _classifier(inputs: EvaluationInputs) -> Figures:
         accuracy = classifier_accuracy(inputs.real.reference, batch, seed=inputs.seed)
         return {"classifier_accuracy": accuracy.mean, "classifier_accuracy_std": accuracy.std}
 
-    return _beside_floor(measure, inputs)
+    return _with_floor(measure, inputs)
 
 
 def _renders(inputs: EvaluationInputs) -> Figures:
@@ -84,13 +84,13 @@ def _renders(inputs: EvaluationInputs) -> Figures:
         accuracy = render_classifier_accuracy(inputs.real.reference, batch, seed=inputs.seed)
         return {"render_accuracy": accuracy.mean, "render_accuracy_std": accuracy.std}
 
-    return _beside_floor(measure, inputs)
+    return _with_floor(measure, inputs)
 
 
 def _fsd(inputs: EvaluationInputs) -> Figures:
     from agents.evaluation.frechet import frechet_scene_distance
 
-    return _beside_floor(
+    return _with_floor(
         lambda batch: {"frechet_scene_distance": frechet_scene_distance(batch, inputs.real.reference)}, inputs
     )
 
@@ -102,7 +102,7 @@ def _fid(inputs: EvaluationInputs) -> Figures:
         raise InvalidInputError("FID needs fid_weights=, the path of an Inception-v3's weights")
 
     real, weights = inputs.real.reference, inputs.fid_weights
-    return _beside_floor(
+    return _with_floor(
         lambda batch: {"frechet_inception_distance": frechet_inception_distance(batch, real, weights)}, inputs
     )
 
@@ -130,13 +130,13 @@ def _novelty(inputs: EvaluationInputs) -> Figures:
             "copied_fraction": float(found.copied.double().mean()),
         }
 
-    return _beside_floor(lambda batch: figures(nearest_scenes(batch, training)), inputs)
+    return _with_floor(lambda batch: figures(nearest_scenes(batch, training)), inputs)
 
 
 MEASURES: dict[str, Callable[[EvaluationInputs], Figures]] = {
-    "layout": lambda inputs: _beside_floor(lambda batch: layout_figures(batch, inputs.real.reference), inputs),
-    "physics": lambda inputs: _beside_floor(lambda batch: physics_figures(batch, inputs.pool), inputs),
-    "ready": lambda inputs: _beside_floor(lambda batch: ready_figures(batch, inputs.pool), inputs),
+    "layout": lambda inputs: _with_floor(lambda batch: layout_figures(batch, inputs.real.reference), inputs),
+    "physics": lambda inputs: _with_floor(lambda batch: physics_figures(batch, inputs.pool), inputs),
+    "ready": lambda inputs: _with_floor(lambda batch: ready_figures(batch, inputs.pool), inputs),
     "fsd": _fsd,
     "novelty": _novelty,
     "prompts": _prompts,

@@ -1,4 +1,4 @@
-"""Distances of scenes from a reference: counts, categories, heights, overlaps. Pure functions, no simulator."""
+"""Distances of scenes from a reference without a simulator: counts, categories, heights."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scene_envs.scene import SceneBatch
 from scene_envs.scene_distance import check_same_assets
 
 KL_EPS = 1e-6
-"""Probability added to every category before renormalising, so that a category never sampled gives no infinite KL."""
+"""Probability added to every category before renormalising, so that the KL is finite if a category is never sampled."""
 
 _CHUNK = 128
 """Scenes whose pairs of objects are in memory together."""
@@ -65,8 +65,8 @@ def height_errors(batch: SceneBatch, supports: Sequence[Support] | None = None) 
     container, see :data:`~agents.evaluation.supports.CONTAINERS`, are left out.
 
     Args:
-        batch: the scenes.
-        supports: where objects may rest; None takes the ones of the scene type.
+        batch: scenes to measure.
+        supports: surfaces on which objects may rest; None takes those of the scene type.
 
     Returns:
         For each kind, a (K,) float tensor of absolute errors in m; K is the number of objects of that kind.
@@ -97,7 +97,6 @@ def out_of_workspace_rate(batch: SceneBatch) -> float:
 
 
 def _chunk_errors(batch: SceneBatch, supports: Sequence[Support]) -> list[tuple[str, Tensor]]:
-    """The errors (K,) of each support's objects."""
     gaps = torch.stack([_height_gap(batch, support) for support in supports])  # (S, B, N)
     catch = torch.tensor([support.catch for support in supports]).to(gaps)[:, None, None]
     nearest = (gaps - 1.0 * ((gaps <= catch) & (catch > 0))).argmin(dim=0)
@@ -122,9 +121,7 @@ def _height_gap(batch: SceneBatch, support: Support) -> Tensor:
 
 
 def _near(batch: SceneBatch, names: Sequence[str], reach: float) -> Tensor:
-    """(B, N, N) bool at [b, i, j]: j is another object than i, one of the assets ``names``, and within ``reach`` of i
-    horizontally.
-    """
+    """(B, N, N) bool at [b, i, j]: object j is not i, is one of the assets ``names``, and is within ``reach`` of i."""
     xy = batch.translations[..., :2].double()
     near = (xy.unsqueeze(2) - xy.unsqueeze(1)).norm(dim=-1) <= reach
     near.diagonal(dim1=1, dim2=2).fill_(False)
@@ -132,7 +129,6 @@ def _near(batch: SceneBatch, names: Sequence[str], reach: float) -> Tensor:
 
 
 def _contained(batch: SceneBatch, containers: Sequence[Container] = CONTAINERS) -> Tensor:
-    """(B, N) bool: the object lies in a container."""
     z = batch.translations[..., 2].double()
     rise = z.unsqueeze(2) - z.unsqueeze(1)  # (B, rider, container)
     inside = torch.zeros_like(batch.is_empty)

@@ -22,24 +22,24 @@ from scene_envs.scene_distance import (
 )
 
 DUPLICATE = 0.01
-"""Objects this close (m) stand in the same place."""
+"""Largest distance (m) between objects that count as at the same place."""
 CANDIDATES = 32
-"""Scenes whose exact distance is computed, the nearest by their features."""
+"""Number of scenes, the nearest by their features, to which the exact distance is computed."""
 
 _ROWS = 256
-"""Scenes whose features are compared with all others at once."""
+"""Number of scenes whose features are compared with all others at once."""
 _WAVES = 12
-"""Test functions of the position, for each asset."""
+"""Number of test functions of the position, for each asset."""
 
 
 @dataclass(frozen=True)
 class Neighbors:
-    """The nearest scene to each of B scenes, among some other scenes.
+    """The nearest scene to each of B scenes.
 
     Attributes:
-        distance: (B,) m, to the nearest scene; see :func:`scene_envs.scene_distance.scene_distances`.
+        distance: (B,) m, distance to the nearest scene; see :func:`scene_envs.scene_distance.scene_distances`.
         index: (B,) int64, index of the nearest scene.
-        copied: (B,) bool: one of the other scenes has the same assets, each within 1 cm of its counterpart.
+        copied: (B,) bool, whether one of the other scenes has the same assets, each within 1 cm of its counterpart.
 
     >>> from scene_envs.grammars import get_grammar
     >>> scenes = get_grammar("dimsum_table").sample(np.random.default_rng(0), 6)
@@ -87,7 +87,7 @@ def novelty(samples: Neighbors, real: Neighbors) -> float:
 
     Args:
         samples: nearest training scenes of the samples.
-        real: nearest training scenes of held-out real scenes, out of the same training scenes.
+        real: nearest training scenes of held-out real scenes, from the same training scenes.
     """
     above, below = float(samples.distance.median()), float(real.distance.median())
     return above / below if below > 0 else (1.0 if above == 0 else math.inf)

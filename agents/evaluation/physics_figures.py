@@ -1,4 +1,4 @@
-"""Overlap and stability figures of scenes, from results of the physics."""
+"""Overlap and stability figures of scenes, computed from physics."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ if TYPE_CHECKING:
     from scene_envs.physics import ObjectPair, PenetrationResult, PhysicsPool
 
 CONTACT = 1e-5
-"""Pairs whose hulls overlap by less than this (m) are in contact, not penetrating: float32 poses are no finer."""
+"""Largest overlap (m) of hulls in contact; float32 poses are not more precise."""
 COLLISION = 1e-3
-"""Pairs that overlap deeper than this (m) collide."""
+"""Overlap (m) above which a pair collides."""
 DEEP = 1e-2
-"""Objects deeper than this (m) in another cannot stay: a simulator throws them apart, and takes long to do so."""
+"""Overlap (m) above which objects are not simulated, because a simulator would throw them apart."""
 
 
 def physics_figures(batch: SceneBatch, pool: PhysicsPool | None = None) -> dict[str, float]:
-    """Overlap, stability and feasibility of scenes as they are; the meaning of each name is on the docs' page.
+    """Overlap, stability and feasibility of scenes as they are; docs/evaluation.md describes each figure.
 
     Scenes whose physics failed are left out of the figures of that computation.
 
     Args:
-        batch: the scenes.
+        batch: scenes to measure.
         pool: worker processes; None computes in this process.
     """
     return {**_overlap(batch, pool), **_furniture(batch, pool), **_feasibility(batch, pool)}

@@ -1,4 +1,4 @@
-"""Prompt-following: the share of samples that hold the numbers, names and relations of their prompts."""
+"""Prompt-following: the share of samples with the numbers, names and relations of their prompts."""
 
 from __future__ import annotations
 
@@ -18,11 +18,10 @@ _NAMES = {"count": "prompt_counts", "names": "prompt_names", "relations": "promp
 
 
 def prompt_following(batch: SceneBatch, prompts: Sequence[str]) -> dict[str, float]:
-    """Share of scenes that hold their own prompt.
+    """Share of scenes that follow their own prompt.
 
-    This is the paper's prompt-following accuracy. A prompt is followed when every claim in it is true of the scene.
-    The numbers of the things that it names must be exact. Relations have the tolerances of the checker, see the page
-    on prompts.
+    This is the paper's prompt-following accuracy. A prompt is followed if every claim in it is true of the scene. The
+    numbers of the named objects must be exact. Relations have the tolerances in docs/prompts.md.
 
     Args:
         batch: B scenes.
@@ -35,7 +34,7 @@ def prompt_following(batch: SceneBatch, prompts: Sequence[str]) -> dict[str, flo
         prompt is followed.
 
     Raises:
-        InvalidInputError: another number of prompts than scenes, no prompt, or one that cannot be read.
+        InvalidInputError: there is not one prompt per scene, or a prompt cannot be read.
 
     >>> scenes = SceneBatch.empty("dimsum_table", 2)
     >>> figures = prompt_following(scenes, ["A scene with 1 object.", "A scene with a teapot."])
@@ -59,18 +58,18 @@ def prompt_following(batch: SceneBatch, prompts: Sequence[str]) -> dict[str, flo
 
 
 def prompt_chance(batch: SceneBatch, prompts: Sequence[str], seed: int = 0) -> dict[str, float]:
-    """Score by chance: each scene is checked against the prompt of another.
+    """Score by chance, in which each scene is checked against the prompt of another.
 
     Args:
         batch: B >= 2 real scenes.
-        prompts: their own prompts, B.
-        seed: of the order in which prompts are handed on.
+        prompts: B prompts of these scenes.
+        seed: seed of the permutation of the prompts.
 
     Returns:
         The shares of :func:`prompt_following` under ``chance_<name>``.
 
     Raises:
-        InvalidInputError: fewer than two scenes.
+        InvalidInputError: there are fewer than two scenes.
     """
     if len(batch) < 2:
         raise InvalidInputError(f"chance needs at least 2 scenes to exchange prompts, got {len(batch)}")

@@ -1,4 +1,4 @@
-"""The real scenes that samples are compared with, from a dataset or from the grammar."""
+"""Real scenes with which samples are compared, from a dataset or from the grammar."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class RealScenes:
     """Disjoint sets of real scenes.
 
     Attributes:
-        reference: held-out scenes that samples are compared with.
-        floor: other held-out scenes: what a perfect sampler would draw.
-        training: scenes that the prior may have been trained on; None when the grammar gave the others.
+        reference: held-out scenes with which samples are compared.
+        floor: other held-out scenes, equivalent to samples of a perfect sampler.
+        training: scenes on which the prior may have been trained; None if the other scenes are from the grammar.
 
     >>> from scene_envs.scene_types import get_scene_type
     >>> real = RealScenes.load(get_scene_type("dimsum_table"), 2)
@@ -45,18 +45,19 @@ class RealScenes:
         """Held-out scenes, at most ``count`` in each of the two sets, and training scenes.
 
         Args:
-            scene_type: of the samples.
-            count: scenes in ``reference`` and in ``floor``, at most.
+            scene_type: scene type of the samples.
+            count: largest number of scenes in ``reference`` and in ``floor``.
             data: dataset folder of the training scenes, or several joined by commas for a prior of their union;
                 empty takes fresh scenes of the grammar, and no training scenes.
             heldout: dataset folder, or folders, of held-out scenes; empty takes the last scenes of ``data``, at most
                 half of it.
-            training: training scenes, drawn at random.
-            seed: of the grammar and of the draw.
+            training: number of training scenes, drawn at random.
+            seed: seed of the grammar and of the draw.
 
         Raises:
-            InvalidInputError: no folder, scenes of another type, fewer than four held-out scenes, numbers below 1.
-            CorruptFileError: a file cannot be read, lacks a column, or holds something that is no scene.
+            InvalidInputError: a folder does not exist, its scenes are of another type, there are fewer than four
+                held-out scenes, or a number is below 1.
+            CorruptFileError: a file cannot be read, lacks a column, or holds rows that are not scenes.
         """
         if count < 2 or training < 1:
             raise InvalidInputError(
@@ -71,7 +72,9 @@ class RealScenes:
             )
         folders, held_folders = _folders(data), _folders(heldout)
         if heldout and len(held_folders) != len(folders):
-            raise InvalidInputError(f"data names {len(folders)} folders and heldout {len(held_folders)}; give as many")
+            raise InvalidInputError(
+                f"data names {len(folders)} folders and heldout {len(held_folders)}; give the same number"
+            )
         share = -(-count // len(folders))
         parts = [
             _split(folder, held, scene_type, share, -(-training // len(folders)), seed)
@@ -111,7 +114,7 @@ def _split(
 
 
 def _in_turn(parts: list[SceneBatch]) -> SceneBatch:
-    """The scenes of all parts, in turn, so that the first ones are of every part."""
+    """The scenes of all parts, in turn, so that any first scenes are from all parts."""
     numbers = torch.cat([torch.arange(len(part)) for part in parts])
     whole = SceneBatch.concatenate(parts)
     return whole[numbers.argsort(stable=True)]
@@ -135,7 +138,6 @@ def _read(folder: str, scene_type: SceneType) -> Tensor:
 
 
 def _distinct(tensor: Tensor) -> Tensor:
-    """Each scene once."""
     _, first = np.unique(_keys(tensor), return_index=True)
     return tensor[torch.from_numpy(np.sort(first))]
 

@@ -36,7 +36,7 @@ def render_classifier_accuracy(
     height: int = HEIGHT,
     config: ClassifierConfig | None = None,
 ) -> Accuracy:
-    """Accuracy, on held-out scenes, of a CNN trained to tell renders of real scenes from renders of samples.
+    """Accuracy, on held-out scenes, of a CNN trained to separate renders of real scenes from renders of samples.
 
     The renders are semantic: one class per asset, seen by the camera of the scene type. The protocol is that of
     :func:`~agents.evaluation.classifier.classifier_accuracy`. A render cannot show millimetres: at the default size a
@@ -45,18 +45,19 @@ def render_classifier_accuracy(
     Args:
         real: real scenes; the two batches should share none.
         fake: samples of the same scene type. The larger batch is subsampled to the size of the smaller one.
-        seeds: repetitions with other splits and weights.
-        seed: of the first repetition.
-        width: of the renders, pixels, at least 16.
-        height: likewise.
-        config: sizes of the parts, and how the classifier is trained.
+        seeds: number of repetitions with other splits and weights.
+        seed: seed of the first repetition.
+        width: width of the renders in pixels, at least 16.
+        height: height of the renders in pixels, at least 16.
+        config: settings of the training and test.
 
     Returns:
         Accuracy as a fraction; 0.5 is chance.
 
     Raises:
         MissingDependencyError: PyBullet is not installed.
-        InvalidInputError: other scene types, fewer than 20 scenes in one batch, no seeds, renders below 16 pixels.
+        InvalidInputError: the scene types differ, a batch has fewer than 20 scenes, ``seeds`` is below 1, or a side of
+            the renders is below 16 pixels.
     """
     check_same_assets(real, fake)
     if min(width, height) < 16:
@@ -78,12 +79,12 @@ def class_images(batches: list[SceneBatch], width: int, height: int) -> tuple[Te
     """Semantic renders as class indices.
 
     Args:
-        batches: scenes of one type, rendered one after the other.
-        width: pixels.
-        height: pixels.
+        batches: scenes of one type.
+        width: width of the renders in pixels.
+        height: height of the renders in pixels.
 
     Returns:
-        (B, H, W) uint8 indices of the colours seen in any of the renders, and how many colours there are.
+        (B, H, W) uint8 indices of the colours of all renders, and the number of colours.
     """
     from scene_envs.render import render
 

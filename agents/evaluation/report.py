@@ -10,7 +10,7 @@ from agents.evaluation.prompt_following import CHANCE_PREFIX
 
 _HEADS = ("figure", "samples", "real", "how to read")
 _NOT_SHOWN = frozenset({"category_kl"})
-"""Figures that the table leaves out, as they are shown under another name, in units of 1e-4."""
+"""Figures that the table leaves out, because they are shown under another name, in units of 1e-4."""
 
 READING: dict[str, str] = {
     "num_steps": "denoiser evaluations per sample",
@@ -46,9 +46,9 @@ READING: dict[str, str] = {
     "ready_invalid_fraction": "scenes that could not be made ready",
     "ready_objects": "feasible objects per scene after projection and settling; higher is better",
     "ready_fraction": "the same as a share of free objects; higher is better",
-    "classifier_accuracy": "a set transformer tells samples from real scenes; 0.5 is chance, lower is better",
+    "classifier_accuracy": "accuracy of a set transformer, samples against real scenes; 0.5 is chance, lower is better",
     "classifier_accuracy_std": "its spread over the seeds",
-    "render_accuracy": "a CNN tells their semantic renders apart; 0.5 is chance, lower is better",
+    "render_accuracy": "accuracy of a CNN on their semantic renders; 0.5 is chance, lower is better",
     "render_accuracy_std": "its spread over the seeds",
     "frechet_scene_distance": "FSD, on features of a frozen set encoder (no FID); lower is better",
     "frechet_inception_distance": "FID of semantic renders; lower is better",

@@ -26,8 +26,8 @@ _VERTICAL_WAVES = (2.56, 1.28, 0.64, 0.32, 0.16, 0.08, 0.04)
 _NEAR = 0.005
 """Gaps (m) are given as asinh(gap / 0.005), which resolves millimetres around contact and stays small in a room."""
 _TIE_BREAK = (7.1e-5, 5.3e-5, 3.1e-5)
-"""Added to the distance per metre of offset. Objects that touch are exactly equally near; the order of slots must not
-decide between them."""
+"""Distance added per metre of offset. Objects that touch are equally near; without this term the order of slots would
+choose between them."""
 _FAR = 1e6
 _CHUNK = 256
 
@@ -41,8 +41,8 @@ class SceneTokens:
         waves: (B, N, 26) Fourier features of the translation.
         categories: (B, N) int64 asset, C where there is none.
         extents: (B, N, 3) asset bounding box, m.
-        offsets: (B, N, K, 7) to each of the nearest neighbours, see :func:`scene_tokens`.
-        neighbours: (B, N, K) int64 their assets, C where there is none.
+        offsets: (B, N, K, 7) offsets to each of the nearest neighbours, see :func:`scene_tokens`.
+        neighbours: (B, N, K) int64 assets of these neighbours, C where there is none.
         present: (B, N) bool, False for padding.
     """
 
@@ -74,7 +74,7 @@ def scene_tokens(batch: SceneBatch, neighbours: int = NEIGHBOURS) -> SceneTokens
 
     Args:
         batch: B scenes.
-        neighbours: K.
+        neighbours: number K of neighbours.
     """
     if not len(batch):
         raise InvalidInputError("a learned measure needs at least one scene, got none")
@@ -96,8 +96,8 @@ def blurred(
     Args:
         batch: the scenes.
         translation: standard deviation per axis, m; a number, or a tensor that broadcasts to (B, N, 3).
-        rotation: standard deviation of the rotation vector per axis, rad; likewise.
-        generator: of the noise.
+        rotation: standard deviation of the rotation vector per axis, rad; a number, or a tensor like ``translation``.
+        generator: random generator of the noise.
     """
     shape = batch.translations.shape
     shift = translation * torch.randn(shape, generator=generator)

@@ -19,25 +19,25 @@ from scene_envs.scene import SceneBatch
 from scene_envs.tensor_files import read_tensors, write_tensors
 
 SHIPPED = Path(__file__).parent / "weights" / "set_encoder.safetensors"
-"""The encoder that :func:`~agents.evaluation.frechet.frechet_scene_distance` uses."""
+"""File of the encoder that :func:`~agents.evaluation.frechet.frechet_scene_distance` uses."""
 
 FEATURES = 64
-"""Numbers per scene."""
+"""Number of features of a scene."""
 
 _OWN = 12 + WAVE_FEATURES + 3
 _CHUNK = 256
 
 
 class SetEncoder(nn.Module):
-    """Scenes of any type to 64 features; invariant to the order of slots and to empty slots.
+    """Encoder of scenes of any type to 64 features; invariant to the order of slots and to empty slots.
 
     Categories are read by asset name, so that a scene has the same features in a union of types as in its own type. An
     asset outside the vocabulary becomes the *unknown* asset, of which the encoder reads the bounding box but no name.
     Distances between scenes of users' own assets depend on sizes, poses and gaps, and not on names.
 
     Args:
-        vocabulary: asset names known by name.
-        config: of the network; None takes the size of the shipped one.
+        vocabulary: names of the known assets.
+        config: sizes of the network; None takes those of the shipped one.
 
     >>> encoder = SetEncoder(("cafe_table", "teacup")).eval()
     >>> encoder.features(SceneBatch.empty("dimsum_table", 2)).shape
@@ -90,8 +90,8 @@ class SetEncoder(nn.Module):
         """Write weights (float16; mean and whitening float32), vocabulary and size to one ``.safetensors`` file.
 
         Args:
-            path: of the file.
-            note: how the encoder was made, kept in the file.
+            path: file to write.
+            note: a sentence on how the encoder was trained, kept in the file.
         """
         weights = {name: value.detach().contiguous() for name, value in self.state_dict().items()}
         weights = {name: value.half() if name.startswith("network.") else value for name, value in weights.items()}
@@ -100,11 +100,11 @@ class SetEncoder(nn.Module):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str] | None = None) -> SetEncoder:
-        """The encoder in ``path``; the shipped one when None. It is frozen, and in evaluation mode.
+        """The encoder in ``path``, frozen and in evaluation mode; None takes the shipped one.
 
         Raises:
-            InvalidInputError: no such file.
-            CorruptFileError: not a file written by :meth:`save`.
+            InvalidInputError: the file does not exist.
+            CorruptFileError: the file was not written by :meth:`save`.
         """
         return _load(str(SHIPPED if path is None else Path(path).resolve()))
 

@@ -17,15 +17,15 @@ class SetNetworkConfig:
     """Size of a :class:`SetNetwork`.
 
     Attributes:
-        features: numbers per object.
+        features: number of features of an object.
         categories: number of category tokens, those for *empty* and *unknown* included.
-        outputs: numbers per scene.
+        outputs: number of outputs for a scene.
         hidden: width of the tokens; a multiple of ``heads``.
-        heads: attention heads.
-        blocks: induced attention blocks.
-        inducing: inducing points per block.
+        heads: number of attention heads.
+        blocks: number of induced attention blocks.
+        inducing: number of inducing points per block.
         dropout: share of the pooled features dropped in training.
-        pair_features: numbers per neighbour of an object.
+        pair_features: number of features of each neighbour of an object.
     """
 
     features: int
@@ -120,7 +120,7 @@ class _ObjectEncoder(nn.Module):
 
 
 class ObjectNetwork(_ObjectEncoder):
-    """One number for each object of a scene, from its neighbours, and from all objects where ``blocks`` is above 0.
+    """Network with one logit for each object of a scene, from its neighbours, and from all objects if ``blocks`` > 0.
 
     ``outputs`` and ``dropout`` of the config are not read.
 
@@ -143,7 +143,7 @@ class ObjectNetwork(_ObjectEncoder):
 
 
 class SetNetwork(_ObjectEncoder):
-    """``outputs`` numbers from the objects of a scene; permutation-invariant, and independent of padding.
+    """Network with ``outputs`` numbers for a scene, invariant to the order of objects and to padding.
 
     The tokens of the objects are pooled by attention, mean, maximum and a scaled sum.
 
@@ -171,9 +171,9 @@ class SetNetwork(_ObjectEncoder):
         """Outputs per scene: logits, or features.
 
         Args:
-            own: (B, N, F) numbers of each object.
-            categories: (B, N) int64.
-            offsets: (B, N, K, P) numbers of each neighbour.
+            own: (B, N, F) features of each object.
+            categories: (B, N) int64 categories of the objects.
+            offsets: (B, N, K, P) features of each neighbour.
             neighbours: (B, N, K) int64 categories of the neighbours.
             present: (B, N) bool, False for padding.
 

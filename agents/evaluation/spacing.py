@@ -1,4 +1,4 @@
-"""Spacing of objects: how far apart objects of two assets stand, compared with real scenes."""
+"""Spacing of objects: distances between neighbours, compared with real scenes."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from scene_envs.scene import SceneBatch
 from scene_envs.scene_distance import check_same_assets
 
 SAME_HEIGHT = 0.02
-"""Objects whose frames differ less in height (m) stand side by side."""
-FARTHEST = 0.5
-"""Larger distances (m) count as this one, so that places on other tables of a room do not outweigh neighbours."""
-FEWEST = 30
-"""Fewest distances of a pair of assets, in each of the two batches; rarer pairs are left out."""
+"""Largest difference in height (m) between the frames of two neighbours."""
+MAX_DISTANCE = 0.5
+"""Bound of a distance (m), so that places on other tables of a room do not outweigh neighbours."""
+MIN_DISTANCES = 30
+"""Smallest number of distances of a pair of assets, in each of the two batches; rarer pairs are left out."""
 
 _CHUNK = 128
 
 
 def spacing_wasserstein(batch: SceneBatch, reference: SceneBatch) -> float | None:
-    """How far the distances between neighbours are from those of real scenes, m.
+    """Distance of the distributions of distances between neighbours from those of real scenes, m.
 
     For each ordered pair of assets (a, b), the horizontal distances from the free objects a to the nearest free object
     b at the same height form a distribution. The figure is the Wasserstein-1 distance of samples and reference, as a
-    mean over the pairs, weighted by their number of distances in the reference. Objects that are pushed apart, or
-    crowded, show in it even if their number and their categories are those of real scenes.
+    mean over the pairs, weighted by their number of distances in the reference. It shows whether objects are pushed
+    apart or crowded, even if their number and categories are those of real scenes.
 
     Args:
         batch: the samples.
@@ -46,7 +46,7 @@ def spacing_wasserstein(batch: SceneBatch, reference: SceneBatch) -> float | Non
 
     check_same_assets(batch, reference)
     samples, real = _distances(batch), _distances(reference)
-    pairs = [pair for pair in real if min(len(real[pair]), len(samples.get(pair, ()))) >= FEWEST]
+    pairs = [pair for pair in real if min(len(real[pair]), len(samples.get(pair, ()))) >= MIN_DISTANCES]
     if not pairs:
         return None
     distances = [float(wasserstein_distance(samples[pair], real[pair])) for pair in pairs]
@@ -60,13 +60,13 @@ def _distances(batch: SceneBatch) -> Mapping[tuple[int, int], np.ndarray[tuple[i
         chunk = batch[start : start + _CHUNK].to("cpu")
         places, free, categories = chunk.translations.double(), chunk.is_free, chunk.categories
         offset = places[:, :, None] - places[:, None]  # (B, N, N, 3)
-        beside = (offset[..., 2].abs() < SAME_HEIGHT) & free[:, :, None] & free[:, None]
-        beside.diagonal(dim1=1, dim2=2).fill_(False)
-        distance = offset[..., :2].norm(dim=-1).masked_fill(~beside, torch.inf)
+        level = (offset[..., 2].abs() < SAME_HEIGHT) & free[:, :, None] & free[:, None]
+        level.diagonal(dim1=1, dim2=2).fill_(False)
+        distance = offset[..., :2].norm(dim=-1).masked_fill(~level, torch.inf)
         for other in categories[free].unique().tolist():
             nearest = distance.masked_fill((categories != other)[:, None], torch.inf).amin(dim=-1)  # (B, N)
             there = nearest.isfinite()
             for asset in categories[there].unique().tolist():
-                values = nearest[there & (categories == asset)].clamp(max=FARTHEST)
+                values = nearest[there & (categories == asset)].clamp(max=MAX_DISTANCE)
                 found[asset, other].append(values.numpy())
     return {pair: np.concatenate(parts) for pair, parts in found.items()}

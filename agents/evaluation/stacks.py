@@ -1,4 +1,4 @@
-"""Stacks: how many objects stand on one another, compared with real scenes."""
+"""Heights of stacks of objects, compared with real scenes."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def tallest_stacks(batch: SceneBatch) -> Tensor:
 def stack_wasserstein(batch: SceneBatch, reference: SceneBatch) -> float:
     """Wasserstein-1 distance of the tallest stack per scene, in objects.
 
-    Stacks that are lower than in real scenes show in it even if the number of objects and their categories are those
-    of real scenes.
+    It shows whether stacks are lower than in real scenes, even if the number and categories of objects are those of
+    real scenes.
 
     Args:
         batch: the samples, at least one.

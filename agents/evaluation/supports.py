@@ -10,14 +10,13 @@ class Support:
     """Support of objects of a scene type: a surface fixed in the world, or the top of another object.
 
     Attributes:
-        kind: the name the height error is reported under, such as ``"table"`` or ``"stack"``.
+        kind: name under which the height error is reported, such as ``"table"`` or ``"stack"``.
         height: z of the surface (m), in the world, or above the frame of the supporting object.
-        on: names of the supporting assets; None when the surface is fixed in the world.
+        on: names of the supporting assets; None if the surface is fixed in the world.
         riders: names of the assets that can rest there; None means all free ones.
         reach: largest horizontal distance (m) between the frames of rider and supporting object.
-        catch: a rider within reach whose z is at most this far (m) off is assigned to this support, even if another
-            surface is nearer. For supports that are thinner than the errors to be told apart, such as a plate on a
-            table.
+        catch: largest height error (m) at which a rider within reach is assigned to this support, even if another
+            surface is nearer; for supports that are thinner than the errors, such as a plate on a table.
 
     >>> [support.kind for support in SUPPORTS["dimsum_table"]]
     ['table', 'stack']
@@ -33,11 +32,11 @@ class Support:
 
 @dataclass(frozen=True)
 class Container:
-    """Hollow assets, in which objects lie as they fell; as no height is right for these objects, they are left out.
+    """Hollow assets, in which objects lie as they fell; these objects have no correct height and are left out.
 
     Attributes:
-        names: the hollow assets.
-        riders: what may lie in them.
+        names: names of the hollow assets.
+        riders: objects that may lie in them.
         reach: largest horizontal distance (m) between the frames.
         depth: largest height (m) of the rider's frame above the container's; the smallest is 1 cm.
 

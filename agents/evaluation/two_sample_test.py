@@ -1,4 +1,4 @@
-"""Protocol of the classifier two-sample test: split, train with early stopping, score on held-out scenes, repeat."""
+"""Classifier two-sample test: split, training with early stopping, score on held-out scenes, repetitions."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from torch.nn import functional as F
 
 from scene_envs.errors import InvalidInputError
 
-FEWEST = 20
-"""Fewest scenes of each class with which a classifier is trained."""
+MIN_SCENES = 20
+"""Smallest number of scenes of each class with which a classifier is trained."""
 
-_SURE = 5e-3
-"""Validation loss (nats) below which training stops: the classes are told apart."""
+_STOP_LOSS = 5e-3
+"""Validation loss (nats) below which training stops, because the classifier separates the classes."""
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Accuracy of a classifier that tells real scenes from samples; 0.5 is chance, 1 is always right.
+    """Accuracy of a classifier of real scenes and samples; 0.5 is chance, 1 is always right.
 
     Attributes:
-        mean: over the seeds.
+        mean: mean over the seeds.
         std: population standard deviation over the seeds.
-        per_seed: the accuracy of each seed on its held-out scenes.
+        per_seed: accuracy of each seed on its held-out scenes.
 
     >>> Accuracy.of([0.5, 0.75])
     Accuracy(mean=0.625, std=0.125, per_seed=(0.5, 0.75))
@@ -48,21 +48,21 @@ class ClassifierConfig:
     """Settings of the training and test of a classifier.
 
     Attributes:
-        train_fraction: share of the scenes of each class to train on.
-        validation_fraction: share that decides when to stop; the rest is held out.
-        most_train: most scenes of each class to train on.
-        most_validation: most scenes of each class to decide on.
-        epochs: most passes over the training part.
-        patience: epochs without a better validation loss after which training stops.
-        batch_size: scenes per step.
-        learning_rate: largest rate of the one-cycle schedule of AdamW.
-        weight_decay: of AdamW.
+        train_fraction: share of training scenes in each class.
+        validation_fraction: share of validation scenes, which decide when training stops; the rest is held out.
+        max_train: largest number of training scenes of each class.
+        max_validation: largest number of validation scenes of each class.
+        epochs: largest number of passes over the training part.
+        patience: number of epochs without a better validation loss after which training stops.
+        batch_size: number of scenes per step.
+        learning_rate: largest learning rate of the one-cycle schedule of AdamW.
+        weight_decay: weight decay of AdamW.
     """
 
     train_fraction: float = 0.5
     validation_fraction: float = 0.15
-    most_train: int = 1000
-    most_validation: int = 250
+    max_train: int = 1000
+    max_validation: int = 250
     epochs: int = 8
     patience: int = 3
     batch_size: int = 64
@@ -80,7 +80,7 @@ class ClassifierConfig:
                 f"train_fraction={self.train_fraction} and validation_fraction={self.validation_fraction} "
                 "leave nothing to hold out; their sum must be below 1"
             )
-        for name in ("most_train", "most_validation", "epochs", "patience", "batch_size"):
+        for name in ("max_train", "max_validation", "epochs", "patience", "batch_size"):
             if getattr(self, name) < 1:
                 raise InvalidInputError(f"{name} must be at least 1, got {getattr(self, name)}")
 
@@ -103,9 +103,9 @@ Prepare = Callable[[Split], tuple[nn.Module, Forward]]
 
 def check_classes(real: int, fake: int, seeds: int) -> None:
     """Raise InvalidInputError unless there are enough scenes of each class, and seeds."""
-    if min(real, fake) < FEWEST:
+    if min(real, fake) < MIN_SCENES:
         raise InvalidInputError(
-            f"a classifier needs at least {FEWEST} real scenes and samples each, got {real} and {fake}"
+            f"a classifier needs at least {MIN_SCENES} real scenes and samples each, got {real} and {fake}"
         )
     if seeds < 1:
         raise InvalidInputError(f"seeds must be at least 1, got {seeds}")
@@ -122,10 +122,10 @@ def two_sample_accuracy(
     Args:
         real: number of real scenes.
         fake: number of samples.
-        prepare: makes the classifier of a split.
+        prepare: function that makes the classifier of a split.
         seeds: number of repetitions, each with a split, weights and order of its own.
-        seed: of the first repetition.
-        config: the protocol.
+        seed: seed of the first repetition.
+        config: settings of the training and test.
     """
     check_classes(real, fake, seeds)
     labels = torch.cat([torch.ones(real), torch.zeros(fake)])
@@ -144,8 +144,8 @@ def two_sample_accuracy(
 def _split(real: int, fake: int, config: ClassifierConfig) -> Split:
     count = min(real, fake)
     rows = [torch.randperm(real)[:count], real + torch.randperm(fake)[:count]]
-    train = min(round(config.train_fraction * count), config.most_train)
-    end = train + max(1, min(round(config.validation_fraction * count), config.most_validation))
+    train = min(round(config.train_fraction * count), config.max_train)
+    end = train + max(1, min(round(config.validation_fraction * count), config.max_validation))
     parts = (slice(train), slice(train, end), slice(end, None))
     return Split(*(torch.cat([of_class[part] for of_class in rows]) for part in parts))
 
@@ -171,7 +171,7 @@ def _train(network: nn.Module, forward: Forward, labels: Tensor, split: Split, c
         if value < best:
             best, since = value, 0
             best_state = {name: tensor.clone() for name, tensor in network.state_dict().items()}
-        if since >= config.patience or value < _SURE:
+        if since >= config.patience or value < _STOP_LOSS:
             break
     network.load_state_dict(best_state)
 

@@ -1,4 +1,4 @@
-"""Typical places of objects in real scenes: the scale on which learned measures read poses."""
+"""Typical places of objects in real scenes, by which learned measures standardise poses."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scene_envs.scene import POSE_FEATURES
 _PRIOR_COUNT = 4.0
 """Weight, in objects, of the variance over all groups in the variance of one group."""
 _CLIP = 8.0
-_LEAST_STD = 1e-4
+_MIN_STD = 1e-4
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Moments:
         squares = torch.zeros_like(mean).index_add(0, groups, (values - mean[groups]) ** 2)
         overall = squares.sum(dim=0) / size.sum().clamp(min=1.0)
         variance = (squares + _PRIOR_COUNT * overall) / (size + _PRIOR_COUNT)
-        return cls(mean.float(), variance.sqrt().clamp(min=_LEAST_STD).float())
+        return cls(mean.float(), variance.sqrt().clamp(min=_MIN_STD).float())
 
     def deviations(self, values: Tensor, groups: Tensor) -> Tensor:
         """(..., 2 F): values in standard deviations from the mean of their group, and log(1 + their squares)."""

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from agents.planning.gradient import GradientPlanner
     from agents.planning.greedy import GreedyPlanner
     from agents.planning.journal import Journal
-    from agents.planning.ledger import Ledger, PlanResult, Searchable, SearchStoppedError
+    from agents.planning.ledger import PlanResult, Searchable, SearchBudget, SearchStoppedError
     from agents.planning.mcts import MCTSPlanner
     from agents.planning.registry import PlannerSettings, list_planners, register_planner
     from agents.planning.search_run import SearchOutcome, run_search
@@ -28,10 +28,10 @@ __all__ = [
     "GradientPlanner",
     "GreedyPlanner",
     "Journal",
-    "Ledger",
     "MCTSPlanner",
     "PlanResult",
     "PlannerSettings",
+    "SearchBudget",
     "SearchConfig",
     "SearchOutcome",
     "SearchRecord",

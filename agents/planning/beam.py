@@ -1,10 +1,10 @@
-"""Beam search: the best few states, inpainted side by side."""
+"""Beam search: the planner that inpaints the best few states in each round."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from agents.planning.ledger import Ledger, Member, PlanResult, Progress, Searchable, best_different
+from agents.planning.ledger import Member, PlanResult, Progress, Searchable, SearchBudget, best_different
 from agents.planning.registry import PlannerSettings, check_at_least, register_planner
 
 
@@ -18,8 +18,8 @@ class BeamPlanner(PlannerSettings):
     A scene is in the beam only once.
 
     Attributes:
-        width: states that are kept.
-        children: inpaintings per state and round; null takes ``branching``.
+        width: number of states that are kept.
+        children: number of inpaintings per state and round; null takes ``branching``.
     """
 
     name: str = "beam"
@@ -32,11 +32,11 @@ class BeamPlanner(PlannerSettings):
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the current state."""
-        ledger, count = Ledger(problem, budget, progress), self.children or 1
-        beam: list[Member] = [(ledger.root, ledger.actions(ledger.root))]
-        while ledger.left and beam:
-            children = ledger.expand([(state, action) for state, actions in beam for action in actions[:count]])
-            pool = [(child, ledger.actions(child)) for child in reversed(children) if child.valid]
+        search, count = SearchBudget(problem, budget, progress), self.children or 1
+        beam: list[Member] = [(search.root, search.actions(search.root))]
+        while search.left and beam:
+            children = search.expand([(state, action) for state, actions in beam for action in actions[:count]])
+            pool = [(child, search.actions(child)) for child in reversed(children) if child.valid]
             pool += [(state, actions[count:]) for state, actions in beam if state.valid or not pool]
             beam = best_different(pool, self.width)
-        return ledger.result()
+        return search.result()

@@ -1,4 +1,4 @@
-"""Configuration of one search run; imports no torch."""
+"""Configuration of a search run; imports no torch."""
 
 from __future__ import annotations
 
@@ -14,10 +14,7 @@ from scene_envs.errors import InvalidInputError
 
 @dataclass
 class BudgetKeys:
-    """Budget of a search.
-
-    :class:`SearchConfig` describes the keys.
-    """
+    """Budget of a search; :class:`SearchConfig` describes the keys."""
 
     budget: int = 64
     max_nfe: int | None = None
@@ -37,16 +34,16 @@ class SearchConfig(BudgetKeys, SamplingKeys):
     Attributes:
         budget: number of scenes that each search generates; the baseline generates as many. NFE is ``budget *
             num_steps``, or twice that with guidance.
-        max_nfe: most denoiser evaluations of each search, if that is less than the budget's; null for no such limit.
+        max_nfe: largest number of denoiser evaluations of each search; null for no limit other than the budget.
         max_seconds: seconds after which the search ends and returns the best scene found; null for no limit. The
             baseline runs afterwards.
         count: number of searches, each with its own seed; each gives one scene. null for one search, or for one from
             each of ``scenes``.
         side_by_side: number of searches that run at once, in common batches of the denoiser; the others follow.
-        baseline: after the search, draw the same number of independent samples and compare with the best of them.
-        branching: inpaintings per state. The first ``branching`` scenes are fresh samples of the prior, or inpaintings
-            of the scene from which the search starts.
-        max_depth: most inpaintings in a row, including the fresh sample.
+        baseline: whether to draw the same number of independent samples after the search, and compare with the best.
+        branching: number of inpaintings per state. The first ``branching`` scenes are fresh samples of the prior, or
+            inpaintings of the scene from which the search starts.
+        max_depth: largest number of inpaintings in a row, including the fresh sample.
         mask: mask that chooses the slots to regenerate: a registered name, or a mapping of its name and settings; in
             Python also a function.
         masks: several masks, each written as ``mask``; every action uses one of them. null uses ``mask`` alone.
@@ -56,8 +53,8 @@ class SearchConfig(BudgetKeys, SamplingKeys):
         prompt: text that all scenes should match, for priors that read prompts; the objective gets it too. null for no
             prompt.
         num_steps: denoiser evaluations per scene.
-        physics_guidance: strength with which regenerated objects are moved out of overlaps and onto supports at the
-            last steps, 0 to 1. A search starts without, also from priors that are sampled with it.
+        physics_guidance: strength, 0 to 1, with which regenerated objects are moved out of overlaps and onto supports
+            at the last steps; 0 by default, even for priors that are sampled with physics guidance.
         slots: slots per scene; null takes the number of the scene type.
         seed: seed of the search tree; the baseline starts with the same first scenes, unless the planner steers the
             denoising.

@@ -1,4 +1,4 @@
-"""Evolution: a population of scenes, pairs of which are cut, spliced and inpainted."""
+"""Evolution: the planner that splices and inpaints pairs of scenes of a population."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 
 from agents.planning.ledger import (
     Candidate,
-    Ledger,
     Member,
     PlanResult,
     Progress,
     Searchable,
+    SearchBudget,
     best_different,
     state_value,
 )
@@ -35,7 +35,7 @@ class EvolutionPlanner(PlannerSettings):
 
     Attributes:
         population: number of scenes that are kept, and of fresh samples at the start.
-        children: offspring per round, one batch of the denoiser; null takes ``branching``.
+        children: number of offspring per round, one batch of the denoiser; null takes ``branching``.
         crossover: probability that an offspring has two parents.
         seed: seed of parents and cuts, together with the seed of the root.
     """
@@ -51,38 +51,38 @@ class EvolutionPlanner(PlannerSettings):
         check_at_least(self, 1, "population", "children")
         check_at_least(self, 0, "crossover", "seed")
         if self.crossover > 1:
-            raise InvalidInputError(f"planner {self.name}: crossover={self.crossover} is a chance, in 0..1")
+            raise InvalidInputError(f"planner {self.name}: crossover={self.crossover} is a probability, in 0..1")
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the current state; without ``with_scene`` there are no splices."""
-        ledger = Ledger(problem, budget, progress)
-        rng = ledger.generator(self.seed)
-        fresh = ledger.actions(ledger.root)
+        search = SearchBudget(problem, budget, progress)
+        rng = search.generator(self.seed)
+        fresh = search.actions(search.root)
         members: list[Member] = []  # the best first
-        while ledger.left:
+        while search.left:
             pairs = []
             for _ in range(self.children or 1 if members else 0):
                 index = _better_of_two(members, rng)
                 parent, actions = members[index]
                 if actions:
-                    pairs.append((self._mated(ledger, index, members, rng), actions[0]))
+                    pairs.append((self._mated(search, index, members, rng), actions[0]))
                     members[index] = parent, actions[1:]
             if not pairs:  # at the beginning, and when no drawn parent has an action left
-                pairs = [(ledger.root, action) for action in fresh[: self.population]]
+                pairs = [(search.root, action) for action in fresh[: self.population]]
                 fresh = fresh[self.population :]
             if not pairs:
                 break
-            born = [(child, ledger.actions(child)) for child in reversed(ledger.expand(pairs)) if child.valid]
-            if ledger.root.valid and not members:
-                members, fresh = [(ledger.root, fresh)], []
+            born = [(child, search.actions(child)) for child in reversed(search.expand(pairs)) if child.valid]
+            if search.root.valid and not members:
+                members, fresh = [(search.root, fresh)], []
             members = best_different([*born, *members], self.population)
-        return ledger.result()
+        return search.result()
 
-    def _mated(self, ledger: Ledger, index: int, members: list[Member], rng: np.random.Generator) -> Candidate:
+    def _mated(self, search: SearchBudget, index: int, members: list[Member], rng: np.random.Generator) -> Candidate:
         """The candidate to inpaint: a member, or its splice with another one."""
         from agents.planning.splice import spliced
 
-        problem: Any = ledger.problem
+        problem: Any = search.problem
         (parent, _), others = members[index], members[:index] + members[index + 1 :]
         if not others or not hasattr(problem, "with_scene") or rng.random() >= self.crossover:
             return parent
@@ -90,8 +90,8 @@ class EvolutionPlanner(PlannerSettings):
         scene = spliced(problem.scene(parent.state), problem.scene(mate), parent.state.mask, mate.mask, rng)
         state = problem.with_scene(parent.state, scene)
         child = replace(parent, state=state, value=state_value(problem, state))
-        ledger.keep(child)
-        return child if ledger.actions(child) else parent
+        search.keep(child)
+        return child if search.actions(child) else parent
 
 
 def _better_of_two(members: Sequence[Member], rng: np.random.Generator) -> int:

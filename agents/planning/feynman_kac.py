@@ -1,4 +1,4 @@
-"""Feynman-Kac steering: scenes denoised side by side, resampled by the objective of their expected final scenes."""
+"""Feynman-Kac steering: the planner that resamples scenes during their denoising by their expected objective."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from agents.planning.greedy import GreedyPlanner
-from agents.planning.ledger import PlanResult, Progress, Searchable, Steered
+from agents.planning.ledger import PlanResult, Progress, Searchable, SteeredProblem
 from agents.planning.registry import PlannerSettings, check_at_least, register_planner
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
@@ -37,7 +37,7 @@ def systematic(weights: np.ndarray, uniform: float) -> np.ndarray:
 
 
 class Particles:
-    """Groups of particles: the children of one parent that are denoised in one batch.
+    """Resampler of groups of particles; a group is the children of one parent that are denoised in one batch.
 
     At ``resamplings`` steps, each group is resampled with the weights exp(strength * (value - value at the last
     resampling)). The product of the weights of a path is then exp(strength * last value) (Singhal et al. 2025,
@@ -45,8 +45,8 @@ class Particles:
 
     Args:
         parents: (B,) parent of each particle, any hashable.
-        rngs: a generator per parent.
-        values: Φ (B,) of denoised scenes.
+        rngs: random generator of each parent.
+        values: function from denoised scenes to their values Φ (B,).
         resamplings: number of resamplings.
         begin: share of the denoising steps before the first resampling.
         strength: factor on the values in the weights.
@@ -89,13 +89,13 @@ class Particles:
 class FeynmanKacPlanner(PlannerSettings):
     """Feynman-Kac steering of every inpainting (Singhal et al. 2025), in rounds of iterated repair.
 
-    A round denoises ``particles`` inpaintings of the current state side by side. During the denoising, the objective
+    A round denoises ``particles`` inpaintings of the current state in one batch. During the denoising, the objective
     scores the scene that the network expects of each particle, and particles with higher scores replace others. The
     finished scenes are treated as in :class:`~agents.planning.GreedyPlanner`. Resampling costs evaluations of the
     objective, but none of the denoiser.
 
     Attributes:
-        particles: inpaintings per round, one batch of the denoiser.
+        particles: number of inpaintings per round, one batch of the denoiser.
         resamplings: number of resamplings per round.
         begin: share of the denoising steps before the first resampling.
         strength: λ in the weight exp(λ Φ) of a particle; 0 resamples nothing.
@@ -121,7 +121,7 @@ class FeynmanKacPlanner(PlannerSettings):
         Raises:
             InvalidInputError: the expansions of ``problem`` cannot be steered.
         """
-        steered = Steered(problem, self.name, self._steer)
+        steered = SteeredProblem(problem, self.name, self._steer)
         return GreedyPlanner(children=self.particles).plan(steered, budget, progress)
 
     def _steer(self, pairs: Sequence[tuple[Any, int]], values: Callable[[SceneBatch], Tensor]) -> Particles:

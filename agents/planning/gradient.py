@@ -1,4 +1,4 @@
-"""Gradient guidance: inpaintings that are moved along the gradient of a weight of scenes while they are denoised."""
+"""Gradient guidance: the planner that moves scenes along the gradient of a weight during their denoising."""
 
 from __future__ import annotations
 
@@ -7,14 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from agents.configuration.tree import build
-from agents.planning.ledger import PlanResult, Progress, Searchable, Steered
-from agents.planning.registry import (
-    PlannerSettings,
-    check_at_least,
-    list_planners,
-    planner_settings,
-    register_planner,
-)
+from agents.planning.ledger import PlanResult, Progress, Searchable, SteeredProblem
+from agents.planning.registry import PlannerSettings, check_at_least, list_planners, planner_settings, register_planner
 from scene_envs.errors import InvalidInputError, unknown_name
 
 if TYPE_CHECKING:
@@ -32,17 +26,17 @@ WEIGHTS = ("overlap",)
 class GradientPlanner(PlannerSettings):
     """Gradient guidance of every inpainting that another planner makes.
 
-    Scenes are distributed as the prior times exp(strength * weight), to first order around the scene that the network
-    expects. The objective scores the finished scenes, and the other planner chooses the scene that is inpainted next.
+    The distribution of scenes is the prior times exp(strength * weight), to first order around the scene that the
+    network expects. The objective scores the finished scenes, and the other planner chooses the next scene to inpaint.
     Guidance adds one gradient of the weight to a step, and no evaluation of the denoiser.
 
     Attributes:
-        planner: the other planner: its name, or a mapping of its ``name`` and keys. It must accept any number of
+        planner: name of the other planner, or a mapping of its ``name`` and keys. It must accept any number of
             children of a state, and must not steer the denoising itself.
         weight: a differentiable log-weight: ``overlap``, or in Python a function.
         strength: factor on the weight; 0 is the other planner alone.
         begin: share of the denoising steps that come before guidance.
-        children: inpaintings per round of the other planner, one batch of the denoiser; null takes ``branching``.
+        children: number of inpaintings per round, one batch of the denoiser; null takes ``branching``.
     """
 
     name: str = "gradient"
@@ -69,11 +63,10 @@ class GradientPlanner(PlannerSettings):
         Raises:
             InvalidInputError: the expansions of ``problem`` cannot be steered.
         """
-        steered = Steered(problem, self.name, self._guide)
+        steered = SteeredProblem(problem, self.name, self._guide)
         return self._guided().make(self.children or 1).plan(steered, budget, progress)
 
     def _guided(self) -> PlannerSettings:
-        """The other planner."""
         keys = {"name": self.planner} if isinstance(self.planner, str) else self.planner
         if not isinstance(keys, Mapping) or not isinstance(keys.get("name"), str):
             raise InvalidInputError(

@@ -1,11 +1,11 @@
-"""Greedy repair: inpainting of the best state again and again."""
+"""Greedy repair: the planner that repeatedly inpaints the best state."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from agents.planning.ledger import Candidate, Ledger, PlanResult, Progress, Searchable
+from agents.planning.ledger import Candidate, PlanResult, Progress, Searchable, SearchBudget
 from agents.planning.registry import PlannerSettings, check_at_least, register_planner
 
 
@@ -19,7 +19,7 @@ class GreedyPlanner(PlannerSettings):
     slots. If the current state has no action left, the best earlier state with an action left replaces it.
 
     Attributes:
-        children: inpaintings per round, one batch of the denoiser; null takes ``branching``.
+        children: number of inpaintings per round, one batch of the denoiser; null takes ``branching``.
     """
 
     name: str = "greedy"
@@ -31,17 +31,17 @@ class GreedyPlanner(PlannerSettings):
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the current state."""
-        ledger, count = Ledger(problem, budget, progress), self.children or 1
-        # The states that were current, the latest last, each with its remaining actions.
-        trail: list[tuple[Candidate, Sequence[int]]] = [(ledger.root, ledger.actions(ledger.root))]
-        while ledger.left and trail:
+        search, count = SearchBudget(problem, budget, progress), self.children or 1
+        # earlier states and the current one (last), each with its remaining actions
+        trail: list[tuple[Candidate, Sequence[int]]] = [(search.root, search.actions(search.root))]
+        while search.left and trail:
             state, actions = trail.pop()
             if not actions:
                 continue
-            children = ledger.expand([(state, action) for action in actions[:count]])
+            children = search.expand([(state, action) for action in actions[:count]])
             trail.append((state, actions[count:]))
             scored = [child for child in children if child.valid]
             best = max(scored, key=lambda child: child.value, default=None)
             if best is not None and not best.value < state.value:
-                trail.append((best, ledger.actions(best)))
-        return ledger.result()
+                trail.append((best, search.actions(best)))
+        return search.result()

@@ -1,4 +1,4 @@
-"""Guidance of the denoising by the gradient of a differentiable weight of scenes, and the weights by name."""
+"""Guidance of the denoising by the gradient of a differentiable weight of scenes, and the named weights."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ Differentiable in ``translations``.
 def overlap(batch: SceneBatch, translations: Tensor) -> Tensor:
     """(B,) minus half the sum of squared overlaps of objects, mm²: 0 where no two overlap.
 
-    Each object is the upright cylinder around its asset. The overlap of a pair is that of the two circles or that of
-    the two heights, whichever is smaller. Two welded objects are no pair.
+    Each object is the upright cylinder around its asset. The overlap of a pair is the smaller of the overlap of their
+    circles and that of their heights. Pairs of two welded objects are left out.
     """
     radius, low, high = (column[batch.categories.clamp(max=batch.scene_type.num_assets)] for column in _sizes(batch))
     flat = translations[..., :2]

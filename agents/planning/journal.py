@@ -1,4 +1,4 @@
-"""Journal of a search: a file of all states that were made, from which a killed run continues."""
+"""Journal of a search: a file of all expanded states, from which a killed run continues."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ _HEAD = struct.Struct("<II")
 
 
 class Journal:
-    """A file of records: the settings of the search, then the states of every round in the order they were made.
+    """A file of records: the settings of the search, then the states of every round, in order.
 
     A record that was being written when the process was killed is dropped.
 
     Args:
-        path: the file; made if it does not exist.
-        settings: the settings that the states depend on, by name.
+        path: journal file, created if it does not exist.
+        settings: settings on which the states depend, by name.
 
     Raises:
         InvalidInputError: the file was made with other settings.
@@ -54,7 +54,7 @@ class Journal:
         return len(self._states)
 
     def take(self, pairs: Sequence[tuple[SearchState, int]]) -> list[SearchState]:
-        """The states that an earlier run made for the first of ``pairs``, as many as the file still has.
+        """The states that an earlier run made for the first of ``pairs``; as many as the file still has.
 
         Raises:
             InvalidInputError: the earlier run made states of other pairs.
@@ -74,7 +74,7 @@ class Journal:
         self._append([{field.name: getattr(state, field.name) for field in fields(state)} for state in states])
 
     def states(self) -> Iterator[SearchState]:
-        """All states in the file in the order they were made, one round in memory at a time."""
+        """All states in the file, in order, with one round in memory at a time."""
         with self.path.open("rb") as file:
             for record in islice(self._records(file), 1, None):
                 yield from map(_state, record)
@@ -109,7 +109,7 @@ class Journal:
             before, now = records[0].get(name), settings.get(name)
             if before != now:
                 raise InvalidInputError(
-                    f"{self.path} is of a search with {name}={before}, not {now}; give another output, or that value"
+                    f"{self.path} holds a search with {name}={before}, not {now}; give another output, or that value"
                 )
         self._states = [_state(values) for states in records[1:] for values in states]
 

@@ -1,4 +1,4 @@
-"""Ledger of a plan: its expansions, its remaining budget and its best state so far."""
+"""The budget of a search and its best state so far, and the protocol of the trees that planners search."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ Progress = Callable[[int, float], None]
 
 
 class SearchStoppedError(SceneEnvsError):
-    """A search environment expands nothing more: the time is over, or the user interrupted.
+    """Raised when a search must end, because of its time limit or an interrupt.
 
-    Planners built on a :class:`Ledger` return their best state. If another planner does not catch this error, the run
-    that started the planner keeps the best state that it saw.
+    Planners built on a :class:`SearchBudget` return their best state. If another planner does not catch this error, the
+    run that started the planner keeps the best state that it saw.
     """
 
 
@@ -84,8 +84,8 @@ class Candidate:
 
     Attributes:
         state: the problem's own immutable state.
-        value: its objective, in [0, 1]; NaN where it could not be scored.
-        path: the actions that lead to it from the root.
+        value: objective of the state, in [0, 1]; NaN if it could not be scored.
+        path: actions from the root to the state.
     """
 
     state: Any
@@ -94,7 +94,7 @@ class Candidate:
 
     @property
     def valid(self) -> bool:
-        """Whether it has a value."""
+        """Whether the state has a value."""
         return math.isfinite(self.value)
 
     @property
@@ -104,7 +104,7 @@ class Candidate:
 
 
 Member = tuple[Candidate, Sequence[int]]
-"""A candidate and the actions it has left."""
+"""A candidate and its remaining actions."""
 
 
 def best_different(pool: Sequence[Member], count: int) -> list[Member]:
@@ -118,16 +118,16 @@ def best_different(pool: Sequence[Member], count: int) -> list[Member]:
     return kept
 
 
-class Ledger:
-    """Common part of the planners: spends a budget of expansions on a problem and records the results.
+class SearchBudget:
+    """Budget of expansions of a planner, and a record of their results.
 
     :attr:`left` is 0 when the budget is spent, when a state of value 1 (the largest value) was found, or when the
     problem stops the search.
 
     Args:
-        problem: the problem that is searched.
-        budget: number of expansions.
-        progress: called after every round.
+        problem: problem to search.
+        budget: largest number of expansions.
+        progress: function to call after every round.
 
     Raises:
         InvalidInputError: the budget is below 1.
@@ -146,7 +146,7 @@ class Ledger:
 
     @property
     def left(self) -> int:
-        """Expansions that may still be made."""
+        """Number of expansions that may still be made."""
         return 0 if self._stopped or self.best.value >= 1.0 else self.budget - len(self.values)
 
     def generator(self, seed: int) -> np.random.Generator:
@@ -154,7 +154,7 @@ class Ledger:
         return np.random.default_rng([seed, getattr(self.root.state, "seed", 0)])
 
     def actions(self, candidate: Candidate) -> Sequence[int]:
-        """Legal actions of a candidate."""
+        """Legal actions of ``candidate``."""
         return self.problem.legal_actions(candidate.state)
 
     def expand(self, pairs: Sequence[tuple[Candidate, int]]) -> list[Candidate]:
@@ -188,13 +188,13 @@ class Ledger:
         return PlanResult(self.best.state, self.best.value, self.best.path, self.values, self.root.value)
 
 
-class Steered:
-    """A problem whose expansions are steered.
+class SteeredProblem:
+    """A search problem with steered expansions.
 
     Args:
-        problem: the problem that is searched.
+        problem: problem to search.
         planner: name of the planner that steers.
-        steering: as ``expand_batch`` takes it; may change between expansions.
+        steering: the argument of ``expand_batch``; may change between expansions.
 
     Raises:
         InvalidInputError: the expansions of ``problem`` cannot be steered.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
-from agents.planning.ledger import Candidate, Ledger, PlanResult, Progress, Searchable, state_value
+from agents.planning.ledger import Candidate, PlanResult, Progress, Searchable, SearchBudget, state_value
 from agents.planning.registry import PlannerSettings, check_at_least, register_planner
 from scene_envs.errors import unknown_name
 
@@ -33,10 +33,10 @@ class MCTSPlanner(PlannerSettings):
     the best state are removed from the result, if the problem has ``without_masked`` and the objective does not fall.
 
     Attributes:
-        exploration: weight of the bound. Values are in [0, 1] and siblings differ by a few hundredths. With the
+        exploration: weight of the bound. Values are in [0, 1] and siblings differ by a few hundredths; with the
             textbook value, 1, the bound outweighs these differences and the tree grows in breadth.
-        children: children of a leaf; null takes ``branching``.
-        rollout: value that is backed up: ``random`` for that of one new child, ``all`` for that of each.
+        children: number of children of a leaf; null takes ``branching``.
+        rollout: value that is backed up: ``random`` for that of one new child, ``all`` for those of all new children.
         seed: seed of the choice of the child, together with the seed of the root.
     """
 
@@ -55,15 +55,15 @@ class MCTSPlanner(PlannerSettings):
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the problem's current state."""
-        ledger = Ledger(problem, budget, progress)
-        rng = ledger.generator(self.seed)
-        root = _Node(ledger.root)
-        while ledger.left and not root.closed:
+        search = SearchBudget(problem, budget, progress)
+        rng = search.generator(self.seed)
+        root = _Node(search.root)
+        while search.left and not root.closed:
             leaf = self._select(root)
-            actions = ledger.actions(leaf.candidate)[: self.children or 1]
+            actions = search.actions(leaf.candidate)[: self.children or 1]
             if not actions and _is_done(leaf.candidate.state):
                 break
-            made = ledger.expand([(leaf.candidate, action) for action in actions])
+            made = search.expand([(leaf.candidate, action) for action in actions])
             leaf.children = [_Node(child, leaf) for child in made if child.valid]
             if not leaf.children:
                 _close(leaf)
@@ -71,7 +71,7 @@ class MCTSPlanner(PlannerSettings):
             rolled = leaf.children if self.rollout == "all" else [leaf.children[rng.integers(len(leaf.children))]]
             for node in rolled:
                 _back_up(node, node.candidate.value)
-        return _cleaned(problem, ledger.result())
+        return _cleaned(problem, search.result())
 
     def _select(self, node: _Node) -> _Node:
         while node.children:
@@ -99,7 +99,6 @@ def _close(node: _Node) -> None:
 
 
 def _is_done(state: object) -> bool:
-    """Whether nothing is masked in ``state``."""
     mask = getattr(state, "mask", None)
     return mask is not None and not bool(mask.any())
 

@@ -11,8 +11,6 @@ from scene_envs.registry import Registry
 
 ENTRY_POINT_GROUP = "scene_envs.planners"
 """Entry points of installed packages: modules that call :func:`register_planner` when they are imported."""
-
-
 PER_STATE = ("children", "parallel")
 """Keys of planners in which null means ``branching``, the children of a state that the user asks for."""
 
@@ -27,19 +25,19 @@ class PlannerSettings:
 
     name: str = ""
     widens: ClassVar[bool] = False
-    """Whether the planner itself chooses the number of children of a state. In a search run, a state then has as many
-    actions as the budget, instead of ``branching``."""
+    """Whether the planner itself chooses the number of children of a state; in a search run, a state then has as many
+    actions as the budget."""
     steers: ClassVar[bool] = False
     """Whether the planner itself steers the denoising."""
 
     def make(self, branching: int) -> Any:
         """The planner: an object with ``plan(problem, budget, progress)``, as :class:`agents.planning.GreedyPlanner`.
 
-        Settings with a method ``plan`` are the planner themselves, with ``branching`` in place of null in the keys of
+        Settings with a method ``plan`` are themselves the planner, with ``branching`` in place of null in the keys of
         :data:`PER_STATE`.
 
         Args:
-            branching: children of a state, as the user asks for them.
+            branching: number of children of a state, which replaces null.
         """
         unset: dict[str, Any] = {name: branching for name in PER_STATE if getattr(self, name, branching) is None}
         return replace(self, **unset) if unset else self
@@ -47,9 +45,7 @@ class PlannerSettings:
 
 _SHIPPED = ("beam", "best_of", "evolution", "feynman_kac", "gradient", "greedy", "mcts")
 _PLANNERS: Registry[type[PlannerSettings]] = Registry(
-    "planner",
-    ENTRY_POINT_GROUP,
-    modules={name: f"agents.planning.{name}" for name in _SHIPPED},
+    "planner", ENTRY_POINT_GROUP, modules={name: f"agents.planning.{name}" for name in _SHIPPED}
 )
 Settings = TypeVar("Settings", bound=type[PlannerSettings])
 
@@ -80,9 +76,9 @@ def planner_settings(name: str) -> type[PlannerSettings]:
     return _PLANNERS[name]
 
 
-def check_at_least(planner: PlannerSettings, least: float, *names: str) -> None:
-    """Raise InvalidInputError where a key is below ``least`` or not finite; keys that are None are left to ``make``."""
+def check_at_least(planner: PlannerSettings, minimum: float, *names: str) -> None:
+    """Raise InvalidInputError if a key is below ``minimum`` or not finite; keys that are None are left to ``make``."""
     for name in names:
         value = getattr(planner, name)
-        if value is not None and not (least <= value < float("inf")):
-            raise InvalidInputError(f"planner {planner.name}: {name} must be a number >= {least:g}, got {value}")
+        if value is not None and not (minimum <= value < float("inf")):
+            raise InvalidInputError(f"planner {planner.name}: {name} must be a number >= {minimum:g}, got {value}")

@@ -1,4 +1,4 @@
-"""Figures of a search run, the content of ``metrics.json``."""
+"""Figures of a search run: the content of ``metrics.json``."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ def search_metrics(
         config: the settings.
         searches: all plans.
         best_of: the baseline; None without one.
-        firsts: the best of the first samples of each search, or the scene it started from; by the seed of the search.
-        seconds: of the search and of the baseline.
-        stopped: why the run ended early; empty if it did not.
-        spent: scenes generated.
+        firsts: best of the first samples of each search, or the scene it started from, by the seed of the search.
+        seconds: duration of the search and the baseline.
+        stopped: reason for which the run ended early; empty if it did not.
+        spent: number of scenes generated.
         from_scenes: whether the searches started from given scenes.
     """
     search = min(searches, key=loss_of)

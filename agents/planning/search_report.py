@@ -24,7 +24,7 @@ def draw_curve(
 
     Args:
         curves: best Φ after each generated scene, by planner; values that are not finite are left out.
-        path: where the picture goes.
+        path: image file to write.
         num_steps: denoiser evaluations per generated scene.
         first: number of scenes that were fresh samples in the tree search; a line marks their end. 0 draws no line.
         scale: raw objective at Φ = 1.
@@ -58,10 +58,10 @@ def draw_scene(scene: SceneBatch, state: Any, path: Path, *, width: int = 640, h
 
     Args:
         scene: a batch of one.
-        state: its search state; ``value``, ``objective`` and ``mask`` (N,) are read.
-        path: where the picture goes.
-        width: pixels.
-        height: pixels.
+        state: search state of the scene; ``value``, ``objective`` and ``mask`` (N,) are read.
+        path: image file to write.
+        width: width of the picture in pixels.
+        height: height of the picture in pixels.
     """
     from scene_envs.render import gallery, render
 

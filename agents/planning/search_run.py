@@ -51,7 +51,7 @@ class SearchOutcome:
         first: the best of the first ``branching`` samples of the best search, or the scene it started from; a batch of
             one.
         best: the best scene of each of ``searches``.
-        metrics: what ``metrics.json`` holds.
+        metrics: contents of ``metrics.json``.
     """
 
     search: PlanResult
@@ -72,25 +72,25 @@ def run_search(
     progress: Progress | None = None,
     **settings: Any,
 ) -> SearchOutcome:
-    """Search for scenes that score high, starting from nothing but the prior, or from given scenes.
+    """Search for scenes that score high, starting from samples of the prior or from given scenes.
 
     The root is the scene with only fixed welded objects, so its children are fresh samples. The planner then
     regenerates the objects that the objective blames (Pfaff et al. 2025, inference-time search). With ``scenes`` there
     is one search for each scene, up to ``count``. It regenerates the blamed objects of that scene, and its result
-    scores no less than the scene. The same seed and settings give the same scenes. An interrupt (Ctrl-C, SIGTERM) ends
-    the search with the best scene so far, as does ``max_seconds``. With an output folder, the same call resumes a
-    search that was killed or has ended; the budget may then be larger. If there are more than ``side_by_side``
-    searches, the folder always has the scenes of the finished ones.
+    scores no less than the scene. The same seed and settings give the same scenes. An interrupt (Ctrl-C, SIGTERM) or
+    ``max_seconds`` ends the search with the best scene so far. With an output folder, the same call resumes a search
+    that was killed or has ended; the budget may then be larger. If there are more than ``side_by_side`` searches, the
+    folder always has the scenes of the finished ones.
 
     Args:
         prior: a prior, or the name or path of one.
-        objective: any reward: name, mapping, function or object.
-        config: the settings; or give its fields as keywords.
-        scenes: what the searches start from, of the prior's scene type; None for fresh samples.
+        objective: a reward, given as a name, mapping, function or object.
+        config: settings of the search; None makes them from the keywords.
+        scenes: scenes of the prior's type from which the searches start; None for fresh samples.
         output: folder for ``curve.png``, ``before.png``, ``after.png``, ``best.safetensors``, ``metrics.json``,
             ``tree.json``, ``tree.html``, the journals, and ``config.yaml``, in which functions and objects are left
             out; None writes nothing.
-        progress: told of every round.
+        progress: function to call after every round.
         **settings: fields of :class:`SearchConfig`.
 
     Raises:
@@ -148,8 +148,8 @@ def _search(
             searches.sort(key=loss_of)
         for lane in session.lanes:
             if starts is not None or lane.first:
-                first = max(lane.first[: config.branching], key=_value_of) if starts is None else lane.root
-                firsts[lane.root.seed] = first
+                new = lane.first[: config.branching] if starts is None else [lane.root]
+                firsts[lane.root.seed] = max(new, key=lambda state: state.value if state.valid else -1.0)
         if folder is not None and len(parts) > 1 and searches:
             _scenes(env, searches).save(folder / "best.safetensors")
         if stopped:
@@ -169,7 +169,7 @@ def _search(
     if not any(math.isfinite(plan.best_value) for plan in searches):
         which = f"the first {config.branching} samples of the prior" if starts is None else "the scenes of the search"
         raise SceneEnvsError(
-            f"the search was interrupted before its first {config.branching} scenes were there; call it again"
+            f"the search was interrupted before its first {config.branching} scenes were made; call it again"
             if stopped and not spent
             else f"the objective {objective!r} could not score any of {which}; the log above says why"
         )
@@ -246,7 +246,7 @@ class _Run:
         session = Session(env, max_seconds=max_seconds, journal=journal)
         title, total = name.split("_")[0], budget * (config.count or 1 if name.startswith("search") else 1)
         before = part.start * budget
-        told = None if progress is None else lambda done, best: progress(title, before + done, total, best)
+        report = None if progress is None else lambda done, best: progress(title, before + done, total, best)
         try:
             empty = SceneBatch.empty(self.prior.scene_type, 1, env.problem.slots)
             roots = []
@@ -254,14 +254,13 @@ class _Run:
                 root = empty if self.starts is None else self.starts[search : search + 1]
                 env.reset(seed=config.seed + search, options={"scene": root})
                 roots.append(env.clone_state())
-            plans = session.run(planner, roots, budget, told, root_counts=self.starts is not None)
+            plans = session.run(planner, roots, budget, report, root_counts=self.starts is not None)
             return env, session, plans
         finally:
             env.close()
 
 
 def _scenes(env: SearchEnv, plans: Sequence[PlanResult]) -> SceneBatch:
-    """The best scenes of plans."""
     return SceneBatch.concatenate([env.scene(plan.best_state) for plan in plans])
 
 
@@ -273,10 +272,6 @@ def _fitting(scenes: SceneBatch, prior: Any, slots: int | None) -> SceneBatch:
             f"{scenes.scene_type.name!r}; give a prior of that type"
         )
     return scenes.with_slots(max(prior.scene_type.slots, scenes.tensor.shape[1]) if slots is None else slots)
-
-
-def _value_of(state: SearchState) -> float:
-    return state.value if state.valid else -1.0
 
 
 def _write(outcome: SearchOutcome, config: SearchConfig, best: SceneBatch, first: SearchState, output: Path) -> None:

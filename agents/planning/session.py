@@ -16,9 +16,9 @@ from agents.utils.interrupts import Terminated, terminable
 from scene_envs.errors import InvalidInputError
 
 Pairs = Sequence[tuple[Any, int]]
-Asked = tuple[Pairs, Any]
-"""Pairs, and their steering; None for no steering."""
-Ask = Callable[[Asked], Sequence[Any]]
+Request = tuple[Pairs, Any]
+"""Request for expansions: pairs and their steering, None for no steering."""
+Ask = Callable[[Request], Sequence[Any]]
 
 
 class Lane:
@@ -27,8 +27,8 @@ class Lane:
     Args:
         problem: the environment.
         root: state that the plan starts from.
-        budget: expansions.
-        ask: expands pairs for this lane.
+        budget: largest number of expansions.
+        ask: function that expands pairs for this lane.
         root_counts: whether the root may be the best state.
 
     Attributes:
@@ -81,7 +81,7 @@ class Lane:
 
 
 class Session:
-    """Runs plans over one environment until they are done, time is over, or the user interrupts.
+    """Plans over one environment that run until they end, the time limit is reached, or the user interrupts.
 
     The rounds of all plans are joined into one batch of the environment. With a journal, every round is written to disk
     before a plan sees it. A session that was killed reads these rounds instead of expanding them again, so it continues
@@ -89,8 +89,8 @@ class Session:
 
     Args:
         problem: the environment.
-        max_seconds: time after which nothing more is expanded, except the first round; None for no limit.
-        journal: of the rounds; None keeps none.
+        max_seconds: seconds after which the plans end, at the earliest after their first round; None for no limit.
+        journal: record of the rounds; None keeps none.
 
     Attributes:
         stopped: ``"time"``, ``"interrupt"`` or ``"terminated"`` (SIGTERM); empty when the plans came to their end.
@@ -120,31 +120,31 @@ class Session:
         """One plan of ``budget`` expansions per root.
 
         Args:
-            planner: has ``plan(problem, budget, progress)``.
+            planner: object with a method ``plan(problem, budget, progress)``.
             roots: states that the plans start from.
             budget: expansions of each plan.
             progress: called with the expansions of all plans together, and with the lowest of the plans' best values.
             root_counts: whether a root may be the best state of its plan.
         """
         lanes = self.lanes = [Lane(self.problem, root, budget, self._expand, root_counts) for root in roots]
-        told = None if progress is None else lambda *_: progress(*_overall(lanes))
+        report = None if progress is None else lambda *_: progress(*_overall(lanes))
         with terminable():
             if len(lanes) > 1:
-                return self._run_together(planner, lanes, told)
+                return self._run_together(planner, lanes, report)
             try:
-                return [_plan(planner, lanes[0], told)]
+                return [_plan(planner, lanes[0], report)]
             except KeyboardInterrupt as interrupt:  # between two rounds
                 self.stopped = _reason(interrupt)
                 return [lanes[0].result()]
 
-    def _run_together(self, planner: Any, lanes: list[Lane], told: Progress | None) -> list[PlanResult]:
+    def _run_together(self, planner: Any, lanes: list[Lane], report: Progress | None) -> list[PlanResult]:
         """Run the plans in threads, one at a time and in order: each runs until it asks for expansions or ends."""
-        heard: queue.Queue[Asked | PlanResult | BaseException] = queue.Queue()
+        messages: queue.Queue[Request | PlanResult | BaseException] = queue.Queue()
         answers: list[queue.Queue[Sequence[Any] | None]] = [queue.Queue() for _ in lanes]
 
         def asks(index: int) -> Ask:
-            def ask(asked: Asked) -> Sequence[Any]:
-                heard.put(asked)
+            def ask(asked: Request) -> Sequence[Any]:
+                messages.put(asked)
                 answer = answers[index].get()
                 if answer is None:
                     raise SearchStoppedError("the search was stopped")
@@ -154,34 +154,33 @@ class Session:
 
         def work(index: int) -> None:
             try:
-                heard.put(_plan(planner, lanes[index], None))
+                messages.put(_plan(planner, lanes[index], None))
             except BaseException as error:
-                heard.put(error)
+                messages.put(error)
 
         results: dict[int, PlanResult] = {}
         failure: BaseException | None = None
-        waiting: dict[int, Asked] = {}
+        waiting: dict[int, Request] = {}
 
-        def hear(index: int) -> None:
-            """Wait until the running plan asks for expansions or ends."""
+        def receive(index: int) -> None:
             nonlocal failure
-            what: Any = None
-            while what is None:
+            message: Any = None
+            while message is None:
                 try:
-                    what = heard.get()
+                    message = messages.get()
                 except KeyboardInterrupt as interrupt:
                     self.stopped = _reason(interrupt)
-            if isinstance(what, PlanResult):
-                results[index] = what
-            elif isinstance(what, BaseException):
-                failure = failure or what
+            if isinstance(message, PlanResult):
+                results[index] = message
+            elif isinstance(message, BaseException):
+                failure = failure or message
             else:
-                waiting[index] = what
+                waiting[index] = message
 
         for index, lane in enumerate(lanes):
             lane.ask = asks(index)
             threading.Thread(target=work, args=(index,), daemon=True).start()
-            hear(index)
+            receive(index)
         while waiting:
             asked, waiting = waiting, {}
             states: list[Any] = []
@@ -197,14 +196,14 @@ class Session:
                 enough = failure is None and len(states) >= len(pairs)
                 answers[index].put(states[: len(pairs)] if enough else None)
                 states = states[len(pairs) :] if enough else []
-                hear(index)
-            if told is not None:
-                told(0, 0.0)
+                receive(index)
+            if report is not None:
+                report(0, 0.0)
         if failure is not None:
             raise failure
         return [results[index] for index in sorted(results)]
 
-    def _expand(self, asked: Asked) -> Sequence[Any]:
+    def _expand(self, asked: Request) -> Sequence[Any]:
         """The children of one joint round: from the journal, or made now and written there."""
         pairs, steering = asked
         if self.stopped:
@@ -233,9 +232,9 @@ def _reason(interrupt: KeyboardInterrupt) -> str:
     return "terminated" if isinstance(interrupt, Terminated) else "interrupt"
 
 
-def _plan(planner: Any, lane: Lane, told: Progress | None) -> PlanResult:
+def _plan(planner: Any, lane: Lane, report: Progress | None) -> PlanResult:
     try:
-        return planner.plan(lane, lane.budget, told)
+        return planner.plan(lane, lane.budget, report)
     except SearchStoppedError:  # the planner did not catch it
         return lane.result()
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from scene_envs.scene import SceneBatch
 
-_SMALLEST_SHARE = 0.25
+_MIN_SHARE = 0.25
 """A cut leaves about this share, or more, of the objects of both scenes together on either side."""
 
 
@@ -44,7 +44,7 @@ def spliced(
     cuts = torch.cat(places).sort().values
     if not len(cuts):
         return result
-    edge = int(_SMALLEST_SHARE * (len(cuts) - 1))
+    edge = int(_MIN_SHARE * (len(cuts) - 1))
     cuts = cuts[edge : len(cuts) - edge]
     gained = (places[0] >= cuts[:, None]).sum(-1) + (places[1] < cuts[:, None]).sum(-1)
     cut = cuts[gained.argmax()]

@@ -1,4 +1,4 @@
-"""Search tree on disk: every scene of a search with its parent, value and cost, in ``tree.json``."""
+"""Search tree in ``tree.json``: every scene of a search with its parent, value and cost."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ class TreeNode:
     """One scene of a search.
 
     Attributes:
-        id: its place in the list of nodes; roots first, then in the order they were made.
-        parent: id of the node it was inpainted from; None for a root.
-        action: which child of its parent it is; None for a root.
-        depth: inpaintings since the root.
-        value: Φ in [0, 1]; None where the objective could not score it.
-        objective: the objective's own value; None where it could not be scored.
-        visits: scored scenes at and below this node.
-        nfe: denoiser evaluations of all searches of the run up to this scene, its own included.
+        id: index in the list of nodes; roots first, then in the order of expansion.
+        parent: id of the node from which it was inpainted; None for a root.
+        action: index among the children of its parent; None for a root.
+        depth: number of inpaintings since the root.
+        value: Φ in [0, 1]; None if the objective could not score the scene.
+        objective: raw objective; None if the scene could not be scored.
+        visits: number of scored scenes at and below this node.
+        nfe: denoiser evaluations of all searches of the run up to and including this scene.
         mask: slots that its children regenerate.
     """
 
@@ -53,7 +53,7 @@ class SearchRecord:
     Attributes:
         settings: ``planner``, ``objective``, ``objective_scale`` (objective at Φ = 1) and ``nfe_per_scene``.
         searches: one mapping per search, the best first: ``seed``, ``root`` and ``best`` (ids).
-        nodes: of all searches.
+        nodes: nodes of all searches.
 
     >>> node = TreeNode(0, None, None, 0, 0.5, 2.0, 1, 0, (1, 2))
     >>> record = SearchRecord({"planner": "greedy"}, [{"seed": 0, "root": 0, "best": 0}], [node])
@@ -77,9 +77,9 @@ class SearchRecord:
 
         Args:
             roots: a state per search, each with a seed of its own.
-            states: all states that were made, in the order they were made.
+            states: all expanded states, in order.
             best: path of the best state, by seed; the best search first.
-            settings: as the attribute; ``nfe_per_scene`` is needed.
+            settings: settings of the search; must contain ``nfe_per_scene``.
         """
         rows: list[dict[str, Any]] = []
         ids: dict[tuple[int, tuple[int, ...]], int] = {}

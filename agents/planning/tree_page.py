@@ -1,4 +1,4 @@
-"""Page of a search tree: all scenes by value, the best ones with pictures, the best path in 3-D, in one HTML file."""
+"""HTML page of a search tree: all scenes by value, pictures of the best ones, and the best path in 3-D."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from scene_envs.files import finite, write_text
 from scene_envs.pages import page_part, page_template
 from scene_envs.scene import SceneBatch
 
-LONGEST_PATH = 60
-"""Most scenes of the best path that are shown; some steps of a longer path are left out."""
-BEST_NODES = 24
-"""Most other scenes that are shown, the best ones."""
+MAX_PATH_SCENES = 60
+"""Largest number of scenes of the best path that are shown; some steps of a longer path are left out."""
+MAX_OTHER_SCENES = 24
+"""Largest number of other scenes that are shown, the best ones."""
 
 
 @dataclass(frozen=True)
@@ -27,12 +27,12 @@ class Card:
     """A scene in the drawing of the best scenes and their ancestors.
 
     Attributes:
-        node: the scene.
-        column: its depth, counted from 0 at the first samples, or at the scene that the search started from.
-        row: counted from 0; a first child is in the row of its parent.
+        node: node of the scene.
+        column: depth of the node; the first samples, or the scene that the search started from, have depth 0.
+        row: row of the card, counted from 0; a first child is in the row of its parent.
         parent: index of the parent's card; None for a first sample.
-        number: which scene of its search it is, counted from 1.
-        frame: its place in the 3-D view, which draws its picture; None without one.
+        number: number of the scene in its search, counted from 1.
+        frame: index of the scene in the 3-D view, which draws its picture; None without one.
         on_path: whether it leads to the best scene.
     """
 
@@ -58,11 +58,11 @@ def _first(record: SearchRecord) -> int:
 def shown_nodes(record: SearchRecord) -> list[int]:
     """Ids of the scenes that the page shows: the best path of the first search, then its other best scenes."""
     path = best_path(record)
-    if len(path) > LONGEST_PATH:
-        path = [path[step] for step in np.linspace(0, len(path) - 1, LONGEST_PATH).round().astype(int)]
+    if len(path) > MAX_PATH_SCENES:
+        path = [path[step] for step in np.linspace(0, len(path) - 1, MAX_PATH_SCENES).round().astype(int)]
     on_path = set(path)
     others = [node for node in record.tree_of(0)[1:] if node.value is not None and node.id not in on_path]
-    best = heapq.nsmallest(BEST_NODES, others, key=lambda node: (-(node.value or 0.0), node.id))
+    best = heapq.nsmallest(MAX_OTHER_SCENES, others, key=lambda node: (-(node.value or 0.0), node.id))
     return path + [node.id for node in best]
 
 
@@ -74,14 +74,14 @@ def write_tree_page(
     *,
     returned: SceneBatch | None = None,
 ) -> Path:
-    """Write the page of the first search of ``record``; it needs no other file and no network.
+    """Write the page of the first search of ``record``, which works offline and without other files.
 
     Args:
-        path: the HTML file.
-        record: all scenes.
+        path: HTML file to write.
+        record: record of all scenes.
         scenes: a batch of one for each id of :func:`shown_nodes`.
-        metrics: what ``metrics.json`` holds.
-        returned: the scene that the search returned, if it is no node: a planner may change the best scene at the end.
+        metrics: contents of ``metrics.json``.
+        returned: scene that the search returned, if it is not a node because the planner changed it at the end.
     """
     from jinja2.utils import htmlsafe_json_dumps
     from markupsafe import Markup
@@ -140,9 +140,7 @@ def write_tree_page(
 def _cards(record: SearchRecord, shown: Sequence[int], way: Sequence[int]) -> list[Card]:
     """The cards of the shown scenes and of all their ancestors except an empty root, parents first.
 
-    The best path is in the first row.
-
-    A chain of first children takes the highest row that is free in all its columns.
+    The best path is in the first row. A chain of first children takes the highest row that is free in all its columns.
     """
     frames, on_path = {node: frame for frame, node in enumerate(shown)}, set(way)
     number = {node.id: k for k, node in enumerate(record.tree_of(0))}

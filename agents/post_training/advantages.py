@@ -140,13 +140,13 @@ def compute_advantages(
 
     Args:
         reward: (B,) or (B, K) floats; K columns (slots) share one baseline and one std.
-        valid: (B,) bool or (B, K) bool; None means all.
+        valid: (B,) or (B, K) bool; None takes all rows as valid.
         baseline: ``"leave_one_out"`` or ``"mean"``.
-        clip: advantages are kept within ±clip.
+        clip: largest absolute value of an advantage.
         groups: (B,) int64, such as an index of the prompt; statistics are taken within each group.
 
     Returns:
-        The shape of ``reward``, float32. All zeros where a group has fewer than two valid entries or no spread.
+        float32 of the shape of ``reward``; zeros for a group with fewer than two valid entries or no spread.
 
     >>> compute_advantages(torch.tensor([0.0, 1.0, 5.0]), torch.tensor([True, True, False]), baseline="mean")
     tensor([-1.,  1.,  0.])
@@ -157,18 +157,15 @@ def compute_advantages(
         raise InvalidInputError(f"advantage_clip={clip} must be positive")
     taken = torch.ones_like(reward, dtype=torch.bool) if valid is None else _expand(valid, reward)
     taken = taken & torch.isfinite(reward)
-    everywhere, mask, all_groups = (
-        gather_rows(reward),
-        gather_rows(taken),
-        None if groups is None else gather_rows(groups),
-    )
-    if groups is None or all_groups is None:
-        return _normalise(reward, taken, everywhere[mask], baseline, clip)
+    all_rewards, all_taken = gather_rows(reward), gather_rows(taken)
+    if groups is None:
+        return _normalise(reward, taken, all_rewards[all_taken], baseline, clip)
+    all_groups = gather_rows(groups)
     advantage = torch.zeros_like(reward, dtype=torch.float32)
     for group in groups.unique():
-        rows = groups == group
-        elsewhere = all_groups == group
-        advantage[rows] = _normalise(reward[rows], taken[rows], everywhere[elsewhere][mask[elsewhere]], baseline, clip)
+        rows, in_group = groups == group, all_groups == group
+        sample = all_rewards[in_group][all_taken[in_group]]
+        advantage[rows] = _normalise(reward[rows], taken[rows], sample, baseline, clip)
     return advantage
 
 

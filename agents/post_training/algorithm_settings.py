@@ -172,7 +172,7 @@ class AWMSettings(ForwardProcessSettings):
     Attributes:
         beta: strength of the pull to the sampling policy, above 1.
         advantage_clip: largest advantage, in standard deviations.
-        expectation_lr: as for ``nft``.
+        expectation_lr: the setting of the same name of ``nft``.
     """
 
     name: str = "awm"

@@ -1,4 +1,4 @@
-"""Registry of post-training algorithms: their settings and the location of their code; imports no torch."""
+"""Registry of the post-training algorithms, with their settings and their classes; imports no torch."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ def register_algorithm(
     or one of its subclasses, such as :class:`agents.post_training.DDPO`.
 
     Args:
-        name: letters, digits and underscores.
-        settings: the dataclass of its keys, with a sentence for each under ``Attributes:``.
+        name: name of letters, digits and underscores.
+        settings: dataclass of the algorithm's keys, with a sentence for each under ``Attributes:``.
 
     Raises:
         InvalidInputError: the name is not one word.

@@ -19,7 +19,7 @@ class AveragedSampler(Algorithm):
     Args:
         policy: policy that is optimised.
         sampler_decay: final decay, per batch, of the weight average that samples.
-        warm_up: of the decay, see :class:`~agents.utils.weight_average.WeightAverage`.
+        warm_up: warm-up of the decay, see :class:`~agents.utils.weight_average.WeightAverage`.
 
     Attributes:
         prior: the prior in training.

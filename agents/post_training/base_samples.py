@@ -30,12 +30,12 @@ def kept_base_samples(
     The samples have the prompts of real scenes, so that prompts do not distinguish samples from real scenes.
 
     Args:
-        directory: of the run.
+        directory: folder of the run.
         base: the base prior.
         bank: real scenes, which give the prompts and the number of slots.
-        config: of the run.
+        config: configuration of the run.
         reuse: load the samples that are already in the folder, as a resumed run does.
-        progress: how the sampling is shown, a style of :class:`~scene_envs.progress.Progress`.
+        progress: a style of :class:`~scene_envs.progress.Progress`.
     """
     path, processes, count = directory / BASE_SAMPLES_NAME, ProcessGroup.current(), config.regularisation.base_samples
     prompts = bank.batch(count, Generator().manual_seed(stream_seed(config.seed, "base_prompts"))).prompts

@@ -37,8 +37,8 @@ class Measured:
             ``reward`` (mean of the trained reward), ``reward_sem``, ``reward_invalid`` (scenes it could not score),
             ``prompt_match`` (with prompts: the reward of that name), ``prompt_match_sem``,
             ``invalid_scenes`` (physics failed: left out of feasible and ready figures), and the cheap realism figures.
-        raw: the samples, unchanged.
-        ready: the same, projected and settled.
+        raw: raw samples.
+        ready: the samples after projection and settling.
         is_ready: (B, N) bool, simulation-ready objects of ``ready``.
     """
 
@@ -61,15 +61,15 @@ def measure_prior(
     slots: int | None = None,
     reward: Any = None,
 ) -> Measured:
-    """Sample ``count`` scenes and measure all of them; none is chosen, none is dropped.
+    """Sample ``count`` scenes and measure all of them.
 
     Args:
-        prior: the prior.
-        count: scenes.
+        prior: prior to measure.
+        count: number of scenes.
         num_steps: denoiser evaluations per scene.
-        seed: of the samples; the same seed for two priors starts both from the same noise.
+        seed: seed of the samples; the same seed for two priors starts both from the same noise.
         pool: physics workers.
-        prompts: one per scene, which the samples are then compared with; None for none.
+        prompts: one prompt per scene, with which the samples are compared; None for none.
         guidance: weight of classifier-free guidance.
         claim_guidance: strength of claim guidance.
         slots: per sample; None means as trained.
@@ -95,7 +95,7 @@ def measure_prior(
         **_counted("ready", ready.counts, ready.valid, free),
         "invalid_scenes": float((~(feasible.valid & ready.valid)).sum()),
         **realism(raw),
-        **({} if prompts is None else _prompt_figures(raw, prompts)),
+        **({} if prompts is None else _mean("prompt_match", PromptMatch()(raw, RewardContext(prompts=tuple(prompts))))),
     }
     return Measured(figures, raw, ready.batch, ready.ready)
 
@@ -103,10 +103,10 @@ def measure_prior(
 def write_comparison(
     result: PostTrainResult, before: Measured, after: Measured, *, title: str, extra: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Write ``before.png``, ``after.png``, ``report.html`` and ``metrics.json`` beside the run's ``curve.png``.
+    """Write ``before.png``, ``after.png``, ``report.html`` and ``metrics.json`` to the run folder.
 
     Args:
-        result: the run.
+        result: result of the run.
         before: samples of the base prior.
         after: samples of the post-trained prior.
         title: heading of the page.
@@ -135,11 +135,11 @@ def write_comparison(
 
 
 def draw_gallery(batch: SceneBatch, path: Path, is_ready: Tensor | None = None) -> Path:
-    """Draw the first scenes of ``batch`` with their counts as a PNG; nothing is selected.
+    """Draw the first scenes of ``batch`` with their counts as a PNG.
 
     Args:
-        batch: the scenes.
-        path: where the picture goes.
+        batch: scenes to draw.
+        path: image file to write.
         is_ready: (B, N) bool; if given, captions count these objects, and the other free objects are red.
     """
     images, captions = _drawn(batch, is_ready, _GALLERY)
@@ -151,8 +151,8 @@ def draw_side_by_side(measured: Mapping[str, Measured], path: Path, *, ready: bo
 
     Args:
         measured: samples of each prior from the same noise, by the name in the captions; three fit the page.
-        path: where the picture goes.
-        ready: show the scenes after projection and settling; objects that are not simulation-ready are red.
+        path: image file to write.
+        ready: whether to show the scenes after projection and settling, with objects that are not ready in red.
     """
     drawn = [
         _drawn(part.ready if ready else part.raw, part.is_ready if ready else None, _GALLERY // 2)
@@ -164,11 +164,11 @@ def draw_side_by_side(measured: Mapping[str, Measured], path: Path, *, ready: bo
     return _save_gallery(images, captions, path)
 
 
-def _drawn(batch: SceneBatch, is_ready: Tensor | None, most: int) -> tuple[NDArray[np.uint8], list[str]]:
-    """Images (b, H, W, 3) of the first scenes, and a caption each."""
+def _drawn(batch: SceneBatch, is_ready: Tensor | None, count: int) -> tuple[NDArray[np.uint8], list[str]]:
+    """Images (b, H, W, 3) of the first ``count`` scenes, and a caption for each."""
     from scene_envs.render import render
 
-    shown = batch[: min(most, len(batch))]
+    shown = batch[:count]
     width, height = _TILE
     if is_ready is None:
         return render(shown, width=width, height=height), [f"{count} objects" for count in shown.counts.tolist()]
@@ -284,7 +284,7 @@ def _tile(
 
 
 def _relative(before: float, after: float | None) -> float | None:
-    """The relative change; None where it has no meaning, as from 0 or from a negative value."""
+    """The relative change; None if ``before`` is not positive."""
     return None if after is None or before <= 0 else after / before - 1.0
 
 
@@ -309,12 +309,8 @@ def _reward_figures(
     return {**_mean("reward", output), "reward_invalid": float((~output.is_valid).sum())}
 
 
-def _prompt_figures(batch: SceneBatch, prompts: Sequence[str]) -> dict[str, float]:
-    """Mean of the reward ``prompt_match``; nothing when no prompt can be read."""
-    return _mean("prompt_match", PromptMatch()(batch, RewardContext(prompts=tuple(prompts))))
-
-
 def _mean(name: str, output: RewardOutput) -> dict[str, float]:
+    """Mean and standard error of a reward over its valid scenes; empty without any."""
     value = output.value[output.is_valid].double()
     return {name: float(value.mean()), f"{name}_sem": _standard_error(value)} if len(value) else {}
 

@@ -24,10 +24,10 @@ from rewards.process import close_reward, run_reward
 from scene_envs.scene import SceneBatch
 
 SAMPLE_SEED = 100_000
-"""Added to the run's seed for the samples that are measured, so that training never saw their noise."""
+"""Number added to the run's seed for the measured samples, so that their noise differs from that of training."""
 
 PHYSICS_TIMEOUT = 300.0
-"""Seconds for a chunk of scenes; long, so that a slow scene on a busy machine does not become an invalid one."""
+"""Seconds for a chunk of scenes; long, so that a slow scene on a busy machine does not become invalid."""
 
 
 def post_train_and_compare(
@@ -41,7 +41,7 @@ def post_train_and_compare(
     Args:
         config: the run; ``config.output`` gets ``report.html``, ``curve.png``, ``before.png``, ``after.png``,
             ``metrics.json`` and the prior. An interrupted run found there is resumed.
-        scenes: fresh samples measured of each prior.
+        scenes: number of fresh samples of each prior.
         num_steps: denoiser evaluations per measured sample.
         prior: prior to start from, in place of the one that ``config.prior`` names.
 
@@ -107,6 +107,6 @@ def _measured_prompts(config: PostTrainConfig, prior: ScenePrior, count: int) ->
 
 
 def say_stage(config: PostTrainConfig, text: str) -> None:
-    """Tell on stderr what is done next, unless the run shows no progress."""
+    """Print ``text``, the next stage, to stderr unless the run shows no progress."""
     if config.logger.progress != "none":
         print(text, file=sys.stderr, flush=True)

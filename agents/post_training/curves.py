@@ -23,10 +23,10 @@ def draw_curve(
 
     Args:
         history: rows with ``iteration``, ``reward``, ``reward_std`` and, at checks, ``guard_ratio``.
-        path: where the picture goes.
+        path: image file to write.
         reward_name: label of the upper axis.
-        limit: of the guard's loss, drawn as a line.
-        beyond: iteration from which the run is over-optimised; shaded from there.
+        limit: limit of the guard's loss, drawn as a line.
+        beyond: iteration from which the run is over-optimised; the picture is shaded from there.
         highest: largest possible reward, which bounds the band of the standard deviation; None for no bound.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -45,7 +45,7 @@ def run_demo(
             ``feasible``, which ``prior=`` loads. An interrupted demonstration is resumed.
         seed: seed of training, from which the seed of the measured samples is derived.
         workers: physics worker processes, of both runs together while they train.
-        scenes: fresh samples measured of each prior.
+        scenes: number of fresh samples of each prior.
         num_steps: denoiser evaluations per measured sample.
         runs: names of the runs, and their keys of ``post-train`` besides output, seed and workers.
 

@@ -1,4 +1,4 @@
-"""Discriminative loss: raises the likelihood of real scenes over the base prior's, and lowers that of base samples."""
+"""Discriminative loss, which raises the likelihood of real scenes and lowers that of samples of the base prior."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from agents.priors.forward import NoisedScenes
 class DiscriminativeLoss:
     """Direct discriminative optimisation (Zheng et al. 2025, arXiv 2503.01103) of a diffusion prior.
 
-    The log-likelihood ratio of the prior and its base is the logit of a discriminator, which tells real scenes from
-    samples of the base prior. It is trained with the logistic loss. The odds of the best discriminator are the density
-    of real scenes divided by that of base samples, so the best prior has the density of real scenes. The pretraining
-    loss l of a noised scene takes the place of -log p. With the gap d = l(base) - l(prior), the losses are
+    The log-likelihood ratio of the prior and its base is the logit of a discriminator of real scenes and samples of the
+    base prior, which is trained with the logistic loss. The odds of the best discriminator are the density of real
+    scenes divided by that of base samples, so the best prior has the density of real scenes. The pretraining loss l of
+    a noised scene takes the place of -log p. With the gap d = l(base) - l(prior), the losses are
 
         (2 / s) softplus(-s d) of real scenes,    (2 / s) softplus(s d) of base samples
 
@@ -31,7 +31,7 @@ class DiscriminativeLoss:
     Attributes:
         prior: prior in training.
         base: base prior, with which the prior is compared; its weights get no gradient.
-        sharpness: s, per unit of the pretraining loss; near 0 nothing bounds the loss of base samples.
+        sharpness: factor s, per unit of the pretraining loss; near 0 the loss of base samples has no bound.
 
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior("dimsum_table", process="mixed")

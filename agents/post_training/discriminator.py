@@ -22,26 +22,25 @@ from scene_envs.scene import SceneBatch
 
 logger = logging.getLogger(__name__)
 
-_MOST_REAL = 1024
-"""Real scenes that are kept."""
+_MAX_REAL_SCENES = 1024
+"""Number of real scenes that are kept."""
 
 
 @register_reward("discriminator")
 class Discriminator:
     """Mean probability, over the free objects, that an object is one of a real scene; from 0 to 1.
 
-    A small network is trained online to tell the objects of real scenes from those of samples (Goodfellow et al. 2014;
-    one logit per object). It reads an object's asset and pose and its four nearest neighbours, not the rest of the
-    scene, so that an object is not blamed for others far away. ``post-train`` trains it from iteration to iteration.
-    Without such a run it has learned nothing, and every object scores 0.5. A scene without free objects scores 0.
-    Generated welded objects, such as the tables of rooms, are judged as well. They get credit, but do not change the
-    value.
+    A small network is trained online to separate the objects of real scenes from those of samples (Goodfellow et al.
+    2014; one logit per object). It reads an object's asset and pose and its four nearest neighbours, not the rest of
+    the scene, so that an object is not blamed for others far away. ``post-train`` trains it in every iteration.
+    Untrained, it scores every object 0.5. A scene without free objects scores 0. Generated welded objects, such as the
+    tables of rooms, are judged as well; they get credit, but do not change the value.
 
     Args:
-        learning_rate: of AdamW.
-        steps: optimiser steps of an iteration.
-        batch_size: real scenes, and samples, of a step.
-        memory: latest samples that steps draw from.
+        learning_rate: learning rate of AdamW.
+        steps: number of optimiser steps of an iteration.
+        batch_size: number of real scenes, and of samples, of a step.
+        memory: number of latest samples from which steps draw.
 
     >>> Discriminator()(SceneBatch.empty("dimsum_table", 1), RewardContext()).value
     tensor([0.])
@@ -64,7 +63,7 @@ class Discriminator:
         return "Discriminator()"
 
     def maximum(self, slots: int, free_slots: int) -> float:
-        """The largest value."""
+        """The largest value, 1."""
         return 1.0
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
@@ -95,10 +94,10 @@ class Discriminator:
         """Start with an untrained network.
 
         Args:
-            real: real scenes; the first 1,024 are kept.
-            seed: of the weights and of all draws.
+            real: real scenes, of which the first 1,024 are kept.
+            seed: seed of the weights and of all draws.
         """
-        self._model = _Model(real[:_MOST_REAL].to("cpu"), seed, self.learning_rate)
+        self._model = _Model(real[:_MAX_REAL_SCENES].to("cpu"), seed, self.learning_rate)
 
     def learn(self, samples: SceneBatch, steps: int | None = None) -> None:
         """Keep ``samples`` among the latest ones, and take optimiser steps.

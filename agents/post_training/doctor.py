@@ -1,4 +1,4 @@
-"""Doctor: checks of a post-training run before it starts, on one batch."""
+"""Doctor: checks of a post-training run on one batch, before it starts."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 LOUD, QUIET = 30.0, 1 / 30.0
 """Ratios of policy to regularisation gradient norm beyond which one of the two gradients dominates."""
-DOMINANT = 0.7
-"""Share of the squared policy gradient beyond which one step dominates the others."""
+MAX_STEP_SHARE = 0.7
+"""Share of the squared policy gradient above which one step dominates the others."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class StepRow:
     Attributes:
         step: index in the step table.
         timestep: timestep at which the step starts.
-        std: its smallest sigma over random entries, normalised units.
+        std: smallest standard deviation of the step over random entries, normalised units.
         weight: weight in the policy gradient; 0 leaves the step out.
-        gradient_norm: norm of this step's policy gradient alone; 0 when the step is left out.
+        gradient_norm: norm of this step's policy gradient alone; 0 if the step is left out.
     """
 
     step: int
@@ -53,19 +53,19 @@ class DoctorReport:
     """Findings of the doctor.
 
     Attributes:
-        log_ratio: largest |log p_now - log p_sampling|; exactly 0 when sampler and loss agree.
-        steps: the sigma table.
-        reward_mean: over one batch.
-        reward_std: over one batch.
-        reward_min: over one batch.
-        reward_max: over one batch.
-        valid_fraction: of the batch.
-        policy_gradient_norm: of the score-function part.
-        pretraining_gradient_norm: of the regularisation, its coefficient included.
-        sampling_seconds: one batch of scenes with its rewards.
-        update_seconds: one update.
-        iterations: iterations of the run, for the estimate of its duration.
-        advice: what to change, in words; empty when all is well.
+        log_ratio: largest |log p_now - log p_sampling|; exactly 0 if sampler and loss agree.
+        steps: one row per step of the chain.
+        reward_mean: mean reward of one batch.
+        reward_std: standard deviation of the batch's rewards.
+        reward_min: smallest reward of the batch.
+        reward_max: largest reward of the batch.
+        valid_fraction: share of scenes in the batch that were scored.
+        policy_gradient_norm: gradient norm of the score-function part.
+        pretraining_gradient_norm: gradient norm of the regularisation, its coefficient included.
+        sampling_seconds: duration of sampling and scoring one batch.
+        update_seconds: duration of one update.
+        iterations: number of iterations of the run, for the estimate of its duration.
+        advice: recommended changes in words; empty if none is needed.
     """
 
     log_ratio: float
@@ -81,11 +81,6 @@ class DoctorReport:
     update_seconds: float
     iterations: int
     advice: list[str] = field(default_factory=list)
-
-    @property
-    def healthy(self) -> bool:
-        """Whether there is nothing to change."""
-        return not self.advice
 
     @property
     def gradient_ratio(self) -> float:
@@ -107,7 +102,7 @@ def diagnose(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> Doc
     """Examine a configuration with one batch of scenes; nothing is trained and nothing is written.
 
     Args:
-        config: the run that is planned.
+        config: configuration of the planned run.
         prior: prior to start from, in place of the one that ``config.prior`` names.
     """
     with TemporaryDirectory() as scratch:
@@ -191,22 +186,25 @@ def _advice(report: DoctorReport, config: PostTrainConfig) -> list[str]:
         )
     weight = config.regularisation.pretraining_weight
     if weight > 0 and report.policy_gradient_norm > 0:
-        if report.gradient_ratio < QUIET:
+        if report.gradient_ratio < MIN_RATIO:
             advice.append(
-                f"Regularisation drowns the policy gradient (ratio {report.gradient_ratio:.2g}): "
-                f"lower regularisation.weight from {weight:g}, or change "
-                "algorithm.log_prob_reduction."
+                f"Regularisation dominates the policy gradient (ratio {report.gradient_ratio:.2g}): lower "
+                f"regularisation.weight from {weight:g}, or change algorithm.log_prob_reduction."
             )
-        if report.gradient_ratio > LOUD:
+        if report.gradient_ratio > MAX_RATIO:
             advice.append(
-                f"The policy gradient drowns the regularisation (ratio {report.gradient_ratio:.2g}): "
-                f"raise regularisation.weight from {weight:g}, or expect the guard to stop you."
+                f"The policy gradient dominates the regularisation (ratio {report.gradient_ratio:.2g}): raise "
+                f"regularisation.weight from {weight:g}, or expect the guard to stop the run."
             )
     if not report.steps:
         return advice
     worst = max(report.steps, key=lambda row: row.gradient_norm)
     total = sum(row.gradient_norm**2 for row in report.steps)
-    if total > 0 and worst.gradient_norm**2 > DOMINANT * total and sum(row.weight > 0 for row in report.steps) > 2:
+    if (
+        total > 0
+        and worst.gradient_norm**2 > MAX_STEP_SHARE * total
+        and sum(row.weight > 0 for row in report.steps) > 2
+    ):
         advice.append(
             f"Step {worst.step} (sigma {worst.std:.3g}) alone is {worst.gradient_norm**2 / total:.0%} of the squared "
             f"policy gradient: raise algorithm.min_std or set algorithm.step_weighting=std."

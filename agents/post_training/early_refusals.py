@@ -1,4 +1,4 @@
-"""Checks that refuse a post-training run that cannot learn, before anything is sampled."""
+"""Checks before the first sample that a post-training run can learn."""
 
 from __future__ import annotations
 

@@ -24,8 +24,8 @@ class Expectation(nn.Module):
     covariance of target and advantage is then left, as in a policy gradient with an exact baseline.
 
     Args:
-        prior: whose denoiser is copied.
-        learning_rate: of AdamW.
+        prior: prior from which the denoiser is copied.
+        learning_rate: learning rate of AdamW.
 
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior("dimsum_table", process="mixed")

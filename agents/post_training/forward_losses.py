@@ -24,7 +24,7 @@ class NFTLoss(ForwardProcessLoss):
     logits in the way that o_plus and o_minus combine outputs.
 
     Args:
-        prior, sampler, expectation, generator: as in :class:`ForwardProcessLoss`.
+        prior, sampler, expectation, generator: the arguments of :class:`ForwardProcessLoss`.
         beta: strength; smaller values step further from the sampling policy.
         clip: c, the advantage at which a sample is fully good or bad.
 
@@ -50,7 +50,7 @@ class NFTLoss(ForwardProcessLoss):
         generator: Generator | None = None,
     ) -> None:
         super().__init__(prior, sampler, expectation=expectation, generator=generator)
-        _positive(beta=beta, clip=clip)
+        _require_positive(beta=beta, clip=clip)
         self.beta, self.clip = beta, clip
 
     def continuous_loss(self, output: Tensor, old: Tensor, target: Tensor, advantage: Tensor) -> Tensor:
@@ -79,7 +79,7 @@ class AWMLoss(ForwardProcessLoss):
     :class:`NFTLoss` divided by the beta of :class:`NFTLoss`.
 
     Args:
-        prior, sampler, expectation, generator: as in :class:`ForwardProcessLoss`.
+        prior, sampler, expectation, generator: the arguments of :class:`ForwardProcessLoss`.
         beta: strength of the pull, above 1.
         clip: c, the largest advantage.
     """
@@ -95,7 +95,7 @@ class AWMLoss(ForwardProcessLoss):
         generator: Generator | None = None,
     ) -> None:
         super().__init__(prior, sampler, expectation=expectation, generator=generator)
-        _positive(clip=clip)
+        _require_positive(clip=clip)
         if not beta > 1:
             raise InvalidInputError(f"beta={beta} must be above 1: below, a bad sample pushes without bound")
         self.beta, self.clip = beta, clip
@@ -113,11 +113,10 @@ class AWMLoss(ForwardProcessLoss):
 
 
 def _cross_entropy(logits: Tensor, category: Tensor) -> Tensor:
-    """(B, N) cross-entropies of (B, N, K) logits."""
     return F.cross_entropy(logits.flatten(0, 1), category.flatten(), reduction="none").view(category.shape)
 
 
-def _positive(**values: float) -> None:
+def _require_positive(**values: float) -> None:
     for name, value in values.items():
         if not value > 0:
             raise InvalidInputError(f"{name}={value} must be positive")

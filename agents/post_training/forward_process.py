@@ -1,4 +1,4 @@
-"""Forward-process algorithms: their sampling policy, their advantages, and their gradient of a batch."""
+"""Forward-process algorithms: sampling policy, advantages, and gradient of a batch."""
 
 from __future__ import annotations
 

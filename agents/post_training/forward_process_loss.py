@@ -32,16 +32,16 @@ class ForwardProcessLoss(OwnSampleLoss):
     the slots whose category is masked at that timestep, times the prior's ``category_weight``.
 
     The error of a sample is its target minus the mean target of own samples at that noised scene. ``expectation``
-    learns this mean. Without it, o_old replaces the mean. Where all samples are bad, o_old then drifts away.
+    learns this mean. Without it, o_old replaces the mean, and drifts where all samples are bad.
 
     ``advantage`` weights the losses of poses, ``category_advantage`` those of categories. Each is one number per scene
     or one per slot. The network denoises every slot given the others, so an advantage per slot credits an object only
     for its own pose.
 
-    Accepted keys (``set_keys``), beside those of :class:`~agents.post_training.own_sample_loss.OwnSampleLoss`:
+    Accepted keys (``set_keys``), and those of :class:`~agents.post_training.own_sample_loss.OwnSampleLoss`:
         advantage: (B,), (B, 1) or (B, N) float, for poses. Default ``"advantage"``.
-        category_advantage: the same for categories, optional; without it they have no credit. Default
-            ``"category_advantage"``.
+        category_advantage: advantage for categories, of the same shapes, optional; without it categories have no
+            credit. Default ``"category_advantage"``.
 
     Args:
         prior: prior that is trained.
@@ -89,10 +89,10 @@ class ForwardProcessLoss(OwnSampleLoss):
         """Losses of continuous entries; all arguments broadcast to (B, N, F).
 
         Args:
-            output: o of the denoiser in training.
-            old: o_old of the sampling policy, a constant.
+            output: output o of the denoiser in training.
+            old: output o_old of the sampling policy, a constant.
             target: training target of the denoiser's output for this noise.
-            advantage: of each entry's slot.
+            advantage: advantage of each entry's slot.
         """
 
     @abstractmethod
@@ -100,10 +100,10 @@ class ForwardProcessLoss(OwnSampleLoss):
         """(B, N) losses of categories.
 
         Args:
-            logits: (B, N, K) of the denoiser in training.
-            old: (B, N, K) of the sampling policy, constants.
+            logits: (B, N, K) logits of the denoiser in training.
+            old: (B, N, K) logits of the sampling policy, constants.
             category: (B, N) int64, the clean categories.
-            advantage: (B, 1) or (B, N).
+            advantage: (B, 1) or (B, N) advantages.
         """
 
     def of_noised(self, noised: NoisedScenes, flat: TensorDictBase) -> TensorDict:

@@ -1,4 +1,4 @@
-"""Guard against over-optimisation: held-out pretraining loss, and measures of samples relative to the base prior."""
+"""Guard against over-optimisation, by the held-out pretraining loss and by measures of samples."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _CHUNK = 256
 
 @dataclass(frozen=True)
 class GuardReading:
-    """One check.
+    """Result of one check.
 
     Attributes:
         iteration: iteration of the check.
@@ -45,7 +45,7 @@ class GuardReading:
 
 
 class Guard:
-    """Monitors the held-out pretraining loss and samples, and keeps the best checkpoint within all limits.
+    """Monitor of the held-out pretraining loss and of samples, which selects the best checkpoint within all limits.
 
     The best checkpoint has the largest reward among the checks within all limits. If the guard samples, the reward of a
     check is that of the samples, which start from the same noise at every check. Checks of the loss alone then keep no
@@ -55,12 +55,12 @@ class Guard:
     in telling samples from real scenes.
 
     Args:
-        heldout: (K, N, D) normalised real scenes that the regularisation never sees.
-        limit: largest ratio before the run counts as over-optimised; no checkpoint beyond it is kept.
+        heldout: (K, N, D) normalised real scenes that are not used by the regularisation.
+        limit: largest ratio before the run counts as over-optimised; no checkpoint above it is kept.
         seed: seed of the fixed timesteps and noise.
         prompts: one prompt of each held-out scene; None measures without prompts.
-        samples: how to sample and measure; None measures the loss alone.
-        limits: by name, the largest excess of a figure of samples over that of the base prior.
+        samples: settings for sampling and measuring; None measures the loss alone.
+        limits: largest excess of each figure of samples over that of the base prior, by name.
         target: largest ratio of a checkpoint that is kept, if the run holds the ratio.
         learns: whether the reward learns during the run.
 
@@ -147,7 +147,7 @@ class Guard:
         """Measure ``prior``; the reading says whether it is the best so far.
 
         Args:
-            prior: with the weights that are evaluated and saved.
+            prior: prior with the weights that are evaluated and saved.
             iteration: number of the finished iteration.
             reward: mean over the batches since the check before.
             realism: further figures, kept with the reading.
@@ -184,7 +184,7 @@ class Guard:
         return next((r.iteration for r in self.readings if r.beyond), None)
 
     def summary(self) -> dict[str, Any]:
-        """JSON-able summary: ratio of the kept checkpoint, first check beyond a limit, limits, and all checks."""
+        """Summary as JSON values: ratio of the kept checkpoint, first check beyond a limit, limits, and all checks."""
         return {
             "ratio": self.best_ratio,
             "last_ratio": self.ratio,
@@ -198,7 +198,7 @@ class Guard:
         }
 
     def state(self) -> dict[str, Any]:
-        """For a checkpoint."""
+        """State for a checkpoint."""
         return {
             "base_loss": self.base_loss,
             "base_samples": self.base_figures,

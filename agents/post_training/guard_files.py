@@ -1,4 +1,4 @@
-"""Guard of a run and its files: the best prior, and the samples that the report shows."""
+"""Guard of a run and its files: the best prior, and the samples in the report."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from agents.priors.base import ScenePrior
 from agents.utils.process_group import ProcessGroup
 
 _PICTURED = 6
-"""Samples of the guard that are kept for the report."""
+"""Number of the guard's samples that are kept for the report."""
 
 
 def make_guard(config: PostTrainConfig, learner: Learner, scenes: SceneBank) -> Guard:
@@ -46,7 +46,7 @@ class GuardFiles:
     """Files of the guard in a run's folder; only the first process writes.
 
     Args:
-        config: of the run.
+        config: configuration of the run.
         base: name of the base prior; empty for a prior that was not loaded by name.
     """
 

@@ -1,4 +1,4 @@
-"""The guard's part of a report: its verdict, its figures and its samples."""
+"""The guard's part of a report: verdict, figures and samples."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def guard_sections(guard: Mapping[str, Any], pictures: Mapping[str, Path]) -> li
     for name, label in _LABELS.items():
         if name in base:
             limit = guard["sample_limits"].get(name)
-            most = "none" if limit is None else f"{base[name] + limit:.3g}"
-            rows.append((label, *(f"{figures[name]:.3g}" for figures in (base, best, last)), most))
+            largest = "none" if limit is None else f"{base[name] + limit:.3g}"
+            rows.append((label, *(f"{figures[name]:.3g}" for figures in (base, best, last)), largest))
     within, beyond = pictures.get("guard_within"), pictures.get("guard_beyond")
     shown = [Picture(within, "Of the prior kept")] if within else []
     shown += [Picture(beyond, "Of the first check beyond a limit")] if beyond else []

@@ -1,4 +1,4 @@
-"""Guidance distillation: a prior learns to place objects as physics guidance places them."""
+"""Guidance distillation: training of a prior to place objects as physics guidance does."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from agents.utils.process_group import ProcessGroup
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import POSE_FEATURES, TRANSLATION
 
-_LEAST = 1e-4
-"""Least standard deviation of a denoised feature in the loss, normalised."""
-_LEAST_METRES = 1e-6
-"""Least standard deviation of a denoised position, m, that moves are compared with."""
+_MIN_STD = 1e-4
+"""Smallest standard deviation of a denoised feature in the loss, normalised."""
+_MIN_METRES = 1e-6
+"""Smallest standard deviation of a denoised position, m, with which moves are compared."""
 
 
 class GuidanceDistillationLoss(PlainLoss):
     """Squared difference of denoised poses from a teacher's, divided by the variance of the denoiser's error.
 
     For one reverse step, the loss of an entry is an upper bound of twice the KL divergence of the prior's step from the
-    teacher's: both are normal with the same variance, which the error of the denoised entry is a part of.
+    teacher's: both are normal with the same variance, which includes the error of the denoised entry.
 
     Accepted keys (``set_keys``):
         scene: (B, N, D) float, scenes x_t of a chain. Default ``"scene"``.
-        timestep: (B,) or (B, 1) int64, their timesteps. Default ``"timestep"``.
+        timestep: (B,) or (B, 1) int64, timesteps of these scenes. Default ``"timestep"``.
         denoised: (B, N, 12) float, the teacher's estimate of the normalised poses of x_0. Default ``"denoised"``.
         trained: (B, N) bool, optional, slots whose poses are trained; without it, all. Default ``"trained"``.
         text, text_mask: (B, L, W) tokens and (B, L) their mask, optional. Default ``"text"`` and ``"text_mask"``.
@@ -104,7 +104,7 @@ class GuidanceDistillationLoss(PlainLoss):
         levels, rows = t.unique(return_inverse=True)
         process, residual = self.prior.process, self.prior.residual
         stds = torch.stack([process.estimate(int(level), int(level) - 1, residual)[1] for level in levels])
-        return stds[:, :POSE_FEATURES].to(like).clamp(min=_LEAST)[rows][:, None]
+        return stds[:, :POSE_FEATURES].to(like).clamp(min=_MIN_STD)[rows][:, None]
 
 
 class GuidanceDistillation(AveragedSampler):
@@ -113,9 +113,9 @@ class GuidanceDistillation(AveragedSampler):
     The sampling policy, a slower copy of the prior, samples a batch of scenes without physics guidance. At random steps
     of these chains, :class:`~agents.priors.physics_guidance.PhysicsGuidance` corrects the scenes that the copy
     denoises, and the prior is trained to denoise the same x_t to the corrected poses. The states come from the policy
-    itself, as in DAgger (Ross et al. 2011), so the prior learns to correct the errors that it makes. The gradient ends
-    where the guidance has nothing left to correct. Rotations are held at what the copy denoises, and categories get no
-    gradient. The reward is reported only.
+    itself, as in DAgger (Ross et al. 2011), so the prior learns to correct its own errors. The gradient vanishes where
+    the guidance has nothing to correct. Rotations are held at those that the copy denoises, and categories get no
+    gradient. The reward is only reported.
 
     Args:
         settings: settings of the algorithm.
@@ -145,10 +145,10 @@ class GuidanceDistillation(AveragedSampler):
         self._stds = [position_std(self.sampler, step, table) for step in range(len(policy))]
         self.steps = [step for step, std in enumerate(self._stds) if PhysicsGuidance.acts(std)]
         if not self.steps:
-            least = 1e3 * float(self._stds[-1][:2].max())
+            error = 1e3 * float(self._stds[-1][:2].max())
             raise InvalidInputError(
                 f"algorithm={settings.name} has nothing to learn: physics guidance acts once horizontal positions are "
-                f"known to 3 cm, and the error of this prior is {least:.0f} mm at the last of num_steps={len(policy)} "
+                f"known to 3 cm, and the error of this prior is {error:.0f} mm at the last of num_steps={len(policy)} "
                 "steps; pretrain the prior for longer"
             )
 
@@ -204,7 +204,7 @@ class GuidanceDistillation(AveragedSampler):
         moves = guidance(step, len(self.policy), lambda: scenes, std)
         assert moves is not None
         moves = moves.to(x) * movable[..., None]
-        far = (moves / std.to(x).clamp(min=_LEAST_METRES)).norm(dim=-1, keepdim=True)
+        far = (moves / std.to(x).clamp(min=_MIN_METRES)).norm(dim=-1, keepdim=True)
         target = denoised[..., :POSE_FEATURES].clone()
         scale = self.sampler.normalizer.scale[TRANSLATION].to(x)
         target[..., TRANSLATION] += scale * moves * (self.settings.clip / far.clamp(min=self.settings.clip))

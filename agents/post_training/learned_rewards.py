@@ -15,9 +15,9 @@ from rewards import learned_parts
 from scene_envs.scene import SceneBatch
 
 FIRST_SAMPLES = 128
-"""Samples of the base prior that a reward learns from before the first iteration."""
+"""Number of samples of the base prior from which a reward learns before the first iteration."""
 FIRST_STEPS = 150
-"""Optimiser steps on these samples."""
+"""Number of optimiser steps on these samples."""
 
 
 class LearnedRewards:
@@ -27,7 +27,7 @@ class LearnedRewards:
 
     Args:
         reward: resolved reward of the run.
-        config: of the run.
+        config: configuration of the run.
     """
 
     def __init__(self, reward: Any, config: PostTrainConfig) -> None:
@@ -47,9 +47,9 @@ class LearnedRewards:
         """Train the parts on samples of the base prior, before they score the first batch.
 
         Args:
-            prior: the base prior.
-            slots: per sample.
-            prompts: one for each of the ``FIRST_SAMPLES``; None without prompts.
+            prior: base prior.
+            slots: slots per sample.
+            prompts: one prompt for each of the ``FIRST_SAMPLES``; None without prompts.
         """
         samples = ProcessGroup.current().from_first(
             lambda: prior.sample(

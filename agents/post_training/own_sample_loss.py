@@ -26,7 +26,7 @@ class PlainLoss(LossModule):
         return False
 
     def _forward_value_estimator_keys(self, **kwargs: object) -> None:
-        """Does nothing: there is no value estimator."""
+        """Do nothing, because there is no value estimator."""
 
 
 class OwnSampleLoss(PlainLoss):
@@ -41,11 +41,11 @@ class OwnSampleLoss(PlainLoss):
         text, text_mask: (B, L, W) tokens and (B, L) their mask, optional. Default ``"text"`` and ``"text_mask"``.
 
     Args:
-        prior: noises the scenes.
+        prior: prior that noises the scenes.
         generator: source of timesteps, noise and observed entries (CPU); None for torch's own.
 
     Returns (``forward``): ``loss_objective`` (), the loss of the prior in training, and ``loss_expectation`` (), the
-        loss of a copy that is trained beside it. Each is 0 if the scenes do not train that model.
+        loss of a trained copy of it. Each is 0 if the scenes do not train that model.
     """
 
     @dataclass

@@ -1,4 +1,4 @@
-"""Base class of algorithms that train on their own finished samples, noised anew for every update."""
+"""Base class of algorithms that train on their own finished samples, noised again for every update."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from agents.utils.process_group import ProcessGroup, gather_rows
 
 
 class OwnSampleAlgorithm(AveragedSampler):
-    """An algorithm that trains on the finished scenes of an averaged sampler.
+    """Algorithm that trains on the finished scenes of an averaged sampler.
 
     Args:
         policy: policy that is optimised.
@@ -25,7 +25,7 @@ class OwnSampleAlgorithm(AveragedSampler):
         sampler_decay: decay, per :meth:`WeightAverage.update`, of the weight average that samples.
 
     Attributes:
-        copy: a copy of the denoiser that is trained on the samples, with ``loss_expectation``; None for none.
+        copy: copy of the denoiser that is trained on the samples with ``loss_expectation``; None for none.
     """
 
     loss: OwnSampleLoss

@@ -1,4 +1,4 @@
-"""Prior as a torchrl policy over the denoising MDP: samples x_{t-1} and gives its log-probability."""
+"""The reverse chain of a prior as a torchrl policy, with samples of x_{t-1} and their log-probabilities."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class DenoisingPolicy(TensorDictModuleBase):
 
     Args:
         prior: prior that denoises; its parameters are the policy's.
-        num_steps: steps of the chain, as in the environment.
-        chunk: scenes denoised at once, for sampling and for log-probabilities; None takes all.
+        num_steps: number of steps of the chain, as in the environment.
+        chunk: number of scenes denoised at once, for sampling and for log-probabilities; None takes all.
         guidance: weight w of classifier-free guidance; if it is not 0, the guided chain is the policy.
         claim_guidance: strength of :meth:`claim_hook`.
         independent: whether slots draw their categories independently, so that log-probabilities are exact; False draws

@@ -1,4 +1,4 @@
-"""Division of a batch among processes: sizes of the shares, and rewards that need the whole batch."""
+"""Division of a batch among processes, and rewards that need the whole batch."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ def check_shares(config: PostTrainConfig, processes: int) -> None:
 
 
 class WholeBatchReward:
-    """A reward that depends on the other scenes of a batch: each process scores the scenes of all processes.
+    """A reward that depends on the other scenes of a batch, for which each process scores the scenes of all processes.
 
     Args:
         reward: resolved reward.
-        processes: processes that all call this reward at the same time, each with the same number of scenes.
+        processes: processes that call this reward together, each with the same number of scenes.
     """
 
     depends_on_batch = True

@@ -19,7 +19,7 @@ def run_progress(title: str, total: int, style: str, done: int = 0) -> Iterator[
         title: name of the run.
         total: number of iterations.
         style: ``"bar"`` (lines when stderr is no terminal), ``"lines"`` or ``"none"``.
-        done: iterations done before, by a resumed run.
+        done: number of iterations before the run was resumed.
     """
     with Progress(title, total, done=done, style=style, every=5.0, always=(done + 1, total)) as progress:
 

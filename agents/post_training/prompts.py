@@ -25,11 +25,11 @@ PromptSets = Callable[[int], Sequence[str]]
 
 
 class GrammarPrompts:
-    """Descriptions of scenes without prompts; those of a scene are written when they are first asked for.
+    """Descriptions of scenes without prompts, written on first use.
 
     Args:
-        batch: the scenes.
-        seed: the descriptions of scene i depend only on the seed and on i.
+        batch: scenes to describe.
+        seed: seed of the descriptions; those of scene i depend only on the seed and on i.
     """
 
     def __init__(self, batch: SceneBatch, seed: int) -> None:
@@ -45,12 +45,12 @@ class GrammarPrompts:
 
 
 class PromptDeck:
-    """Deals the prompts of batches.
+    """Deck from which the prompts of batches are dealt.
 
     Args:
         prompt: one text, a list, ``"data"`` (the prompts of real scenes) or ``"grammar"``.
         share: number of scenes of a batch that share a prompt, so that they can be compared.
-        real: prompts of real scenes by index; for ``"data"``.
+        real: prompts of real scenes by index, for ``"data"``.
         count: number of real scenes.
 
     >>> deck = PromptDeck(["A scene with two cups.", "A scene with a teapot."], share=2)

@@ -54,9 +54,9 @@ class Regularisation:
         Args:
             prior: prior in training.
             real: real scenes of all processes.
-            base: as many samples of the base prior; None for any loss but the discriminative one.
+            base: an equal number of samples of the base prior; None for any loss but the discriminative one.
             generator: source of timesteps and noise (CPU).
-            chunk: scenes per pass.
+            chunk: number of scenes per pass.
         """
 
         def add(scenes: PromptedScenes, generator: Generator, loss: SceneLoss | None) -> tuple[float, float]:
@@ -117,7 +117,7 @@ class Regularisation:
         )
 
     def summary(self) -> dict[str, Any] | None:
-        """JSON-able, for the metrics; None without a target."""
+        """Values for the metrics; None without a target."""
         if self.target is None:
             return None
         return {
@@ -129,7 +129,7 @@ class Regularisation:
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """For a checkpoint."""
+        """State for a checkpoint."""
         return asdict(self.state)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

@@ -16,7 +16,7 @@ class Picture:
     """An image of the page.
 
     Attributes:
-        path: PNG file; its bytes go into the page.
+        path: PNG file that is embedded in the page.
         caption: one line below the image.
     """
 
@@ -31,7 +31,7 @@ class Tile:
     Attributes:
         label: name of the number.
         value: the number as text.
-        note: what the number is compared with.
+        note: the value that the number is compared with.
     """
 
     label: str
@@ -41,7 +41,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class Section:
-    """A heading with text, pictures (two stand side by side) and a table.
+    """A heading with text, pictures (in two columns) and a table.
 
     Attributes:
         title: heading.
@@ -62,7 +62,7 @@ class Page:
 
     Attributes:
         title: heading of the page.
-        lead: what was done, in a sentence or two.
+        lead: a sentence or two on the run.
         tiles: headline numbers.
         sections: sections of the page, in order.
         settings: settings of the run, shown folded at the end.

@@ -32,7 +32,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def writing(what: str, write: Callable[[], object]) -> None:
-    """Run ``write``; an OSError or RuntimeError of it becomes a TrainingError that names ``what``."""
+    """Run ``write``, and turn its OSError or RuntimeError into a TrainingError that names ``what``."""
     try:
         write()
     except (OSError, RuntimeError) as error:

@@ -1,4 +1,4 @@
-"""Check of a prior by its samples: reward, counts, categories, and a classifier that tells them from real scenes."""
+"""Check of a prior by its samples: reward, counts, categories, and a classifier of samples and real scenes."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from scene_envs.envs.scoring import RewardScorer
 from scene_envs.scene import SceneBatch
 
 _AT_ONCE = 32
-"""Scenes sampled together."""
+"""Number of scenes sampled together."""
 _CLASSIFIERS = 3
 """Number of classifiers over which the accuracy is averaged."""
 
 
 @dataclass(frozen=True)
 class SampleCheck:
-    """Samples a prior from the same noise at every call, and measures the samples.
+    """Check that samples a prior from the same noise at every call, and measures the samples.
 
     Attributes:
-        real: real scenes that training never sees.
-        scorer: of the run's reward.
+        real: real scenes that are not used in training.
+        scorer: scorer of the run's reward.
         count: number of samples.
         num_steps: denoising steps per sample.
-        seed: of the noise.
-        slots: per sample.
-        prompts: one per sample; None without prompts.
+        seed: seed of the noise.
+        slots: slots per sample.
+        prompts: one prompt per sample; None without prompts.
         guidance: weight of classifier-free guidance.
         claim_guidance: strength of claim guidance.
 

@@ -24,7 +24,7 @@ from scene_envs.scene_types import SceneType
 _WITHHELD = 0.1
 """Share of real scenes whose prompt is withheld, as in pretraining."""
 _DRAWN = 64
-"""Scenes of the grammar between two updates of the progress."""
+"""Number of scenes of the grammar between two updates of the progress."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class PromptedScenes:
     """Normalised scenes and one prompt for each.
 
     Attributes:
-        scenes: (M, N, D).
-        prompts: one per scene, ``""`` for a scene without one; None for a prior that reads no prompts.
+        scenes: (M, N, D) normalised scenes.
+        prompts: one prompt per scene, ``""`` for a scene without one; None for a prior that reads no prompts.
     """
 
     scenes: Tensor
@@ -51,8 +51,8 @@ class SceneBank:
     """Normalised real scenes, in a fixed split into training scenes and held-out scenes.
 
     Attributes:
-        train: (M, N, D) for the regularisation.
-        heldout: (K, N, D) for the guard.
+        train: (M, N, D) scenes for the regularisation.
+        heldout: (K, N, D) scenes for the guard.
         prompts: all prompts of a scene by its index, with held-out scenes after training scenes; None without prompts.
         base: samples of the base prior; None for none.
     """
@@ -93,7 +93,7 @@ class SceneBank:
             count: number of scenes; None for all.
             slots: largest number of objects that a prompt may ask for; ``""`` stands for a prompt that asks for more.
                 None allows any number.
-            scene_type: of the scenes; only needed with ``slots``.
+            scene_type: scene type of the scenes; only needed with ``slots``.
         """
         if self.prompts is None:
             return None
@@ -117,11 +117,11 @@ def kept_scenes(
     """The real scenes of a run, kept in its folder with the prompts of a dataset; the first process draws them.
 
     Args:
-        directory: of the run.
-        prior, seed, slots: as for :func:`real_scenes`.
+        directory: folder of the run.
+        prior, seed, slots: the arguments of :func:`real_scenes`.
         settings: source and number of the scenes.
         reuse: load the scenes that are already in the folder, as a resumed run does.
-        progress: how the drawing is shown, a style of :class:`~scene_envs.progress.Progress`.
+        progress: a style of :class:`~scene_envs.progress.Progress`.
     """
     path, texts, processes = directory / SCENES_NAME, directory / PROMPTS_NAME, ProcessGroup.current()
     if processes.is_first and not (reuse and path.exists()):
@@ -141,13 +141,13 @@ def real_scenes(
     """``count`` real scenes of the prior's scene type, and the prompts of each if they have any.
 
     Args:
-        prior: whose scene type is wanted.
+        prior: prior of the wanted scene type.
         source: ``"grammar"``, or the directory of a dataset.
         count: number of scenes; a smaller dataset gives all it has.
-        seed: of the grammar, or of the choice of rows.
+        seed: seed of the grammar, or of the choice of rows.
         slots: smallest number of slots per scene; None takes as many as the prior was trained on. Real scenes keep all
             their slots, because a prior reads any number of slots.
-        progress: how the drawing is shown, a style of :class:`~scene_envs.progress.Progress`.
+        progress: a style of :class:`~scene_envs.progress.Progress`.
     """
     slots = max(prior.scene_type.slots, prior.config.slots if slots is None else slots)
     if source == "grammar":

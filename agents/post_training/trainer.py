@@ -1,4 +1,4 @@
-"""Post-training loop: sample scenes, score them, update the prior, check the guard."""
+"""Post-training loop: sampling, scores, updates of the prior, and checks of the guard."""
 
 from __future__ import annotations
 
@@ -42,20 +42,20 @@ from rewards import reward_label
 from scene_envs.errors import TrainingError
 from scene_envs.folders import claimed
 
-_MOST_ROLLBACKS = 3
+_MAX_ROLLBACKS = 3
 """Number of returns to the best checkpoint that a run may make; one more ends it."""
 
 
 @dataclass(frozen=True)
 class PostTrainResult:
-    """A finished run.
+    """Result of a finished run.
 
     Attributes:
-        prior: the best prior within the guard's limit; on disk in ``directory / "prior"``.
-        history: one row per iteration.
-        metrics: what ``metrics.json`` holds.
-        directory: the run directory.
-        config: what was run; on disk in ``config.yaml``.
+        prior: best prior within the guard's limit, also in ``directory / "prior"``.
+        history: one row of the log per iteration.
+        metrics: contents of ``metrics.json``.
+        directory: folder of the run.
+        config: configuration of the run, also in ``config.yaml``.
     """
 
     prior: ScenePrior
@@ -72,8 +72,8 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> P
     process writes files.
 
     Args:
-        config: the run.
-        prior: the prior itself, in place of the one that ``config.prior`` names; it is not changed.
+        config: configuration of the run.
+        prior: prior to start from, instead of the one that ``config.prior`` names; it is not changed.
 
     Raises:
         TrainingError: a gradient or a value of the prior is not finite, no reward was valid for too long, the disk is
@@ -106,8 +106,8 @@ class PostTrainer:
     """One run: its loop, its guard and its files.
 
     Args:
-        config: the run.
-        prior: prior to start from, in place of the one that ``config.prior`` names.
+        config: configuration of the run.
+        prior: prior to start from, instead of the one that ``config.prior`` names.
     """
 
     guard: Guard
@@ -178,7 +178,7 @@ class PostTrainer:
         return self._finish()
 
     def prepare(self, *, reuse_scenes: bool = False) -> None:
-        """Draw the real scenes, or reuse those kept beside a run that is resumed, and make the guard."""
+        """Draw the real scenes, or reuse those in the folder of a resumed run, and make the guard."""
         config, seed, slots = self.config, stream_seed(self.config.seed, "bank"), self.learner.slots
         shown = config.logger.progress if self.processes.is_first else "none"
         batch = kept_scenes(
@@ -233,7 +233,7 @@ class PostTrainer:
     @property
     def _stopped(self) -> bool:
         if self.config.guard.action == "rollback":
-            return self.rollbacks > _MOST_ROLLBACKS
+            return self.rollbacks > _MAX_ROLLBACKS
         return self.config.guard.action == "stop" and self.guard.over_limit_at is not None
 
     def _check(self, batch: TensorDict, *, sample: bool) -> None:

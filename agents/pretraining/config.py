@@ -1,4 +1,4 @@
-"""Configuration of one pretraining run; imports no torch."""
+"""Configuration of a pretraining run; imports no torch."""
 
 from __future__ import annotations
 
@@ -22,10 +22,7 @@ from agents.pretraining.settings import (
 
 @dataclass
 class SceneKeys:
-    """Scenes to train on.
-
-    :class:`PretrainConfig` describes the keys.
-    """
+    """Scenes to train on; :class:`PretrainConfig` describes the keys."""
 
     scene: Any = named("dimsum_table", "scene")
     data: str = "data/dimsum_table"

@@ -26,15 +26,15 @@ class TrainingData(Protocol):
         """Number of distinct scenes; 0 for an endless stream."""
 
     def draw(self, count: int, generator: Generator, *, prompts: bool) -> tuple[Tensor, list[Sequence[str]]]:
-        """(count, N, D) encoded scenes, and the prompts of each, if asked for."""
+        """(count, N, D) encoded scenes, and the prompts of each if ``prompts`` is True."""
 
 
 class SceneTable:
     """Scenes in memory, drawn with replacement.
 
     Args:
-        scenes: (M, N, D) as the prior encodes them.
-        prompts: prompts of every scene; may be empty when none are asked for.
+        scenes: (M, N, D) scenes as the prior encodes them.
+        prompts: prompts of every scene; may be empty if draws need no prompts.
     """
 
     def __init__(self, scenes: Tensor, prompts: Sequence[Sequence[str]] = ()) -> None:
@@ -56,7 +56,7 @@ class UnionTable:
     """Scenes of several types in memory, as scenes of their union; each type is as likely as the others.
 
     Args:
-        datasets: one per scene type.
+        datasets: one dataset per scene type.
         prior: prior of the union, which encodes the drawn scenes.
     """
 
@@ -91,11 +91,11 @@ class UnionTable:
 
 
 class GrammarStream:
-    """Fresh scenes of a grammar, not verified by physics: no scene is seen twice.
+    """Endless fresh scenes of a grammar, not verified by physics.
 
     Args:
-        grammar: draws scenes.
-        prior: encodes them.
+        grammar: grammar of the scenes.
+        prior: prior that encodes the scenes.
     """
 
     def __init__(self, grammar: Grammar, prior: ScenePrior) -> None:
@@ -104,7 +104,7 @@ class GrammarStream:
 
     @property
     def size(self) -> int:
-        """0: there is no end."""
+        """0, because the stream is endless."""
         return 0
 
     def draw(self, count: int, generator: Generator, *, prompts: bool) -> tuple[Tensor, list[Sequence[str]]]:

@@ -1,4 +1,4 @@
-"""Initial priors of pretraining runs: fresh ones, and older ones that are trained further."""
+"""Initial priors of pretraining runs: fresh priors, and existing priors that are trained further."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ MOMENTS = ("category", "feature", "scene")
 """Groups of values whose mean and standard deviation the preconditioning of a network uses."""
 
 FITTED_ON = 20_000
-"""Scenes to which moments are fitted."""
+"""Largest number of scenes to which moments are fitted."""
 
 
 def build_prior(
@@ -46,10 +46,10 @@ def build_prior(
     """The prior that ``config`` starts from: an older one, or a fresh one with preconditioning fitted to raw scenes.
 
     Args:
-        config: the run.
-        raw: (M, N, D) scenes.
-        normalizer: of raw scenes.
-        prompts: prompts of every scene, from which a prior that reads them takes its vocabulary.
+        config: configuration of the run.
+        raw: (M, N, D) raw scenes.
+        normalizer: normaliser of raw scenes.
+        prompts: prompts of every scene, the source of the vocabulary of a prior that reads prompts.
     """
     if config.prior:
         return _started(config, raw, prompts)
@@ -69,8 +69,8 @@ def _started(config: PretrainConfig, raw: Tensor, prompts: Sequence[Sequence[str
     its vocabulary; words of ``prompts`` that it lacks are listed in a warning.
 
     Raises:
-        InvalidInputError: its scene type or its slots are not those of the data, or a feature that it takes as constant
-            varies in the scenes.
+        InvalidInputError: scene type or slots of the prior are not those of the data, or a feature that the prior takes
+            as constant varies in the scenes.
     """
     slots = raw.shape[1]
     prior = ScenePrior.load(config.prior)
@@ -85,7 +85,7 @@ def _started(config: PretrainConfig, raw: Tensor, prompts: Sequence[Sequence[str
 
 
 def _check_constants(prior: ScenePrior, free: Tensor, name: str) -> None:
-    """Refuse scenes in which a feature varies that the prior would overwrite with a constant."""
+    """Raise InvalidInputError if a feature varies in the scenes that the prior would overwrite with a constant."""
     normalizer = prior.normalizer
     constant = normalizer.is_constant.cpu().clone()
     if prior.process_name == "mixed":
@@ -220,7 +220,7 @@ def _kinds(scene: str) -> tuple[int, ...]:
 
 
 def _conditions_counts(config: PretrainConfig) -> bool:
-    """Whether the network is told how many objects of each kind a prompt asks for."""
+    """Whether the network reads how many objects of each kind a prompt asks for."""
     return (
         config.text.count_conditioning
         and config.network.name == "flux"

@@ -1,13 +1,11 @@
-"""Log of a training run: rows for the CSV file and for a logger, and pictures of samples."""
+"""Log of a training run: rows of the CSV file and of a logger, and pictures of samples."""
 
 from __future__ import annotations
 
 import csv
 import io
 import logging
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from agents.priors.base import ScenePrior
 from agents.utils.loggers import RunLogger
@@ -20,11 +18,11 @@ FIELDS = ("step", "loss", "heldout", "gradient_norm", "learning_rate", "seconds"
 
 
 class TrainingLog:
-    """Log of a run; each row is written when it comes.
+    """Log of a run; each row is written at once.
 
     Args:
-        directory: where ``log.csv`` goes.
-        also: the logger that gets the same rows, as :func:`agents.utils.loggers.make_logger` makes it.
+        directory: folder of ``log.csv``.
+        also: another logger that gets the same rows, see :func:`agents.utils.loggers.make_logger`.
     """
 
     def __init__(self, directory: Path, also: RunLogger | None = None) -> None:
@@ -38,7 +36,9 @@ class TrainingLog:
             return
         with path.open(newline="", encoding="utf-8", errors="replace") as file:
             rows = list(csv.DictReader(file))
-        kept = {int(row["step"]): row for row in rows if _is_whole(row) and int(row["step"]) <= step}
+        # the last row of a killed run may lack some numbers
+        whole = [row for row in rows if str(row.get("step") or "").isdigit() and None not in map(row.get, FIELDS)]
+        kept = {int(row["step"]): row for row in whole if int(row["step"]) <= step}
         if not kept:
             path.unlink()
             return
@@ -65,11 +65,6 @@ class TrainingLog:
                 writer.writeheader()
             writer.writerow(row)
         self._also.log({key: value for key, value in row.items() if key != "step"}, step)
-
-
-def _is_whole(row: Mapping[str, Any]) -> bool:
-    """Whether a row of the file has all its numbers; the last row of a killed run may lack some."""
-    return str(row.get("step") or "").isdigit() and all(row.get(name) is not None for name in FIELDS)
 
 
 def draw_samples(prior: ScenePrior, directory: Path, step: int, seed: int) -> None:

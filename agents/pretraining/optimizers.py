@@ -40,10 +40,10 @@ def build_optimizer(
 
     Args:
         name: ``"adamw"``, or ``"muon"`` for Muon on the matrices inside ``blocks`` and AdamW on the rest.
-        network: what is trained.
+        network: network to train.
         weight_decay: decoupled weight decay.
         text_rate: ``rate`` of the parameters under ``text_encoder``. At first, only a few percent of the loss depend on
-            prompts. With steps as long as elsewhere, all words become alike before the network reads any of them.
+            prompts; with the full learning rate, all words get the same embedding before the network reads them.
     """
     if name not in OPTIMIZERS:
         raise unknown_name("optimizer", name, OPTIMIZERS)
@@ -74,8 +74,8 @@ class MuonAdamW(torch.optim.Optimizer):
     Args:
         matrices: two-dimensional parameters, updated by Muon.
         others: parameters updated by AdamW.
-        lr: learning rate of both.
-        weight_decay: decoupled, of both.
+        lr: learning rate of both optimisers.
+        weight_decay: decoupled weight decay of both optimisers.
 
     >>> weight = nn.Parameter(torch.eye(2))
     >>> optimizer = MuonAdamW([weight], [], lr=0.1, weight_decay=0.0)
@@ -135,7 +135,7 @@ class MuonAdamW(torch.optim.Optimizer):
 
 
 def orthogonalised(matrix: Tensor, steps: int = 5) -> Tensor:
-    """``matrix`` (M, N) with all singular values brought near 1, between 0.7 and 1.2, by Newton-Schulz iterations."""
+    """``matrix`` (M, N) with its singular values moved near 1, between 0.7 and 1.2, by Newton-Schulz iterations."""
     a, b, c = _COEFFICIENTS
     tall = matrix.shape[0] > matrix.shape[1]
     x = matrix.T if tall else matrix

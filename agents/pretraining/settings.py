@@ -15,15 +15,15 @@ class ModuleSettings:
     """Modules that are added to the core of the mixed flux network; other networks do not read them.
 
     Attributes:
-        observed_flags: give the network flags that say which poses and categories are observed in inpainting.
-        pooled_text: also modulate every block by the mean of the text tokens.
-        count_embedding: give the network the numbers of visible slots of each category and of masked slots.
-        relations: give attention the relative positions of slots. ``axis`` blurs them along x, y and z by the noise of
-            that axis, ``largest`` by the largest noise of the three; ``none`` is plain attention.
-        rotation_features: give the network the difference of each rotation from SO(3) and from upright, in units of the
-            noise.
-        contacts: predict the distances at which two objects touch, and give the network the remaining gaps in units of
-            the noise; needs relations.
+        observed_flags: whether the network reads flags of the poses and categories that are observed in inpainting.
+        pooled_text: whether the mean of the text tokens also modulates every block.
+        count_embedding: whether the network reads the numbers of visible slots of each category and of masked slots.
+        relations: relative positions of slots that attention reads. ``axis`` blurs them along x, y and z by the noise
+            of that axis, ``largest`` by the largest noise of the three; ``none`` is plain attention.
+        rotation_features: whether the network reads the difference of each rotation from SO(3) and from upright, in
+            units of the noise.
+        contacts: whether the network predicts the distances at which two objects touch, and reads the remaining gaps in
+            units of the noise; needs relations.
     """
 
     observed_flags: bool = True
@@ -155,8 +155,8 @@ class LossSettings:
         category_weight: weight of the category loss; the weight of the pose loss is 1.
         observed_share: share of the training scenes of a mixed prior in which some poses or categories are observed, as
             in inpainting.
-        open_empty_share: among training scenes in which whole slots are observed, the share in which all empty slots
-            are masked. A prior that is trained with 0 adds too many objects when all empty slots are masked.
+        open_empty_share: share of scenes with masked empty slots among the training scenes in which whole slots are
+            observed. A prior that is trained with 0 adds too many objects if all empty slots are masked.
     """
 
     noise_mean: float = -1.8

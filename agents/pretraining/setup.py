@@ -24,9 +24,9 @@ from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import register_scene_type, union_scene_type
 
 _SAMPLE = 1024
-"""Scenes of a grammar to which the moments and the vocabulary are fitted."""
+"""Number of scenes of a grammar to which the moments and the vocabulary are fitted."""
 _HELD_OUT = 512
-"""Held-out scenes of a grammar."""
+"""Number of held-out scenes of a grammar."""
 
 
 def prepare(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:

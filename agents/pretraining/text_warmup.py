@@ -1,4 +1,4 @@
-"""Text warm-up: training of the text encoder to predict the object numbers of its prompts, before a run."""
+"""Text warm-up: training of the text encoder, before a run, to predict the object numbers of its prompts."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ _RATE, _RISE = 3e-3, 0.2
 
 
 def warm_up_text(prior: ScenePrior, data: TrainingData, steps: int, batch_size: int, seed: int) -> float | None:
-    """Train the text encoder, and the layers that read numbers from it, only on prompts and counts of their scenes.
+    """Train the text encoder, and the layers that predict numbers from it, only on prompts and counts of their scenes.
 
     No scene is denoised, so hundreds of such steps take a minute. The run that follows starts with predicted numbers,
-    from which the network can subtract the objects it sees.
+    from which the network can subtract the visible objects.
 
     Args:
-        prior: changed in place; a prior whose network has no count conditioning is not changed.
+        prior: prior that is changed in place; without count conditioning it is not changed.
         data: scenes and their prompts.
-        steps: optimiser steps.
-        batch_size: scenes per step.
+        steps: number of optimiser steps.
+        batch_size: number of scenes per step.
         seed: seed of all draws; the same seed gives the same weights.
 
     Returns:
-        Mean loss of the last tenth of the steps, in nats per kind of object; None where there was nothing to learn.
+        Mean loss of the last tenth of the steps, in nats per kind of object; None if nothing was trained.
     """
     conditioning = prior.count_conditioning
     if conditioning is None or steps < 1:

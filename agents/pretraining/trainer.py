@@ -1,4 +1,4 @@
-"""Pretraining loop of a scene prior: one loop, exact resume, logs and model cards."""
+"""Pretraining loop of a scene prior, with exact resume, logs and model cards."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ logger = logging.getLogger(__name__)
 _MAY_DIFFER = ("iterations", "output", "logger", "device", "recipe")
 """Keys that may change between a run and its continuation."""
 _RESIDUAL = 512
-"""Held-out scenes on which the error that is left is measured."""
+"""Number of held-out scenes on which the residual error of the denoiser is measured."""
 _PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 
@@ -58,7 +58,7 @@ class Pretrainer:
     processes take the same steps as one process with twice the parts. A killed run continues bit for bit.
 
     Args:
-        config: the run.
+        config: configuration of the run.
         data: training scenes.
         heldout: (K, N, D) held-out scenes as the prior encodes them.
         prior: the prior to train, in place.
@@ -106,14 +106,15 @@ class Pretrainer:
             self.prior.denoiser.network.compile()
         if self.processes.is_first:
             self.log.begin(self.step)
-        for row in self._steps():
-            if self.processes.is_first:
-                self.log.write(row, self.config.iterations)
+        with finishing_steps() as end:
+            for row in self._steps(end):
+                if self.processes.is_first:
+                    self.log.write(row, self.config.iterations)
         self.log.close()
         if self.processes.is_first:
-            logger.info("measuring the error that is left at 40 noise levels, for the samplers")
+            logger.info("measuring the residual error at 40 noise levels, for the samplers")
         with self._averaged():
-            count = len(self.heldout_data)  # of a union the scenes of each type stand together
+            count = len(self.heldout_data)  # scenes of a union are sorted by type
             rows = torch.linspace(0, count - 1, min(_RESIDUAL, count)).long()
             self.prior.fit_residual(self.heldout_data[rows].to(self.config.device))
         self.prior.denoiser.precision = torch.float32
@@ -126,14 +127,9 @@ class Pretrainer:
             self.processes.share(self.network.parameters())
             self.average = WeightAverage(self.network, self.config.optimizer.ema)
 
-    def _steps(self) -> Iterator[dict[str, float]]:
-        started = time.perf_counter() - self.seconds
+    def _steps(self, end: Ending) -> Iterator[dict[str, float]]:
+        started, config = time.perf_counter() - self.seconds, self.config
         running: list[float] = []
-        with finishing_steps() as end:
-            yield from self._stepping(started, running, end)
-
-    def _stepping(self, started: float, running: list[float], end: Ending) -> Iterator[dict[str, float]]:
-        config = self.config
         while self.step < config.iterations:
             loss, norm = self._update()
             running.append(loss)
@@ -253,13 +249,13 @@ class Pretrainer:
             )
         check_tensors(self.network, state["network"], self.checkpoint_path)
         try:
-            self.network.load_state_dict({**state["network"], **state["average"]})  # gives weights their present names
+            self.network.load_state_dict({**state["network"], **state["average"]})  # weights get their present names
             average = WeightAverage(self.network, self.config.optimizer.ema)
             self.network.load_state_dict(state["network"])
             self.optimizer.load_state_dict(state["optimizer"])
         except (RuntimeError, ValueError, KeyError) as error:
             raise InvalidInputError(
-                f"the run in {str(self.directory)!r} cannot go on: it was started with another network or optimiser; "
+                f"the run in {str(self.directory)!r} cannot be resumed: it has another network or optimiser; "
                 "give the same keys again, or another output"
             ) from error
         self.average = average
@@ -270,13 +266,13 @@ class Pretrainer:
         logger.info("resumed at step %d", self.step)
 
     def _data_facts(self) -> dict[str, Any]:
-        """Facts by which a resumed run knows its data: numbers of scenes, and the means of the held-out ones."""
+        """Facts with which a resumed run checks its data: numbers of scenes, and means of the held-out ones."""
         heldout = self.heldout_data.double()
         mean = torch.stack([heldout.mean(dim=(0, 1)), heldout.square().mean(dim=(0, 1))])
         return {"scenes": [self.data.size or 0, len(heldout)], "mean": mean}
 
     def _started_with(self, state: dict[str, Any]) -> str:
-        """Keys of the checkpoint's run with values other than in this run; empty if all are the same."""
+        """Keys of the checkpoint's run whose values differ from this run's; empty if none do."""
         before, now = dotted(state["config"]), dotted(asdict(self.config))
         keys = [
             f"{key}={value}"
@@ -303,7 +299,7 @@ class Pretrainer:
 
 
 def _origin(base: str, card: Mapping[str, Any]) -> dict[str, Any]:
-    """Entries of a card that stay true when the prior ``base`` is trained further; none for a fresh prior."""
+    """Entries of a card that stay true if the prior ``base`` is trained further; none for a fresh prior."""
     if not base:
         return {}
     kept = {key: card[key] for key in ("imported_from", "license", "post_training") if key in card}
@@ -314,7 +310,7 @@ def pretrain(config: PretrainConfig) -> dict[str, Any]:
     """Train a prior as ``config`` says; resumes a run found in ``config.output``.
 
     Returns:
-        The numbers of ``metrics.json``, which is written beside the prior and ``config.yaml``.
+        The numbers of ``metrics.json``, which is written to the run folder.
     """
     with claimed(config.directory, "pretrain") if is_first_process() else nullcontext():
         prior, data, heldout = prepare(config)

@@ -1,4 +1,4 @@
-"""Checkpoints on disk: written whole or not at all, and read without running code in the file."""
+"""Checkpoints on disk, written atomically and read without running code in the file."""
 
 from __future__ import annotations
 
@@ -57,8 +57,7 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
         content, written = content[:-_TRAILER], content[-64:].decode(errors="replace")
         if hashlib.sha256(content).hexdigest() != written:
             raise CorruptFileError(
-                f"{str(path)!r} is damaged: its contents are not what was written (checksum); delete it to start the "
-                "run anew"
+                f"{str(path)!r} is damaged (checksum of another content); delete it to start the run anew"
             )
     try:
         state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
@@ -72,12 +71,12 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def check_tensors(module: nn.Module, tensors: Mapping[str, Tensor], path: str | os.PathLike[str]) -> None:
-    """Refuse weights of a checkpoint whose names and shapes are not those of ``module``.
+    """Raise unless the weights of a checkpoint have the names and shapes of those of ``module``.
 
     Args:
         module: the module to restore.
-        tensors: its state dict in the checkpoint.
-        path: the checkpoint, for the message.
+        tensors: state dict of the module in the checkpoint.
+        path: file of the checkpoint, for the message.
 
     Raises:
         InvalidInputError: a tensor is missing, unknown or of another shape.

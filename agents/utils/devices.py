@@ -8,7 +8,7 @@ from scene_envs.errors import InvalidInputError
 
 
 def check_device(name: str) -> None:
-    """Refuse a device that torch does not know or that this machine does not have.
+    """Raise unless torch knows the device and this machine has it.
 
     Raises:
         InvalidInputError: the device cannot be used; the message says which would work.
@@ -22,7 +22,7 @@ def check_device(name: str) -> None:
         here = ["cpu"]
         here += [f"cuda:{index}" for index in range(torch.cuda.device_count())]
         raise InvalidInputError(
-            f"device={str(name)[:60]!r} is not a torch device of this machine; here: {', '.join(here)}"
+            f"device={str(name)[:60]!r} is not a torch device of this machine; use one of {', '.join(here)}"
         ) from None
     if device.type == "meta":
-        raise InvalidInputError("device='meta' holds no numbers; give cpu or cuda")
+        raise InvalidInputError("device='meta' stores no data; give cpu or cuda")

@@ -1,4 +1,4 @@
-"""Meanings of the fields of dataclasses, as their docstrings give them."""
+"""Meanings of the fields of dataclasses, read from their docstrings."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ def attribute_meanings(cls: type) -> dict[str, str]:
     ...     '''Extent.
     ...
     ...     Attributes:
-    ...         height: along z, in
+    ...         height: extent along z, in
     ...             ``metres``.
     ...     '''
     >>> attribute_meanings(Size)
-    {'height': 'along z, in metres.'}
+    {'height': 'extent along z, in metres.'}
     """
     meanings: dict[str, str] = {}
     for base in reversed(cls.__mro__):

@@ -1,4 +1,4 @@
-"""Signals that end a command: SIGTERM as an exception; SIGTERM and Ctrl-C held back until a step is finished."""
+"""Signals that end a command: SIGTERM as an exception, and SIGTERM and Ctrl-C delayed to the end of a step."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 logger = logging.getLogger(__name__)
 
-_GRACE = 15
+_GRACE_SECONDS = 15
 """Seconds that a step may take to end before the signal ends it."""
 
 
@@ -26,7 +26,7 @@ def terminable(received: list[int] | None = None) -> Iterator[None]:
 
     Args:
         received: a list to which the number of each such signal is appended. Compiled code, such as the import of an
-            extension module, may turn the exception into another error; the list then tells that a signal came.
+            extension module, may turn the exception into another error; the list then shows that a signal came.
     """
 
     def note_and_raise(number: int, frame: FrameType | None) -> None:
@@ -69,16 +69,16 @@ class Ending:
         if self.number:
             _raise(number, frame)
         self.number = number
-        signal.alarm(_GRACE)
+        signal.alarm(_GRACE_SECONDS)
         logger.info("finishing this step and saving; the same signal again ends at once")
 
     def late(self, number: int, frame: FrameType | None) -> None:
         """Raise the exception of the waiting signal, as the step took too long."""
         _raise(self.number, frame)
 
-    def __call__(self, elsewhere: bool = False) -> None:
-        """Raise if a signal waits; one that waits ``elsewhere``, in another process of the run, counts as SIGTERM."""
-        if self.number or elsewhere:
+    def __call__(self, in_another_process: bool = False) -> None:
+        """Raise if a signal waits; one that waits ``in_another_process`` of the run counts as SIGTERM."""
+        if self.number or in_another_process:
             _raise(self.number or signal.SIGTERM, None)
 
 

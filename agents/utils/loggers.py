@@ -26,14 +26,14 @@ class RunLogger:
         """One row of figures after ``step`` steps or iterations."""
 
     def close(self) -> None:
-        """Write what is left; nothing is logged after it."""
+        """Write the remaining rows and end the log."""
 
 
 class TensorBoardRunLogger(RunLogger):
     """Events for TensorBoard.
 
     Args:
-        folder: of the run; events go into ``tensorboard/`` in it.
+        folder: folder of the run; events go into its ``tensorboard/``.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -56,7 +56,7 @@ class WandbRunLogger(RunLogger):
     """A run of Weights & Biases that stays on disk; ``wandb sync`` sends it.
 
     Args:
-        folder: of the run; its name is the name of the run, and files go into ``wandb/`` in it.
+        folder: folder of the run, which also names the run; files go into its ``wandb/``.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -86,11 +86,11 @@ def make_logger(name: str, folder: str | os.PathLike[str]) -> RunLogger:
 
     Args:
         name: ``"csv"``, ``"tensorboard"`` or ``"wandb"``.
-        folder: of the run.
+        folder: folder of the run.
 
     Raises:
         UnknownNameError: no such logger.
-        MissingDependencyError: its package is not installed.
+        MissingDependencyError: the package of the logger is not installed.
     """
     if name == "csv":
         return RunLogger()

@@ -1,4 +1,4 @@
-"""Process group of a training run on several processes, as ``torchrun``, Accelerate or MPI starts them."""
+"""Process group of a training run that ``torchrun``, Accelerate or MPI starts on several processes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LAUNCHERS = {
     "LOCAL_RANK": ("MPI_LOCALRANKID", "OMPI_COMM_WORLD_LOCAL_RANK", "MV2_COMM_WORLD_LOCAL_RANK"),
 }
 """Variables of ``torchrun``, and their names in Intel MPI, Open MPI and MVAPICH."""
-_PATIENCE = 600.0
+TIMEOUT_SECONDS = 600.0
 """Seconds that a process waits for the others."""
 
 
@@ -34,8 +34,8 @@ class ProcessGroup:
     :class:`TrainingError`.
 
     Attributes:
-        rank: number of this process.
-        size: how many there are; 1 without a launcher.
+        rank: index of this process.
+        size: number of processes; 1 without a launcher.
 
     >>> group = ProcessGroup(rank=1, size=2)
     >>> group.rows(6), group.is_first
@@ -46,12 +46,12 @@ class ProcessGroup:
     size: int = 1
 
     @classmethod
-    def join(cls, device: str = "cpu", patience: float = _PATIENCE) -> ProcessGroup:
+    def join(cls, device: str = "cpu", timeout: float = TIMEOUT_SECONDS) -> ProcessGroup:
         """The group that the launcher set up, joined on first use; without a launcher, this process alone.
 
         Args:
-            device: of the training; each process of ``"cuda"`` takes a GPU of its own.
-            patience: seconds that a process waits for the others.
+            device: training device; each process of ``"cuda"`` takes a GPU of its own.
+            timeout: seconds that a process waits for the others.
 
         Raises:
             InvalidInputError: ``WORLD_SIZE`` is set, and the other variables of a launcher are not.
@@ -69,11 +69,11 @@ class ProcessGroup:
         if not distributed.is_initialized():
             backend = "cpu:gloo,cuda:nccl" if device.startswith("cuda") else "gloo"
             try:
-                with _reaching_others():
-                    distributed.init_process_group(backend, timeout=timedelta(seconds=patience))
+                with _distributed_errors():
+                    distributed.init_process_group(backend, timeout=timedelta(seconds=timeout))
             except ValueError as error:
                 raise InvalidInputError(
-                    f"WORLD_SIZE={size} asks for several processes, which cannot meet ({error}); start them with "
+                    f"WORLD_SIZE={size} asks for several processes, which cannot connect ({error}); start them with "
                     "torchrun, or unset WORLD_SIZE"
                 ) from None
         return cls.current()
@@ -98,12 +98,12 @@ class ProcessGroup:
         """The sum of ``value`` over all processes."""
         if self.size > 1:
             value = value.clone()
-            with _reaching_others():
+            with _distributed_errors():
                 distributed.all_reduce(value)
         return value
 
     def sum_tensors(self, values: Sequence[Tensor]) -> list[Tensor]:
-        """The sum of each tensor over all processes, in one message; all are of one type."""
+        """The sum over all processes of each tensor, in one message; the tensors have the same dtype."""
         if self.size == 1 or not values:
             return list(values)
         flat = self.sum(torch.cat([value.flatten() for value in values]))
@@ -119,11 +119,11 @@ class ProcessGroup:
         return max(self.gather(value))
 
     def any(self, flag: bool) -> bool:
-        """Whether ``flag`` is set in one process at least."""
+        """Whether ``flag`` is set in at least one process."""
         return self.sum_numbers(float(flag))[0] > 0
 
     def sum_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
-        """Replace every ``.grad`` by its sum over all processes, in one message; where all are None it stays None."""
+        """Replace every ``.grad`` by its sum over all processes, in one message; None if it is None in all of them."""
         if self.size == 1:
             return
         taken = list(parameters)
@@ -137,7 +137,7 @@ class ProcessGroup:
         """Replace the values of every process by those of the first."""
         if self.size > 1:
             for parameter in parameters:
-                with _reaching_others():
+                with _distributed_errors():
                     distributed.broadcast(parameter.data, src=0)
 
     def gather(self, value: Value) -> list[Value]:
@@ -145,7 +145,7 @@ class ProcessGroup:
         if self.size == 1:
             return [value]
         found: list[Any] = [None] * self.size
-        with _reaching_others():
+        with _distributed_errors():
             distributed.all_gather_object(found, value)
         return found
 
@@ -154,7 +154,7 @@ class ProcessGroup:
         if self.size == 1:
             return make()
         made: list[Any] = [make() if self.is_first else None]
-        with _reaching_others():
+        with _distributed_errors():
             distributed.broadcast_object_list(made, src=0)
         return made[0]  # type: ignore[no-any-return]
 
@@ -169,18 +169,18 @@ def gather_rows(x: Tensor) -> Tensor:
     if size == 1:
         return x
     parts = [torch.empty_like(x, memory_format=torch.contiguous_format) for _ in range(size)]
-    with _reaching_others():
+    with _distributed_errors():
         distributed.all_gather(parts, x.contiguous())
     return torch.cat(parts)
 
 
 def launched_processes() -> int:
-    """How many processes the launcher of this one started; 1 without a launcher."""
+    """Number of processes that the launcher started; 1 without a launcher."""
     return int(_launched_as("WORLD_SIZE") or "1")
 
 
 def is_first_process() -> bool:
-    """Whether this process is the one, of those that a launcher started, that writes files and messages."""
+    """Whether this process writes files and messages: the first of a launcher's processes, or the only one."""
     return int(_launched_as("RANK") or "0") == 0
 
 
@@ -190,21 +190,22 @@ def _launched_as(name: str) -> str | None:
 
 
 def _check_accelerate() -> None:
-    """Refuse to run where Accelerate was asked for several processes on a CPU, because it starts only one."""
+    """Raise InvalidInputError if Accelerate was asked for several processes on a CPU, as it starts only one."""
     asked = os.environ.get("ACCELERATE_USE_CPU", "").lower() == "true" and "MASTER_ADDR" in os.environ
     if asked and _launched_as("WORLD_SIZE") is None:
         raise InvalidInputError(
-            "accelerate launch --cpu starts one process, whatever --num_processes says; for several on a CPU give "
+            "accelerate launch --cpu ignores --num_processes and starts one process; for several on a CPU give "
             "--multi_gpu in place of --cpu, and device=cpu to the command, or use torchrun"
         )
 
 
 @contextmanager
-def _reaching_others() -> Iterator[None]:
+def _distributed_errors() -> Iterator[None]:
+    """Context that turns the RuntimeErrors of gloo and NCCL into a :class:`TrainingError`."""
     try:
         yield
-    except RuntimeError as error:  # of gloo and of NCCL
+    except RuntimeError as error:
         raise TrainingError(
-            "another process of this run ended or did not answer in time, what it says is the cause; the same command "
-            f"goes on from the last checkpoint ({str(error).splitlines()[0][:200]})"
+            "another process of this run ended or did not answer in time; its output says why, and the same command "
+            f"resumes from the last checkpoint ({str(error).splitlines()[0][:200]})"
         ) from error

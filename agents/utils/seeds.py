@@ -1,4 +1,4 @@
-"""Seeds of independent random streams, each derived from a key, so that a resumed run needs no generator's state."""
+"""Seeds of independent random streams, derived from keys; a resumed run needs no state of a generator."""
 
 from __future__ import annotations
 

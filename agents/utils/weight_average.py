@@ -16,7 +16,7 @@ class WeightAverage:
     """Exponential moving average of a module's parameters.
 
     Args:
-        module: whose parameters are averaged.
+        module: module to average.
         decay: final decay.
         warm_up: updates after which the decay is one half, if the final decay is not reached before; 0 for the final
             decay from the first update on.
@@ -36,7 +36,7 @@ class WeightAverage:
 
     @torch.no_grad()
     def update(self, module: nn.Module) -> float:
-        """Move towards ``module``; returns the decay that was used."""
+        """Move the averages towards ``module``; returns the decay of this update."""
         self.updates += 1
         decay = min(self.decay, self.updates / (self.updates + self.warm_up))
         named = dict(module.named_parameters())
@@ -63,11 +63,11 @@ class WeightAverage:
 
 
 class AveragedWeights(Generic[Module]):
-    """Context in which a module holds its averaged weights; at the end it gets its own weights back.
+    """Context in which a module has its averaged weights; at the end it gets its own weights back.
 
     Args:
-        module: whose parameters are exchanged.
-        average: of its parameters; None leaves them as they are.
+        module: module that takes part in the exchange.
+        average: average of the parameters; None leaves the module unchanged.
     """
 
     def __init__(self, module: Module, average: WeightAverage | None) -> None:

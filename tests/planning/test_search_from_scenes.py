@@ -173,7 +173,7 @@ def test_wider_scenes_keep_their_slots(prior: ScenePrior, scenes: SceneBatch) ->
 @pytest.mark.slow
 def test_a_search_is_not_continued_with_another_objective(prior: ScenePrior, tmp_path: Path) -> None:
     run_search(prior, CategoryCount("teacup"), output=tmp_path / "assets", **SMALL)
-    with pytest.raises(InvalidInputError, match="is of a search with objective"):
+    with pytest.raises(InvalidInputError, match="holds a search with objective"):
         run_search(prior, CategoryCount("dinner_plate"), output=tmp_path / "assets", **SMALL)
     file = tmp_path / "mine.py"
     allow_local_rewards(file)

@@ -198,7 +198,7 @@ def test_a_larger_budget_goes_on(prior: ScenePrior, tmp_path: Path) -> None:
 
 def test_another_search_in_the_folder_is_refused(prior: ScenePrior, tmp_path: Path) -> None:
     run_search(prior, near_middle, output=tmp_path, **SETTINGS)
-    with pytest.raises(InvalidInputError, match="is of a search with seed=3, not 4; give another output"):
+    with pytest.raises(InvalidInputError, match="holds a search with seed=3, not 4; give another output"):
         run_search(prior, near_middle, output=tmp_path, **{**SETTINGS, "seed": 4})
     journal = tmp_path / "search.journal"
     content = bytearray(journal.read_bytes())
@@ -225,7 +225,7 @@ def test_another_search_in_the_folder_is_refused(prior: ScenePrior, tmp_path: Pa
         ({"planner": "beem"}, "did you mean 'beam'"),
         ({"planner": {"name": "beam", "width": 0}}, "planner beam: width must be a number >= 1, got 0"),
         ({"planner": {"name": "mcts", "rollout": "some"}}, "unknown rollout 'some'"),
-        ({"planner": {"name": "evolution", "crossover": 2}}, "planner evolution: crossover=2.0 is a chance"),
+        ({"planner": {"name": "evolution", "crossover": 2}}, "planner evolution: crossover=2.0 is a probability"),
         ({"planner": {"name": "feynman_kac", "begin": 1}}, "planner feynman_kac: begin=1.0 is a share"),
         ({"mask": {"name": "empty", "cuont": 1}}, "did you mean 'count'"),
     ],

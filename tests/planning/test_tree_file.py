@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from agents.planning import SearchOutcome, SearchRecord, list_planners, run_search
-from agents.planning.tree_page import BEST_NODES, LONGEST_PATH, _cards, shown_nodes, write_tree_page
+from agents.planning.tree_page import MAX_OTHER_SCENES, MAX_PATH_SCENES, _cards, shown_nodes, write_tree_page
 from agents.priors.testing import tiny_prior
 from rewards import RewardContext, RewardOutput
 from scene_envs.envs import SearchState
@@ -149,11 +149,11 @@ def test_cards_have_a_place_each_and_the_best_path_the_first_row() -> None:
 def test_the_page_of_thousands_of_scenes_is_small(tmp_path: Path) -> None:
     record, _ = recorded(depth=1250, width=4)
     shown = shown_nodes(record)
-    assert len(shown) == LONGEST_PATH + BEST_NODES
+    assert len(shown) == MAX_PATH_SCENES + MAX_OTHER_SCENES
     path = record.path(record.searches[0]["best"])
-    assert shown[:LONGEST_PATH:LONGEST_PATH] == path[1:2]
-    assert shown[LONGEST_PATH - 1] == path[-1]
-    assert all(a < b for a, b in pairwise(shown[:LONGEST_PATH]))
+    assert shown[:MAX_PATH_SCENES:MAX_PATH_SCENES] == path[1:2]
+    assert shown[MAX_PATH_SCENES - 1] == path[-1]
+    assert all(a < b for a, b in pairwise(shown[:MAX_PATH_SCENES]))
     page = write_tree_page(tmp_path / "tree.html", record, dict.fromkeys(shown, search_scene()), metrics_of(record))
     assert page.stat().st_size < 10_000_000
     record.save(tmp_path / "tree.json")

@@ -87,7 +87,7 @@ def join_as_open_mpi_does(folder: Path) -> None:
         os.environ[f"OMPI_COMM_WORLD_{known}"] = os.environ.pop(name)
     first = is_first_process()
     assert launched_processes() == 2
-    group = ProcessGroup.join(patience=60.0)
+    group = ProcessGroup.join(timeout=60.0)
     assert group.is_first == first
     (folder / str(group.rank)).write_text(str(group.sum(torch.tensor([10.0**group.rank])).tolist()))
 

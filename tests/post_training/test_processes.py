@@ -172,7 +172,7 @@ def test_a_run_goes_on_after_a_process_died(tmp_path: Path) -> None:
 
 def wait_in_vain(note: Path) -> None:
     """The second process comes, and then never answers."""
-    processes = ProcessGroup.join(patience=2.0)
+    processes = ProcessGroup.join(timeout=2.0)
     if not processes.is_first:
         while not note.exists():
             time.sleep(0.05)
