@@ -23,7 +23,7 @@ from agents.priors.base import ScenePrior
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-LOUD, QUIET = 30.0, 1 / 30.0
+MAX_RATIO, MIN_RATIO = 30.0, 1 / 30.0
 """Ratios of policy to regularisation gradient norm beyond which one of the two gradients dominates."""
 MAX_STEP_SHARE = 0.7
 """Share of the squared policy gradient above which one step dominates the others."""
