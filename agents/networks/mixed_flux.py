@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -20,7 +19,6 @@ from agents.networks.flux import timestep_embedding
 from agents.networks.flux_blocks import DoubleStreamBlock, SingleStreamBlock
 from agents.networks.flux_modules import FluxModule, Place, Scene
 from agents.networks.mixed_flux_config import MixedFluxConfig
-from agents.networks.mixed_flux_files import current_name
 from agents.networks.rotation_features import nearest_rotations
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import POSE_FEATURES
@@ -77,7 +75,6 @@ class MixedFlux(nn.Module):
         self.rotations: Tensor
         self.register_buffer("unit", torch.tensor(config.unit), persistent=False)
         self.register_buffer("rotations", torch.tensor(config.rotations), persistent=False)
-        self.register_load_state_dict_pre_hook(_rename_weights)
 
     def forward(
         self,
@@ -231,14 +228,6 @@ class MixedFlux(nn.Module):
         biases, features = zip(*parts, strict=True)
         scene.pairs = features[0] if len(features) == 1 else torch.cat(features, dim=-1)
         return iter(biases[0] if len(biases) == 1 else torch.stack(biases).sum(dim=0))
-
-
-def _rename_weights(_: nn.Module, state: dict[str, Any], prefix: str, *__: Any) -> None:
-    """Give weights of files of earlier versions their present names, before they are loaded."""
-    for name in [name for name in state if name.startswith(prefix)]:
-        present = prefix + current_name(name.removeprefix(prefix))
-        if present != name:
-            state[present] = state.pop(name)
 
 
 def _mean_token(text: Tensor, mask: Tensor | None) -> Tensor:

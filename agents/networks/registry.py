@@ -16,7 +16,6 @@ from agents.networks.fourier_features import FourierFeaturesConfig
 from agents.networks.midiffusion import MiDiffusion, MiDiffusionConfig, MixedMiDiffusion, MixedMiDiffusionConfig
 from agents.networks.mixed_flux import MixedFlux
 from agents.networks.mixed_flux_config import MODULES, MixedFluxConfig, make_module, module_states
-from agents.networks.mixed_flux_files import current_fields
 from agents.networks.observed_flags import ObservedFlagsConfig
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.plugins import load_plugins
@@ -183,17 +182,15 @@ def config_state(config: NetworkConfig) -> dict[str, Any]:
 
 
 def config_from_state(state: Mapping[str, Any], process: str) -> NetworkConfig:
-    """Inverse of :func:`config_state`; files without a ``kind`` hold ``flux`` networks.
+    """Inverse of :func:`config_state`.
 
     Raises:
         UnknownNameError: no network or no process has that name.
         InvalidInputError: fields are missing or not known; the message names them.
     """
-    name = state.get("kind", "flux")
+    name = state.get("kind", "")
     kind = _entry(name, process).config
     values = {key: value for key, value in state.items() if key != "kind"}
-    if kind is MixedFluxConfig:
-        values = current_fields(values)
     strange = sorted(values.keys() - {field.name for field in fields(kind)})
     missing = sorted(
         field.name

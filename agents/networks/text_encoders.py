@@ -41,10 +41,6 @@ def text_config(key: str, prompts: Iterable[str]) -> AnyTextConfig:
     return BertTextConfig.from_model(key, download=True)
 
 
-_PRESENT = {"asked": "count_tokens"}
-"""Names of fields in files of earlier versions, and the present ones."""
-
-
 def text_config_from_state(fields: Mapping[str, Any] | None) -> AnyTextConfig | None:
     """Inverse of :func:`dataclasses.asdict`, also after a trip through JSON; None stays None.
 
@@ -55,5 +51,4 @@ def text_config_from_state(fields: Mapping[str, Any] | None) -> AnyTextConfig | 
         return None
     if fields.get("kind") == "bert":
         return BertTextConfig(**{**fields, "nothing": tuple(fields["nothing"])})
-    present = {_PRESENT.get(name, name): value for name, value in fields.items()}
-    return TextConfig(**{**present, "words": tuple(fields["words"])})
+    return TextConfig(**{**fields, "words": tuple(fields["words"])})

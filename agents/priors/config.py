@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
-from agents.diffusion.gaussian import current_prediction
 from agents.networks.registry import ContinuousNetworkConfig, MixedNetworkConfig, NetworkConfig
 from agents.networks.text_encoders import AnyTextConfig
 
@@ -117,12 +114,3 @@ class MixedPriorConfig(PoseDiffusionConfig, DenoiserConfig):
     empty_slots: str = "attended"
     unmasking: str = "even"
     union: str = "one_type"
-
-
-def current_names(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a prior's configuration under their present names; a file of an earlier version may have others."""
-    renamed = {"given_share": "observed_share"}
-    return {
-        renamed.get(key, key): current_prediction(value) if key == "prediction" else value
-        for key, value in fields.items()
-    }

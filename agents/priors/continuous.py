@@ -18,7 +18,7 @@ from agents.networks.mixed_denoiser import Observed
 from agents.networks.registry import build_network, config_from_state
 from agents.networks.text import Text
 from agents.priors.base import ScenePrior
-from agents.priors.config import PriorConfig, current_names
+from agents.priors.config import PriorConfig
 from agents.priors.forward import DenoiserOutput, NoisedScenes
 from agents.priors.hooks import Hook, Start
 from agents.priors.inpainting import draw_noise
@@ -106,7 +106,7 @@ class ContinuousPrior(ScenePrior):
         residual: ResidualVariance | None,
     ) -> ContinuousPrior:
         """From the ``prior`` entry of a configuration file."""
-        fields = {**current_names(fields), "network": config_from_state(fields["network"], "continuous")}
+        fields = {**fields, "network": config_from_state(fields["network"], "continuous")}
         check_types(PriorConfig, fields)
         return cls(PriorConfig(**fields), normalizer, preconditioning, card, residual)
 

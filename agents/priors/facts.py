@@ -60,12 +60,12 @@ class PriorFacts:
             return cls(
                 name=str(name),
                 scene_type=made["scene_type"],
-                process=state.get("process", "continuous"),
+                process=state["process"],
                 slots=made["slots"],
                 text=_reader(made.get("text")),
                 parameters=count_parameters(name),
                 megabytes=(folder / WEIGHTS_NAME).stat().st_size / 1e6,
-                card=state.get("card") or {},
+                card=state["card"],
             )
         except (KeyError, TypeError, AttributeError) as error:
             raise CorruptFileError(

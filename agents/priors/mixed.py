@@ -33,7 +33,7 @@ from agents.networks.registry import build_network, config_from_state
 from agents.networks.text import Text
 from agents.networks.text_encoders import text_config_from_state, text_encoder
 from agents.priors.base import UNIONS
-from agents.priors.config import MixedPriorConfig, current_names
+from agents.priors.config import MixedPriorConfig
 from agents.priors.hooks import Hook, Start
 from agents.priors.inpainting import draw_noise
 from agents.priors.mixed_training import TrainableMixedPrior
@@ -117,7 +117,7 @@ class MixedPrior(TrainableMixedPrior):
     ) -> MixedPrior:
         """From the ``prior`` entry of a configuration file."""
         text = text_config_from_state(fields.get("text"))
-        fields = {**current_names(fields), "network": config_from_state(fields["network"], "mixed"), "text": text}
+        fields = {**fields, "network": config_from_state(fields["network"], "mixed"), "text": text}
         check_types(MixedPriorConfig, fields)
         return cls(MixedPriorConfig(**fields), normalizer, preconditioning, card, residual)
 

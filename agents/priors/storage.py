@@ -67,9 +67,9 @@ def read_stored(name: str | os.PathLike[str]) -> StoredPrior:
             normalizer=Normalizer.from_state(state["normalizer_state"]),
             residual=ResidualVariance(tensors.pop(_LEVELS), tensors.pop(_RESIDUAL)) if _LEVELS in tensors else None,
             scene_type=_known_scene_type(state, find_prior(name)),
-            process=state.get("process", "continuous"),
+            process=state["process"],
             fields=state["prior"],
-            card=state.get("card") or {},
+            card=state["card"],
             tensors=tensors,
         )
 
