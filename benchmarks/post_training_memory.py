@@ -18,6 +18,7 @@ from typing import Any
 from weakref import finalize
 
 import torch
+from agents.priors.prior import ScenePrior
 from rich.console import Console
 from rich.table import Table
 from tensordict import TensorDict
@@ -26,7 +27,6 @@ from torch import Tensor
 from agents.diffusion.reverse_steps import gaussian_log_prob
 from agents.post_training import DDPOSFLoss, DenoisingPolicy
 from agents.post_training.policy import gradient_weights
-from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 
 MEBIBYTE = 2**20

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from agents.priors.prior import ScenePrior
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor
@@ -27,7 +28,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from agents.pretraining import PretrainConfig
 from agents.pretraining.initial_prior import build_prior
-from agents.priors.base import ScenePrior
 from scene_envs.grammars import get_grammar
 from scene_envs.normalizer import Normalizer
 

@@ -12,7 +12,7 @@ from agents.post_training.base_kl import Parts, forward_kl
 from agents.post_training.gradients import BatchGradient
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import Branching, Rollout
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.utils.weight_average import WeightAverage
 
 Credit = TypeVar("Credit")

@@ -15,8 +15,7 @@ from agents.diffusion.divergence import step_kl
 from agents.networks.text import Text
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import Rollout
-from agents.priors.base import ScenePrior
-from agents.priors.forward import NoisedScenes
+from agents.priors.prior import NoisedScenes, ScenePrior
 from agents.utils.process_group import ProcessGroup, gather_rows
 
 Parts = Iterator[Iterator[Tensor]]

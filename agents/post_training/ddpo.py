@@ -12,7 +12,7 @@ from agents.post_training.gradients import BatchGradient, accumulate_policy_grad
 from agents.post_training.losses import DDPOSFLoss
 from agents.post_training.policy import DenoisingPolicy, gradient_weights
 from agents.post_training.rollouts import Rollout, rollout_groups
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 
 
 class DDPO(Algorithm[Tensor]):

@@ -16,7 +16,7 @@ from agents.post_training.report import Page, Picture, Section, Tile, write_repo
 from agents.post_training.run_files import write_metrics
 from agents.post_training.side_by_side import post_train_side_by_side
 from agents.post_training.trainer import PostTrainResult
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from rewards import reward_label
 
 RUNS = ("clutter", "feasible")

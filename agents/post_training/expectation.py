@@ -10,8 +10,7 @@ from torch import Tensor, nn
 
 from agents.networks.low_rank import LowRank
 from agents.networks.text import Text
-from agents.priors.base import ScenePrior
-from agents.priors.forward import NoisedScenes
+from agents.priors.prior import NoisedScenes, ScenePrior
 from agents.utils.process_group import ProcessGroup
 
 

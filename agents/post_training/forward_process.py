@@ -24,7 +24,7 @@ from agents.post_training.gradients import BatchGradient, credited_reward, judge
 from agents.post_training.own_samples import OwnSampleAlgorithm
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import Branching, Rollout, rollout_groups
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.utils.process_group import ProcessGroup
 
 

@@ -11,7 +11,7 @@ from torch import Generator, Tensor
 
 from agents.post_training.inpaint_settings import InpaintSettings
 from agents.post_training.prompts import PromptSets
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.utils.seeds import derived_seed
 from scene_envs.envs.masks import MaskGenerator, mask_for_prompt, masked_slots, resolve_mask
 from scene_envs.envs.scoring import RewardScorer, Score

@@ -7,7 +7,7 @@ from typing import Any
 
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.rollouts import Rollout, gathered, stream_seed
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.utils.process_group import ProcessGroup
 from rewards import RewardContext, learned_parts
 from rewards.statistics import fit_statistics, has_open_statistics, load_statistics, statistics_of

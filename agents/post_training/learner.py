@@ -25,8 +25,7 @@ from agents.post_training.rollouts import Rollout, collect, stream_seed
 from agents.post_training.run_files import CHECKPOINT_NAME
 from agents.post_training.scene_bank import SceneBank
 from agents.priors.adapters import attach_adapter
-from agents.priors.base import ScenePrior
-from agents.priors.prompt_validation import no_text
+from agents.priors.prior import ScenePrior, no_text
 from agents.utils.checkpoints import check_tensors
 from agents.utils.process_group import ProcessGroup
 from agents.utils.weight_average import AveragedWeights, WeightAverage

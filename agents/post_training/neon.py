@@ -15,8 +15,7 @@ from agents.post_training.own_sample_loss import OwnSampleLoss
 from agents.post_training.own_samples import OwnSampleAlgorithm
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import Rollout
-from agents.priors.base import ScenePrior
-from agents.priors.forward import NoisedScenes
+from agents.priors.prior import NoisedScenes, ScenePrior
 
 
 class SelfTrainingLoss(OwnSampleLoss):

@@ -18,7 +18,7 @@ from agents.post_training.hold import FAR, HIGHEST, HoldState, adjust
 from agents.post_training.regularisation_settings import RegularisationSettings
 from agents.post_training.rollouts import Rollout
 from agents.post_training.scene_bank import PromptedScenes
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.utils.process_group import ProcessGroup
 
 logger = logging.getLogger(__name__)

@@ -13,7 +13,7 @@ from torch import Generator, Tensor
 from agents.networks.text import Text
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.prompts import prompt_groups
-from agents.priors.observed_scenes import ObservedScenes
+from agents.priors.prior import ObservedScenes
 from agents.utils.process_group import ProcessGroup, gather_rows
 from agents.utils.seeds import derived_seed
 from scene_envs.envs import DenoisingTorchRLEnv

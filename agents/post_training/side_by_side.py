@@ -14,7 +14,7 @@ from collections.abc import Generator, Iterable, Mapping
 
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.trainer import PostTrainResult, post_train
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from scene_envs.worker_processes import module_command, module_environment
 
 _GRACE = 30.0

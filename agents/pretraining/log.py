@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.utils.loggers import RunLogger
 from scene_envs.errors import MissingDependencyError
 from scene_envs.files import write_text

@@ -16,7 +16,7 @@ from torch import Tensor
 from agents.configuration.prior_names import find_prior
 from agents.diffusion import Preconditioning
 from agents.networks.low_rank import add_low_rank, low_rank_tensors, merge, set_low_rank
-from agents.priors.storage import StoredPrior, read_stored
+from agents.priors.files import StoredPrior, read_stored
 from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError
 from scene_envs.files import write_json
 from scene_envs.normalizer import Normalizer
@@ -46,7 +46,7 @@ class AdapterFacts:
 
 
 class Adaptable(Protocol):
-    """Interface of a prior that adapters use; :class:`~agents.priors.base.ScenePrior` has it."""
+    """Interface of a prior that adapters use; :class:`~agents.priors.prior.ScenePrior` has it."""
 
     adapter: AdapterFacts | None
     denoiser: Any

@@ -13,14 +13,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.configuration.prior_names import CONFIG_NAME
-from agents.priors.facts import PriorFacts
-from agents.priors.files import read_config, write_config
+from agents.priors.files import PriorFacts, read_config, write_config
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.files import read_sealed, write_text
 from scene_envs.folders import claimed
 
 if TYPE_CHECKING:
-    from agents.priors.base import ScenePrior
+    from agents.priors.prior import ScenePrior
 
 README = "README.md"
 _TITLE = "# Prior `"
@@ -62,7 +61,7 @@ def package_prior(
             half precision cannot hold, or a folder that holds anything but a packaged prior.
         CorruptFileError: the evaluation is not a JSON mapping, as the command writes it.
     """
-    from agents.priors.base import ScenePrior
+    from agents.priors.prior import ScenePrior
 
     _check_folder(Path(output))
 

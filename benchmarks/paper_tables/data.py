@@ -12,10 +12,10 @@ from benchmarks.paper_tables.settings import TablesConfig
 from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:
+    from agents.priors.prior import ScenePrior
     from torch import Tensor
 
     from agents.pretraining.data import TrainingData
-    from agents.priors.base import ScenePrior
     from scene_envs.datasets import SceneDataset
     from scene_envs.scene import SceneBatch
 

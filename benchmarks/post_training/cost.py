@@ -18,11 +18,11 @@ from typing import Any
 from unittest.mock import patch
 
 import yaml
+from agents.priors.prior import ScenePrior
 
 from agents.configuration.tree import changed
 from agents.post_training import PostTrainConfig, PostTrainer, regularisation
 from agents.post_training.algorithms import list_algorithms
-from agents.priors.base import ScenePrior
 from scene_envs.envs.scoring import RewardScorer
 
 DEFAULTS = {"prior": "dimsum_table", "reward": "feasible_share", "iterations": "3"}

@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from agents.networks import MixedFluxConfig, build_network
-from agents.networks.contacts import CHANNELS, Contacts, ContactsConfig, gated_displacement
-from agents.networks.relations import RelationsConfig
+from agents.networks.geometry import CHANNELS, Contacts, ContactsConfig, RelationsConfig, gated_displacement
 
 MODULES = (RelationsConfig(), ContactsConfig())
 SIDEWAYS, HEIGHT, OWN, OTHERS = 0, 1, slice(2, 5), slice(5, 8)

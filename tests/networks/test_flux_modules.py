@@ -7,15 +7,14 @@ from typing import Any
 
 import pytest
 import torch
+from agents.priors.prior import ScenePrior
 from safetensors.torch import load_file
 
 from agents import PretrainConfig
 from agents.configuration.prior_names import SHIPPED, list_priors
 from agents.networks import MixedFlux, MixedFluxConfig, build_network, network_config
-from agents.networks.contacts import ContactsConfig
-from agents.networks.observed_flags import ObservedFlagsConfig
-from agents.networks.relations import RelationsConfig
-from agents.priors.base import ScenePrior
+from agents.networks.flux_modules import ObservedFlagsConfig
+from agents.networks.geometry import ContactsConfig, RelationsConfig
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 SIZES: dict[str, Any] = {"features": 20, "categories": 8, "hidden": 16, "depth": 2, "heads": 2}

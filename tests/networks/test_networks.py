@@ -27,10 +27,9 @@ from agents.networks import (
     network_config,
     parameter_count,
 )
-from agents.networks.count_conditioning import CountConditioning, still_to_come
-from agents.networks.count_embedding import count_states
+from agents.networks.flux_modules import CountConditioning, count_states, still_to_come
+from agents.networks.geometry import RelationsConfig
 from agents.networks.registry import config_from_state, config_state
-from agents.networks.relations import RelationsConfig
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 FEATURES, CATEGORIES, TEXT = 20, 8, 12

@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from agents.networks import MixedFlux, MixedFluxConfig
-from agents.networks.flux_modules import ModuleConfig
-from agents.networks.fourier_features import FourierFeaturesConfig
-from agents.networks.rotation_features import RotationFeaturesConfig, nearest_rotations, rotation_features
+from agents.networks.flux_modules import FourierFeaturesConfig, ModuleConfig
+from agents.networks.geometry import RotationFeaturesConfig, nearest_rotations, rotation_features
 from scene_envs.errors import InvalidInputError
 
 

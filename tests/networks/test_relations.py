@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from agents.networks.relations import FEATURES, Relations, joint_attention, pair_features
+from agents.networks.geometry import PAIR_FEATURES, Relations, joint_attention, pair_features
 from scene_envs.errors import UnknownNameError
 
 SCALES = torch.logspace(-2, 0, 8, dtype=torch.float64)
@@ -63,11 +63,11 @@ def test_a_low_axis_is_blurred_by_its_own_noise() -> None:
 def test_messages_are_weighted_means_of_the_features() -> None:
     """With flat logits every slot gathers the mean of its features; text tokens gather nothing."""
     heads, width, text, slots = 2, 4, 3, 5
-    features = torch.rand(1, slots, slots, FEATURES)
+    features = torch.rand(1, slots, slots, PAIR_FEATURES)
     zeros = torch.zeros(1, heads, text + slots, width)
     mask = torch.zeros(1, heads, text + slots, text + slots)
     mask[..., :text] = -torch.inf
-    gathered = nn.Linear(heads * FEATURES, heads * width, bias=False)
+    gathered = nn.Linear(heads * PAIR_FEATURES, heads * width, bias=False)
     found = joint_attention(zeros, zeros, zeros, mask, features, gathered)
     mean = features.mean(dim=2).repeat(1, 1, heads)
     torch.testing.assert_close(found[:, text:], gathered(mean))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from agents.priors.prior import ScenePrior
 
 from agents.cli import main
 from agents.planning import (
@@ -20,7 +21,6 @@ from agents.planning import (
     run_search,
 )
 from agents.planning.journal import _described
-from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards import RewardContext, RewardOutput
 from rewards.category_count import CategoryCount

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from agents.priors.prior import ScenePrior
 
 from agents.cli import main
 from agents.planning import SearchOutcome, UCTPlanner, run_search
-from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards import RewardContext, RewardOutput, register_reward
 from scene_envs.envs import SearchEnv

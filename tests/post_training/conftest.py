@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from agents.priors.prior import ScenePrior
 from PIL import Image
 
 from agents.post_training import scene_bank
-from agents.priors.base import ScenePrior
 from scene_envs.scene import SceneBatch
 
 _DRAWN: dict[tuple[Any, ...], SceneBatch] = {}

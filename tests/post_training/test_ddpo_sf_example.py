@@ -9,11 +9,11 @@ from types import ModuleType
 
 import pytest
 import torch
+from agents.priors.prior import ScenePrior
 
 from agents.diffusion import GaussianStep
 from agents.diffusion.reverse_steps import gaussian_log_prob
 from agents.post_training import compute_advantages
-from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from tests.helpers.examples import load_example
 

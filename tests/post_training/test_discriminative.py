@@ -10,12 +10,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from agents.priors.prior import NoisedScenes, ScenePrior
 
 from agents.post_training import post_train
 from agents.post_training.discriminative import DiscriminativeLoss
 from agents.post_training.trainer import PostTrainer
-from agents.priors.base import ScenePrior
-from agents.priors.forward import NoisedScenes
 from agents.priors.testing import tiny_prior
 from scene_envs.scene import SceneBatch
 from tests.helpers.small_runs import count_objects, small_config

@@ -6,12 +6,12 @@ from copy import deepcopy
 
 import pytest
 import torch
+from agents.priors.prior import ScenePrior
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
 from agents.post_training.expectation import Expectation
 from agents.post_training.forward_losses import AWMLoss, NFTLoss
-from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 
 

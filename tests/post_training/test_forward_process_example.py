@@ -10,11 +10,11 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
+from agents.priors.prior import ScenePrior
 from tensordict import TensorDict
 
 from agents.post_training import NFTLoss, compute_advantages
 from agents.post_training.expectation import Expectation
-from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from agents.utils.weight_average import WeightAverage
 from rewards import evaluate_reward, make_reward

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from agents.priors.prior import ScenePrior
 from scipy.stats import norm
 from tensordict import TensorDict
 from torch import Generator, Tensor
@@ -21,7 +22,6 @@ from agents.post_training.inpaint_settings import InpaintSettings
 from agents.post_training.rollouts import Rollout, collect
 from agents.post_training.run_files import CHECKPOINT_NAME, load_resumable
 from agents.post_training.trainer import PostTrainer
-from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from agents.utils.checkpoints import save_checkpoint
 from agents.utils.seeds import derived_seed

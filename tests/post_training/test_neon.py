@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from agents.priors.prior import ScenePrior
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
@@ -17,7 +18,6 @@ from agents.post_training import PostTrainer, SelfTrainingLoss
 from agents.post_training.expectation import TrainedCopy
 from agents.post_training.neon import Neon
 from agents.post_training.scene_bank import PromptedScenes
-from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError
 from tests.helpers.small_runs import count_objects, small_config

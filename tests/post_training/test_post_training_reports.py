@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from agents.priors.prior import ScenePrior
 from PIL import Image
 from rich.console import Console
 
@@ -20,7 +21,6 @@ from agents.post_training.demo import run_demo
 from agents.post_training.doctor import diagnose
 from agents.post_training.report import Page, Picture, Section, Tile, write_report
 from agents.post_training.trainer import post_train
-from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards import make_reward
 from rewards.base import RewardContext, RewardOutput

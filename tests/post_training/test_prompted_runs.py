@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from agents.priors.prior import ScenePrior
 from torch import Generator
 
 from agents.post_training import (
@@ -19,7 +20,6 @@ from agents.post_training import (
 from agents.post_training.doctor import diagnose
 from agents.post_training.prompts import PromptDeck, prompt_groups
 from agents.post_training.rollouts import collect
-from agents.priors.base import ScenePrior
 from agents.priors.mixed import MixedPrior
 from agents.priors.testing import tiny_prior
 from rewards.base import RewardContext, RewardOutput

@@ -18,7 +18,7 @@ from agents.networks.registry import build_network
 from agents.priors import ScenePrior, list_priors
 from agents.priors.adapters import ADAPTER_NAME, attach_adapter, save_adapter
 from agents.priors.card import card_page
-from agents.priors.facts import PriorFacts
+from agents.priors.files import PriorFacts
 from agents.priors.testing import tiny_prior
 from scene_envs.envs.resolvers import resolve_prior
 from scene_envs.errors import CorruptFileError, InvalidInputError

@@ -13,13 +13,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
+from agents.priors.prior import ScenePrior
 from safetensors.torch import save_file
 
 from agents.cli import main
 from agents.diffusion import StepTable
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.trainer import pretrain
-from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.datasets import SceneDataset
 from scene_envs.datasets.prompts import describe_all

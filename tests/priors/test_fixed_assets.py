@@ -6,11 +6,11 @@ import dataclasses
 
 import pytest
 import torch
+from agents.priors.prior import ScenePrior
 
 from agents.diffusion import CategoricalProcess
 from agents.diffusion.categorical import make_categorical_schedule
 from agents.diffusion.reverse_steps import one_hot_state
-from agents.priors.base import ScenePrior
 from agents.priors.mixed import MixedPrior
 from agents.priors.testing import tiny_prior
 from scene_envs.scene import SceneBatch

@@ -10,7 +10,7 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from agents.priors.number_guidance import NumberGuidance, kind_weights, number_bounds
+from agents.priors.guidance import NumberGuidance, kind_weights, number_bounds
 from agents.priors.testing import tiny_prior
 from scene_envs.datasets import describe, parse_prompt, scene_facts
 from scene_envs.grammars import get_grammar

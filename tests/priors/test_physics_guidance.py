@@ -12,7 +12,7 @@ from agents import ScenePrior
 from agents.configuration.prior_names import list_priors
 from agents.priors.card import package_prior
 from agents.priors.files import read_config
-from agents.priors.physics_guidance import PhysicsGuidance
+from agents.priors.guidance import PhysicsGuidance
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.physics import feasibility

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from agents.priors.prior import ScenePrior
 from safetensors import safe_open
 
-from agents.priors.base import ScenePrior
 from agents.priors.files import to_precision
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError, UnknownNameError

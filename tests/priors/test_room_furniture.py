@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
+from agents.priors.prior import ScenePrior
 
 from agents.post_training.policy import DenoisingPolicy
-from agents.priors.base import ScenePrior
 from agents.priors.mixed import MixedPrior
 from agents.priors.testing import tiny_prior
 from scene_envs.envs import SearchEnv

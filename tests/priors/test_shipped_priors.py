@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from agents.priors.prior import ScenePrior
 
 from agents.configuration.prior_names import SHIPPED, list_priors
-from agents.priors.base import ScenePrior
-from agents.priors.facts import PriorFacts
+from agents.priors.files import PriorFacts
 from scene_envs.grammars import get_grammar
 
 READERS = [name for name in list_priors() if PriorFacts.of(name).text]
