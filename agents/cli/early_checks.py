@@ -68,18 +68,15 @@ def check_early(settings: Any, config_dir: str = "", module: ModuleType | None =
         raise InvalidInputError(f"scene={str(scene)[:200]}: give the name of one scene type, or several joined by +")
     for scene in str(getattr(settings, "scene", "") or "").split("+"):
         _check_name("scene type", scene, known_scenes, "scene_envs.grammars", config_dir)
-    asked = [getattr(settings, "mask", None), _dotted(settings, "inpaint.mask")]
-    for mask in [*asked, *(getattr(settings, "masks", None) or [])]:
+    for mask in [getattr(settings, "mask", None), *(getattr(settings, "masks", None) or [])]:
         _check_name("mask", mask, known_masks, "scene_envs.envs.masks", config_dir)
     if isinstance(device := getattr(settings, "device", "cpu"), str):
         _check_device(device)
     if (scenes := getattr(settings, "scenes", None)) and isinstance(scenes, str):
         find_scenes(Path(scenes))
     resumed = exists(Path(str(getattr(settings, "output", "") or "."), "checkpoint.pt"))
-    kept = ("regularisation.scenes",) if resumed else ()  # a resumed run has them in its folder
-    if not resumed and isinstance(replay := _dotted(settings, "regularisation.replay"), str):
-        find_scenes(Path(replay), "regularisation.replay")
-    for key in set(_DATASETS) - set(kept) - set(getattr(settings, "NO_PATHS", ())):
+    kept = {"regularisation.scenes"} if resumed else set()  # a resumed run has them in its folder
+    for key in set(_DATASETS) - kept - set(getattr(settings, "NO_PATHS", ())):
         _check_dataset(key, _dotted(settings, key))
     _check_guidance(settings)
 
@@ -128,11 +125,7 @@ def _check_prior(name: str) -> None:
     if not adapters or exists(Path(adapters)):
         return
     for part in adapters.split("+"):
-        if not exists(Path(part.rpartition("*")[2].strip())):
-            raise InvalidInputError(
-                f"adapter={adapters[:200]!r}: nothing is at {part[:200]!r}; name the folder of a run with adapter.rank "
-                "or its adapter.safetensors"
-            )
+        find_prior(part.rpartition("*")[2].strip())
 
 
 def _check_name(kind: str, value: Any, known: Any, registry: str, config_dir: str) -> None:

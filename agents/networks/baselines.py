@@ -22,9 +22,7 @@ order of slots, although scenes have no order.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -89,9 +87,6 @@ class Attention(nn.Module):
     >>> attention(torch.randn(2, 5, 16), torch.randn(2, 3, 16)).shape
     torch.Size([2, 5, 16])
     """
-
-    MATRICES: ClassVar[Sequence[str]] = ("query", "key_value", "out")
-    """Layers that adapters update."""
 
     def __init__(self, hidden: int, heads: int) -> None:
         super().__init__()
@@ -280,8 +275,6 @@ class _AdaptiveNorm(nn.Module):
 
 class _Block(nn.Module):
     """Self-attention, cross-attention to the text when there is any, and a feed-forward layer."""
-
-    MATRICES: ClassVar[Sequence[str]] = ("feed.0", "feed.2")
 
     def __init__(self, config: _MiDiffusionSize) -> None:
         super().__init__()

@@ -25,7 +25,6 @@ from agents.diffusion import (
     StepTable,
 )
 from agents.diffusion.categorical import make_categorical_schedule
-from agents.diffusion.divergence import categorical_kl
 from agents.diffusion.gaussian import timestep_weights
 from agents.diffusion.reverse_steps import ReverseStep, state_of
 from agents.diffusion.schedules import make_schedule
@@ -41,7 +40,6 @@ from agents.priors.guidance import Hook, Start
 from agents.priors.prior import (
     UNIONS,
     DenoiserOutput,
-    Noise,
     NoisedScenes,
     ScenePrior,
     check_object_count,
@@ -497,23 +495,6 @@ class MixedPrior(ScenePrior):
             x, table, generators, observed, text, guidance, resample, hook=hook, first=first, closed=closed
         )
 
-    def observed_transition(
-        self, x_t: Tensor, step: int, table: StepTableLike, observed: Tensor, *,
-        text: Text | None = None, guidance: float = 0.0,
-    ) -> MixedStep:  # fmt: skip
-        """p(x_{t-1} | x_t) of scenes whose observed entries are certain; see :class:`Inpainting`.
-
-        A room that keeps generated furniture gets no further furniture.
-        """
-        entries = Observed(x_t, observed[..., 0], observed[..., 1])
-        closed = self.closed_by_furniture(state_of(x_t[..., POSE_FEATURES:]), observed[..., 1])
-        reverse = self.transition(x_t, step, table, observed=entries, text=text, guidance=guidance, closed=closed)
-        return reverse.observing(entries.pose, entries.category, x_t)
-
-    def write_observed(self, x: Tensor, x0: Tensor, observed: Tensor, level: int, noise: Noise | None = None) -> Tensor:
-        """States with the observed entries of ``x0``, without noise at every level."""
-        return Observed(x0, observed[..., 0], observed[..., 1]).write(x)
-
     # -- training ---------------------------------------------------------------------------------
 
     def noised_loss(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
@@ -539,16 +520,13 @@ class MixedPrior(ScenePrior):
             loss = loss + _COUNT_WEIGHT * conditioning.count_loss(text[0][:, : conditioning.things], noised.category)
         return loss
 
-    def noised(
-        self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None, observed: Observed | None = None
-    ) -> NoisedScenes:
+    def noised(self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None) -> NoisedScenes:
         """Noised scenes, their targets and weights; see :meth:`ScenePrior.noised`."""
         config, device = self.config, x0.device
         if t is None:
             t = self.draw_timesteps(x0.shape[0], generator).to(device)
         noise = torch.randn(x0.shape, generator=generator).to(device)
-        if observed is None and config.observed_share > 0:
-            observed = self.draw_observed(x0, generator)
+        observed = self.draw_observed(x0, generator) if config.observed_share > 0 else None
         x_t = self.add_noise(x0, t, noise)
         x_t = x_t if observed is None else observed.write(x_t)
         pose0, category = x0[..., :POSE_FEATURES], x0[..., POSE_FEATURES:].argmax(dim=-1)
@@ -578,18 +556,6 @@ class MixedPrior(ScenePrior):
         poses, states = noised.x_t[..., :POSE_FEATURES], state_of(noised.x_t[..., POSE_FEATURES:])
         moments = self.denoiser.moments(states, noised.t)
         return self.process.x0_from_output(poses, noised.t, output.continuous, moments)
-
-    def category_kl(self, noised: NoisedScenes, now: DenoiserOutput, then: DenoiserOutput) -> Tensor:
-        """(B, N) KL divergences of the categories' reverse steps t -> t - 1, nats; 0 where ``drawn`` is 0."""
-        assert now.logits is not None
-        assert then.logits is not None
-        assert noised.drawn is not None
-        state = state_of(noised.x_t[..., POSE_FEATURES:])
-        probs, others = (
-            self.categories.posterior(state, logits.softmax(dim=-1), noised.t, noised.t - 1)
-            for logits in (now.logits, then.logits)
-        )
-        return categorical_kl(probs, others) * noised.drawn
 
     def draw_observed(self, x0: Tensor, generator: Generator | None) -> Observed:
         """Random observed entries: slots (completion), all categories (rearrangement), or any attribute of any slot.

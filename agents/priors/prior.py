@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Generator, Tensor, nn
@@ -17,10 +17,9 @@ from agents.configuration.prior_names import joint_name, split_name
 from agents.diffusion import GaussianProcess, Preconditioning, ResidualVariance, ReverseStep, StepTable
 from agents.networks.denoisers import Observed
 from agents.networks.flux_modules import CountConditioning
-from agents.networks.low_rank import merged_weights
 from agents.networks.registry import config_state
 from agents.networks.text import Text
-from agents.priors.adapters import AdapterFacts, AdapterSpec, merge_adapters, parse_adapters
+from agents.priors.adapters import AdapterSpec, merge_adapters, parse_adapters
 from agents.priors.files import StoredPrior, explained, read_stored, write_stored
 from agents.priors.guidance import Guide, Hook, Start, Watch, guidance_hook, physics_strength
 from scene_envs.datasets.prompts import parse_prompt
@@ -36,9 +35,6 @@ UNIONS = ("one_type", "any")
 
 Prompt = str | Sequence[str] | None
 """One text for all scenes, one per scene, or None for anything."""
-
-Noise = Callable[[], Tensor]
-"""``() -> (B, N, D)``: standard normal noise."""
 
 Prior = TypeVar("Prior", bound="ScenePrior")
 
@@ -94,59 +90,6 @@ class DenoiserOutput:
     logits: Tensor | None = None
 
 
-class Writer(Protocol):
-    """A prior that writes observed entries into states."""
-
-    def write_observed(self, x: Tensor, x0: Tensor, observed: Tensor, level: int, noise: Noise | None) -> Tensor:
-        """``x`` at timestep ``level`` with the ``observed`` entries of ``x0``."""
-
-
-@dataclass(frozen=True)
-class ObservedScenes:
-    """B scenes with observed entries, which every state and every result of a chain holds.
-
-    Made by :meth:`ScenePrior.observe`; environments take it for the episodes of an inpainting.
-
-    Attributes:
-        prior: the prior that denoises the other entries.
-        batch: the scenes.
-        mask: (B, N, 2) bool, True where the pose, or the category, of a slot is regenerated.
-        x0: (B, N, D) the scenes as the prior encodes them.
-
-    >>> from agents.priors.testing import tiny_prior
-    >>> prior = tiny_prior("dimsum_table", process="mixed")
-    >>> observed = prior.observe(prior.sample(2, num_steps=3), torch.zeros(2, 34, dtype=torch.bool))
-    >>> x = observed.write(prior.initial(2, 34), 0)
-    >>> bool((x == observed.x0).all()), bool(observed.entries.all())
-    (True, True)
-    """
-
-    prior: Writer
-    batch: SceneBatch
-    mask: Tensor
-    x0: Tensor
-
-    @property
-    def entries(self) -> Tensor:
-        """(B, N, 2) bool, True where the pose, or the category, of a slot is observed."""
-        return ~self.mask
-
-    def write(self, x: Tensor, level: int, noise: Noise | None = None) -> Tensor:
-        """``x`` (B, N, D) at timestep ``level`` with the observed entries in place.
-
-        Args:
-            x: states.
-            level: timestep, 0 for finished scenes.
-            noise: gives standard normal noise (B, N, D), for priors that read observed entries with the noise of each
-                level; None for torch's own.
-        """
-        return self.prior.write_observed(x, self.x0, self.entries.to(x.device), level, noise)
-
-    def merge(self, scenes: SceneBatch) -> SceneBatch:
-        """``scenes`` with the observed entries of the batch, bit for bit."""
-        return merge(self.batch, scenes, self.mask)
-
-
 class ScenePrior(nn.Module, ABC):
     """A trained denoiser with its schedule, layout and normalizer. Tensors x are normalised scenes (B, N, D).
 
@@ -178,8 +121,6 @@ class ScenePrior(nn.Module, ABC):
     """Gaussian process of the poses, and of all other continuous features."""
     denoiser: Any
     """The network inside its process, a module with ``.network``."""
-    adapter: AdapterFacts | None = None
-    """Facts about the low-rank updates in training; None for a prior without."""
     loaded_as: str = ""
     """Name or path by which :meth:`load` found the prior, with its adapters; empty for one that was not loaded."""
     _fixed: Tensor
@@ -222,9 +163,8 @@ class ScenePrior(nn.Module, ABC):
 
         Args:
             name: of the prior; ``NAME with ADAPTER`` names its adapters as well.
-            adapter: updates that are added to its weights: a file of low-rank ones, a run folder, or a prior that was
-                trained from this one. Several are joined by ``+`` or in a list, each with a factor before ``*`` if need
-                be.
+            adapter: updates that are added to its weights: priors that were trained from this one, or the folders of
+                such runs. Several are joined by ``+`` or in a list, each with a factor before ``*`` if need be.
 
         Raises:
             UnknownNameError: no shipped prior has that name.
@@ -288,7 +228,7 @@ class ScenePrior(nn.Module, ABC):
 
     def weights(self) -> dict[str, Tensor]:
         """Trained tensors by name, as a prior's file holds them."""
-        return merged_weights(self.denoiser.network)
+        return dict(self.denoiser.network.state_dict())
 
     def load_weights(self, tensors: dict[str, Tensor]) -> None:
         """Inverse of :meth:`weights`; raises RuntimeError when names or shapes differ."""
@@ -721,43 +661,6 @@ class ScenePrior(nn.Module, ABC):
         furniture = torch.isin(categories, indices) & slots
         return furniture[:, len(self.scene_type.fixed) :].any(dim=1, keepdim=True) & welded
 
-    def observe(self, batch: SceneBatch, mask: Tensor) -> ObservedScenes:
-        """Scenes that are regenerated where ``mask`` (B, N), or (B, N, 2) for pose and category, is True.
-
-        Fixed welded slots are always observed.
-
-        Raises:
-            InvalidInputError: the mask does not fit the batch.
-        """
-        both = check_mask(batch, mask).to(self.device)
-        both[:, : len(self.scene_type.fixed)] = False
-        return ObservedScenes(self, batch, both.to(batch.tensor.device), self.encode(batch.to(self.device)))
-
-    @abstractmethod
-    def observed_transition(
-        self,
-        x_t: Tensor,
-        step: int,
-        table: StepTableLike,
-        observed: Tensor,
-        *,
-        text: Text | None = None,
-        guidance: float = 0.0,
-    ) -> ReverseStep:
-        """p(x_{t-1} | x_t) of scenes (B, N, D) whose observed entries are certain, and so add nothing to log p.
-
-        Args:
-            x_t: scenes with the observed entries in place, see :meth:`observe`.
-            step: index in the table.
-            table: the chain.
-            observed: (B, N, 2) bool, True where the pose, or the category, of a slot is observed.
-            text, guidance: tokens of a prompt and weight of its guidance, for priors that read prompts.
-        """
-
-    @abstractmethod
-    def write_observed(self, x: Tensor, x0: Tensor, observed: Tensor, level: int, noise: Noise | None = None) -> Tensor:
-        """States ``x`` (B, N, D) at timestep ``level`` with the entries ``observed`` (B, N, 2) of ``x0`` in place."""
-
     # -- training ---------------------------------------------------------------------------------
 
     def pretraining_loss(
@@ -785,17 +688,13 @@ class ScenePrior(nn.Module, ABC):
         """(B,) training losses of scenes that :meth:`noised` has noised; arguments as for :meth:`output`."""
 
     @abstractmethod
-    def noised(
-        self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None, observed: Observed | None = None
-    ) -> NoisedScenes:
+    def noised(self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None) -> NoisedScenes:
         """A draw of the forward process for scenes ``x0`` (B, N, D), as the pretraining loss takes it.
 
         Args:
             x0: normalised scenes.
             generator: source of timesteps, noise and observed entries (CPU).
             t: (B,) timesteps, drawn when None.
-            observed: entries that have no part in the loss; None draws them as in pretraining. A continuous prior draws
-                none.
         """
 
     @abstractmethod
@@ -815,17 +714,6 @@ class ScenePrior(nn.Module, ABC):
     def observed_entries(self, x: Tensor, observed: Observed | None = None) -> Observed | None:
         """Observed entries of scenes ``x`` (B, N, D), without noise, as the network reads them; None for none."""
         return observed
-
-    def observed_by_mask(self, x: Tensor, observed: Tensor | None) -> Observed | None:
-        """Observed entries of scenes ``x`` (B, N, D) from flags (B, N, 2) for pose and category; None for None."""
-        return None if observed is None else Observed(x, observed[..., 0], observed[..., 1])
-
-    def category_kl(self, noised: NoisedScenes, now: DenoiserOutput, then: DenoiserOutput) -> Tensor | None:
-        """(B, N) KL divergences between the categories' reverse steps t -> t - 1 under two outputs, nats.
-
-        ``None`` where categories are a part of the continuous output.
-        """
-        return None
 
     def draw_timesteps(self, count: int, generator: Generator | None = None) -> Tensor:
         """(count,) int64 training timesteps, from the distribution that the configuration names."""

@@ -137,10 +137,10 @@ def composes(command: str, folder: str, option: str) -> bool:
         return False
 
 
-@pytest.mark.parametrize("command", ["pretrain", "post-train", "search"])
+@pytest.mark.parametrize("command", ["pretrain", "search"])
 def test_old_keys_name_the_new_ones(command: str) -> None:
     kind = CONFIGS[command]
-    known = {*dotted_values(kind()), "algorithm.clip_epsilon", "algorithm.updates"}
+    known = {*dotted_values(kind())}
     known |= {"planner.exploration", "planner.parallel"}  # of planner=uct
     for old, new in kind.RENAMED.items():
         word = old if "=" in old else f"{old}=1"
@@ -196,7 +196,7 @@ def test_words_win_over_a_file(tmp_path: Path) -> None:
     "words",
     [
         ["reward={name: weighted_sum, rewards: [object_count]}", "optimizer={lr: 0.1}", "optimizer.lr=1e-4"],
-        ["algorithm=nft", "algorithm={siblings: 2}", "seed=null", "prompt='${x}, y'"],
+        ["algorithm=nft", "algorithm={draws: 3}", "seed=null", "prompt='${x}, y'"],
         ["guard={action: rollback}", "hold=guard:1.05", "reward.name=clip"],
         ["seed=range(1,3)"],
         ["seed.x=3"],
