@@ -48,9 +48,9 @@ def package_prior(
         output: the folder; its name is the prior's. An earlier packaged prior in it is replaced.
         evaluation: ``metrics.json`` of ``scene-envs evaluate``, or the folder it is in; None for a prior that was not
             measured.
-        precision: of the weights, ``"float16"`` or ``"float32"``.
+        precision: number format of the weights, ``"float16"`` or ``"float32"``.
         data: the training data, in a sentence.
-        license: of the data; empty for that of this package, unless the prior was imported.
+        license: licence of the data; empty for that of this package, unless the prior was imported.
         machine: the hardware of the training, as in ``"one NVIDIA H200"``.
         limits: weaknesses of the prior, in sentences.
         physics_guidance: strength of physics guidance of samples of the package where a caller gives none; None keeps

@@ -125,7 +125,7 @@ def bert_of(width: int, name: str, file: str | os.PathLike[str]) -> BertTextConf
     """The BERT that a checkpoint reads prompts with; None for a prior without prompts.
 
     Args:
-        width: of the checkpoint's text tokens; 0 for none.
+        width: width of the checkpoint's text tokens; 0 for none.
         name: folder or hub name; empty for BERT-base, if it can be loaded without a download.
         file: the checkpoint, for messages.
 

@@ -28,9 +28,9 @@ from scene_envs.supports import CONTACT, LARGEST_CONTACT
 _FINEST = 0.02
 """Error (m) of positions below which nothing is moved: the denoising that is left separates objects again."""
 _SHALLOW = 0.02
-"""Depth (m) of a plate: up to it, things stand on the middle of a thing and not on its rim."""
+"""Depth (m) of a plate, up to which objects stand on the middle of an object and not on its rim."""
 _UPRIGHT = 0.85
-"""Cosine of the tilt up to which a thing carries others on its upper side."""
+"""Cosine of the tilt up to which an object carries others on its upper side."""
 
 
 class ClaimGuidance:
@@ -46,7 +46,7 @@ class ClaimGuidance:
 
     Args:
         prompts: B texts.
-        scene_type: of the scenes.
+        scene_type: scene type of the scenes.
         strength: factor on the moves; 1 is the conditional mean of one constraint.
         movable: (B, N) bool, slots whose poses are denoised; None for all but the fixed ones.
 
@@ -67,8 +67,8 @@ class ClaimGuidance:
         """(B, N, 3) m, how far the denoised positions move; None when nothing moves any more.
 
         Args:
-            step, steps: not used.
-            denoised: gives the B scenes that the network expects.
+            step, steps: step and number of steps, which are not used.
+            denoised: function that gives the B scenes that the network expects.
             std: (3,) standard deviation of their positions along the axes of the world, m.
         """
         error = np.sqrt(np.square(self._axes) @ np.square(std.cpu().double().numpy()))
@@ -156,7 +156,7 @@ def _surfaces(batch: SceneBatch, row: int, scene: SceneFacts) -> Surfaces:
     upright = batch.rotations[row, :, 2, 2].numpy()[scene.slots] > _UPRIGHT
     middle = _middles(batch.scene_type.library)[categories]
     highest = scene.boxes[:, 1, 2] - scene.positions[:, 2]
-    flat = upright & (middle + origin > highest - _SHALLOW)  # not so of a hollow thing, whose rim carries others
+    flat = upright & (middle + origin > highest - _SHALLOW)  # false for a hollow object, whose rim carries others
     top = np.where(flat, middle + origin, highest)
     return Surfaces(top, shapes.tiers[categories] + origin[:, None])
 
@@ -175,15 +175,15 @@ def _middles(library: AssetLibrary) -> Array:
 _OFFSET, _CONE = 0.035, 1.3
 """Least offset (m) to a side, and its ratio to the offset across: the claim holds from 0.02 m and 1 on."""
 _BESIDE = 0.02
-"""Distance (m) of things that are next to each other; the claim holds up to 0.05 m."""
+"""Distance (m) of objects that are next to each other; the claim holds up to 0.05 m."""
 _ORDER = 0.02
 """Least distance (m) between neighbours in an order."""
 _NEAR = 0.35
-"""A thing whose centre is within this share of the width of another may stand on it, given the error of positions."""
+"""Largest centre distance, as a share of the lower object's width, at which the upper may stand on it."""
 _SHARP = 0.1
-"""Error (m) of positions below which single supports can be told apart."""
+"""Error (m) of positions below which single supports are distinguished."""
 _STOREY = 0.2
-"""Difference of the heights (m) of two things that may stand on each other."""
+"""Largest difference of the heights (m) of two objects that may stand on each other."""
 
 
 @lru_cache(maxsize=4096)
@@ -198,13 +198,13 @@ def claims_of(prompt: str, scene_type: str | SceneType) -> tuple[Claim, ...]:
 def constraints(claims: Sequence[Claim], scene: SceneFacts, surfaces: Surfaces, error: Array) -> list[Constraint]:
     """Constraints under which ``claims`` hold, with as few changes of supports and orders as possible.
 
-    Claims on numbers of objects have none (:mod:`agents.priors.guidance`). Nor do claims whose things are not in
-    the scene (yet).
+    Claims on numbers of objects have none (:mod:`agents.priors.guidance`). Nor do claims whose objects are not in the
+    scene (yet).
 
     Args:
-        claims: of one prompt.
-        scene: n objects, expected at their places.
-        surfaces: of these objects.
+        claims: claims of one prompt.
+        scene: n objects at their expected places.
+        surfaces: surfaces of these objects.
         error: (3,) standard deviation of the positions, m.
     """
     found: list[Constraint] = []
@@ -225,10 +225,10 @@ def constraints(claims: Sequence[Claim], scene: SceneFacts, surfaces: Surfaces, 
 def _refer(
     reference: Reference, scene: SceneFacts, surfaces: Surfaces, taken: int = -1
 ) -> tuple[int, list[Constraint]]:
-    """The object that a reference means, -1 for none, and the constraints under which it means this one.
+    """Index of the referenced object (-1: none), and constraints that make the reference unambiguous.
 
-    Things that are counted at a place come there as far as the reference needs them. ``taken`` is the other thing of
-    the claim. Where both references mean the same object, its neighbour in the order takes its place.
+    Objects that are counted at a place move there as far as the reference needs them. ``taken`` is the other object of
+    the claim. Where both references mean the same object, its neighbour in the order is taken instead.
     """
     members, found = scene.named(reference.name), []
     if reference.place is not None:
@@ -258,7 +258,7 @@ def _refer(
 
 
 def _direction(side: str) -> Array:
-    """(3,) unit vector of a side: of right, front and up, as positions."""
+    """(3,) unit vector toward a side, in the axes right, front and up of positions."""
     axis, sign = {"left": (0, -1.0), "right": (0, 1.0), "front": (1, 1.0), "back": (1, -1.0)}[side]
     return sign * AXES[axis]
 
@@ -285,7 +285,7 @@ def _side(claim: SideClaim, scene: SceneFacts, surfaces: Surfaces, placed: Colle
 
 
 def _come_together(comes: int, stays: int, scene: SceneFacts, surfaces: Surfaces) -> list[Constraint]:
-    """One thing comes to the furniture and the tier of another; the other way where the other is on no furniture."""
+    """Constraints that move ``comes`` to the furniture and tier of ``stays``, or the reverse if ``stays`` is on none."""
     place, tier = scene.held.place, scene.held.tier
     if place[comes] == place[stays] and tier[comes] == tier[stays]:
         return []
@@ -299,28 +299,28 @@ def _come_together(comes: int, stays: int, scene: SceneFacts, surfaces: Surfaces
 def _support(claim: PairCount | SupportCount, scene: SceneFacts, surfaces: Surfaces, error: Array) -> list[Constraint]:
     if isinstance(claim, PairCount):
         found: list[Constraint] = []
-        holding = scene.named(claim.under)
+        supports = scene.named(claim.under)
     else:
         landmark, found = _refer(claim.landmark, scene, surfaces)
-        holding = np.array([landmark] if landmark >= 0 else [], dtype=np.int64)
+        supports = np.array([landmark] if landmark >= 0 else [], dtype=np.int64)
     members = scene.named(claim.name)
-    if not len(holding) or not len(members):
+    if not len(supports) or not len(members):
         return found
-    holder = _likely_holders(claim, scene, members, holding, error)
-    held = np.isin(holder[members], holding)
-    missing = claim.number - int(held.sum())
-    stays, leaves = list(members[held]), []
+    support_of = _likely_supports(claim, scene, members, supports, error)
+    is_supported = np.isin(support_of[members], supports)
+    missing = claim.number - int(is_supported.sum())
+    kept, removed = list(members[is_supported]), []
     if missing > 0:
-        for upper, lower in _closest_pairs(claim, scene, members[~held], holding, holder)[:missing]:
+        for upper, lower in _closest_pairs(claim, scene, members[~is_supported], supports, support_of)[:missing]:
             found += stands_on(upper, lower, claim.inside, scene, surfaces)
     elif missing < 0 and error[:2].max() < _SHARP:
-        bears = set(holder.tolist()) | set(scene.held.support.tolist())
-        stays.sort(key=lambda index: (index in bears, -distance_across(scene, index, holder[index])))
-        leaves, stays = stays[:-missing], stays[-missing:]
-    for index in stays if missing >= 0 or leaves else []:
-        found += stands_on(int(index), int(holder[index]), claim.inside, scene, surfaces)
-    for index in leaves:
-        found += stands_beside(int(index), int(holder[index]), scene)
+        bearing = set(support_of.tolist()) | set(scene.held.support.tolist())
+        kept.sort(key=lambda index: (index in bearing, -distance_across(scene, index, support_of[index])))
+        removed, kept = kept[:-missing], kept[-missing:]
+    for index in kept if missing >= 0 or removed else []:
+        found += stands_on(int(index), int(support_of[index]), claim.inside, scene, surfaces)
+    for index in removed:
+        found += stands_beside(int(index), int(support_of[index]), scene)
     return found
 
 
@@ -357,19 +357,19 @@ def _place(claim: PlaceCount, scene: SceneFacts, surfaces: Surfaces) -> list[Con
 # -- supports ---------------------------------------------------------------------------------------
 
 
-def _likely_holders(
-    claim: PairCount | SupportCount, scene: SceneFacts, members: Index, holding: Index, error: Array
+def _likely_supports(
+    claim: PairCount | SupportCount, scene: SceneFacts, members: Index, supports: Index, error: Array
 ) -> Index:
-    """(n,) what holds each object; for ``members`` not held by ``holding``, what may do so given the error.
+    """(n,) support of each object; for ``members`` not on ``supports``, the likely one given the error.
 
-    While heights are uncertain, a thing is taken to stand on the highest of the things below its middle.
+    While heights are uncertain, an object is taken to stand on the highest of the objects below its middle.
     """
-    holder = holders(scene, claim.inside).copy()
+    support_of = holders(scene, claim.inside).copy()
     if claim.inside or error[:2].max() >= _SHARP:
-        return holder
+        return support_of
     reach = _NEAR * sizes(scene)[:, :2].max(axis=1)
     height = scene.boxes[:, 0, 2]
-    for index in members[~np.isin(holder[members], holding)]:
+    for index in members[~np.isin(support_of[members], supports)]:
         above = height[index] - height
         below: Mask = (
             (distance_across(scene, index, np.arange(scene.count)) < reach) & (above > 0.0) & (above < _STOREY)
@@ -377,25 +377,26 @@ def _likely_holders(
         below[index] = False
         if below.any():
             nearest = int(np.where(below, above, np.inf).argmin())
-            holder[index] = nearest if nearest in holding else holder[index]
-    return holder
+            support_of[index] = nearest if nearest in supports else support_of[index]
+    return support_of
 
 
 def _closest_pairs(
-    claim: PairCount | SupportCount, scene: SceneFacts, free: Index, holding: Index, holder: Index
+    claim: PairCount | SupportCount, scene: SceneFacts, free: Index, supports: Index, support_of: Index
 ) -> list[tuple[int, int]]:
-    """Pairs of a thing that nothing of ``holding`` holds and one that may hold it, the closest ones first.
+    """Pairs of an object of ``free`` and one of ``supports`` that may support it, the closest ones first.
 
-    Every thing is in one pair at most. Only containers, and the landmark of a claim, hold several.
+    Every object is in one pair at most. Only containers, and the landmark of a claim, support several.
     """
     one_each = isinstance(claim, PairCount) and not claim.inside
-    occupied = set(holder.tolist()) | set(scene.held.support[~scene.held.contained].tolist()) if one_each else set()
+    standing = scene.held.support[~scene.held.contained]
+    occupied = {*support_of.tolist(), *standing.tolist()} if one_each else set()
     width = sizes(scene)[:, :2].max(axis=1)
-    ranked = sorted(  # of two orders of a pair, the wider thing below
+    ranked = sorted(  # of two orders of a pair, the wider object below
         (float(distance_across(scene, upper, lower)), float(width[upper] - width[lower]), int(upper), int(lower))
         for upper in free
-        for lower in holding
-        if upper != lower and lower not in occupied and holder[lower] != upper and not scene.carries(upper, lower)
+        for lower in supports
+        if upper != lower and lower not in occupied and support_of[lower] != upper and not scene.carries(upper, lower)
     )
     under: dict[int, int] = {}
     for _, _, upper, lower in ranked:
@@ -406,7 +407,7 @@ def _closest_pairs(
 
 
 def _stands_over(under: Mapping[int, int], upper: int, lower: int) -> bool:
-    """Whether the chain of things under ``upper`` leads to ``lower``."""
+    """Whether the chain of objects under ``upper`` leads to ``lower``."""
     while (upper := under.get(upper, -1)) >= 0:
         if upper == lower:
             return True
@@ -419,21 +420,21 @@ def _stands_over(under: Mapping[int, int], upper: int, lower: int) -> bool:
 AXES = np.eye(3)
 """Right, front and up, the axes of positions."""
 _UPON = 0.15
-"""Share of a thing's width within which the centre of what stands on it lies, to each side of its own centre."""
+"""Share of an object's width within which the centre of what stands on it lies, to each side of its own centre."""
 _WITHIN = 0.25
-"""The same for things in a container."""
+"""The same share for objects in a container."""
 _LEVEL = 0.004
-"""Heights of two things in contact differ by at most this (m)."""
+"""Largest difference of the heights of two objects in contact (m)."""
 _FLOOR, _FILL = 0.01, 0.03
-"""Thickness (m) of the bottom of a container; height (m) above it that the lowest things lie within."""
+"""Thickness (m) of the bottom of a container; height (m) above it within which the lowest objects lie."""
 _REST = 0.01
-"""Height (m) above a tier that things on it stand within."""
+"""Height (m) above a tier within which objects on it stand."""
 _CLEAR = 1.1
-"""Things that no longer stand on each other are apart by this times their mean width."""
+"""Distance of objects that no longer stand on each other, over their mean width."""
 _SPOT = 0.03
-"""They come within this distance (m) of the chosen place."""
+"""Distance (m) from the chosen place within which such an object comes."""
 _OFF = 10.0
-"""A place outside the furniture counts as less roomy by this times its distance."""
+"""A place outside the furniture counts as less roomy by this factor times its distance."""
 
 
 @dataclass(frozen=True)
@@ -460,8 +461,8 @@ class Surfaces:
     """Heights of the surfaces of n objects that carry others, relative to the positions of :class:`SceneFacts`, m.
 
     Attributes:
-        top: (n,) of the upper side at the middle; of the rim of a hollow thing.
-        tiers: (n, L) of the tiers, from the top; NaN for none.
+        top: (n,) height of the upper side at the middle, or of the rim of a hollow object.
+        tiers: (n, L) heights of the tiers, from the top; NaN for none.
     """
 
     top: Array
@@ -485,7 +486,7 @@ def height_above_foot(scene: SceneFacts, index: int) -> float:
 
 
 def stands_on(upper: int, lower: int, inside: bool, scene: SceneFacts, surfaces: Surfaces) -> Iterator[Constraint]:
-    """One thing stands on another, or lies in it."""
+    """Constraints under which ``upper`` stands on ``lower``, or lies in it."""
     share = _WITHIN if inside else _UPON
     for axis in (0, 1):
         reach = share * sizes(scene)[lower, axis]
@@ -496,7 +497,7 @@ def stands_on(upper: int, lower: int, inside: bool, scene: SceneFacts, surfaces:
 
 
 def stands_beside(upper: int, lower: int, scene: SceneFacts) -> Iterator[Constraint]:
-    """What stands on a thing comes to stand beside it, where most room is."""
+    """Constraints that move ``upper`` from ``lower`` to the place next to it that has most room."""
     base = lower
     while (below := int(scene.held.support[base])) >= 0 and not scene.fixed[below]:
         base = below
@@ -508,7 +509,7 @@ def stands_beside(upper: int, lower: int, scene: SceneFacts) -> Iterator[Constra
 
 
 def _roomiest(upper: int, lower: int, scene: SceneFacts) -> Array:
-    """(2,) place around ``lower``, on the same furniture, that is farthest from all other things."""
+    """(2,) place around ``lower``, on the same furniture, that is farthest from all other objects."""
     clear = _CLEAR * float(sizes(scene)[[upper, lower], :2].mean())
     angles = np.arange(16) * np.pi / 8
     places = scene.positions[lower, :2] + clear * np.stack([np.cos(angles), np.sin(angles)], axis=1)  # (16, 2)
@@ -523,7 +524,7 @@ def _roomiest(upper: int, lower: int, scene: SceneFacts) -> Array:
 
 
 def stands_at(index: int, unit: int, scene: SceneFacts, level: float | None) -> Iterator[Constraint]:
-    """A thing is within the outline of a piece of furniture, and at the height ``level`` above its position."""
+    """Constraints that put an object in the outline of furniture ``unit``, ``level`` above its position."""
     low, high = scene.boxes[unit] - scene.positions[unit]
     margin = sizes(scene)[index] / 2
     for axis in (0, 1):

@@ -44,7 +44,7 @@ class ContinuousPrior(ScenePrior):
 
     Args:
         config: its configuration.
-        normalizer: of raw scenes in the scene type's layout.
+        normalizer: normalizer of raw scenes in the scene type's layout.
         preconditioning: moments (D,) of encoded scenes.
         card: facts about its training.
         residual: (G, D) measured error of the denoised scene.
@@ -85,7 +85,7 @@ class ContinuousPrior(ScenePrior):
 
         Args:
             config: its configuration.
-            normalizer: of raw scenes.
+            normalizer: normalizer of raw scenes.
             raw: scenes in the scene type's layout.
             moments: one of :data:`SCENE_MOMENTS`: those of each feature, or one standard deviation for all.
         """
@@ -320,12 +320,12 @@ class SceneCode:
     other components are constant.
 
     Args:
-        scene_type: of the scenes.
+        scene_type: scene type of the scenes.
         rotation: one of :data:`ROTATIONS`.
-        normalizer: of raw scenes in the scene type's layout.
+        normalizer: normalizer of raw scenes in the scene type's layout.
 
     Attributes:
-        normalizer: of the F numbers; what it calls constant never varies.
+        normalizer: Normalizer of the F numbers; numbers that it calls constant never vary.
 
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior("dimsum_table")

@@ -82,11 +82,11 @@ def make_hook(
     """The hook of one chain; None if nothing watches or guides it.
 
     Args:
-        prior: that denoises.
+        prior: Prior that denoises.
         table: the chain.
         scenes: the B scenes of normalised x_0 (B, N, D), as watch and guides see them.
         moved: (B, N, 1) bool, slots whose poses guides may move.
-        watch, guides, draw: called in this order: ``watch.see``, ``draw``, guides, ``watch``.
+        watch, guides, draw: Callables, in the order ``watch.see``, ``draw``, guides, ``watch``.
     """
     see = getattr(watch, "see", None)
 
@@ -161,7 +161,7 @@ class PhysicsGuidance:
 
         Args:
             step, steps: not used.
-            denoised: gives the B scenes that the network expects.
+            denoised: Function that gives the B scenes that the network expects.
             std: (3,) standard deviation of their positions along the axes of the world, m.
         """
         if not self.acts(std):
@@ -180,10 +180,10 @@ class PhysicsGuidance:
 
 _ROUNDS = 50
 """Rounds of iterative scaling; numbers are then within a few thousandths of their bounds."""
-_LARGEST = 1e9
+_MAX_FACTOR = 1e9
 """Largest factor on a probability, and the inverse of the smallest."""
 _SAME = 1e-6
-"""A factor this close to 1 changes nothing."""
+"""Difference of a factor from 1 below which it changes nothing."""
 _TINY = 1e-12
 Bounds = dict[str, tuple[float, float]]
 """Least and largest number of objects of each display name; the name "" stands for all objects."""
@@ -192,18 +192,17 @@ Bounds = dict[str, tuple[float, float]]
 class NumberGuidance:
     """Draws categories so that each scene holds the numbers of objects that its prompt claims.
 
-    At a step, the visible objects of a kind and the sum of its probabilities over the masked slots are the number that
-    is expected in the end. Where this number is outside the bounds that the claims put on it, the probabilities of the
-    kind are multiplied by one factor for all slots, so that it comes to the nearest bound. Of all distributions with
-    these expectations this one has the least divergence from that of the prior (Csiszar 1975). The chance of a slot to
-    be unmasked stays as it is. Kinds with a factor, or with one number as bounds, are drawn by systematic sampling
-    (:mod:`agents.diffusion.unmasking`).
+    Expected final count of a kind = its unmasked objects + its summed probability over masked slots. Where it is
+    outside the bounds that the claims put on it, the probabilities of the kind are multiplied by one factor for all
+    slots, so that it comes to the nearest bound. Of all distributions with these expectations this one has the least
+    divergence from that of the prior (Csiszar 1975). The chance of a slot to be unmasked stays as it is. Kinds with a
+    factor, or with one number as bounds, are drawn by systematic sampling (:mod:`agents.diffusion.unmasking`).
 
     Steps of continuous priors, and of categories that are replaced or unmasked independently, are not changed.
 
     Args:
         prompts: B texts. Text that cannot be read makes no claims.
-        scene_type: of the scenes.
+        scene_type: Scene type of the scenes.
 
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior("dimsum_table", process="mixed", text=True, kernel="squared_absorbing")
@@ -283,8 +282,8 @@ def kind_weights(probs: Tensor, low: Tensor, high: Tensor) -> Tensor:
         bound = target != expected
         left = (slots - torch.where(bound, target, 0.0).sum(dim=1, keepdim=True)).clamp(min=0.0)
         others = torch.where(bound, 0.0, number).sum(dim=1, keepdim=True)
-        rest = (rest * left / others.clamp(min=_TINY)).clamp(1 / _LARGEST, _LARGEST)
-        scaled = (weights * target / number.clamp(min=_TINY)).clamp(1 / _LARGEST, _LARGEST)
+        rest = (rest * left / others.clamp(min=_TINY)).clamp(1 / _MAX_FACTOR, _MAX_FACTOR)
+        scaled = (weights * target / number.clamp(min=_TINY)).clamp(1 / _MAX_FACTOR, _MAX_FACTOR)
         weights = torch.where(bound, scaled, rest)
     return weights / rest
 
@@ -326,7 +325,7 @@ def _bounds_of(claim: Claim) -> Iterator[tuple[str, float, float]]:
 
 
 def _of_reference(reference: Reference) -> Iterator[tuple[str, float, float]]:
-    """One thing of the name and no other, or as many as an order or a place needs."""
+    """Count bounds that a reference implies: exactly one, or at least its ordinal."""
     if reference.place is not None:
         yield from _of_reference(reference.place.unit)
     only = not reference.ordinal and reference.place is None
@@ -340,9 +339,9 @@ def physics_strength(given: float | None, config: Any, scene_type: SceneType) ->
     """Strength of physics guidance of a chain.
 
     Args:
-        given: by the caller; None takes that of the prior.
-        config: of the prior.
-        scene_type: of the scenes.
+        given: Strength that the caller gives; None takes that of the prior.
+        config: Configuration of the prior.
+        scene_type: Scene type of the scenes.
 
     Raises:
         InvalidInputError: not from 0 to 1, or the assets have no geometry.
@@ -368,16 +367,16 @@ def guidance_hook(
     """The hook of one chain under guidance; None if nothing watches or guides it.
 
     Args:
-        prior: that denoises.
-        scene_type: of the scenes.
+        prior: Prior that denoises.
+        scene_type: Scene type of the scenes.
         table: the chain.
         scenes: the B scenes of normalised x_0 (B, N, D), as watch and guides see them.
         moved: (B, N, 1) bool, slots whose poses are denoised.
         prompts: one per scene; without prompts there is no claim guidance.
         claim_guidance: strength, 0 for none.
         physics_guidance: strength, 0 for none.
-        guide: called before the other guides.
-        watch: called at the end of each step.
+        guide: Guide that is called before the others.
+        watch: Watch that is called at the end of each step.
     """
     movable = moved.squeeze(-1)
     guides: list[Guide] = [] if guide is None else [guide]
