@@ -71,7 +71,7 @@ class MixedBaselineConfig(BaselineConfig):
 
     Attributes:
         categories: K = C + 1, assets and *empty*; the mask token is one more.
-        time_scale: Factor on timesteps before they are embedded.
+        time_scale: factor on timesteps before they are embedded.
         flags: 1 to tell the network which poses and categories are observed (inpainting), 0 as published.
     """
 

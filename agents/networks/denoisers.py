@@ -148,7 +148,7 @@ class MixedDenoiser(nn.Module):
         Args:
             x_t: (B, N, 12 + K), observed entries in place.
             t: (B,) timesteps.
-            observed: Entries that carry no noise.
+            observed: entries that carry no noise.
             text: (B, L, W) tokens and (B, L) their mask.
         """
         pose, states = x_t[..., :POSE_FEATURES], state_of(x_t[..., POSE_FEATURES:])
@@ -248,7 +248,7 @@ def run_packed(
 
     Args:
         active: (B, N) bool.
-        run: Function of rows, index and mask of :func:`pack` that gives two tensors (b, M, W).
+        run: function of rows, index and mask of :func:`pack` that gives two tensors (b, M, W).
         widths: W of the two outputs.
     """
     parts, order = [], []

@@ -91,7 +91,7 @@ class DoubleStreamBlock(nn.Module):
     """Joint attention of two streams with their own projections, norms and MLPs, gated by the condition.
 
     Args:
-        hidden, heads, mlp_ratio, relations: Arguments of :class:`SingleStreamBlock`.
+        hidden, heads, mlp_ratio, relations: arguments of :class:`SingleStreamBlock`.
         text_ends: whether no later block reads the text, so that this block need not update it.
     """
 
@@ -290,9 +290,9 @@ class MixedFluxConfig(MixedFluxSize):
         embedding: E, width of the embedding of a slot, and of what leaves the last layer.
         pose_head: hidden width of the pose output.
         text_width: W, width of the text tokens; 0 for none.
-        text_reach: Blocks that read text: the ``"double"``-stream ones, or ``"all"``, as the paper's.
-        time_input: Number that is embedded as time, one of :data:`TIME_INPUTS`; ``"timestep"`` is the paper's.
-        time_scale: Factor on the time before it is embedded.
+        text_reach: blocks that read text: the ``"double"``-stream ones, or ``"all"``, as the paper's.
+        time_input: number that is embedded as time, one of :data:`TIME_INPUTS`; ``"timestep"`` is the paper's.
+        time_scale: factor on the time before it is embedded.
         unit: metres per normalised unit along x, y, z, for modules that read geometry.
         rotations: what the nine normalised numbers of a rotation are multiplied by, and what is then added, to be that
             of an object, for modules that read rotations.

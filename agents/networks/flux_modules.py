@@ -146,7 +146,7 @@ class ModuleConfig(ABC):
     """Configuration of a module; subclasses are frozen dataclasses whose fields go into files as they are.
 
     Attributes:
-        name: Name of the module, in files and as the first part of the names of its weights.
+        name: name of the module, in files and as the first part of the names of its weights.
         place: after which part of the core its weights are drawn.
         requires: names of modules that must stand before it.
         reads_geometry: whether it reads positions and the noise on them.

@@ -251,7 +251,7 @@ def joint_attention(
 
     Args:
         query, key, value: (B, heads, T, H / heads).
-        mask: Mask of :func:`torch.nn.functional.scaled_dot_product_attention`; a float one with ``relations``.
+        mask: mask of :func:`torch.nn.functional.scaled_dot_product_attention`; a float one with ``relations``.
         relations: (B, N, N, F) features of pairs of the last N tokens, the slots; None for none.
         gathered: linear map from heads * F to H.
     """
@@ -314,7 +314,7 @@ class Contacts(FluxModule):
         features: numbers per pair of slots, from :class:`~agents.networks.geometry.Relations`.
         hidden: width of the messages.
         embedding: width of the features from which the gates of the displacements are computed.
-        width: Width of the networks on pairs.
+        width: width of the networks on pairs.
         kind: width of the embedding of a category.
 
     >>> contacts = Contacts(categories=3, features=40, hidden=16, embedding=16)
@@ -425,7 +425,7 @@ def gated_displacement(displacements: Tensor, gates: Tensor) -> Tensor:
     """Contribution (B, N, 3) of displacements (B, N, :data:`CHANNELS`, 3) to the translation output.
 
     Args:
-        displacements: Displacements that :class:`Contacts` returns.
+        displacements: displacements that :class:`Contacts` returns.
         gates: (B, N, CHANNELS * 3), one for each entry of the displacements.
     """
     return (displacements * gates.unflatten(-1, (CHANNELS, 3))).sum(dim=-2)

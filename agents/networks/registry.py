@@ -84,13 +84,13 @@ def register_network(
     ``scene_envs.networks``.
 
     Args:
-        name: Name of the network.
+        name: name of the network.
         process: ``"continuous"`` or ``"mixed"``.
         config: class of its configuration: a frozen dataclass of JSON values with ``categories`` (mixed) or
             ``features`` (continuous), and ``text_width`` where it reads text.
-        network: Function from such a configuration to a module, which keeps it as ``config``.
+        network: function from such a configuration to a module, which keeps it as ``config``.
         ratio: the field besides ``hidden`` that :func:`match_parameters` adjusts.
-        sizes: Function from the keys of :func:`network_config` to fields of ``config``; None takes the same keys.
+        sizes: function from the keys of :func:`network_config` to fields of ``config``; None takes the same keys.
 
     Raises:
         UnknownNameError: no process has that name.
@@ -153,7 +153,7 @@ def network_config(
     """The size of a network from the keys that all networks share.
 
     Args:
-        name: Name of a network, see :func:`list_networks`.
+        name: name of a network, see :func:`list_networks`.
         process: ``"continuous"`` or ``"mixed"``.
         features: D, numbers per slot; read by continuous networks.
         categories: K = C + 1; read by mixed networks.
@@ -164,8 +164,8 @@ def network_config(
         text_width: width of the text tokens; 0 for none. The continuous ``flux`` reads none.
         frequencies: octaves of Fourier features, read by ``flux`` alone. The other networks have none, as
             published, unless their configuration is made by hand.
-        double_blocks: Number of double-stream blocks of the mixed ``flux``; None for a third of ``depth``.
-        embedding: Width of the slots of the mixed ``flux``; None for ``hidden``.
+        double_blocks: number of double-stream blocks of the mixed ``flux``; None for a third of ``depth``.
+        embedding: width of the slots of the mixed ``flux``; None for ``hidden``.
         pose_head, time_scale, text_reach, unit, rotations: read by the mixed ``flux`` alone, see
             :class:`~agents.networks.MixedFluxConfig`.
         modules: modules of the mixed ``flux``, without the Fourier features, which ``frequencies`` adds. All are put
@@ -313,7 +313,7 @@ def match_parameters(name: str, process: str, target: int, **sizes: Any) -> Netw
     count within 1 % of ``target`` is taken, or else the change that brings it nearest.
 
     Args:
-        name: Name of a network.
+        name: name of a network.
         process: ``"continuous"`` or ``"mixed"``.
         target: parameters, as :func:`parameter_count` counts them.
         sizes: the keys of :func:`network_config` except ``hidden``.

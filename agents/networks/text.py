@@ -66,7 +66,7 @@ class TextConfig:
 
     Attributes:
         words: the vocabulary, sorted; tokens are its indices after three special ones.
-        width: Width of the tokens.
+        width: width of the tokens.
         depth: transformer layers.
         heads: attention heads.
         max_tokens: longest prompt, its start token included.

@@ -167,9 +167,9 @@ class BertTextConfig:
 
     Attributes:
         model: folder with the model, or its name on the Hugging Face hub.
-        width: Width of its tokens, 768 for BERT-base.
+        width: width of its tokens, 768 for BERT-base.
         digest: SHA-256 of its weights and vocabulary; another model is refused.
-        size: Size of its vocabulary.
+        size: size of its vocabulary.
         nothing: its tokens of ``""``, start and end.
         max_tokens: longest prompt in its tokens, start and end included.
         kind: ``"bert"``, which tells the entry of a configuration file from that of another encoder.
@@ -214,7 +214,7 @@ class BertEncoder(nn.Module):
     share one BERT. The hidden states of the latest prompts are cached.
 
     Args:
-        config: Configuration that names the BERT.
+        config: configuration that names the BERT.
         cached: number of prompts whose hidden states are cached.
     """
 

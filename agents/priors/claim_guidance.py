@@ -285,7 +285,7 @@ def _side(claim: SideClaim, scene: SceneFacts, surfaces: Surfaces, placed: Colle
 
 
 def _come_together(comes: int, stays: int, scene: SceneFacts, surfaces: Surfaces) -> list[Constraint]:
-    """Constraints that move ``comes`` to the furniture and tier of ``stays``, or the reverse if ``stays`` is on none."""
+    """Constraints that move ``comes`` to the furniture and tier of ``stays``, or the reverse if ``stays`` has none."""
     place, tier = scene.held.place, scene.held.tier
     if place[comes] == place[stays] and tier[comes] == tier[stays]:
         return []

@@ -325,7 +325,7 @@ class SceneCode:
         normalizer: normalizer of raw scenes in the scene type's layout.
 
     Attributes:
-        normalizer: Normalizer of the F numbers; numbers that it calls constant never vary.
+        normalizer: normalizer of the F numbers; numbers that it calls constant never vary.
 
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior("dimsum_table")

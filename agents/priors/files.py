@@ -138,7 +138,7 @@ class StoredPrior:
         process: name of its process.
         fields: its configuration, as its class reads it.
         scene_type: its scene type.
-        normalizer: Normalizer of raw scenes.
+        normalizer: normalizer of raw scenes.
         preconditioning: moments of encoded scenes.
         card: facts about its training.
         residual: measured error of the denoiser, if it was measured.
@@ -253,8 +253,8 @@ def check_sizes(fields: Any, weights: int, name: str | os.PathLike[str]) -> None
 
     Args:
         fields: the configuration, nested.
-        weights: Number of weights in the file.
-        name: Name of the prior, for the message.
+        weights: number of weights in the file.
+        name: name of the prior, for the message.
 
     Raises:
         CorruptFileError: a size is out of proportion.
@@ -303,7 +303,7 @@ class PriorFacts:
     """Facts about a prior from its files.
 
     Attributes:
-        name: Name or path under which the prior was asked for.
+        name: name or path under which the prior was asked for.
         scene_type: its scene type.
         process: ``"continuous"`` or ``"mixed"``.
         slots: slots per scene that it was trained on.

@@ -82,11 +82,11 @@ def make_hook(
     """The hook of one chain; None if nothing watches or guides it.
 
     Args:
-        prior: Prior that denoises.
+        prior: prior that denoises.
         table: the chain.
         scenes: the B scenes of normalised x_0 (B, N, D), as watch and guides see them.
         moved: (B, N, 1) bool, slots whose poses guides may move.
-        watch, guides, draw: Callables, in the order ``watch.see``, ``draw``, guides, ``watch``.
+        watch, guides, draw: callables, in the order ``watch.see``, ``draw``, guides, ``watch``.
     """
     see = getattr(watch, "see", None)
 
@@ -161,7 +161,7 @@ class PhysicsGuidance:
 
         Args:
             step, steps: not used.
-            denoised: Function that gives the B scenes that the network expects.
+            denoised: function that gives the B scenes that the network expects.
             std: (3,) standard deviation of their positions along the axes of the world, m.
         """
         if not self.acts(std):
@@ -202,7 +202,7 @@ class NumberGuidance:
 
     Args:
         prompts: B texts. Text that cannot be read makes no claims.
-        scene_type: Scene type of the scenes.
+        scene_type: scene type of the scenes.
 
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior("dimsum_table", process="mixed", text=True, kernel="squared_absorbing")
@@ -339,9 +339,9 @@ def physics_strength(given: float | None, config: Any, scene_type: SceneType) ->
     """Strength of physics guidance of a chain.
 
     Args:
-        given: Strength that the caller gives; None takes that of the prior.
-        config: Configuration of the prior.
-        scene_type: Scene type of the scenes.
+        given: strength that the caller gives; None takes that of the prior.
+        config: configuration of the prior.
+        scene_type: scene type of the scenes.
 
     Raises:
         InvalidInputError: not from 0 to 1, or the assets have no geometry.
@@ -367,16 +367,16 @@ def guidance_hook(
     """The hook of one chain under guidance; None if nothing watches or guides it.
 
     Args:
-        prior: Prior that denoises.
-        scene_type: Scene type of the scenes.
+        prior: prior that denoises.
+        scene_type: scene type of the scenes.
         table: the chain.
         scenes: the B scenes of normalised x_0 (B, N, D), as watch and guides see them.
         moved: (B, N, 1) bool, slots whose poses are denoised.
         prompts: one per scene; without prompts there is no claim guidance.
         claim_guidance: strength, 0 for none.
         physics_guidance: strength, 0 for none.
-        guide: Guide that is called before the others.
-        watch: Watch that is called at the end of each step.
+        guide: guide that is called before the others.
+        watch: watch that is called at the end of each step.
     """
     movable = moved.squeeze(-1)
     guides: list[Guide] = [] if guide is None else [guide]

@@ -75,7 +75,7 @@ class MixedPrior(ScenePrior):
 
     Args:
         config: its configuration.
-        normalizer: Normalizer of raw scenes; only its pose features are used.
+        normalizer: normalizer of raw scenes; only its pose features are used.
         preconditioning: moments (12,) of normalised poses.
         card: facts about its training.
         residual: (G, 12) measured error of the denoised pose.
@@ -447,9 +447,9 @@ class MixedPrior(ScenePrior):
             table: the chain.
             noises: one generator for all scenes, or one per scene; None for torch's own.
             observed: entries that carry no noise.
-            text, guidance, eta, closed: Arguments of :meth:`transition`.
+            text, guidance, eta, closed: arguments of :meth:`transition`.
             resample: number of times that each step is taken, with noise added again in between.
-            hook: Hook that is called at the last time that each step is taken.
+            hook: hook that is called at the last time that each step is taken.
             first: step that the chain begins at.
         """
         free = self.unconditional(len(x)) if text is None or guidance else None

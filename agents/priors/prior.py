@@ -162,7 +162,7 @@ class ScenePrior(nn.Module, ABC):
         """A shipped prior by name, or one from a prior or run directory; in evaluation mode.
 
         Args:
-            name: Name or path of the prior; ``NAME with ADAPTER`` names its adapters as well.
+            name: name or path of the prior; ``NAME with ADAPTER`` names its adapters as well.
             adapter: updates that are added to its weights: priors that were trained from this one, or the folders of
                 such runs. Several are joined by ``+`` or in a list, each with a factor before ``*`` if need be.
 
@@ -196,7 +196,7 @@ class ScenePrior(nn.Module, ABC):
 
         Args:
             directory: folder, made if need be.
-            precision: Format of the weights in the file, ``"float32"`` or ``"float16"``; loading makes float32.
+            precision: format of the weights in the file, ``"float32"`` or ``"float16"``; loading makes float32.
         """
         stored = StoredPrior(
             self.process_name,
@@ -389,7 +389,7 @@ class ScenePrior(nn.Module, ABC):
 
         Args:
             count: number of scenes.
-            prompt: Text that says what the scenes should hold, one for all or one per scene; None for anything.
+            prompt: text that says what the scenes should hold, one for all or one per scene; None for anything.
             guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional (Ho and Salimans 2022); it
                 needs a prompt.
             claim_guidance: strength of guidance to the claims of the prompt, see
@@ -401,7 +401,7 @@ class ScenePrior(nn.Module, ABC):
                 ``_feasible``, otherwise 0.
             num_steps: denoiser evaluations per scene, 1..T.
             slots: slots per scene; more than trained is allowed.
-            seed: Seed of the torch generator; the same seed and batch size give the same scenes.
+            seed: seed of the torch generator; the same seed and batch size give the same scenes.
             batch_size: scenes denoised at once.
             eta: noise of the continuous features in the reverse steps (Song et al. 2021, Eq. 16). 1 is the ancestral
                 chain. With 0, only x_T and the discrete categories of a mixed prior are random.
@@ -475,7 +475,7 @@ class ScenePrior(nn.Module, ABC):
             slots: slots per scene.
             num_steps: steps of the chain.
             prompts: one per scene; without prompts there is no claim guidance.
-            claim_guidance: Strength of claim guidance, see :meth:`sample`.
+            claim_guidance: strength of claim guidance, see :meth:`sample`.
             physics_guidance: strength, 0 for none.
         """
         moved = torch.ones(count, slots, 1, dtype=torch.bool)
@@ -513,7 +513,7 @@ class ScenePrior(nn.Module, ABC):
             batch: scenes to change.
             mask: bool, True where something is regenerated: (B, N) for whole slots, or (B, N, 2) for the pose and the
                 category of each slot. Fixed welded slots are never regenerated.
-            prompt: Text that says what the whole scenes should hold in the end, one for all or one per scene.
+            prompt: text that says what the whole scenes should hold in the end, one for all or one per scene.
             guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional; it needs a prompt.
             claim_guidance: strength of guidance to the claims of the prompt, see
                 :class:`~agents.priors.claim_guidance.ClaimGuidance` and
@@ -523,7 +523,7 @@ class ScenePrior(nn.Module, ABC):
                 strength of the prior, as :meth:`ScenePrior.sample` does.
             num_steps: denoiser evaluations of one pass, 1..T.
             generators: one per scene, so that a scene's result does not depend on its neighbours' noise.
-            seed: Seed of the generators, where none are given.
+            seed: seed of the generators, where none are given.
             resample: number of times that each step is taken, with noise added again in between (Lugmayr et al. 2022,
                 Algorithm 1).
             watch: called at every step; chooses the scenes that continue. A scene may be replaced only by one with the
@@ -585,12 +585,12 @@ class ScenePrior(nn.Module, ABC):
 
         Args:
             batch: scenes.
-            prompt: Text that says what the completed scenes should hold, one for all or one per scene.
-            guidance, claim_guidance, physics_guidance: Arguments of :meth:`inpaint`.
+            prompt: text that says what the completed scenes should hold, one for all or one per scene.
+            guidance, claim_guidance, physics_guidance: arguments of :meth:`inpaint`.
             slots: slots of the result, at least those of ``batch``; None keeps them.
             fill: most objects to add to a scene; None for as many as there are empty slots.
             num_steps: denoiser evaluations per scene.
-            seed: Seed of the noise; scene i uses ``seed + i``.
+            seed: seed of the noise; scene i uses ``seed + i``.
         """
         wide = batch if slots is None else batch.with_slots(slots)
         if fill is not None and fill < 0:
@@ -675,7 +675,7 @@ class ScenePrior(nn.Module, ABC):
 
         Args:
             x0: normalised scenes.
-            generator: Source of timesteps and noise (CPU).
+            generator: source of timesteps and noise (CPU).
             reduction: ``"mean"`` over scenes, or ``"none"`` for (B,); always the mean over entries.
             t: (B,) timesteps, drawn when None.
             text: tokens (B, L, W) and their mask (B, L), as :meth:`encode_prompts` gives them; None without prompts.
@@ -693,7 +693,7 @@ class ScenePrior(nn.Module, ABC):
 
         Args:
             x0: normalised scenes.
-            generator: Source of timesteps, noise and observed entries (CPU).
+            generator: source of timesteps, noise and observed entries (CPU).
             t: (B,) timesteps, drawn when None.
         """
 
@@ -702,7 +702,7 @@ class ScenePrior(nn.Module, ABC):
         """Output of the denoiser for noised scenes; differentiable in its parameters.
 
         Args:
-            noised: Scenes that :meth:`noised` gives.
+            noised: scenes that :meth:`noised` gives.
             text: tokens (B, L, W) and their mask (B, L), as :meth:`encode_prompts` gives them; None without prompts.
         """
 
@@ -787,7 +787,7 @@ def check_prompts(
         prompt: one text for all scenes, one per scene, or None.
         guidance: w of classifier-free guidance.
         count: scenes.
-        scene_type: Scene type of the scenes.
+        scene_type: scene type of the scenes.
         slots: slots per scene.
         conditional: whether the prior reads prompts.
         claim_guidance: strength of claim guidance.

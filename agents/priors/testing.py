@@ -30,7 +30,7 @@ def tiny_prior(
 
     Args:
         scene_type: scene type or its name.
-        seed: Seed of the weights.
+        seed: seed of the weights.
         slots: slots per scene; the scene type's when None.
         process: ``"continuous"`` or ``"mixed"``.
         text: whether it reads prompts, with the vocabulary of prompts about scenes of this type; mixed only.
