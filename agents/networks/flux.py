@@ -263,21 +263,7 @@ MODULES: dict[str, type[ModuleConfig]] = {
 
 
 @dataclass(frozen=True)
-class MixedFluxSize:
-    """Size of the core of a :class:`~agents.networks.MixedFlux`; :class:`MixedFluxConfig` describes the fields."""
-
-    categories: int
-    hidden: int = 128
-    double_blocks: int = 2
-    single_blocks: int = 4
-    heads: int = 4
-    mlp_ratio: float = 4.0
-    embedding: int = 128
-    pose_head: int = 64
-
-
-@dataclass(frozen=True)
-class MixedFluxConfig(MixedFluxSize):
+class MixedFluxConfig:
     """Size of a :class:`~agents.networks.MixedFlux`, what it reads, and the modules that are added to its core.
 
     Attributes:
@@ -304,6 +290,14 @@ class MixedFluxConfig(MixedFluxSize):
     (RelationsConfig(blur='axis'),)
     """
 
+    categories: int
+    hidden: int = 128
+    double_blocks: int = 2
+    single_blocks: int = 4
+    heads: int = 4
+    mlp_ratio: float = 4.0
+    embedding: int = 128
+    pose_head: int = 64
     text_width: int = 0
     text_reach: str = "all"
     time_input: str = "timestep"

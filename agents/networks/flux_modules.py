@@ -21,39 +21,24 @@ Place = Literal["slots", "condition", "attention", "output"]
 
 
 class FluxSizes(Protocol):
-    """The sizes of the core that modules are built for; fields of :class:`~agents.networks.MixedFluxConfig`."""
+    """The sizes of the core that modules are built for, as :class:`~agents.networks.MixedFluxConfig` describes them."""
 
     @property
-    def categories(self) -> int:
-        """Assets and *empty*."""
-
+    def categories(self) -> int: ...
     @property
-    def hidden(self) -> int:
-        """Width of the token streams."""
-
+    def hidden(self) -> int: ...
     @property
-    def heads(self) -> int:
-        """Attention heads."""
-
+    def heads(self) -> int: ...
     @property
-    def embedding(self) -> int:
-        """Width of the embedding of a slot."""
-
+    def embedding(self) -> int: ...
     @property
-    def text_width(self) -> int:
-        """Width of the text tokens; 0 without text."""
-
+    def text_width(self) -> int: ...
     @property
-    def unit(self) -> tuple[float, float, float]:
-        """Metres per normalised unit along x, y, z."""
-
+    def unit(self) -> tuple[float, float, float]: ...
     @property
-    def blocks(self) -> int:
-        """Number of blocks, of both kinds."""
-
+    def blocks(self) -> int: ...
     @property
-    def pair_width(self) -> int:
-        """Number of features of a pair of slots, summed over all modules."""
+    def pair_width(self) -> int: ...
 
 
 @dataclass
