@@ -165,14 +165,9 @@ class ContinuousBaseline(_Baseline):
         self.scene_out = head(config.hidden, features)
 
     def forward(
-        self,
-        x: Tensor,
-        position: Tensor,
-        noise_level: Tensor,
-        *,
-        text: Tensor | None = None,
+        self, x: Tensor, position: Tensor, noise_level: Tensor, *, text: Tensor | None = None,
         text_mask: Tensor | None = None,
-    ) -> Tensor:
+    ) -> Tensor:  # fmt: skip
         """Predict.
 
         Args:
@@ -203,17 +198,10 @@ class MixedBaseline(_Baseline):
         self.logits_out = head(hidden, config.categories)
 
     def forward(
-        self,
-        pose: Tensor,
-        states: Tensor,
-        time: Tensor,
-        *,
-        text: Tensor | None = None,
-        text_mask: Tensor | None = None,
-        position: Tensor | None = None,
-        noise_level: Tensor | None = None,
+        self, pose: Tensor, states: Tensor, time: Tensor, *, text: Tensor | None = None,
+        text_mask: Tensor | None = None, position: Tensor | None = None, noise_level: Tensor | None = None,
         observed: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """Predict; arguments and results as in :meth:`agents.networks.flux.MixedFlux.forward`."""
         tokens = self.pose_in(self._with_octaves(pose, position, noise_level)) + self.category_in(states)
         if self.given_in is not None and observed is not None:
@@ -240,14 +228,12 @@ class _MiDiffusionSize(BaselineConfig):
 class MiDiffusionConfig(_MiDiffusionSize):
     """Size of a :class:`MiDiffusion`.
 
+    Further fields are those of :class:`BaselineConfig`.
+
     Attributes:
         features: D, numbers per slot.
-        hidden: width of the tokens; a multiple of ``heads``.
-        depth: blocks.
-        heads: attention heads.
+        depth: number of blocks.
         mlp_ratio: width of the feed-forward layers over ``hidden``.
-        text_width: width of the text tokens; 0 for none.
-        frequencies: octaves of Fourier features of each translation; 0 for none, as published.
     """
 
     features: int
@@ -309,7 +295,6 @@ class _Transformer(nn.Module):
 class MiDiffusion(ContinuousBaseline):
     """Scenes (B, N, D) at a noise level (B,) to a prediction (B, N, D); permutation-equivariant in N.
 
-    >>> import torch
     >>> network = MiDiffusion(MiDiffusionConfig(features=20, hidden=32, depth=2, heads=2))
     >>> x = torch.randn(2, 34, 20)
     >>> network(x, x, torch.tensor([0.1, 0.2])).shape
@@ -323,7 +308,6 @@ class MiDiffusion(ContinuousBaseline):
 class MixedMiDiffusion(MixedBaseline):
     """Poses (B, N, 12) and states (B, N) to a pose output (B, N, 12) and logits (B, N, K); permutation-equivariant.
 
-    >>> import torch
     >>> network = MixedMiDiffusion(MixedMiDiffusionConfig(categories=8, hidden=32, depth=2, heads=2, text_width=16))
     >>> pose, states = torch.randn(2, 5, 12), torch.randint(9, (2, 5))
     >>> out, logits = network(pose, states, torch.tensor([3.0, 7.0]), text=torch.randn(2, 4, 16))
@@ -368,8 +352,6 @@ class DiffuSceneConfig(_DiffuSceneSize):
         blocks: residual blocks per level, on the way down and again on the way up.
         heads: attention heads, and groups of the group norms.
         inner_ratio: channels between the two convolutions of a residual block, over ``hidden``.
-        text_width: width of the text tokens; 0 for none.
-        frequencies: octaves of Fourier features of each translation; 0 for none, as published.
     """
 
     features: int

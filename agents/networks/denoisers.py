@@ -178,16 +178,9 @@ class MixedDenoiser(nn.Module):
         extra = {} if slot_mask is None else {"slot_mask": slot_mask}
         with autocast(scaled, self.precision):
             output, logits = self.network(
-                scaled,
-                states,
-                time,
-                text=tokens,
-                text_mask=mask,
-                position=position,
-                noise_level=level,
-                observed=flags[0] if flags else None,
-                **extra,
-            )
+                scaled, states, time, text=tokens, text_mask=mask, position=position, noise_level=level,
+                observed=flags[0] if flags else None, **extra,
+            )  # fmt: skip
         return output.to(scaled.dtype), logits.to(scaled.dtype)
 
     def _on_present(self, inputs: Sequence[Tensor], time: Tensor, text: Text | None) -> tuple[Tensor, Tensor]:

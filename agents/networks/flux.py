@@ -426,18 +426,10 @@ class MixedFlux(nn.Module):
         self.register_buffer("rotations", torch.tensor(config.rotations), persistent=False)
 
     def forward(
-        self,
-        pose: Tensor,
-        states: Tensor,
-        time: Tensor,
-        *,
-        text: Tensor | None = None,
-        text_mask: Tensor | None = None,
-        position: Tensor | None = None,
-        noise_level: Tensor | None = None,
-        observed: Tensor | None = None,
-        slot_mask: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor]:
+        self, pose: Tensor, states: Tensor, time: Tensor, *, text: Tensor | None = None,
+        text_mask: Tensor | None = None, position: Tensor | None = None, noise_level: Tensor | None = None,
+        observed: Tensor | None = None, slot_mask: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """Predict.
 
         Args:
@@ -489,14 +481,9 @@ class MixedFlux(nn.Module):
     # -- blocks -----------------------------------------------------------------------------------
 
     def _attend(
-        self,
-        slots: Tensor,
-        words: Tensor | None,
-        condition: Tensor,
-        text_mask: Tensor | None,
-        biases: Iterator[Tensor | None],
-        scene: Scene,
-    ) -> Tensor:
+        self, slots: Tensor, words: Tensor | None, condition: Tensor, text_mask: Tensor | None,
+        biases: Iterator[Tensor | None], scene: Scene,
+    ) -> Tensor:  # fmt: skip
         """Slots (B, N, H) and words (B, L, H) through all blocks to slots (B, N, H)."""
         count = 0 if words is None else words.shape[1]
         mask = _where_to_attend(text_mask, scene.slot_mask, count, slots)

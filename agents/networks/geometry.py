@@ -356,14 +356,9 @@ class Contacts(FluxModule):
         return None if moves is None else F.pad(gated_displacement(moves, self.gates(features)), (0, 9))
 
     def forward(
-        self,
-        metres: Tensor,
-        rotation: Tensor,
-        states: Tensor,
-        noise: Tensor,
-        features: Tensor,
+        self, metres: Tensor, rotation: Tensor, states: Tensor, noise: Tensor, features: Tensor,
         slot_mask: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """Messages (B, N, H) to slots, and displacements (B, N, :data:`CHANNELS`, 3) in units of the noise.
 
         Args:

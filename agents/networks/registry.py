@@ -67,14 +67,9 @@ _ENTRIES: dict[tuple[str, str], _Entry] = {}
 
 
 def register_network(
-    name: str,
-    process: str,
-    config: type[Any],
-    network: Callable[[Any], nn.Module],
-    *,
-    ratio: str | None = None,
+    name: str, process: str, config: type[Any], network: Callable[[Any], nn.Module], *, ratio: str | None = None,
     sizes: Callable[[Mapping[str, Any]], dict[str, Any]] | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Make a network known as ``network=NAME`` to training, files and comparisons.
 
     A mixed network has the ``forward`` of :class:`~agents.networks.MixedFlux`, a continuous one that of
@@ -131,25 +126,13 @@ def build_network(config: NetworkConfig) -> nn.Module:
 
 
 def network_config(
-    name: str,
-    process: str,
-    *,
-    features: int,
-    categories: int,
-    hidden: int,
-    depth: int,
-    heads: int,
-    text_width: int = 0,
-    frequencies: int = 8,
-    double_blocks: int | None = None,
-    embedding: int | None = None,
-    pose_head: int = 64,
-    time_scale: float = 1.0,
-    text_reach: str = "all",
+    name: str, process: str, *, features: int, categories: int, hidden: int, depth: int, heads: int,
+    text_width: int = 0, frequencies: int = 8, double_blocks: int | None = None, embedding: int | None = None,
+    pose_head: int = 64, time_scale: float = 1.0, text_reach: str = "all",
     modules: Sequence[ModuleConfig | Mapping[str, Any]] | None = None,
     unit: tuple[float, float, float] = (1.0, 1.0, 1.0),
     rotations: tuple[tuple[float, ...], tuple[float, ...]] = ((1.0,) * 9, (0.0,) * 9),
-) -> NetworkConfig:
+) -> NetworkConfig:  # fmt: skip
     """The size of a network from the keys that all networks share.
 
     Args:

@@ -30,17 +30,10 @@ _OPTIMIZERS = {"adamw": "AdamW", "muon": "Muon and AdamW"}
 
 
 def package_prior(
-    source: str | os.PathLike[str] | ScenePrior,
-    output: str | os.PathLike[str],
-    *,
-    evaluation: str | os.PathLike[str] | None = None,
-    precision: str = "float16",
-    data: str = "",
-    license: str = "",
-    machine: str = "",
-    limits: str = "",
-    physics_guidance: float | None = None,
-) -> Path:
+    source: str | os.PathLike[str] | ScenePrior, output: str | os.PathLike[str], *,
+    evaluation: str | os.PathLike[str] | None = None, precision: str = "float16", data: str = "", license: str = "",
+    machine: str = "", limits: str = "", physics_guidance: float | None = None,
+) -> Path:  # fmt: skip
     """Write a prior as a folder to publish: ``config.json``, ``model.safetensors`` and the model card ``README.md``.
 
     Args:

@@ -172,17 +172,10 @@ class ContinuousPrior(ScenePrior):
         return observed.repeat_interleave(widths, dim=-1)
 
     def regenerate(
-        self,
-        batch: SceneBatch,
-        mask: Tensor,
-        table: StepTable,
-        generators: Sequence[Generator],
-        resample: int,
-        prompts: Sequence[str] | None = None,
-        guidance: float = 0.0,
-        hook: Hook | None = None,
+        self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int,
+        prompts: Sequence[str] | None = None, guidance: float = 0.0, hook: Hook | None = None,
         start: Start | None = None,
-    ) -> Tensor:
+    ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; used by :meth:`inpaint`."""
         x0, keep = self.encode(batch), self._entries(~mask)
         x = self.clamp(draw_noise(x0, generators))

@@ -70,15 +70,9 @@ class Estimating(Protocol):
 
 
 def make_hook(
-    prior: Estimating,
-    table: StepTable,
-    scenes: Callable[[Tensor], SceneBatch],
-    moved: Tensor,
-    *,
-    watch: Watch | None = None,
-    guides: Sequence[Guide] = (),
-    draw: Draw | None = None,
-) -> Hook | None:
+    prior: Estimating, table: StepTable, scenes: Callable[[Tensor], SceneBatch], moved: Tensor, *,
+    watch: Watch | None = None, guides: Sequence[Guide] = (), draw: Draw | None = None,
+) -> Hook | None:  # fmt: skip
     """The hook of one chain; None if nothing watches or guides it.
 
     Args:
@@ -352,18 +346,10 @@ def physics_strength(given: float | None, config: Any, scene_type: SceneType) ->
 
 
 def guidance_hook(
-    prior: Estimating,
-    scene_type: SceneType,
-    table: StepTable,
-    scenes: Callable[[Tensor], SceneBatch],
-    moved: Tensor,
-    *,
-    prompts: Sequence[str] | None = None,
-    claim_guidance: float = 0.0,
-    physics_guidance: float = 0.0,
-    guide: Guide | None = None,
-    watch: Watch | None = None,
-) -> Hook | None:
+    prior: Estimating, scene_type: SceneType, table: StepTable, scenes: Callable[[Tensor], SceneBatch], moved: Tensor,
+    *, prompts: Sequence[str] | None = None, claim_guidance: float = 0.0, physics_guidance: float = 0.0,
+    guide: Guide | None = None, watch: Watch | None = None,
+) -> Hook | None:  # fmt: skip
     """The hook of one chain under guidance; None if nothing watches or guides it.
 
     Args:

@@ -350,18 +350,10 @@ class MixedPrior(ScenePrior):
         return super().step_table(num_steps)
 
     def transition(
-        self,
-        x_t: Tensor,
-        step: int,
-        table: StepTableLike,
-        *,
-        observed: Observed | None = None,
-        text: Text | None = None,
-        guidance: float = 0.0,
-        free: Text | None = None,
-        eta: float = 1.0,
+        self, x_t: Tensor, step: int, table: StepTableLike, *, observed: Observed | None = None,
+        text: Text | None = None, guidance: float = 0.0, free: Text | None = None, eta: float = 1.0,
         closed: Tensor | None = None,
-    ) -> MixedStep:
+    ) -> MixedStep:  # fmt: skip
         """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters.
 
         The assets of fixed objects have probability 0 in all other slots.
@@ -417,17 +409,9 @@ class MixedPrior(ScenePrior):
 
     @torch.no_grad()
     def sample_tensor(
-        self,
-        count: int,
-        *,
-        prompts: Sequence[str] | None = None,
-        guidance: float = 0.0,
-        num_steps: int = 50,
-        slots: int | None = None,
-        generator: Generator | None = None,
-        eta: float = 1.0,
-        hook: Hook | None = None,
-    ) -> Tensor:
+        self, count: int, *, prompts: Sequence[str] | None = None, guidance: float = 0.0, num_steps: int = 50,
+        slots: int | None = None, generator: Generator | None = None, eta: float = 1.0, hook: Hook | None = None,
+    ) -> Tensor:  # fmt: skip
         """``count`` denoised scenes x_0 (count, slots, D), as :meth:`ScenePrior.sample_tensor` describes."""
         text = None if prompts is None else self.encode_prompts(prompts)
         start = self.initial(count, self.config.slots if slots is None else slots, generator)

@@ -372,19 +372,10 @@ class ScenePrior(nn.Module, ABC):
         return weight, std[TRANSLATION].to(self.device)
 
     def sample(
-        self,
-        count: int,
-        *,
-        prompt: str | Sequence[str] | None = None,
-        guidance: float = 0.0,
-        claim_guidance: float = 0.0,
-        physics_guidance: float | None = None,
-        num_steps: int = 50,
-        slots: int | None = None,
-        seed: int = 0,
-        batch_size: int = 64,
-        eta: float = 1.0,
-    ) -> SceneBatch:
+        self, count: int, *, prompt: str | Sequence[str] | None = None, guidance: float = 0.0,
+        claim_guidance: float = 0.0, physics_guidance: float | None = None, num_steps: int = 50,
+        slots: int | None = None, seed: int = 0, batch_size: int = 64, eta: float = 1.0,
+    ) -> SceneBatch:  # fmt: skip
         """``count`` scenes by ancestral sampling (Ho et al. 2020, Algorithm 2) over ``num_steps`` strides.
 
         Args:
@@ -433,17 +424,9 @@ class ScenePrior(nn.Module, ABC):
 
     @torch.no_grad()
     def sample_tensor(
-        self,
-        count: int,
-        *,
-        prompts: Sequence[str] | None = None,
-        guidance: float = 0.0,
-        num_steps: int = 50,
-        slots: int | None = None,
-        generator: Generator | None = None,
-        eta: float = 1.0,
-        hook: Hook | None = None,
-    ) -> Tensor:
+        self, count: int, *, prompts: Sequence[str] | None = None, guidance: float = 0.0, num_steps: int = 50,
+        slots: int | None = None, generator: Generator | None = None, eta: float = 1.0, hook: Hook | None = None,
+    ) -> Tensor:  # fmt: skip
         """``count`` denoised scenes x_0 (count, slots, D), normalised, from one batch; arguments as in :meth:`sample`.
 
         ``hook`` is called at every step, before x_{t-1} is drawn.
@@ -459,15 +442,9 @@ class ScenePrior(nn.Module, ABC):
         return x
 
     def sampling_hook(
-        self,
-        count: int,
-        slots: int,
-        num_steps: int,
-        *,
-        prompts: Sequence[str] | None = None,
-        claim_guidance: float = 0.0,
-        physics_guidance: float = 0.0,
-    ) -> Hook | None:
+        self, count: int, slots: int, num_steps: int, *, prompts: Sequence[str] | None = None,
+        claim_guidance: float = 0.0, physics_guidance: float = 0.0,
+    ) -> Hook | None:  # fmt: skip
         """Hook of a chain that samples whole scenes under guidance; None where nothing guides them.
 
         Args:
@@ -489,21 +466,11 @@ class ScenePrior(nn.Module, ABC):
 
     @torch.no_grad()
     def inpaint(
-        self,
-        batch: SceneBatch,
-        mask: Tensor,
-        *,
-        prompt: str | Sequence[str] | None = None,
-        guidance: float = 0.0,
-        claim_guidance: float = 0.0,
-        physics_guidance: float | None = None,
-        num_steps: int = 50,
-        generators: Sequence[Generator] | None = None,
-        seed: int = 0,
-        resample: int = 1,
-        watch: Watch | None = None,
+        self, batch: SceneBatch, mask: Tensor, *, prompt: str | Sequence[str] | None = None, guidance: float = 0.0,
+        claim_guidance: float = 0.0, physics_guidance: float | None = None, num_steps: int = 50,
+        generators: Sequence[Generator] | None = None, seed: int = 0, resample: int = 1, watch: Watch | None = None,
         guide: Guide | None = None,
-    ) -> SceneBatch:
+    ) -> SceneBatch:  # fmt: skip
         """Regenerate the masked entries, given the rest.
 
         A room keeps its furniture: if generated welded objects are kept and none is masked, masked slots take no
@@ -567,18 +534,10 @@ class ScenePrior(nn.Module, ABC):
         return merge(batch, self.decode(x).to(batch.tensor.device), both)
 
     def complete(
-        self,
-        batch: SceneBatch,
-        *,
-        prompt: str | Sequence[str] | None = None,
-        guidance: float = 0.0,
-        claim_guidance: float = 0.0,
-        physics_guidance: float | None = None,
-        slots: int | None = None,
-        fill: int | None = None,
-        num_steps: int = 50,
-        seed: int = 0,
-    ) -> SceneBatch:
+        self, batch: SceneBatch, *, prompt: str | Sequence[str] | None = None, guidance: float = 0.0,
+        claim_guidance: float = 0.0, physics_guidance: float | None = None, slots: int | None = None,
+        fill: int | None = None, num_steps: int = 50, seed: int = 0,
+    ) -> SceneBatch:  # fmt: skip
         """Fill the empty slots of ``batch``, keeping its objects.
 
         With all empty slots open, a prior crowds a scene. With ``fill`` open slots, it adds at most that many objects.
@@ -602,16 +561,9 @@ class ScenePrior(nn.Module, ABC):
         )  # fmt: skip
 
     def rearrange(
-        self,
-        batch: SceneBatch,
-        *,
-        prompt: str | Sequence[str] | None = None,
-        guidance: float = 0.0,
-        claim_guidance: float = 0.0,
-        physics_guidance: float | None = None,
-        num_steps: int = 50,
-        seed: int = 0,
-    ) -> SceneBatch:
+        self, batch: SceneBatch, *, prompt: str | Sequence[str] | None = None, guidance: float = 0.0,
+        claim_guidance: float = 0.0, physics_guidance: float | None = None, num_steps: int = 50, seed: int = 0,
+    ) -> SceneBatch:  # fmt: skip
         """New poses for the free objects of ``batch``; all categories, and the poses of welded objects, stay.
 
         Arguments as in :meth:`complete`.
@@ -625,17 +577,10 @@ class ScenePrior(nn.Module, ABC):
 
     @abstractmethod
     def regenerate(
-        self,
-        batch: SceneBatch,
-        mask: Tensor,
-        table: StepTable,
-        generators: Sequence[Generator],
-        resample: int,
-        prompts: Sequence[str] | None = None,
-        guidance: float = 0.0,
-        hook: Hook | None = None,
+        self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int,
+        prompts: Sequence[str] | None = None, guidance: float = 0.0, hook: Hook | None = None,
         start: Start | None = None,
-    ) -> Tensor:
+    ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; used by :meth:`inpaint`."""
 
     def closed_categories(self, batch: SceneBatch, mask: Tensor) -> Tensor:
