@@ -307,7 +307,7 @@ class MixedFluxConfig:
     modules: tuple[ModuleConfig, ...] = ()
 
     reads_slot_mask: ClassVar[bool] = True
-    """Whether the network can be told to ignore slots."""
+    """Whether the network takes ``slot_mask``, the slots that it ignores."""
 
     def __post_init__(self) -> None:
         if self.text_reach not in TEXT_REACHES:

@@ -81,7 +81,7 @@ class Scene:
 
 
 class FluxModule(nn.Module):
-    """A part of the network beside its core. Every hook may be left out; None adds nothing.
+    """A part of the network outside of its core. Every hook may be left out; None adds nothing.
 
     The core calls the hooks in the order in which they are defined here. It calls each hook for all modules, in the
     order of the configuration, and adds what they return. All must be permutation-equivariant in the slots.
@@ -291,7 +291,7 @@ _DELTA = 0.02
 """Number of objects that is added before a logarithm is taken, so that it is finite."""
 _KNOWN = 0.8
 """A text gives the number of a kind if the likeliest number has at least this probability."""
-_LEAST = 0.1
+_MIN_REST = 0.1
 """Probability of the visible number and all larger ones; below it, fewer objects of a known number are expected."""
 _TINY = 1e-9
 
@@ -301,7 +301,7 @@ class CountConditioningConfig(ModuleConfig):
     """Numbers that a prompt asks for; the first text tokens are of the kinds of objects, and of all objects.
 
     Attributes:
-        largest: the largest number that is told apart.
+        largest: largest number that has a class of its own.
         kinds: (K - 1,) the kind of each category, as prompts call it; empty where each is one of its own.
     """
 
@@ -329,7 +329,7 @@ class CountConditioningConfig(ModuleConfig):
 class CountConditioning(FluxModule):
     """Logits (B, K) that are added to those of every slot: how much of each category is still wanted.
 
-    A prompt asks for numbers: of objects, of cups, of whatever is named. Attention takes averages and learns exact
+    A prompt asks for numbers: of objects, of cups, of any kind. Attention takes averages and learns exact
     numbers very slowly, so this module subtracts. The text gives the probability of each number of each kind of object
     (:meth:`count_logits`, trained on the counts of scenes). Numbers below the visible count are impossible. The mean
     of the other numbers minus the visible count is the number still missing. The missing objects of a kind over the
@@ -341,10 +341,10 @@ class CountConditioning(FluxModule):
         kinds: (C,) the kind 0..G-1 of each category but *empty*: prompts call several assets by one name.
         text_width: W, width of the text tokens: one for each kind, and a last one for all objects.
         hidden: width inside.
-        most: largest number that is told apart; larger numbers count as this one.
+        most: largest number that has a class of its own; larger numbers count as this one.
 
     Attributes:
-        things: G + 1, the number of kinds, plus one for all objects.
+        things: number of kinds G plus one for all objects.
 
     >>> count_conditioning = CountConditioning(kinds=(0, 1, 1, 2), text_width=16, hidden=32, most=5)
     >>> count_conditioning(torch.randint(6, (2, 5)), torch.randn(2, 4, 16)).shape
@@ -420,8 +420,8 @@ def still_to_come(logits: Tensor, visible: Tensor) -> Tensor:
 
     It is the mean of the numbers that are not below the visible one, minus the visible one. In one case it shrinks to 0
     in proportion: one number above 0 has a probability of at least ``_KNOWN``, and the numbers that are not below the
-    visible one have less than ``_LEAST`` together. Then more objects are visible than the text asks for. Without this
-    bound the mean would be that of the remote tail, and all masked slots would become objects of a kind that is
+    visible one have less than ``_MIN_REST`` together. Then more objects are visible than the text asks for. Without
+    this bound the mean would be that of the remote tail, and all masked slots would become objects of a kind that is
     complete. Kinds that are seldom present at all are not bounded in this way.
 
     >>> still_to_come(torch.tensor([[0.0, 0.0, 0.0, 0.0]]), torch.tensor([1.0]))  # 1, 2 or 3, as likely
@@ -434,7 +434,7 @@ def still_to_come(logits: Tensor, visible: Tensor) -> Tensor:
     beyond = number - visible[..., None]
     probability = logits.softmax(dim=-1)
     weight = probability * (beyond >= 0)
-    least = torch.where(probability[..., 1:].amax(dim=-1) >= _KNOWN, _LEAST, _TINY)
+    least = torch.where(probability[..., 1:].amax(dim=-1) >= _KNOWN, _MIN_REST, _TINY)
     return (weight * beyond).sum(dim=-1) / weight.sum(dim=-1).maximum(least)
 
 

@@ -44,7 +44,7 @@ _TILT_REACH = 4.0
 
 @dataclass(frozen=True)
 class RotationFeaturesConfig(ModuleConfig):
-    """Features of rotations, read beside each pose and added, through gates, to the output of rotations."""
+    """Features of rotations, read with each pose and added, through gates, to the output of rotations."""
 
     name = "rotation_features"
     place = "output"

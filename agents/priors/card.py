@@ -69,12 +69,12 @@ def package_prior(
     config = prior.config
     if physics_guidance is not None:
         prior.with_physics_guidance(physics_guidance)
-    told = {"data": data, "license": license or _license(prior.card), "machine": machine, "limits": limits}
+    given = {"data": data, "license": license or _license(prior.card), "machine": machine, "limits": limits}
     kept = prior.card
     # the settings of a post-training run describe the post-training; the card has those of the pretraining
     steered = bool(kept.get("post_training"))
     trained = {} if isinstance(source, ScenePrior) or steered else _training_of(Path(source))
-    prior.card = {**kept, **trained, **{key: text for key, text in told.items() if text}}
+    prior.card = {**kept, **trained, **{key: text for key, text in given.items() if text}}
     if measures:
         prior.card["measures"] = measures
     try:
@@ -270,7 +270,7 @@ def _iterations(run: Mapping[str, Any]) -> str:
 
 
 def _training_of(source: Path) -> dict[str, Any]:
-    """Training settings of a run, from the ``config.yaml`` beside its prior."""
+    """Training settings of a run, from the ``config.yaml`` of its folder."""
     import yaml
 
     folder = source.parent if source.name == "prior" else source

@@ -1,6 +1,6 @@
 """Claim guidance: denoising whose poses are moved toward the claims of a prompt.
 
-Claims become linear constraints on pairs of objects: what stands on, in, beside or at what.
+Claims become linear constraints on pairs of objects: what stands on, in, next to or at what.
 """
 
 from __future__ import annotations

@@ -86,7 +86,7 @@ class MixedPriorConfig(PoseDiffusionConfig, DenoiserConfig):
         timesteps: distribution of training timesteps, one of those of continuous priors but not None.
         kernel: kernel of the categories, one of :data:`~agents.diffusion.CATEGORICAL_KERNELS`.
         category_loss: ``"cross_entropy"`` of the clean category, or ``"bound"``, the paper's variational bound.
-        category_weight: weight of the category loss beside the pose loss.
+        category_weight: weight of the category loss, over that of the pose loss.
         auxiliary: weight of the cross-entropy in the bound.
         observed_share: share of training scenes in which some poses or categories are observed, for inpainting.
         open_empty_share: share of those in which whole slots are observed that observe no empty slot, as a mask of all

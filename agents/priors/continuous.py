@@ -323,7 +323,7 @@ class SceneCode:
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior("dimsum_table")
     >>> code = SceneCode(prior.scene_type, "quaternion", prior.normalizer)
-    >>> code.features, code.normalizer.is_constant[code.rotation_slice].tolist()  # (w, x, y, z): things turn about z
+    >>> code.features, code.normalizer.is_constant[code.rotation_slice].tolist()  # (w, x, y, z): objects turn about z
     (15, [False, True, True, False])
     """
 

@@ -92,7 +92,7 @@ def count_parameters(name: str | os.PathLike[str]) -> int:
 
 
 def read_prior(name: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Configuration and weights of a prior, floats in float32 whatever the file holds.
+    """Configuration and weights of a prior, floats in float32 for every number format of the file.
 
     Raises:
         UnknownNameError: no shipped prior has that name (the nearest one is offered).

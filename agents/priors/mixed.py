@@ -264,8 +264,7 @@ class MixedPrior(ScenePrior):
     def observed_entries(self, x: Tensor, observed: Observed | None = None) -> Observed | None:
         """Observed entries of scenes ``x`` (B, N, D) for the network: ``observed``, or else the fixed objects.
 
-        A prior trained with observed entries was always told of its fixed objects. A prior trained without them is not
-        told of any.
+        In training with observed entries, fixed objects are always observed; without them, nothing is.
         """
         if observed is not None or self.config.observed_share <= 0:
             return observed
@@ -298,7 +297,7 @@ class MixedPrior(ScenePrior):
 
     @staticmethod
     def with_states(pose: Tensor, probs: Tensor, noise: Tensor) -> Tensor:
-        """``pose`` (B, N, 12) beside states drawn from ``probs`` (B, N, K + 1) by ``noise`` (B, N, D)."""
+        """``pose`` (B, N, 12) with states drawn from ``probs`` (B, N, K + 1) by ``noise`` (B, N, D)."""
         random = torch.ones(pose.shape[1], dtype=torch.bool, device=pose.device)
         return MixedStep(pose, torch.zeros_like(pose[0]), probs, random).from_noise(noise)
 
@@ -545,7 +544,7 @@ class MixedPrior(ScenePrior):
         """Random observed entries: slots (completion), all categories (rearrangement), or any attribute of any slot.
 
         In ``open_empty_share`` of the completions, only objects are observed and all empty slots are open. A search
-        masks slots because they are empty. Under random masks alone, many open slots beside many observed objects are
+        masks slots because they are empty. Under random masks alone, many open slots with many observed objects are
         a sign of a full scene.
         """
         batch, slots = x0.shape[:2]

@@ -343,7 +343,7 @@ class ScenePrior(nn.Module, ABC):
     def with_open_empty(self: Prior, share: float) -> Prior:
         """This prior; in its training, ``share`` of the masks of whole slots include every empty slot.
 
-        A prior that is not told of observed entries has no such masks and is not changed.
+        A prior whose network reads no observed entries has no such masks and is not changed.
         """
         return self
 
