@@ -26,7 +26,7 @@ from torch import Tensor
 from agents.diffusion.reverse_steps import gaussian_log_prob
 from agents.post_training import DDPOSFLoss, DenoisingPolicy
 from agents.post_training.policy import gradient_weights
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 
 MEBIBYTE = 2**20

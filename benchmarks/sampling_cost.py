@@ -27,7 +27,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from agents.pretraining import PretrainConfig
 from agents.pretraining.initial_prior import build_prior
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from scene_envs.grammars import get_grammar
 from scene_envs.normalizer import Normalizer
 

@@ -48,7 +48,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from agents import ScenePrior
-from agents.priors.forward import NoisedScenes
+from agents.priors.prior import NoisedScenes
 from rewards import RewardOutput, evaluate_reward, make_reward
 from scene_envs import SceneBatch
 from scene_envs.grammars import get_grammar

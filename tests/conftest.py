@@ -113,9 +113,9 @@ def blank_curves(monkeypatch: pytest.MonkeyPatch) -> None:
 def few_residual_levels() -> Iterator[None]:
     """After pretraining, the error of the denoiser is measured at 3 timesteps and not at 40, as long as a small run."""
     from agents.priors.continuous import ContinuousPrior
-    from agents.priors.mixed_training import TrainableMixedPrior
+    from agents.priors.mixed import MixedPrior
 
     with pytest.MonkeyPatch.context() as patch:
-        for kind in (ContinuousPrior, TrainableMixedPrior):
+        for kind in (ContinuousPrior, MixedPrior):
             patch.setattr(kind, "fit_residual", partialmethod(kind.fit_residual, levels=3))
         yield

@@ -17,32 +17,18 @@ Moments = tuple[Tensor, Tensor]
 
 PREDICTIONS = ("edm", "epsilon", "x0", "v")
 """Targets that a network may predict; see :meth:`GaussianProcess.x0_from_output`."""
-_FORMER = {"karras": "edm"}
-"""Former names of predictions, and the present ones."""
 
 
 def check_prediction(name: str) -> None:
     """Raise when ``name`` is not a prediction.
 
     Raises:
-        InvalidInputError: the prediction has another name now; the message gives it.
         UnknownNameError: there is no such prediction.
 
     >>> check_prediction("edm")
     """
-    if name in _FORMER:
-        raise InvalidInputError(f"prediction={name!r} has another name now: prediction={_FORMER[name]!r}")
     if name not in PREDICTIONS:
         raise unknown_name("prediction", name, PREDICTIONS)
-
-
-def current_prediction(name: str) -> str:
-    """The name of a prediction that a file, perhaps of an earlier version, calls ``name``.
-
-    >>> current_prediction("karras"), current_prediction("v")
-    ('edm', 'v')
-    """
-    return _FORMER.get(name, name)
 
 
 class GaussianProcess:

@@ -30,7 +30,7 @@ FLOOR_PREFIX = "floor_"
 
 
 class Sampler(Protocol):
-    """Protocol of the priors that :func:`evaluate` takes, such as ``agents.priors.base.ScenePrior``."""
+    """Protocol of the priors that :func:`evaluate` takes, such as ``agents.priors.prior.ScenePrior``."""
 
     @property
     def scene_type(self) -> SceneType: ...

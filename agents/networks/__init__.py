@@ -1,12 +1,25 @@
 """Denoiser networks."""
 
-from agents.networks.diffuscene import DiffuScene, DiffuSceneConfig, MixedDiffuScene, MixedDiffuSceneConfig
-from agents.networks.flux import FluxConfig, FluxDenoiser
-from agents.networks.midiffusion import MiDiffusion, MiDiffusionConfig, MixedMiDiffusion, MixedMiDiffusionConfig
-from agents.networks.mixed_flux import MixedFlux
-from agents.networks.mixed_flux_config import MixedFluxConfig
-from agents.networks.parameters import match_parameters, parameter_count
-from agents.networks.registry import NETWORKS, build_network, list_networks, network_config, register_network
+from agents.networks.baselines import (
+    DiffuScene,
+    DiffuSceneConfig,
+    MiDiffusion,
+    MiDiffusionConfig,
+    MixedDiffuScene,
+    MixedDiffuSceneConfig,
+    MixedMiDiffusion,
+    MixedMiDiffusionConfig,
+)
+from agents.networks.flux import FluxConfig, FluxDenoiser, MixedFlux, MixedFluxConfig
+from agents.networks.registry import (
+    NETWORKS,
+    build_network,
+    list_networks,
+    match_parameters,
+    network_config,
+    parameter_count,
+    register_network,
+)
 from agents.networks.text import TextConfig, TextEncoder
 
 __all__ = [

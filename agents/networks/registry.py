@@ -1,23 +1,36 @@
-"""Registry of networks: their sizes, how they are built, and how a size is written to a file."""
+"""Registry of networks: their sizes, how they are built, parameter counts, and how a size is written to a file."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
+from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass, replace
+from functools import lru_cache
 from typing import Any
 
+import torch
 from torch import nn
 
 from agents.configuration.checks import check_types
-from agents.networks.diffuscene import DiffuScene, DiffuSceneConfig, MixedDiffuScene, MixedDiffuSceneConfig
-from agents.networks.flux import FluxConfig, FluxDenoiser
-from agents.networks.flux_modules import ModuleConfig
-from agents.networks.fourier_features import FourierFeaturesConfig
-from agents.networks.midiffusion import MiDiffusion, MiDiffusionConfig, MixedMiDiffusion, MixedMiDiffusionConfig
-from agents.networks.mixed_flux import MixedFlux
-from agents.networks.mixed_flux_config import MODULES, MixedFluxConfig, make_module, module_states
-from agents.networks.mixed_flux_files import current_fields
-from agents.networks.observed_flags import ObservedFlagsConfig
+from agents.networks.baselines import (
+    DiffuScene,
+    DiffuSceneConfig,
+    MiDiffusion,
+    MiDiffusionConfig,
+    MixedDiffuScene,
+    MixedDiffuSceneConfig,
+    MixedMiDiffusion,
+    MixedMiDiffusionConfig,
+)
+from agents.networks.flux import (
+    MODULES,
+    FluxConfig,
+    FluxDenoiser,
+    MixedFlux,
+    MixedFluxConfig,
+    make_module,
+    module_states,
+)
+from agents.networks.flux_modules import FourierFeaturesConfig, ModuleConfig, ObservedFlagsConfig
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.plugins import load_plugins
 
@@ -54,14 +67,9 @@ _ENTRIES: dict[tuple[str, str], _Entry] = {}
 
 
 def register_network(
-    name: str,
-    process: str,
-    config: type[Any],
-    network: Callable[[Any], nn.Module],
-    *,
-    ratio: str | None = None,
+    name: str, process: str, config: type[Any], network: Callable[[Any], nn.Module], *, ratio: str | None = None,
     sizes: Callable[[Mapping[str, Any]], dict[str, Any]] | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Make a network known as ``network=NAME`` to training, files and comparisons.
 
     A mixed network has the ``forward`` of :class:`~agents.networks.MixedFlux`, a continuous one that of
@@ -71,13 +79,13 @@ def register_network(
     ``scene_envs.networks``.
 
     Args:
-        name: of the network.
+        name: name of the network.
         process: ``"continuous"`` or ``"mixed"``.
         config: class of its configuration: a frozen dataclass of JSON values with ``categories`` (mixed) or
             ``features`` (continuous), and ``text_width`` where it reads text.
-        network: from such a configuration to a module, which keeps it as ``config``.
+        network: function from such a configuration to a module, which keeps it as ``config``.
         ratio: the field besides ``hidden`` that :func:`match_parameters` adjusts.
-        sizes: from the keys of :func:`network_config` to fields of ``config``; None takes the keys that are fields.
+        sizes: function from the keys of :func:`network_config` to fields of ``config``; None takes the same keys.
 
     Raises:
         UnknownNameError: no process has that name.
@@ -118,29 +126,17 @@ def build_network(config: NetworkConfig) -> nn.Module:
 
 
 def network_config(
-    name: str,
-    process: str,
-    *,
-    features: int,
-    categories: int,
-    hidden: int,
-    depth: int,
-    heads: int,
-    text_width: int = 0,
-    frequencies: int = 8,
-    double_blocks: int | None = None,
-    embedding: int | None = None,
-    pose_head: int = 64,
-    time_scale: float = 1.0,
-    text_reach: str = "all",
+    name: str, process: str, *, features: int, categories: int, hidden: int, depth: int, heads: int,
+    text_width: int = 0, frequencies: int = 8, double_blocks: int | None = None, embedding: int | None = None,
+    pose_head: int = 64, time_scale: float = 1.0, text_reach: str = "all",
     modules: Sequence[ModuleConfig | Mapping[str, Any]] | None = None,
     unit: tuple[float, float, float] = (1.0, 1.0, 1.0),
     rotations: tuple[tuple[float, ...], tuple[float, ...]] = ((1.0,) * 9, (0.0,) * 9),
-) -> NetworkConfig:
+) -> NetworkConfig:  # fmt: skip
     """The size of a network from the keys that all networks share.
 
     Args:
-        name: of a network, see :func:`list_networks`.
+        name: name of a network, see :func:`list_networks`.
         process: ``"continuous"`` or ``"mixed"``.
         features: D, numbers per slot; read by continuous networks.
         categories: K = C + 1; read by mixed networks.
@@ -151,12 +147,12 @@ def network_config(
         text_width: width of the text tokens; 0 for none. The continuous ``flux`` reads none.
         frequencies: octaves of Fourier features, read by ``flux`` alone. The other networks have none, as
             published, unless their configuration is made by hand.
-        double_blocks: read by the mixed ``flux`` alone; None for a third of ``depth``.
-        embedding: read by the mixed ``flux`` alone; None for ``hidden``.
+        double_blocks: number of double-stream blocks of the mixed ``flux``; None for a third of ``depth``.
+        embedding: width of the slots of the mixed ``flux``; None for ``hidden``.
         pose_head, time_scale, text_reach, unit, rotations: read by the mixed ``flux`` alone, see
             :class:`~agents.networks.MixedFluxConfig`.
         modules: modules of the mixed ``flux``, without the Fourier features, which ``frequencies`` adds. All are put
-            in the order of :data:`~agents.networks.mixed_flux_config.MODULES`. None for the flags of inpainting alone.
+            in the order of :data:`~agents.networks.flux.MODULES`. None for the flags of inpainting alone.
 
     Raises:
         UnknownNameError: no network or no process has that name.
@@ -183,17 +179,15 @@ def config_state(config: NetworkConfig) -> dict[str, Any]:
 
 
 def config_from_state(state: Mapping[str, Any], process: str) -> NetworkConfig:
-    """Inverse of :func:`config_state`; files without a ``kind`` hold ``flux`` networks.
+    """Inverse of :func:`config_state`.
 
     Raises:
         UnknownNameError: no network or no process has that name.
         InvalidInputError: fields are missing or not known; the message names them.
     """
-    name = state.get("kind", "flux")
+    name = state.get("kind", "")
     kind = _entry(name, process).config
     values = {key: value for key, value in state.items() if key != "kind"}
-    if kind is MixedFluxConfig:
-        values = current_fields(values)
     strange = sorted(values.keys() - {field.name for field in fields(kind)})
     missing = sorted(
         field.name
@@ -277,3 +271,89 @@ for _arguments in (
     ("diffuscene", "mixed", MixedDiffuSceneConfig, MixedDiffuScene, "inner_ratio", _diffuscene("categories")),
 ):
     register_network(*_arguments[:4], ratio=_arguments[4], sizes=_arguments[5])
+
+
+_RATIO_STEPS, _RATIO_STEP = 24, 1 / 64
+
+
+@lru_cache(maxsize=1024)
+def parameter_count(config: NetworkConfig) -> int:
+    """Number of parameters of a network; leaves the random state unchanged.
+
+    >>> from agents.networks.flux import FluxConfig
+    >>> parameter_count(FluxConfig(features=20, hidden=96, depth=3, heads=4))
+    466916
+    """
+    with torch.random.fork_rng(devices=[]):
+        return sum(parameter.numel() for parameter in build_network(config).parameters())
+
+
+def match_parameters(name: str, process: str, target: int, **sizes: Any) -> NetworkConfig:
+    """The size at which a network has nearly ``target`` parameters, for comparisons at equal parameters.
+
+    The width ``hidden`` is chosen first, as a multiple of ``heads``. Then the width inside the blocks (the MLPs of the
+    transformers, the residual blocks of ``diffuscene``) is changed by at most 3/8. The least change that brings the
+    count within 1 % of ``target`` is taken, or else the change that brings it nearest.
+
+    Args:
+        name: name of a network.
+        process: ``"continuous"`` or ``"mixed"``.
+        target: parameters, as :func:`parameter_count` counts them.
+        sizes: the keys of :func:`network_config` except ``hidden``.
+
+    Raises:
+        InvalidInputError: the narrowest such network has more parameters than ``target``.
+
+    >>> ours = network_config("flux", "mixed", features=20, categories=8, hidden=96, depth=4, heads=4)
+    >>> keys = {"features": 20, "categories": 8, "depth": 4, "heads": 4}
+    >>> theirs = match_parameters("diffuscene", "mixed", parameter_count(ours), **keys)
+    >>> abs(parameter_count(theirs) / parameter_count(ours) - 1) < 0.03
+    True
+    """
+    ratio_field = ratio_name(name, process)
+
+    def at_width(units: int) -> NetworkConfig:
+        return network_config(name, process, hidden=units * sizes["heads"], **sizes)
+
+    def at_ratio(config: NetworkConfig, step: int) -> NetworkConfig:
+        if ratio_field is None:
+            return config
+        ratio = getattr(config, ratio_field) * (1 + step * _RATIO_STEP)
+        return replace(config, **{ratio_field: ratio})
+
+    smallest = parameter_count(at_width(1))
+    if target < smallest:
+        raise InvalidInputError(
+            f"target={target}: a {process} {name} network of this depth and these heads has at least {smallest} "
+            "parameters; ask for more, or lower depth"
+        )
+    highest = 1
+    while parameter_count(at_width(highest)) < target:
+        highest *= 2
+    width = _last(1, highest, lambda units: parameter_count(at_width(units)) <= target)
+    candidates: list[tuple[NetworkConfig, int]] = []
+    for units in (width, width + 1):
+        step = _last(
+            -_RATIO_STEPS,
+            _RATIO_STEPS - 1,
+            lambda step, units=units: parameter_count(at_ratio(at_width(units), step)) <= target,  # type: ignore[misc]
+        )
+        candidates += [(at_ratio(at_width(units), near), abs(near)) for near in (step, step + 1, 0)]
+
+    def distance(candidate: tuple[NetworkConfig, int]) -> tuple[float, int]:
+        """Sort key: relative error of the count, where errors below 1 % count as 1 %, then change of the ratio."""
+        config, departure = candidate
+        return max(abs(parameter_count(config) / target - 1.0), 0.01), departure
+
+    return min(candidates, key=distance)[0]
+
+
+def _last(low: int, high: int, holds: Callable[[int], bool]) -> int:
+    """The largest number from ``low`` to ``high`` for which ``holds`` is true; ``low`` when it is true for none.
+
+    Once ``holds`` is false for a number, it must be false for all larger ones.
+    """
+    while low < high:
+        middle = (low + high + 1) // 2
+        low, high = (middle, high) if holds(middle) else (low, middle - 1)
+    return low

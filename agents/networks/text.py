@@ -66,7 +66,7 @@ class TextConfig:
 
     Attributes:
         words: the vocabulary, sorted; tokens are its indices after three special ones.
-        width: of the tokens.
+        width: width of the tokens.
         depth: transformer layers.
         heads: attention heads.
         max_tokens: longest prompt, its start token included.
@@ -125,14 +125,9 @@ class TextEncoder(nn.Module):
             nn.Conv1d(config.width, config.width, config.window, padding="same") if config.window > 1 else None
         )
         layer = nn.TransformerEncoderLayer(
-            config.width,
-            config.heads,
-            4 * config.width,
-            dropout=0.0,
-            activation="gelu",
-            batch_first=True,
+            config.width, config.heads, 4 * config.width, dropout=0.0, activation="gelu", batch_first=True,
             norm_first=True,
-        )
+        )  # fmt: skip
         self.layers = nn.TransformerEncoder(layer, config.depth, enable_nested_tensor=False)
         self.norm = nn.LayerNorm(config.width)
         questions = config.count_tokens + config.latents

@@ -1,12 +1,329 @@
-"""Choice of the text encoder of a mixed prior: by configuration, by the entry of a file, by the key of a run."""
+"""Text encoders of mixed priors: BERT, and the choice between it and the small encoder of :mod:`agents.networks.text`.
+
+The paper conditions its Flux model on BERT-base (Devlin et al. 2019; Pfaff et al., CoRL 2025). Here a prior is
+conditioned on the last hidden states of BERT's tokens. BERT is frozen, read from a folder or the local cache of the
+Hugging Face hub, loaded once, identified by a digest, and not part of the prior's file. The package ``transformers`` is
+imported when a prompt is first read, never before.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import hashlib
+import logging
+import os
+import re
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
-from agents.networks.bert import BertEncoder, BertTextConfig
-from agents.networks.text import TextConfig, TextEncoder, vocabulary
+import torch
+from safetensors import SafetensorError
+from torch import Tensor, nn
+
+from agents.networks.text import PADDING, TextConfig, TextEncoder, split_words, vocabulary, warn_unknown
+from scene_envs.errors import InvalidInputError, MissingDependencyError
+
+_LOGGER = logging.getLogger(__name__)
+
+BERT_BASE = "google-bert/bert-base-uncased"
+"""Name of BERT-base on the Hugging Face hub."""
+FOLDER_VARIABLE = "SCENE_ENVS_BERT"
+"""Environment variable that names the folder of the BERT model, for priors trained with it elsewhere."""
+_HUB_NAME = re.compile(r"[\w.-]+(/[\w.-]+)?")
+
+
+@dataclass(frozen=True, eq=False)
+class Bert:
+    """A loaded model.
+
+    Attributes:
+        model: ``transformers.BertModel``, frozen.
+        tokenizer: its tokenizer.
+        digest: SHA-256 of weights and vocabulary.
+    """
+
+    model: Any
+    tokenizer: Any
+    digest: str
+
+
+@lru_cache(maxsize=4)
+def load_bert(model: str, device: str = "cpu") -> Bert:
+    """The frozen model at ``model``, loaded once per process and device; only local files are read.
+
+    Args:
+        model: folder, or name on the hub of a model in the local cache.
+        device: torch device.
+
+    Raises:
+        MissingDependencyError: ``transformers`` is not installed.
+        InvalidInputError: no such model at hand, or not a BERT.
+    """
+    kinds = _transformers()
+    try:
+        with _quiet(kinds):
+            kind = kinds.AutoConfig.from_pretrained(model, local_files_only=True).model_type
+            if kind != "bert":
+                raise InvalidInputError(f"the text encoder {model!r} is a {kind!r} model, not a BERT")
+            tokenizer = kinds.AutoTokenizer.from_pretrained(model, local_files_only=True)
+            network, report = kinds.BertModel.from_pretrained(
+                model, local_files_only=True, add_pooling_layer=False, output_loading_info=True
+            )
+    except InvalidInputError:
+        raise
+    except (OSError, ValueError, KeyError, RuntimeError, SafetensorError) as error:
+        raise InvalidInputError(_not_at_hand(model, error)) from error
+    if tokenizer.pad_token_id != PADDING:
+        raise InvalidInputError(f"the vocabulary of {model!r} does not begin with its padding token, as BERT's do")
+    if report["missing_keys"]:
+        missing = ", ".join(sorted(report["missing_keys"])[:4])
+        raise InvalidInputError(f"the BERT at {model!r} lacks weights: {missing}; fetch the model again")
+    network = network.float().eval().requires_grad_(False)
+    return Bert(network.to(device), tokenizer, _digest(network, tokenizer))
+
+
+@contextmanager
+def _quiet(kinds: Any) -> Iterator[None]:
+    """Silence the library's reports and progress bars; :func:`load_bert` reports errors itself."""
+    library, verbosity = kinds.utils.logging, kinds.utils.logging.get_verbosity()
+    bars = library.is_progress_bar_enabled()
+    library.set_verbosity_error()
+    library.disable_progress_bar()
+    try:
+        yield
+    finally:
+        library.set_verbosity(verbosity)
+        if bars:
+            library.enable_progress_bar()
+
+
+def _transformers() -> Any:
+    try:
+        import transformers
+    except ImportError as error:
+        raise MissingDependencyError(
+            "prompts of this prior are read by BERT, which needs the package transformers: pip install "
+            "'scene-envs[bert]'; without it, sample without a prompt"
+        ) from error
+    return transformers
+
+
+def download_bert(model: str) -> None:
+    """Fetch a hub model into the local cache, unless it is there or ``model`` is a folder."""
+    _transformers()
+    from huggingface_hub import snapshot_download
+
+    if os.path.isdir(model):
+        return
+    try:
+        snapshot_download(model, allow_patterns=["*.json", "vocab.txt", "model.safetensors"])
+    except Exception as error:
+        _LOGGER.info("%s could not be downloaded (%s); the local cache is looked into", model, _first_line(error))
+
+
+def _not_at_hand(model: str, error: Exception) -> str:
+    if os.path.isdir(model):
+        return (
+            f"the folder {model!r} holds no BERT that transformers can read ({_first_line(error)}); it needs "
+            "config.json, the tokenizer's files and model.safetensors, as save_pretrained writes them"
+        )
+    return (
+        f"the BERT model {model!r} is neither a folder nor in the local cache of the Hugging Face hub; fetch it with "
+        f"'hf download {model if _HUB_NAME.fullmatch(model) else BERT_BASE}', or name a folder that holds one, as text "
+        f"encoder or in {FOLDER_VARIABLE}"
+    )
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0].strip().rstrip(".")
+
+
+def _digest(model: nn.Module, tokenizer: Any) -> str:
+    """SHA-256 of the weights (float32, by name) and of the vocabulary."""
+    digest = hashlib.sha256()
+    for name, weight in sorted(model.named_parameters()):
+        digest.update(f"{name} {tuple(weight.shape)}\n".encode())
+        digest.update(weight.detach().cpu().contiguous().numpy().tobytes())
+    for word, index in sorted(tokenizer.get_vocab().items()):
+        digest.update(f"{word}\t{index}\n".encode())
+    return digest.hexdigest()
+
+
+Row = tuple[int, ...]
+"""The tokens of one prompt, without padding."""
+CACHED_PROMPTS = 4096
+"""Number of latest prompts whose hidden states are cached."""
+_TOGETHER = 64
+"""Prompts encoded together on an accelerator; on CPU each is encoded alone, so that no result depends on others."""
+
+
+@dataclass(frozen=True)
+class BertTextConfig:
+    """Which BERT a prior reads prompts with.
+
+    Attributes:
+        model: folder with the model, or its name on the Hugging Face hub.
+        width: width of its tokens, 768 for BERT-base.
+        digest: SHA-256 of its weights and vocabulary; another model is refused.
+        size: size of its vocabulary.
+        nothing: its tokens of ``""``, start and end.
+        max_tokens: longest prompt in its tokens, start and end included.
+        kind: ``"bert"``, which tells the entry of a configuration file from that of another encoder.
+    """
+
+    model: str
+    width: int
+    digest: str
+    size: int = 30522
+    nothing: tuple[int, ...] = (101, 102)
+    max_tokens: int = 512
+    kind: str = "bert"
+
+    @classmethod
+    def from_model(cls, model: str | os.PathLike[str], *, download: bool = False) -> BertTextConfig:
+        """The config of a model at hand.
+
+        Args:
+            model: folder with the model, or its name on the hub, which is looked for in the local cache.
+            download: whether a hub model that is not in the cache is downloaded.
+
+        Raises:
+            MissingDependencyError: ``transformers`` is not installed.
+            InvalidInputError: no such model at hand, or not a BERT.
+        """
+        name = os.path.abspath(model) if Path(model).is_dir() else str(model)
+        if download:
+            download_bert(name)
+        bert = load_bert(name)
+        nothing = tuple(bert.tokenizer("")["input_ids"])
+        settings = bert.model.config
+        return cls(
+            name, settings.hidden_size, bert.digest, settings.vocab_size, nothing, settings.max_position_embeddings
+        )
+
+
+class BertEncoder(nn.Module):
+    """Prompts to the last hidden states (B, L, W) of a frozen BERT.
+
+    Its only own tensor is ``nothing`` (2, W), the hidden states of the empty prompt ``""``. A prior's file holds this
+    tensor and not BERT, so that the prior can be sampled without prompts where BERT is not at hand. Copies of a prior
+    share one BERT. The hidden states of the latest prompts are cached.
+
+    Args:
+        config: configuration that names the BERT.
+        cached: number of prompts whose hidden states are cached.
+    """
+
+    nothing: Tensor
+
+    def __init__(self, config: BertTextConfig, cached: int = CACHED_PROMPTS) -> None:
+        super().__init__()
+        self.config = config
+        self.cached = cached
+        self._states: OrderedDict[Row, Tensor] = OrderedDict()
+        self.register_buffer("nothing", torch.full((len(config.nothing), config.width), torch.nan))
+
+    @property
+    def token_space(self) -> tuple[int, int]:
+        """Largest number of tokens in a prompt, and number of different tokens."""
+        return self.config.max_tokens, self.config.size
+
+    def tokenize(self, prompts: Sequence[str]) -> tuple[Tensor, list[str]]:
+        """Token indices (B, L) int64, padded with 0 at the end, and the words for which BERT has no word pieces.
+
+        Raises:
+            MissingDependencyError: ``transformers`` is not installed.
+            InvalidInputError: BERT is not at hand or is another model, or a prompt is too long.
+        """
+        if not any(prompts):
+            return torch.tensor([self.config.nothing] * len(prompts)), []
+        tokenizer = self._bert().tokenizer
+        rows = tokenizer(list(prompts))["input_ids"]
+        for prompt, row in zip(prompts, rows, strict=True):
+            if len(row) > self.config.max_tokens:
+                raise InvalidInputError(
+                    f"the prompt {prompt[:60]!r}… has {len(row)} tokens; BERT reads at most {self.config.max_tokens}"
+                )
+        unknown = tokenizer.unk_token_id
+        words = dict.fromkeys(w for p, row in zip(prompts, rows, strict=True) if unknown in row for w in split_words(p))
+        strange = [word for word in words if unknown in tokenizer(word, add_special_tokens=False)["input_ids"]]
+        return nn.utils.rnn.pad_sequence([torch.tensor(row) for row in rows], batch_first=True), strange
+
+    def forward(self, prompts: Sequence[str]) -> tuple[Tensor, Tensor]:
+        """Tokens (B, L, W) and their mask (B, L), True for real ones; ``""`` stands for no prompt.
+
+        Raises:
+            MissingDependencyError, InvalidInputError: as :meth:`tokenize`.
+        """
+        indices, unknown = self.tokenize(prompts)
+        warn_unknown(unknown)
+        return self.encode(indices)
+
+    def encode(self, indices: Tensor) -> tuple[Tensor, Tensor]:
+        """Tokens and mask as of :meth:`forward`, from token indices (B, L) int64 as :meth:`tokenize` gives them."""
+        rows = [tuple(index for index in row if index != PADDING) for row in indices.tolist()]
+        states = self._remembered(list(dict.fromkeys(rows)))
+        padded = nn.utils.rnn.pad_sequence([states[row] for row in rows], batch_first=True)
+        lengths = torch.tensor([len(row) for row in rows], device=padded.device)
+        return padded, torch.arange(padded.shape[1], device=padded.device) < lengths[:, None]
+
+    def _remembered(self, rows: list[Row]) -> dict[Row, Tensor]:
+        """The hidden states (L, W) of each prompt; those that are not cached are computed, and cached."""
+        found = {row: self._states[row] for row in rows if row in self._states}
+        if self.config.nothing in rows:
+            self._know_nothing()
+            found[self.config.nothing] = self.nothing
+        missing = [row for row in rows if row not in found]
+        together = 1 if self.nothing.device.type == "cpu" else _TOGETHER
+        for start in range(0, len(missing), together):
+            some = missing[start : start + together]
+            found.update(zip(some, self._hidden_states(some), strict=True))
+        for row in rows:
+            self._states[row] = found[row]
+            self._states.move_to_end(row)
+        while len(self._states) > self.cached:
+            self._states.popitem(last=False)
+        return found
+
+    @torch.no_grad()
+    def _hidden_states(self, rows: list[Row]) -> list[Tensor]:
+        device = self.nothing.device
+        indices = nn.utils.rnn.pad_sequence([torch.tensor(row) for row in rows], batch_first=True).to(device)
+        with torch.autocast(device.type, enabled=False):
+            states = self._bert().model(indices, attention_mask=(indices != PADDING).long()).last_hidden_state
+        return [state[: len(row)].to(self.nothing.dtype) for state, row in zip(states, rows, strict=True)]
+
+    def _bert(self) -> Bert:
+        folder = os.environ.get(FOLDER_VARIABLE, "")
+        bert = load_bert(folder or self.config.model, str(self.nothing.device))
+        if bert.digest != self.config.digest:
+            raise InvalidInputError(
+                f"the model at {folder or self.config.model!r} is not the BERT that this prior was trained with: its "
+                f"digest is {bert.digest[:12]}…, not {self.config.digest[:12]}…; name the folder of the right one in "
+                f"{FOLDER_VARIABLE}"
+            )
+        return bert
+
+    def _know_nothing(self) -> None:
+        if bool(self.nothing.isnan().any()):
+            self.nothing.copy_(self._hidden_states([self.config.nothing])[0])
+
+    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
+        self._know_nothing()
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+
+    def _apply(self, fn: Any, recurse: bool = True) -> BertEncoder:
+        self._states.clear()  # the cached states are on the former device
+        super()._apply(fn, recurse)
+        return self
+
+
+# -- choice ---------------------------------------------------------------------------------------
+
 
 VOCABULARY = "vocabulary"
 """The key of the small encoder with a closed vocabulary, trained with the prior."""
@@ -41,10 +358,6 @@ def text_config(key: str, prompts: Iterable[str]) -> AnyTextConfig:
     return BertTextConfig.from_model(key, download=True)
 
 
-_PRESENT = {"asked": "count_tokens"}
-"""Names of fields in files of earlier versions, and the present ones."""
-
-
 def text_config_from_state(fields: Mapping[str, Any] | None) -> AnyTextConfig | None:
     """Inverse of :func:`dataclasses.asdict`, also after a trip through JSON; None stays None.
 
@@ -55,5 +368,4 @@ def text_config_from_state(fields: Mapping[str, Any] | None) -> AnyTextConfig | 
         return None
     if fields.get("kind") == "bert":
         return BertTextConfig(**{**fields, "nothing": tuple(fields["nothing"])})
-    present = {_PRESENT.get(name, name): value for name, value in fields.items()}
-    return TextConfig(**{**present, "words": tuple(fields["words"])})
+    return TextConfig(**{**fields, "words": tuple(fields["words"])})

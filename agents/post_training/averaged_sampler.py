@@ -7,7 +7,7 @@ from typing import Any
 
 from agents.post_training.base import Algorithm
 from agents.post_training.policy import DenoisingPolicy
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.utils.weight_average import WeightAverage
 
 

@@ -12,7 +12,7 @@ from torchrl.objectives import LossModule
 
 from agents.post_training.gradients import BatchGradient
 from agents.post_training.policy import DenoisingPolicy
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.utils.weight_average import WeightAverage
 
 

@@ -10,7 +10,7 @@ from agents.post_training.config import PostTrainConfig
 from agents.post_training.rollouts import stream_seed
 from agents.post_training.run_files import BASE_SAMPLES_NAME, writing
 from agents.post_training.scene_bank import PromptedScenes, SceneBank
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.utils.process_group import ProcessGroup
 from scene_envs.progress import Progress
 from scene_envs.scene import SceneBatch

@@ -16,7 +16,7 @@ from agents.post_training.hold_report import hold_sections
 from agents.post_training.report import Page, Picture, Section, Tile, write_report
 from agents.post_training.run_files import write_metrics
 from agents.post_training.trainer import PostTrainResult
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from rewards import PromptMatch, RewardContext, RewardOutput, evaluate_reward, reward_label
 from scene_envs.scene import SceneBatch
 

@@ -16,7 +16,7 @@ from agents.post_training.prompts import PromptDeck, prompts_beside
 from agents.post_training.rollouts import stream_seed
 from agents.post_training.run_files import CHECKPOINT_NAME, SCENES_NAME
 from agents.post_training.trainer import post_train
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.utils.checkpoints import load_checkpoint
 from agents.utils.process_group import ProcessGroup
 from rewards import reward_label

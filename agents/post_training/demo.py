@@ -17,7 +17,7 @@ from agents.post_training.comparison import Measured, draw_side_by_side, measure
 from agents.post_training.comparison_run import PHYSICS_TIMEOUT, SAMPLE_SEED
 from agents.post_training.report import Page, Picture, Section, Tile, write_report
 from agents.post_training.run_files import METRICS_NAME, write_metrics
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from rewards import reward_label
 from scene_envs.errors import TrainingError
 from scene_envs.files import read_sealed

@@ -9,8 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from agents.networks.text import Text
-from agents.priors.base import ScenePrior
-from agents.priors.forward import NoisedScenes
+from agents.priors.prior import NoisedScenes, ScenePrior
 
 
 @dataclass(frozen=True)

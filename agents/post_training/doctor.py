@@ -18,7 +18,7 @@ from agents.post_training.gradients import accumulate_policy_gradient, gradient_
 from agents.post_training.learner import Learner
 from agents.post_training.losses import DDPOSFLoss
 from agents.post_training.trainer import PostTrainer
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

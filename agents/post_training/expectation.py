@@ -9,8 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from agents.networks.text import Text
-from agents.priors.base import ScenePrior
-from agents.priors.forward import NoisedScenes
+from agents.priors.prior import NoisedScenes, ScenePrior
 from agents.utils.process_group import ProcessGroup
 
 

@@ -7,7 +7,7 @@ from torch.nn import functional as F
 
 from agents.post_training.expectation import Expectation
 from agents.post_training.forward_process_loss import ForwardProcessLoss
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from scene_envs.errors import InvalidInputError
 
 

@@ -18,7 +18,7 @@ from agents.post_training.forward_process_loss import ForwardProcessLoss
 from agents.post_training.gradients import BatchGradient
 from agents.post_training.own_samples import OwnSampleAlgorithm
 from agents.post_training.policy import DenoisingPolicy
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 
 
 class ForwardAdvantage(Advantage):

@@ -18,8 +18,7 @@ from torch import Generator, Tensor
 from agents.networks.text import Text
 from agents.post_training.expectation import Expectation
 from agents.post_training.own_sample_loss import OwnSampleLoss
-from agents.priors.base import ScenePrior
-from agents.priors.forward import NoisedScenes
+from agents.priors.prior import NoisedScenes, ScenePrior
 from scene_envs.errors import InvalidInputError
 
 

@@ -11,8 +11,7 @@ from torch import Generator, Tensor, nn
 
 from agents.networks.text import Text
 from agents.post_training.losses import DDPOSFLoss
-from agents.priors.base import ScenePrior
-from agents.priors.forward import NoisedScenes
+from agents.priors.prior import NoisedScenes, ScenePrior
 from agents.utils.process_group import ProcessGroup
 
 SceneLoss = Callable[[NoisedScenes, Text | None], Tensor]

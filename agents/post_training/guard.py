@@ -12,7 +12,7 @@ from torch import Generator, Tensor
 
 from agents.post_training.gradients import prompted_loss
 from agents.post_training.sample_check import SampleCheck, beyond
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.utils.process_group import ProcessGroup
 from scene_envs.scene import SceneBatch
 

@@ -16,10 +16,8 @@ from agents.post_training.gradients import BatchGradient, GradientSum
 from agents.post_training.own_sample_loss import PlainLoss
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import text_of
-from agents.priors.base import ScenePrior
-from agents.priors.forward import NoisedScenes
-from agents.priors.hooks import position_std
-from agents.priors.physics_guidance import PhysicsGuidance
+from agents.priors.guidance import PhysicsGuidance, position_std
+from agents.priors.prior import NoisedScenes, ScenePrior
 from agents.utils.process_group import ProcessGroup
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import POSE_FEATURES, TRANSLATION
@@ -111,7 +109,7 @@ class GuidanceDistillation(AveragedSampler):
     """On-policy distillation of physics guidance.
 
     The sampling policy, a slower copy of the prior, samples a batch of scenes without physics guidance. At random steps
-    of these chains, :class:`~agents.priors.physics_guidance.PhysicsGuidance` corrects the scenes that the copy
+    of these chains, :class:`~agents.priors.guidance.PhysicsGuidance` corrects the scenes that the copy
     denoises, and the prior is trained to denoise the same x_t to the corrected poses. The states come from the policy
     itself, as in DAgger (Ross et al. 2011), so the prior learns to correct its own errors. The gradient vanishes where
     the guidance has nothing to correct. Rotations are held at those that the copy denoises, and categories get no

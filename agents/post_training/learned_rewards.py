@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.rollouts import gathered_scenes, stream_seed
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.utils.process_group import ProcessGroup
 from rewards import learned_parts
 from scene_envs.scene import SceneBatch

@@ -23,8 +23,7 @@ from agents.post_training.regularisation import Regularisation
 from agents.post_training.rollouts import collect, stream_seed
 from agents.post_training.run_files import CHECKPOINT_NAME
 from agents.post_training.scene_bank import SceneBank
-from agents.priors.base import ScenePrior
-from agents.priors.prompt_validation import no_text
+from agents.priors.prior import ScenePrior, no_text
 from agents.utils.checkpoints import check_tensors
 from agents.utils.process_group import ProcessGroup
 from agents.utils.weight_average import AveragedWeights, WeightAverage

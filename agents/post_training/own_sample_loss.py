@@ -13,8 +13,7 @@ from torch import Generator, Tensor
 from torchrl.objectives import LossModule
 
 from agents.networks.text import Text
-from agents.priors.base import ScenePrior
-from agents.priors.forward import NoisedScenes
+from agents.priors.prior import NoisedScenes, ScenePrior
 
 
 class PlainLoss(LossModule):

@@ -13,8 +13,8 @@ from torch import Generator, Tensor
 from agents.diffusion import ReverseStep
 from agents.diffusion.reverse_steps import MixedStep, concatenate_steps
 from agents.networks.text import Text
-from agents.priors.base import ScenePrior
-from agents.priors.hooks import Hook
+from agents.priors.guidance import Hook
+from agents.priors.prior import ScenePrior
 from scene_envs.errors import InvalidInputError
 from scene_envs.protocols import PriorLike, PromptedPriorLike, StepTableLike
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Generator
 
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.envs.prompts import grammar_prompts
 from scene_envs.files import write_text

@@ -14,7 +14,7 @@ from agents.post_training.gradients import SceneLoss, add_regularisation_gradien
 from agents.post_training.hold import FAR, HIGHEST, HoldState, adjust, relative_error
 from agents.post_training.regularisation_settings import RegularisationSettings
 from agents.post_training.scene_bank import PromptedScenes
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 
 logger = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from torch import Generator, Tensor
 from agents.networks.text import Text
 from agents.post_training.advantages import at_all_steps, final_reward
 from agents.post_training.policy import DenoisingPolicy
-from agents.priors.hooks import Hook
+from agents.priors.guidance import Hook
 from agents.utils.process_group import ProcessGroup, gather_rows
 from agents.utils.seeds import derived_seed
 from scene_envs.envs import DenoisingTorchRLEnv

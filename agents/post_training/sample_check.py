@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.utils.process_group import ProcessGroup
 from agents.utils.seeds import derived_seed
 from scene_envs.envs.scoring import RewardScorer

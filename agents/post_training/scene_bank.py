@@ -13,8 +13,7 @@ from torch import Generator, Tensor
 from agents.post_training.config import RegularisationSettings
 from agents.post_training.prompts import PROMPTS_NAME, PromptSets, save_prompts
 from agents.post_training.run_files import SCENES_NAME, writing
-from agents.priors.base import ScenePrior
-from agents.priors.prompt_validation import asked_objects
+from agents.priors.prior import ScenePrior, asked_objects
 from agents.utils.process_group import ProcessGroup
 from scene_envs.errors import InvalidInputError
 from scene_envs.progress import Progress

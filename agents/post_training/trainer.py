@@ -32,8 +32,7 @@ from agents.post_training.run_files import (
     write_metrics,
 )
 from agents.post_training.scene_bank import SceneBank, kept_scenes
-from agents.priors.base import ScenePrior
-from agents.priors.prompt_validation import check_object_count
+from agents.priors.prior import ScenePrior, check_object_count
 from agents.utils.checkpoints import save_checkpoint
 from agents.utils.interrupts import finishing_steps
 from agents.utils.loggers import make_logger

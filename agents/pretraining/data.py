@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Generator, Tensor
 
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from scene_envs.datasets import SceneDataset, to_union
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.grammars import Grammar

@@ -12,22 +12,21 @@ from torch import Tensor
 from agents.diffusion import Preconditioning
 from agents.diffusion.moments import CategoryMoments
 from agents.networks import TextConfig
-from agents.networks.contacts import ContactsConfig
-from agents.networks.count_conditioning import CountConditioningConfig
-from agents.networks.count_embedding import CountEmbeddingConfig
-from agents.networks.flux_modules import ModuleConfig
-from agents.networks.observed_flags import ObservedFlagsConfig
-from agents.networks.pooled_text import PooledTextConfig
+from agents.networks.flux_modules import (
+    CountConditioningConfig,
+    CountEmbeddingConfig,
+    ModuleConfig,
+    ObservedFlagsConfig,
+    PooledTextConfig,
+)
+from agents.networks.geometry import ContactsConfig, RelationsConfig, RotationFeaturesConfig
 from agents.networks.registry import NetworkConfig, network_config
-from agents.networks.relations import RelationsConfig
-from agents.networks.rotation_features import RotationFeaturesConfig
 from agents.networks.text_encoders import VOCABULARY, AnyTextConfig, text_config
 from agents.pretraining.config import PretrainConfig
-from agents.priors.base import ScenePrior
 from agents.priors.config import PROCESSES, MixedPriorConfig, PriorConfig
-from agents.priors.continuous import ContinuousPrior
+from agents.priors.continuous import ContinuousPrior, SceneCode
 from agents.priors.mixed import MixedPrior
-from agents.priors.rotation_codes import SceneCode
+from agents.priors.prior import ScenePrior
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import POSE_FEATURES

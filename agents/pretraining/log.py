@@ -7,7 +7,7 @@ import io
 import logging
 from pathlib import Path
 
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.utils.loggers import RunLogger
 from scene_envs.errors import MissingDependencyError
 from scene_envs.files import write_text

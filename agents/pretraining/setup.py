@@ -12,8 +12,8 @@ from torch import Tensor
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.data import PROMPTS_PER_SCENE, GrammarStream, SceneTable, TrainingData, UnionTable
 from agents.pretraining.initial_prior import FITTED_ON, build_prior
-from agents.priors.base import ScenePrior
-from agents.priors.facts import PriorFacts
+from agents.priors.files import PriorFacts
+from agents.priors.prior import ScenePrior
 from scene_envs.datasets import SceneDataset, to_union
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.datasets.ranges import fixed_normalizer

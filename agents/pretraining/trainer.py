@@ -23,7 +23,7 @@ from agents.pretraining.log import TrainingLog, draw_samples
 from agents.pretraining.optimizers import build_optimizer, learning_rate_at
 from agents.pretraining.setup import prepare
 from agents.pretraining.text_warmup import warm_up_text
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.utils.checkpoints import check_tensors, load_checkpoint, save_checkpoint
 from agents.utils.interrupts import Ending, finishing_steps
 from agents.utils.loggers import make_logger

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 from torch import Tensor
 
 from agents.diffusion import Preconditioning
-from agents.priors.storage import StoredPrior, read_stored
+from agents.priors.files import StoredPrior, read_stored
 from scene_envs.errors import InvalidInputError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene_types import SceneType
@@ -22,7 +22,7 @@ AdapterSpec = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 
 
 class Adaptable(Protocol):
-    """Interface of a prior that adapters use; :class:`~agents.priors.base.ScenePrior` has it."""
+    """Interface of a prior that adapters use; :class:`~agents.priors.prior.ScenePrior` has it."""
 
     scene_type: SceneType
     process_name: str

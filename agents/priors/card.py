@@ -13,14 +13,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.configuration.prior_names import CONFIG_NAME
-from agents.priors.facts import PriorFacts
-from agents.priors.files import read_config, write_config
+from agents.priors.files import PriorFacts, read_config, write_config
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.files import read_sealed, write_text
 from scene_envs.folders import claimed
 
 if TYPE_CHECKING:
-    from agents.priors.base import ScenePrior
+    from agents.priors.prior import ScenePrior
 
 README = "README.md"
 _TITLE = "# Prior `"
@@ -31,17 +30,10 @@ _OPTIMIZERS = {"adamw": "AdamW", "muon": "Muon and AdamW"}
 
 
 def package_prior(
-    source: str | os.PathLike[str] | ScenePrior,
-    output: str | os.PathLike[str],
-    *,
-    evaluation: str | os.PathLike[str] | None = None,
-    precision: str = "float16",
-    data: str = "",
-    license: str = "",
-    machine: str = "",
-    limits: str = "",
-    physics_guidance: float | None = None,
-) -> Path:
+    source: str | os.PathLike[str] | ScenePrior, output: str | os.PathLike[str], *,
+    evaluation: str | os.PathLike[str] | None = None, precision: str = "float16", data: str = "", license: str = "",
+    machine: str = "", limits: str = "", physics_guidance: float | None = None,
+) -> Path:  # fmt: skip
     """Write a prior as a folder to publish: ``config.json``, ``model.safetensors`` and the model card ``README.md``.
 
     Args:
@@ -49,9 +41,9 @@ def package_prior(
         output: the folder; its name is the prior's. An earlier packaged prior in it is replaced.
         evaluation: ``metrics.json`` of ``scene-envs evaluate``, or the folder it is in; None for a prior that was not
             measured.
-        precision: of the weights, ``"float16"`` or ``"float32"``.
+        precision: number format of the weights, ``"float16"`` or ``"float32"``.
         data: the training data, in a sentence.
-        license: of the data; empty for that of this package, unless the prior was imported.
+        license: licence of the data; empty for that of this package, unless the prior was imported.
         machine: the hardware of the training, as in ``"one NVIDIA H200"``.
         limits: weaknesses of the prior, in sentences.
         physics_guidance: strength of physics guidance of samples of the package where a caller gives none; None keeps
@@ -62,7 +54,7 @@ def package_prior(
             half precision cannot hold, or a folder that holds anything but a packaged prior.
         CorruptFileError: the evaluation is not a JSON mapping, as the command writes it.
     """
-    from agents.priors.base import ScenePrior
+    from agents.priors.prior import ScenePrior
 
     _check_folder(Path(output))
 
@@ -77,12 +69,12 @@ def package_prior(
     config = prior.config
     if physics_guidance is not None:
         prior.with_physics_guidance(physics_guidance)
-    told = {"data": data, "license": license or _license(prior.card), "machine": machine, "limits": limits}
+    given = {"data": data, "license": license or _license(prior.card), "machine": machine, "limits": limits}
     kept = prior.card
     # the settings of a post-training run describe the post-training; the card has those of the pretraining
     steered = bool(kept.get("post_training"))
     trained = {} if isinstance(source, ScenePrior) or steered else _training_of(Path(source))
-    prior.card = {**kept, **trained, **{key: text for key, text in told.items() if text}}
+    prior.card = {**kept, **trained, **{key: text for key, text in given.items() if text}}
     if measures:
         prior.card["measures"] = measures
     try:
@@ -278,7 +270,7 @@ def _iterations(run: Mapping[str, Any]) -> str:
 
 
 def _training_of(source: Path) -> dict[str, Any]:
-    """Training settings of a run, from the ``config.yaml`` beside its prior."""
+    """Training settings of a run, from the ``config.yaml`` of its folder."""
     import yaml
 
     folder = source.parent if source.name == "prior" else source

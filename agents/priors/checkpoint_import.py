@@ -1,23 +1,26 @@
-"""Import of the mixed Flux checkpoints of the paper's authors (PyTorch Lightning)."""
+"""Import of the mixed Flux checkpoints of the paper's authors (PyTorch Lightning).
+
+Of a checkpoint, only tensors, numbers, strings and containers are read. Every other object in the file becomes an inert
+placeholder, so nothing in it is run.
+"""
 
 from __future__ import annotations
 
 import logging
 import os
+import pickle
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import torch
 from torch import Tensor
 
 from agents.diffusion import Preconditioning
-from agents.networks.bert import BertTextConfig
-from agents.networks.bert_files import BASE
-from agents.networks.mixed_flux_config import MixedFluxConfig
+from agents.networks.flux import MixedFluxConfig
+from agents.networks.text_encoders import BERT_BASE, BertTextConfig
 from agents.priors.config import MixedPriorConfig
-from agents.priors.lightning_files import read_lightning
 from agents.priors.mixed import MixedPrior
 from scene_envs.datasets import DatasetInfo, read_metadata
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
@@ -122,7 +125,7 @@ def bert_of(width: int, name: str, file: str | os.PathLike[str]) -> BertTextConf
     """The BERT that a checkpoint reads prompts with; None for a prior without prompts.
 
     Args:
-        width: of the checkpoint's text tokens; 0 for none.
+        width: width of the checkpoint's text tokens; 0 for none.
         name: folder or hub name; empty for BERT-base, if it can be loaded without a download.
         file: the checkpoint, for messages.
 
@@ -134,7 +137,7 @@ def bert_of(width: int, name: str, file: str | os.PathLike[str]) -> BertTextConf
             raise InvalidInputError(f"{str(file)!r} was trained without text; leave text_encoder={name!r} out")
         return None
     try:
-        config = BertTextConfig.from_model(name or BASE, download=bool(name))
+        config = BertTextConfig.from_model(name or BERT_BASE, download=bool(name))
         if config.width != width:
             raise InvalidInputError(
                 f"{str(file)!r} reads text tokens of width {width}, and those of {config.model!r} have {config.width}"
@@ -286,3 +289,80 @@ def _with_categories(normalizer: Normalizer, scene: SceneType) -> Normalizer:
     scale, offset = whole.scale.clone(), whole.min.clone()
     scale[:POSE_FEATURES], offset[:POSE_FEATURES] = normalizer.scale[:POSE_FEATURES], normalizer.min[:POSE_FEATURES]
     return Normalizer(scale, offset, whole.input_min, whole.input_max)
+
+
+# -- files of PyTorch Lightning -------------------------------------------------------------------
+
+
+def read_lightning(file: str | os.PathLike[str]) -> dict[str, Any]:
+    """The content of a Lightning checkpoint: tensors and plain data; everything else is a placeholder.
+
+    Raises:
+        InvalidInputError: no such file.
+        CorruptFileError: not a checkpoint, or without a ``state_dict``.
+    """
+    path = Path(file)
+    if not path.is_file():
+        raise InvalidInputError(f"no checkpoint at {str(file)!r}")
+    try:
+        try:
+            content = torch.load(path, map_location="cpu", weights_only=True)
+        except pickle.UnpicklingError:
+            content = torch.load(path, map_location="cpu", weights_only=False, pickle_module=_Inert)
+    except Exception as error:  # a damaged file may raise any error; torch's message would advise to run its code
+        raise CorruptFileError(
+            f"{str(file)!r} is truncated or not a checkpoint of PyTorch ({type(error).__name__})"
+        ) from error
+    if not isinstance(content, dict) or not isinstance(content.get("state_dict"), Mapping):
+        raise CorruptFileError(f"{str(file)!r} is not a Lightning checkpoint: it has no 'state_dict'")
+    return content
+
+
+class _Placeholder:
+    """Stands for an object that is not read; takes anything and does nothing."""
+
+    def __init__(self, *_: Any, **__: Any) -> None:
+        pass
+
+    def __setstate__(self, _: Any) -> None:
+        pass
+
+    def __call__(self, *_: Any, **__: Any) -> _Placeholder:
+        return self
+
+    def append(self, _: Any) -> None:
+        pass
+
+    def extend(self, _: Any) -> None:
+        pass
+
+    def __setitem__(self, _: Any, __: Any) -> None:
+        pass
+
+
+_ALLOWED = {
+    ("collections", "OrderedDict"),
+    ("torch._utils", "_rebuild_tensor_v2"),
+    ("torch._utils", "_rebuild_parameter"),
+    ("torch", "Size"),
+    ("torch", "device"),
+} | {
+    ("torch", f"{kind}Storage")
+    for kind in ("Float", "Double", "Half", "BFloat16", "Long", "Int", "Short", "Char", "Byte", "Bool")
+}
+
+
+class _Inert:
+    """A pickle module for ``torch.load`` that builds tensors and plain containers, and placeholders for the rest."""
+
+    class Unpickler(pickle.Unpickler):
+        """Finds no class but those of tensors."""
+
+        def find_class(self, module: str, name: str) -> Any:
+            """The class if it is harmless; else the placeholder."""
+            return super().find_class(module, name) if (module, name) in _ALLOWED else _Placeholder
+
+    @classmethod
+    def load(cls, file: IO[bytes], **options: Any) -> Any:
+        """Object that :class:`Unpickler` reads from ``file``; torch calls it for files older than the zip format."""
+        return cls.Unpickler(file, **options).load()

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
-from agents.diffusion.gaussian import current_prediction
 from agents.networks.registry import ContinuousNetworkConfig, MixedNetworkConfig, NetworkConfig
 from agents.networks.text_encoders import AnyTextConfig
 
@@ -45,7 +42,7 @@ class PoseDiffusionConfig:
         timesteps: distribution of training timesteps, ``"lognormal"`` (of the noise-to-signal ratio), ``"uniform"`` or
             ``"both"`` in equal parts; None is what was published with the prediction, lognormal for ``"edm"`` and
             uniform for the others.
-        loss_weighting: of the loss by timestep, ``"none"`` or ``"min_snr"``.
+        loss_weighting: weighting of the loss by timestep, ``"none"`` or ``"min_snr"``.
         noise_floor: lowest noise-to-signal ratio of the ``"karras"`` schedule, in normalised units.
         noise_ceiling: highest.
         clip: bound on denoised scenes while sampling, normalised units; 0 for none (1 is that of Ho et al. 2020).
@@ -72,7 +69,7 @@ class PriorConfig(PoseDiffusionConfig, DenoiserConfig):
 
     Attributes:
         network: kind and size of its denoiser, any configuration of a continuous network.
-        rotation: what is diffused as rotation, ``"matrix"``, ``"quaternion"`` or ``"axis_angle"``.
+        rotation: representation of the rotations, ``"matrix"``, ``"quaternion"`` or ``"axis_angle"``.
     """
 
     network: ContinuousNetworkConfig
@@ -86,10 +83,10 @@ class MixedPriorConfig(PoseDiffusionConfig, DenoiserConfig):
     Further fields are those of :class:`DenoiserConfig` and :class:`PoseDiffusionConfig`.
 
     Attributes:
-        timesteps: as of continuous priors, but for None.
-        kernel: of the categories, one of :data:`~agents.diffusion.CATEGORICAL_KERNELS`.
+        timesteps: distribution of training timesteps, one of those of continuous priors but not None.
+        kernel: kernel of the categories, one of :data:`~agents.diffusion.CATEGORICAL_KERNELS`.
         category_loss: ``"cross_entropy"`` of the clean category, or ``"bound"``, the paper's variational bound.
-        category_weight: weight of the category loss beside the pose loss.
+        category_weight: weight of the category loss, over that of the pose loss.
         auxiliary: weight of the cross-entropy in the bound.
         observed_share: share of training scenes in which some poses or categories are observed, for inpainting.
         open_empty_share: share of those in which whole slots are observed that observe no empty slot, as a mask of all
@@ -117,12 +114,3 @@ class MixedPriorConfig(PoseDiffusionConfig, DenoiserConfig):
     empty_slots: str = "attended"
     unmasking: str = "even"
     union: str = "one_type"
-
-
-def current_names(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a prior's configuration under their present names; a file of an earlier version may have others."""
-    renamed = {"given_share": "observed_share"}
-    return {
-        renamed.get(key, key): current_prediction(value) if key == "prediction" else value
-        for key, value in fields.items()
-    }

@@ -1,29 +1,341 @@
-"""Guidance of a reverse chain by the claims of prompts and by physics."""
+"""Guidance of a reverse chain: hooks that watch or change its steps, and guidance by physics and by numbers of objects.
+
+Guidance of poses by the claims of prompts is in :mod:`agents.priors.claim_guidance`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Protocol
 
+import torch
 from torch import Tensor
+from torch.nn import functional as F
 
+from agents.diffusion.reverse_steps import MixedStep, ReverseStep, state_of
 from agents.diffusion.step_tables import StepTable
-from agents.priors.claim_guidance import ClaimGuidance
-from agents.priors.hooks import Estimating, Guide, Hook, Watch, make_hook
-from agents.priors.number_guidance import NumberGuidance
-from agents.priors.physics_guidance import PhysicsGuidance
+from agents.priors.claim_guidance import ClaimGuidance, claims_of
+from scene_envs.datasets.prompts.claims import (
+    Claim,
+    NameCount,
+    ObjectCount,
+    PairCount,
+    PlaceCount,
+    Reference,
+    SideClaim,
+    SupportCount,
+)
 from scene_envs.envs.settings import check_physics_guidance
-from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import SceneType
+from scene_envs.normalizer import Normalizer
+from scene_envs.physics.correction import corrections
+from scene_envs.scene import POSE_FEATURES, TRANSLATION, SceneBatch
+from scene_envs.scene_types import SceneType, get_scene_type
+
+# -- hooks ----------------------------------------------------------------------------------------
+
+
+Hook = Callable[[int, Tensor, ReverseStep], ReverseStep]
+"""``(step, x_t, reverse) -> reverse``: called at every step before x_{t-1} is drawn; may change the rows of
+``reverse`` or shift it.
+"""
+Start = tuple[int, Tensor]
+"""A step of a chain, and x_t (B, N, D) at this step. The chain begins there instead of at x_T."""
+Guide = Callable[[int, int, Callable[[], SceneBatch], Tensor], Tensor | None]
+"""``(step, steps, denoised, std) -> shift``: moves the denoised translations by ``shift`` (B, N, 3), m.
+
+``denoised`` is as for :data:`Watch`; ``std`` (3,) is the standard deviation of the denoised translations, m. If the
+shift is None, the step is not changed.
+"""
+Draw = Callable[[Tensor, ReverseStep], ReverseStep]
+"""``(x_t, reverse) -> reverse``: changes how the categories of masked slots are drawn."""
+Watch = Callable[[int, int, Callable[[], SceneBatch]], Tensor | None]
+"""``(step, steps, denoised) -> rows``: called at the steps of the denoising; chooses the scenes that continue.
+
+``denoised()`` gives the B scenes that the network expects at this step. ``rows`` (B,) is the index of the scene that
+each place continues with, such as ``[0, 0, 2]``; if it is None, every scene continues in its own place.
+
+If a watch has a method ``start(steps)``, the chain begins at the :data:`Start` that the method returns, if any. If a
+watch has a method ``see(step, steps, x)``, the method is called with x_t (B, N, D) at every step.
+"""
+
+
+class Estimating(Protocol):
+    """A prior, as far as hooks need it."""
+
+    normalizer: Normalizer
+
+    def estimate(self, step: int, table: StepTable) -> tuple[float, Tensor]:
+        """Weight of the denoised translations in x_{t-1}, and their standard deviation (3,), normalised."""
+
+
+def make_hook(
+    prior: Estimating, table: StepTable, scenes: Callable[[Tensor], SceneBatch], moved: Tensor, *,
+    watch: Watch | None = None, guides: Sequence[Guide] = (), draw: Draw | None = None,
+) -> Hook | None:  # fmt: skip
+    """The hook of one chain; None if nothing watches or guides it.
+
+    Args:
+        prior: prior that denoises.
+        table: the chain.
+        scenes: the B scenes of normalised x_0 (B, N, D), as watch and guides see them.
+        moved: (B, N, 1) bool, slots whose poses guides may move.
+        watch, guides, draw: callables, in the order ``watch.see``, ``draw``, guides, ``watch``.
+    """
+    see = getattr(watch, "see", None)
+
+    def hook(step: int, x: Tensor, reverse: ReverseStep) -> ReverseStep:
+        estimate = reverse.denoised
+        if see is not None:
+            see(step, len(table), x)
+        if draw is not None:
+            reverse = draw(x, reverse)
+        if estimate is None:
+            return reverse
+
+        def denoised() -> SceneBatch:
+            return scenes(estimate)
+
+        if guides:
+            weight, std = prior.estimate(step, table)
+            scale = prior.normalizer.scale[TRANSLATION].to(std)
+            metres = _in_metres(std, scale)
+        for guide in guides:
+            shift = guide(step, len(table), denoised, metres)
+            if shift is not None:
+                reverse = reverse.shifted(weight * scale * shift.to(std) * moved.to(std))
+        rows = None if watch is None else watch(step, len(table), denoised)
+        return reverse if rows is None else reverse.take(rows.to(x.device))
+
+    return None if watch is None and draw is None and not guides else hook
+
+
+def position_std(prior: Estimating, step: int, table: StepTable) -> Tensor:
+    """(3,) standard deviation of the denoised positions at a step of a chain, m; 0 on axes without extent."""
+    _, std = prior.estimate(step, table)
+    return _in_metres(std, prior.normalizer.scale[TRANSLATION].to(std))
+
+
+def _in_metres(std: Tensor, scale: Tensor) -> Tensor:
+    """(3,) deviations in metres of normalised ones; 0 where ``scale`` (3,) is 0."""
+    return torch.where(scale == 0, torch.zeros_like(scale), std / scale)
+
+
+# -- physics --------------------------------------------------------------------------------------
+
+
+_FINE = 0.03
+"""Error (m) of horizontal positions below which objects are moved; above it, overlaps are not known yet."""
+
+
+class PhysicsGuidance:
+    """Moves the objects of each scene out of overlaps and onto supports, at the last steps of the denoising.
+
+    From the step on at which the horizontal error of the denoised positions is below 3 cm, objects that overlap in the
+    denoised scene come apart, and floating ones come down, by ``strength`` times the moves of
+    :func:`~scene_envs.physics.correction.corrections`. The following steps adapt the scene to the moves. At the last
+    step the moves change the sample itself.
+
+    Args:
+        strength: factor on the moves, 0 to 1.
+        movable: (B, N) bool, slots whose poses are denoised; None for all but the fixed ones.
+
+    >>> import torch
+    >>> guidance = PhysicsGuidance(1.0)
+    >>> guidance(49, 50, lambda: SceneBatch.empty("dimsum_table", 1), torch.full((3,), 0.001)).abs().max()
+    tensor(0.)
+    """
+
+    def __init__(self, strength: float, movable: Tensor | None = None) -> None:
+        self.strength = strength
+        self._movable = None if movable is None else movable.cpu().numpy()
+
+    def __call__(self, step: int, steps: int, denoised: Callable[[], SceneBatch], std: Tensor) -> Tensor | None:
+        """(B, N, 3) m, how far the denoised positions move; None at steps at which nothing moves.
+
+        Args:
+            step, steps: not used.
+            denoised: function that gives the B scenes that the network expects.
+            std: (3,) standard deviation of their positions along the axes of the world, m.
+        """
+        if not self.acts(std):
+            return None
+        error = std.cpu().double().numpy()
+        return (self.strength * corrections(denoised().to("cpu"), error, self._movable)).to(std.device)
+
+    @staticmethod
+    def acts(std: Tensor) -> bool:
+        """Whether objects are moved at steps whose denoised positions have the standard deviation ``std`` (3,), m."""
+        return float(std[:2].max()) <= _FINE
+
+
+# -- numbers --------------------------------------------------------------------------------------
+
+
+_ROUNDS = 50
+"""Rounds of iterative scaling; numbers are then within a few thousandths of their bounds."""
+_MAX_FACTOR = 1e9
+"""Largest factor on a probability, and the inverse of the smallest."""
+_SAME = 1e-6
+"""Difference of a factor from 1 below which it changes nothing."""
+_TINY = 1e-12
+Bounds = dict[str, tuple[float, float]]
+"""Least and largest number of objects of each display name; the name "" stands for all objects."""
+
+
+class NumberGuidance:
+    """Draws categories so that each scene holds the numbers of objects that its prompt claims.
+
+    Expected final count of a kind = its unmasked objects + its summed probability over masked slots. Where it is
+    outside the bounds that the claims put on it, the probabilities of the kind are multiplied by one factor for all
+    slots, so that it comes to the nearest bound. Of all distributions with these expectations this one has the least
+    divergence from that of the prior (Csiszar 1975). The chance of a slot to be unmasked stays as it is. Kinds with a
+    factor, or with one number as bounds, are drawn by systematic sampling (:mod:`agents.diffusion.unmasking`).
+
+    Steps of continuous priors, and of categories that are replaced or unmasked independently, are not changed.
+
+    Args:
+        prompts: B texts. Text that cannot be read makes no claims.
+        scene_type: scene type of the scenes.
+
+    >>> from agents.priors.testing import tiny_prior
+    >>> prior = tiny_prior("dimsum_table", process="mixed", text=True, kernel="squared_absorbing")
+    >>> batch = prior.sample(2, prompt="A scene with 12 cups.", claim_guidance=1.0, num_steps=20)
+    >>> [names.count("teacup") for names in batch.names()]
+    [12, 12]
+    """
+
+    def __init__(self, prompts: Sequence[str], scene_type: str | SceneType) -> None:
+        library = get_scene_type(scene_type).library
+        kinds: dict[str, int] = {}
+        of_asset = [kinds.setdefault(asset.display_name, len(kinds)) for asset in library]
+        self._kinds = torch.tensor([*of_asset, len(kinds)])  # (K,); *empty* is a kind of its own, the last
+        self._bounds = [number_bounds(claims_of(prompt, scene_type)) for prompt in prompts]
+        self._names = [*kinds, ""]
+        self._member = F.one_hot(self._kinds, len(self._names)).double()  # (K, R)
+        self._limits: dict[int, tuple[Tensor, Tensor]] = {}
+
+    def __call__(self, x: Tensor, reverse: ReverseStep) -> ReverseStep:
+        """The step at x_t (B, N, D) with other probabilities of the masked slots' categories."""
+        if not isinstance(reverse, MixedStep) or reverse.masked is None or not bool(reverse.masked.any()):
+            return reverse
+        masked, kinds, states = reverse.masked, self._kinds.to(x.device), state_of(x[..., POSE_FEATURES:])
+        probs, chance = reverse.probs[..., :-1], 1 - reverse.probs[..., -1:]
+        member = self._member.to(x.device)
+        drawn = torch.where(masked[..., None], probs.double(), 0.0) @ member / chance.clamp(min=_TINY).double()
+        visible = F.one_hot(states, len(kinds) + 1)[..., :-1].sum(dim=1).double() @ member
+        low, high = (bound.to(visible) - visible for bound in self._limits_of(x.shape[1]))
+        weights = kind_weights(drawn, low.clamp(min=0.0), high.clamp(min=0.0))  # (B, R)
+        tilted = probs * weights[:, kinds].unsqueeze(1).to(probs)
+        tilted = tilted * (chance / tilted.sum(dim=-1, keepdim=True).clamp(min=_TINY))
+        changed = (weights - 1).abs() > _SAME
+        tilted = torch.where(masked[..., None] & changed.any(dim=-1)[:, None, None], tilted, probs)
+        together = ((low == high) | changed)[:, kinds]
+        others = torch.full_like(self._kinds, -1).expand(len(x), -1) if reverse.groups is None else reverse.groups
+        groups = torch.where(together, kinds + 2 * len(kinds), others.to(x.device))
+        return reverse._replace(probs=torch.cat([tilted, reverse.probs[..., -1:]], dim=-1), groups=groups)
+
+    def _limits_of(self, slots: int) -> tuple[Tensor, Tensor]:
+        """(B, R) least and largest number of each kind, in scenes of ``slots``."""
+        if slots not in self._limits:
+            low = torch.zeros(len(self._bounds), len(self._names), dtype=torch.float64)
+            high = torch.full_like(low, torch.inf)
+            for row, bounds in enumerate(self._bounds):
+                for name, (least, most) in bounds.items():
+                    if not name:
+                        least, most = slots - most, slots - least
+                    kind = self._names.index(name)
+                    low[row, kind], high[row, kind] = max(least, 0.0), max(most, 0.0)
+            self._limits[slots] = low, high
+        return self._limits[slots]
+
+
+def kind_weights(probs: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """(B, R) factors on the probabilities of R kinds that bring expected numbers within their bounds.
+
+    Bounds that cannot all be met are approached in proportion.
+
+    Args:
+        probs: (B, N, R) probabilities of the kinds in each slot; slots that are not drawn have none.
+        low, high: (B, R) least and largest sum over the slots.
+
+    >>> probs = torch.tensor([[[0.5, 0.5], [0.25, 0.75]]], dtype=torch.float64)
+    >>> weights = kind_weights(probs, torch.tensor([[1.0, 0.0]]), torch.tensor([[1.0, 9.0]]))
+    >>> tilted = probs * weights
+    >>> round((tilted / tilted.sum(dim=-1, keepdim=True))[..., 0].sum().item(), 6)
+    1.0
+    """
+    low, high = low.to(probs), high.to(probs)
+    slots = probs.sum(dim=(1, 2))[:, None]
+    weights, rest = torch.ones_like(low), torch.ones_like(slots)  # rest: factor of the kinds within their bounds
+    for _ in range(_ROUNDS):
+        tilted = probs * weights.unsqueeze(1)
+        number = (tilted / tilted.sum(dim=-1, keepdim=True).clamp(min=_TINY)).sum(dim=1)
+        expected = number * rest / weights.clamp(min=_TINY)  # near the solution, without the factor of the kind
+        target = torch.minimum(torch.maximum(expected, low), high)
+        bound = target != expected
+        left = (slots - torch.where(bound, target, 0.0).sum(dim=1, keepdim=True)).clamp(min=0.0)
+        others = torch.where(bound, 0.0, number).sum(dim=1, keepdim=True)
+        rest = (rest * left / others.clamp(min=_TINY)).clamp(1 / _MAX_FACTOR, _MAX_FACTOR)
+        scaled = (weights * target / number.clamp(min=_TINY)).clamp(1 / _MAX_FACTOR, _MAX_FACTOR)
+        weights = torch.where(bound, scaled, rest)
+    return weights / rest
+
+
+def number_bounds(claims: Sequence[Claim]) -> Bounds:
+    """Bounds on the numbers of objects under which ``claims`` can hold.
+
+    >>> from scene_envs.datasets import parse_prompt
+    >>> prompt = "A scene where the teapot is behind the second cup from the left."
+    >>> number_bounds(parse_prompt(prompt, "dimsum_table").claims)
+    {'teapot': (1, 1), 'cup': (2, inf)}
+    """
+    found: Bounds = {}
+    for claim in claims:
+        for name, least, most in _bounds_of(claim):
+            low, high = found.get(name, (0.0, math.inf))
+            found[name] = max(low, least), min(high, most)
+    return found
+
+
+def _bounds_of(claim: Claim) -> Iterator[tuple[str, float, float]]:
+    if isinstance(claim, ObjectCount):
+        yield "", claim.number, claim.number
+    elif isinstance(claim, NameCount):
+        yield claim.name, claim.number, claim.number
+    elif isinstance(claim, PlaceCount):
+        yield claim.name, claim.number, math.inf
+        yield from _of_reference(claim.place.unit)
+    elif isinstance(claim, SupportCount):
+        yield claim.name, claim.number + (claim.name == claim.landmark.name), math.inf
+        yield from _of_reference(claim.landmark)
+    elif isinstance(claim, PairCount):
+        under = min(claim.number, 1) if claim.inside else claim.number
+        yield claim.under, under, math.inf
+        yield claim.name, claim.number + (claim.name == claim.under and claim.number > 0), math.inf
+    elif isinstance(claim, SideClaim):
+        for reference in (claim.subject, claim.landmark):
+            yield from _of_reference(reference)
+
+
+def _of_reference(reference: Reference) -> Iterator[tuple[str, float, float]]:
+    """Count bounds that a reference implies: exactly one, or at least its ordinal."""
+    if reference.place is not None:
+        yield from _of_reference(reference.place.unit)
+    only = not reference.ordinal and reference.place is None
+    yield reference.name, max(2, reference.ordinal) if reference.ordinal else 1, 1 if only else math.inf
+
+
+# -- all together ---------------------------------------------------------------------------------
 
 
 def physics_strength(given: float | None, config: Any, scene_type: SceneType) -> float:
     """Strength of physics guidance of a chain.
 
     Args:
-        given: by the caller; None takes that of the prior.
-        config: of the prior.
-        scene_type: of the scenes.
+        given: strength that the caller gives; None takes that of the prior.
+        config: configuration of the prior.
+        scene_type: scene type of the scenes.
 
     Raises:
         InvalidInputError: not from 0 to 1, or the assets have no geometry.
@@ -34,31 +346,23 @@ def physics_strength(given: float | None, config: Any, scene_type: SceneType) ->
 
 
 def guidance_hook(
-    prior: Estimating,
-    scene_type: SceneType,
-    table: StepTable,
-    scenes: Callable[[Tensor], SceneBatch],
-    moved: Tensor,
-    *,
-    prompts: Sequence[str] | None = None,
-    claim_guidance: float = 0.0,
-    physics_guidance: float = 0.0,
-    guide: Guide | None = None,
-    watch: Watch | None = None,
-) -> Hook | None:
+    prior: Estimating, scene_type: SceneType, table: StepTable, scenes: Callable[[Tensor], SceneBatch], moved: Tensor,
+    *, prompts: Sequence[str] | None = None, claim_guidance: float = 0.0, physics_guidance: float = 0.0,
+    guide: Guide | None = None, watch: Watch | None = None,
+) -> Hook | None:  # fmt: skip
     """The hook of one chain under guidance; None if nothing watches or guides it.
 
     Args:
-        prior: that denoises.
-        scene_type: of the scenes.
+        prior: prior that denoises.
+        scene_type: scene type of the scenes.
         table: the chain.
         scenes: the B scenes of normalised x_0 (B, N, D), as watch and guides see them.
         moved: (B, N, 1) bool, slots whose poses are denoised.
         prompts: one per scene; without prompts there is no claim guidance.
         claim_guidance: strength, 0 for none.
         physics_guidance: strength, 0 for none.
-        guide: called before the other guides.
-        watch: called at the end of each step.
+        guide: guide that is called before the others.
+        watch: watch that is called at the end of each step.
     """
     movable = moved.squeeze(-1)
     guides: list[Guide] = [] if guide is None else [guide]

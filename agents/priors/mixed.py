@@ -6,11 +6,13 @@ While a category is masked its K entries are zeros. (Pfaff et al., CoRL 2025; Hu
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Any, TypeVar
 
 import torch
-from torch import Generator, Tensor, nn
+from torch import Generator, Tensor
 from torch.nn import functional as F
 
 from agents.configuration.checks import check_types
@@ -27,32 +29,53 @@ from agents.diffusion.gaussian import timestep_weights
 from agents.diffusion.reverse_steps import ReverseStep, state_of
 from agents.diffusion.schedules import make_schedule
 from agents.diffusion.unmasking import UNMASKINGS
-from agents.diffusion.weighting import check_weighting
-from agents.networks.mixed_denoiser import MixedDenoiser, Observed
+from agents.diffusion.weighting import check_weighting, loss_weights
+from agents.networks.denoisers import MixedDenoiser, Observed
+from agents.networks.flux_modules import CountConditioning
 from agents.networks.registry import build_network, config_from_state
-from agents.networks.text import Text
+from agents.networks.text import PADDING, Text, TextEncoder, vocabulary, warn_unknown
 from agents.networks.text_encoders import text_config_from_state, text_encoder
-from agents.priors.base import UNIONS
-from agents.priors.config import MixedPriorConfig, current_names
-from agents.priors.hooks import Hook, Start
-from agents.priors.inpainting import draw_noise
-from agents.priors.mixed_training import TrainableMixedPrior
+from agents.priors.config import MixedPriorConfig
+from agents.priors.guidance import Hook, Start
+from agents.priors.prior import (
+    UNIONS,
+    DenoiserOutput,
+    NoisedScenes,
+    ScenePrior,
+    check_object_count,
+    draw_noise,
+    no_text,
+)
+from scene_envs.datasets.prompts.facts import SIDES
+from scene_envs.datasets.prompts.language import NUMBERS, ORDINALS, SIDE_PHRASES, Nouns
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
 from scene_envs.scene import POSE_FEATURES, SceneBatch
-from scene_envs.scene_types import get_scene_type
+from scene_envs.scene_types import SceneType, get_scene_type, members_of
 
 CATEGORY_LOSSES = ("cross_entropy", "bound")
+
 _TEXT = "text_encoder."
 
+_EMPTY_WEIGHT = 0.1
+"""Weight of the pose of an empty slot in the loss. The pose has no meaning, but chains should not drift on it."""
 
-class MixedPrior(TrainableMixedPrior):
-    """A :class:`~agents.priors.base.ScenePrior` whose categories are discrete.
+_COUNT_WEIGHT = 0.5
+"""Weight of the count loss of networks with count conditioning, which read numbers of objects from the text alone."""
+
+_AT_ONCE = 32
+"""Scenes whose residual is measured in one batch: features of all pairs of slots of 512 rooms would be gigabytes."""
+
+Prior = TypeVar("Prior", bound="MixedPrior")
+
+
+class MixedPrior(ScenePrior):
+    """A :class:`~agents.priors.prior.ScenePrior` whose categories are discrete.
 
     Args:
         config: its configuration.
-        normalizer: of raw scenes; only its pose features are used.
+        normalizer: normalizer of raw scenes; only its pose features are used.
         preconditioning: moments (12,) of normalised poses.
         card: facts about its training.
         residual: (G, 12) measured error of the denoised pose.
@@ -66,6 +89,10 @@ class MixedPrior(TrainableMixedPrior):
     """
 
     process_name = "mixed"
+    config: MixedPriorConfig
+    denoiser: MixedDenoiser
+    categories: CategoricalProcess
+    """The process of the categories."""
 
     def __init__(
         self,
@@ -75,7 +102,7 @@ class MixedPrior(TrainableMixedPrior):
         card: dict[str, Any] | None = None,
         residual: ResidualVariance | None = None,
     ) -> None:
-        nn.Module.__init__(self)
+        super().__init__()
         scene_type = get_scene_type(config.scene_type)
         if config.network.categories != scene_type.num_assets + 1:
             raise InvalidInputError(
@@ -116,7 +143,7 @@ class MixedPrior(TrainableMixedPrior):
     ) -> MixedPrior:
         """From the ``prior`` entry of a configuration file."""
         text = text_config_from_state(fields.get("text"))
-        fields = {**current_names(fields), "network": config_from_state(fields["network"], "mixed"), "text": text}
+        fields = {**fields, "network": config_from_state(fields["network"], "mixed"), "text": text}
         check_types(MixedPriorConfig, fields)
         return cls(MixedPriorConfig(**fields), normalizer, preconditioning, card, residual)
 
@@ -136,21 +163,196 @@ class MixedPrior(TrainableMixedPrior):
         if self.denoiser.text_encoder is not None:
             self.denoiser.text_encoder.load_state_dict(text)
 
-    # -- the reverse chain ----------------------------------------------------------------------
+    # -- text -------------------------------------------------------------------------------------
+
+    @property
+    def conditional(self) -> bool:
+        """Whether the prior reads prompts."""
+        return self.denoiser.text_encoder is not None
+
+    @property
+    def prompt_space(self) -> tuple[int, int]:
+        """Largest number of tokens of a prompt, and size of the vocabulary; 0 is padding."""
+        return self._encoder("").token_space
+
+    def read_prompts(self, prompts: Sequence[str], slots: int) -> Tensor:
+        """Token indices (B, L) int64 on the CPU, padded to the length of the longest possible prompt.
+
+        Unknown words are listed in a warning.
+
+        Raises:
+            InvalidInputError: the prior reads no prompts, a prompt is too long, or one asks for more objects than
+                ``slots``.
+        """
+        encoder = self._encoder(prompts[0])
+        check_object_count(prompts, self.scene_type, slots)
+        indices, unknown = encoder.tokenize(prompts)
+        warn_unknown(unknown)
+        longest = encoder.token_space[0]
+        return torch.nn.functional.pad(indices, (0, longest - indices.shape[1]), value=PADDING)
+
+    def encode_tokens(self, indices: Tensor) -> Text:
+        """Tokens (B, L', W) and mask (B, L') of token indices (B, L); equal rows are encoded once."""
+        used = (indices != PADDING).any(dim=0)
+        rows, place = torch.unique(indices[:, used].cpu(), dim=0, return_inverse=True)
+        tokens, mask = self._encoder("").encode(rows)
+        place = place.to(tokens.device)
+        return tokens[place], mask[place]
+
+    def encode_prompts(self, prompts: Sequence[str]) -> Text:
+        """Tokens (B, L, W) and mask (B, L) of prompts; equal prompts are encoded once.
+
+        Raises:
+            InvalidInputError: the prior reads no prompts, or one is too long.
+        """
+        different = list(dict.fromkeys(prompts))
+        tokens, mask = self._encoder(different[0])(different)
+        place = torch.tensor([different.index(prompt) for prompt in prompts], device=tokens.device)
+        return tokens[place], mask[place]
+
+    def unconditional(self, count: int) -> Text | None:
+        """Text of the empty prompt; None for a prior without text."""
+        if not self.conditional:
+            return None
+        tokens, mask = self.encode_prompts([""])
+        return tokens.expand(count, -1, -1), mask.expand(count, -1)
+
+    def warn_unknown_words(self, prompts: Iterable[str]) -> None:
+        """Warn of words in ``prompts`` that the vocabulary of the prior lacks."""
+        if isinstance(self.denoiser.text_encoder, TextEncoder):
+            warn_unknown(self.denoiser.text_encoder.unknown_words(prompts))
+
+    @property
+    def count_conditioning(self) -> CountConditioning | None:
+        """The part of the network that reads how many objects a prompt asks for; None if there is none."""
+        return getattr(self.denoiser.network, "count_conditioning", None) if self.conditional else None
+
+    def freeze_text(self) -> None:
+        """Freeze the text encoder, if there is one: training does not change it from then on."""
+        if self.denoiser.text_encoder is not None:
+            self.denoiser.text_encoder.requires_grad_(False)
+
+    def _encoder(self, prompt: str) -> Any:
+        if self.denoiser.text_encoder is None:
+            raise no_text(self.scene_type, prompt)
+        return self.denoiser.text_encoder
+
+    # -- scenes and numbers -----------------------------------------------------------------------
+
+    @property
+    def num_categories(self) -> int:
+        """K = C + 1."""
+        return self.config.network.categories
+
+    @property
+    def is_constant(self) -> Tensor:
+        """(D,) bool: features of the pose that never vary."""
+        constant = self.normalizer.is_constant.clone()
+        constant[POSE_FEATURES:] = False
+        return constant
+
+    def normalised(self, batch: SceneBatch) -> Tensor:
+        """(B, N, D): normalised pose, one-hot category as it is.
+
+        The pose of an empty slot has no meaning. It is set to the mean of poses, so that it asks nothing of the
+        network.
+        """
+        pose = batch.to_tensor(normalised=self.normalizer)[..., :POSE_FEATURES]
+        pose = torch.where(batch.is_empty[..., None], self.preconditioning.mean.to(pose), pose)
+        return torch.cat([pose, batch.tensor[..., POSE_FEATURES:]], dim=-1)
+
+    def observed_entries(self, x: Tensor, observed: Observed | None = None) -> Observed | None:
+        """Observed entries of scenes ``x`` (B, N, D) for the network: ``observed``, or else the fixed objects.
+
+        In training with observed entries, fixed objects are always observed; without them, nothing is.
+        """
+        if observed is not None or self.config.observed_share <= 0:
+            return observed
+        fixed = torch.zeros(x.shape[:2], dtype=torch.bool, device=x.device)
+        fixed[:, : len(self.scene_type.fixed)] = True
+        return Observed(x, fixed, fixed)
+
+    def with_union(self: Prior, union: str) -> Prior:
+        """Restrict the scenes of a union, as :meth:`ScenePrior.with_union` does."""
+        super().with_union(union)
+        self.config = replace(self.config, union=union)
+        return self
+
+    def with_open_empty(self: Prior, share: float) -> Prior:
+        """Set the share of training masks that open every empty slot, as :meth:`ScenePrior.with_open_empty` does."""
+        self.config = replace(self.config, open_empty_share=share)
+        return self
+
+    def initial(self, count: int, slots: int, generator: Generator | None = None) -> Tensor:
+        """x_T (count, slots, D): normal poses, categories from their distribution at T, known entries clamped."""
+        noise = torch.randn(count, slots, self.scene_type.features, generator=generator, device=self._fixed.device)
+        probs = self.categories.prior().to(noise).expand(count, slots, -1)
+        return self.clamp(self.with_states(noise[..., :POSE_FEATURES], probs, noise))
+
+    def add_noise(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
+        """A sample of q(x_t | x_0) from standard normal noise (B, N, D)."""
+        pose = self.process.add_noise(x0[..., :POSE_FEATURES], t, noise[..., :POSE_FEATURES])
+        category = x0[..., POSE_FEATURES:].argmax(dim=-1)
+        return self.clamp(self.with_states(pose, self.categories.marginal(category, t.expand(len(x0))), noise))
+
+    @staticmethod
+    def with_states(pose: Tensor, probs: Tensor, noise: Tensor) -> Tensor:
+        """``pose`` (B, N, 12) with states drawn from ``probs`` (B, N, K + 1) by ``noise`` (B, N, D)."""
+        random = torch.ones(pose.shape[1], dtype=torch.bool, device=pose.device)
+        return MixedStep(pose, torch.zeros_like(pose[0]), probs, random).from_noise(noise)
+
+    def barred_categories(self, state: Tensor, closed: Tensor | None = None) -> Tensor:
+        """(B, N, K) bool: categories of x_0 with probability 0, given states (B, N) of x_t.
+
+        These are the categories of fixed objects, in all slots but theirs, and ``closed`` (B, K). With
+        ``union="one_type"``, they are also the assets that no member has together with all assets that the scene holds
+        already. If the chain only absorbs, the category that a slot holds already is not barred in this slot.
+        """
+        barred = torch.zeros(*state.shape, self.num_categories, dtype=torch.bool, device=state.device)
+        barred[:, len(self.scene_type.fixed) :, list(self.scene_type.fixed_categories)] = True
+        if closed is not None:
+            barred |= closed[:, None]
+        if self.categories.only_absorbs:
+            held = F.one_hot(state, self.num_categories + 1)[..., :-1] > 0
+            if self._separates_members:
+                barred[..., :-1] |= ~self._fitting_assets(held[..., :-1].any(dim=1))[:, None]
+            barred &= ~held
+        return barred
+
+    @property
+    def _separates_members(self) -> bool:
+        """Whether a scene holds the assets of one member of a union only."""
+        return self.config.union == "one_type" and len(self._members) > 1 and self.categories.only_absorbs
+
+    @cached_property
+    def _members(self) -> Tensor:
+        """(M, C) bool: assets of each member of a union of scene types; one row for any other type."""
+        assets = self.scene_type.assets
+        return torch.tensor([[asset in member.assets for asset in assets] for member in members_of(self.scene_type)])
+
+    def _fitting_assets(self, present: Tensor) -> Tensor:
+        """(B, C) bool: assets of the members that have all of ``present`` (B, C) bool; all if no member has them."""
+        members = self._members.to(present.device)
+        fits = ~(present[:, None] & ~members).any(dim=-1)  # (B, M)
+        allowed = (fits[..., None] & members).any(dim=1)
+        return allowed | ~fits.any(dim=-1, keepdim=True)
+
+    # -- the reverse chain ------------------------------------------------------------------------
+
+    def step_table(self, num_steps: int) -> StepTable:
+        """The reverse steps of a chain of ``num_steps``, any number in 1..T.
+
+        If a scene holds the assets of one member of a union only, each of the first steps unmasks about one slot.
+        """
+        if self._separates_members:
+            return StepTable.gradual(self.categories.schedule.mask, self.config.slots, num_steps)
+        return super().step_table(num_steps)
 
     def transition(
-        self,
-        x_t: Tensor,
-        step: int,
-        table: StepTableLike,
-        *,
-        observed: Observed | None = None,
-        text: Text | None = None,
-        guidance: float = 0.0,
-        free: Text | None = None,
-        eta: float = 1.0,
+        self, x_t: Tensor, step: int, table: StepTableLike, *, observed: Observed | None = None,
+        text: Text | None = None, guidance: float = 0.0, free: Text | None = None, eta: float = 1.0,
         closed: Tensor | None = None,
-    ) -> MixedStep:
+    ) -> MixedStep:  # fmt: skip
         """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters.
 
         The assets of fixed objects have probability 0 in all other slots.
@@ -204,22 +406,16 @@ class MixedPrior(TrainableMixedPrior):
             clamped[..., :POSE_FEATURES], std * (~known).to(mean.dtype), probs, random, masked, estimate, groups
         )
 
-    def regenerate(
-        self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int,
-        prompts: Sequence[str] | None = None, guidance: float = 0.0, hook: Hook | None = None,
-        start: Start | None = None,
+    @torch.no_grad()
+    def sample_tensor(
+        self, count: int, *, prompts: Sequence[str] | None = None, guidance: float = 0.0, num_steps: int = 50,
+        slots: int | None = None, generator: Generator | None = None, eta: float = 1.0, hook: Hook | None = None,
     ) -> Tensor:  # fmt: skip
-        """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; the rest is observed."""
+        """``count`` denoised scenes x_0 (count, slots, D), as :meth:`ScenePrior.sample_tensor` describes."""
         text = None if prompts is None else self.encode_prompts(prompts)
-        observed = Observed(self.encode(batch), ~mask[..., 0], ~mask[..., 1])
-        noise = draw_noise(observed.x, generators)
-        probs = self.categories.prior().to(noise).expand(*noise.shape[:2], -1)
-        x = self.clamp(self.with_states(noise[..., :POSE_FEATURES], probs, noise))
-        first, x = (0, x) if start is None else (start[0], start[1].to(x))
-        closed = self.closed_categories(batch, mask)
-        return self.run_chain(
-            x, table, generators, observed, text, guidance, resample, hook=hook, first=first, closed=closed
-        )
+        start = self.initial(count, self.config.slots if slots is None else slots, generator)
+        table = self.step_table(num_steps)
+        return self.run_chain(start, table, generator, text=text, guidance=guidance, eta=eta, hook=hook)
 
     @torch.no_grad()
     def run_chain(
@@ -234,9 +430,9 @@ class MixedPrior(TrainableMixedPrior):
             table: the chain.
             noises: one generator for all scenes, or one per scene; None for torch's own.
             observed: entries that carry no noise.
-            text, guidance, eta, closed: as in :meth:`transition`.
+            text, guidance, eta, closed: arguments of :meth:`transition`.
             resample: number of times that each step is taken, with noise added again in between.
-            hook: called at the last time that each step is taken.
+            hook: hook that is called at the last time that each step is taken.
             first: step that the chain begins at.
         """
         free = self.unconditional(len(x)) if text is None or guidance else None
@@ -263,21 +459,137 @@ class MixedPrior(TrainableMixedPrior):
         rows = self.categories.transition(s, t).to(x_s)[state_of(x_s[..., POSE_FEATURES:])]
         return self.clamp(self.with_states(pose, rows, noise))
 
-    @torch.no_grad()
-    def sample_tensor(
-        self,
-        count: int,
-        *,
-        prompts: Sequence[str] | None = None,
-        guidance: float = 0.0,
-        num_steps: int = 50,
-        slots: int | None = None,
-        generator: Generator | None = None,
-        eta: float = 1.0,
-        hook: Hook | None = None,
-    ) -> Tensor:
-        """``count`` denoised scenes x_0 (count, slots, D), as :meth:`ScenePrior.sample_tensor` describes."""
+    # -- inpainting -------------------------------------------------------------------------------
+
+    def regenerate(
+        self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int,
+        prompts: Sequence[str] | None = None, guidance: float = 0.0, hook: Hook | None = None,
+        start: Start | None = None,
+    ) -> Tensor:  # fmt: skip
+        """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; the rest is observed."""
         text = None if prompts is None else self.encode_prompts(prompts)
-        start = self.initial(count, self.config.slots if slots is None else slots, generator)
-        table = self.step_table(num_steps)
-        return self.run_chain(start, table, generator, text=text, guidance=guidance, eta=eta, hook=hook)
+        observed = Observed(self.encode(batch), ~mask[..., 0], ~mask[..., 1])
+        noise = draw_noise(observed.x, generators)
+        probs = self.categories.prior().to(noise).expand(*noise.shape[:2], -1)
+        x = self.clamp(self.with_states(noise[..., :POSE_FEATURES], probs, noise))
+        first, x = (0, x) if start is None else (start[0], start[1].to(x))
+        closed = self.closed_categories(batch, mask)
+        return self.run_chain(
+            x, table, generators, observed, text, guidance, resample, hook=hook, first=first, closed=closed
+        )
+
+    # -- training ---------------------------------------------------------------------------------
+
+    def noised_loss(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
+        """(B,) mean squared pose error plus ``category_weight`` times the category loss, over unobserved entries."""
+        config = self.config
+        text = self.unconditional(len(noised.t)) if text is None else text
+        output = self.output(noised, text)
+        logits, drawn, weight = output.logits, noised.drawn, noised.weight
+        assert logits is not None
+        assert drawn is not None
+        error = output.continuous - noised.target
+        pose_loss = (error.square() * weight).sum(dim=(1, 2)) / weight.sum(dim=(1, 2)).clamp(min=1.0)
+        pose_loss = pose_loss * noised.scale
+        if config.category_loss == "bound":
+            states = state_of(noised.x_t[..., POSE_FEATURES:])
+            losses = self.categories.loss(noised.category, states, noised.t, logits, config.auxiliary)
+        else:
+            losses = F.cross_entropy(logits.flatten(0, 1), noised.category.flatten(), reduction="none").view_as(drawn)
+        category_loss = (losses * drawn).sum(dim=1) / drawn.sum(dim=1).clamp(min=1.0)
+        loss = pose_loss + config.category_weight * category_loss
+        conditioning = self.count_conditioning
+        if conditioning is not None and text is not None:
+            loss = loss + _COUNT_WEIGHT * conditioning.count_loss(text[0][:, : conditioning.things], noised.category)
+        return loss
+
+    def noised(self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None) -> NoisedScenes:
+        """Noised scenes, their targets and weights; see :meth:`ScenePrior.noised`."""
+        config, device = self.config, x0.device
+        if t is None:
+            t = self.draw_timesteps(x0.shape[0], generator).to(device)
+        noise = torch.randn(x0.shape, generator=generator).to(device)
+        observed = self.draw_observed(x0, generator) if config.observed_share > 0 else None
+        x_t = self.add_noise(x0, t, noise)
+        x_t = x_t if observed is None else observed.write(x_t)
+        pose0, category = x0[..., :POSE_FEATURES], x0[..., POSE_FEATURES:].argmax(dim=-1)
+        states = state_of(x_t[..., POSE_FEATURES:])
+        moments = self.denoiser.moments(states, t)
+        target = self.process.target(pose0, x_t[..., :POSE_FEATURES], t, noise[..., :POSE_FEATURES], moments)
+        weight = self.loss_weight(x0.shape[1])[None, :, :POSE_FEATURES].to(device).expand(len(x0), -1, -1)
+        empty = (category == self.num_categories - 1)[..., None]
+        weight = torch.where(empty, _EMPTY_WEIGHT * weight, weight)
+        drawn = torch.ones(x0.shape[:2], device=device)
+        drawn[:, : len(self.scene_type.fixed)] = 0.0
+        if observed is not None:
+            weight = weight * (~observed.pose)[..., None]
+            drawn = drawn * (~observed.category)
+        if self.denoiser.drops_empty:  # an unmasked category is certain
+            drawn = drawn * (states == self.num_categories)
+        scale = loss_weights(self.process.schedule, t, config.prediction, config.loss_weighting).to(device)
+        return NoisedScenes(x_t, t, target, weight, scale, category, drawn, observed)
+
+    def output(self, noised: NoisedScenes, text: Text | None = None) -> DenoiserOutput:
+        """The pose output (B, N, 12) and logits (B, N, K) of noised scenes."""
+        text = self.unconditional(len(noised.t)) if text is None else text
+        return DenoiserOutput(*self.denoiser.output(noised.x_t, noised.t, noised.observed, text))
+
+    def denoised(self, noised: NoisedScenes, output: DenoiserOutput) -> Tensor:
+        """(B, N, 12) estimate of the clean poses from the pose output of noised scenes."""
+        poses, states = noised.x_t[..., :POSE_FEATURES], state_of(noised.x_t[..., POSE_FEATURES:])
+        moments = self.denoiser.moments(states, noised.t)
+        return self.process.x0_from_output(poses, noised.t, output.continuous, moments)
+
+    def draw_observed(self, x0: Tensor, generator: Generator | None) -> Observed:
+        """Random observed entries: slots (completion), all categories (rearrangement), or any attribute of any slot.
+
+        In ``open_empty_share`` of the completions, only objects are observed and all empty slots are open. A search
+        masks slots because they are empty. Under random masks alone, many open slots with many observed objects are
+        a sign of a full scene.
+        """
+        batch, slots = x0.shape[:2]
+        kind, share = torch.rand(2, batch, 1, generator=generator)
+        kind = kind / max(self.config.observed_share, 1e-9)  # above 1: nothing is observed
+        picks = torch.rand(2, batch, slots, generator=generator) < share
+        whole, rearrange, free = kind < 0.5, (kind >= 0.5) & (kind < 0.75), (kind >= 0.75) & (kind < 1.0)
+        if self.config.open_empty_share > 0:
+            empty = (x0[..., POSE_FEATURES:].argmax(dim=-1) == self.num_categories - 1).cpu()
+            opened = torch.rand(batch, 1, generator=generator) < self.config.open_empty_share
+            picks[0] &= ~(whole & opened & empty)
+        pose = (whole & picks[0]) | (rearrange & picks[0] & (share < 0.5)) | (free & picks[0])
+        category = (whole & picks[0]) | rearrange.expand(-1, slots) | (free & picks[1])
+        fixed = torch.zeros(slots, dtype=torch.bool)
+        fixed[: len(self.scene_type.fixed)] = True
+        return Observed(x0, (pose | fixed).to(x0.device), (category | fixed).to(x0.device))
+
+    @torch.no_grad()
+    def fit_residual(self, x0: Tensor, levels: int = 40, seed: int = 0) -> ResidualVariance:
+        """Measure the error of the denoised pose on scenes ``x0`` (B, N, D) at ``levels`` timesteps, and keep it."""
+        generator = Generator().manual_seed(seed)
+        timesteps = StepTable.spaced(self.config.num_timesteps, levels).timesteps.flip(0)
+        present = (x0[..., POSE_FEATURES:].argmax(dim=-1) != self.num_categories - 1).float()
+        present[:, : len(self.scene_type.fixed)] = 0.0
+        rows = []
+        for t in timesteps:
+            noise = torch.randn(x0.shape, generator=generator).to(x0.device)
+            level = t.to(x0.device).expand(len(x0))
+            poses = [
+                self.denoiser(part, level[: len(part)], self.observed_entries(part), self.unconditional(len(part)))[0]
+                for part in self.add_noise(x0, level, noise).split(_AT_ONCE)
+            ]
+            error = (torch.cat(poses) - x0[..., :POSE_FEATURES]).square() * present[..., None]
+            rows.append((error.sum(dim=(0, 1)) / present.sum()).cpu())
+        self.residual = ResidualVariance(timesteps, torch.stack(rows))
+        return self.residual
+
+
+def prompt_words(scene_type: SceneType) -> tuple[str, ...]:
+    """The words of all prompts that can be written about scenes of a type, sorted, with the numbers up to 130.
+
+    >>> from scene_envs.scene_types import get_scene_type
+    >>> {"teapot", "cups", "behind", "17"} <= set(prompt_words(get_scene_type("dimsum_table")))
+    True
+    """
+    names = Nouns(scene_type).plural
+    frame = "A scene with where, and is are each an on in top of the same shelf tier from bottom object objects."
+    return vocabulary([frame, *NUMBERS, *ORDINALS, *SIDES, *SIDE_PHRASES.values(), *names, *names.values()])

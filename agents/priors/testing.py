@@ -7,13 +7,11 @@ from torch import nn
 
 from agents.diffusion import Preconditioning
 from agents.networks import FluxConfig, MixedFluxConfig, TextConfig
-from agents.networks.fourier_features import FourierFeaturesConfig
-from agents.networks.observed_flags import ObservedFlagsConfig
-from agents.priors.base import ScenePrior
+from agents.networks.flux_modules import FourierFeaturesConfig, ObservedFlagsConfig
 from agents.priors.config import PROCESSES, MixedPriorConfig, PriorConfig
 from agents.priors.continuous import ContinuousPrior
-from agents.priors.mixed import MixedPrior
-from agents.priors.text import prompt_words
+from agents.priors.mixed import MixedPrior, prompt_words
+from agents.priors.prior import ScenePrior
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import POSE_FEATURES
@@ -32,7 +30,7 @@ def tiny_prior(
 
     Args:
         scene_type: scene type or its name.
-        seed: of the weights.
+        seed: seed of the weights.
         slots: slots per scene; the scene type's when None.
         process: ``"continuous"`` or ``"mixed"``.
         text: whether it reads prompts, with the vocabulary of prompts about scenes of this type; mixed only.

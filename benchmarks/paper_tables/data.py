@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from agents.pretraining.data import TrainingData
-    from agents.priors.base import ScenePrior
+    from agents.priors.prior import ScenePrior
     from scene_envs.datasets import SceneDataset
     from scene_envs.scene import SceneBatch
 

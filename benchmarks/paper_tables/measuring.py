@@ -12,7 +12,7 @@ from benchmarks.paper_tables.settings import TablesConfig
 from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from agents.priors.base import ScenePrior
+    from agents.priors.prior import ScenePrior
     from scene_envs.physics import PhysicsPool
     from scene_envs.scene import SceneBatch
 

@@ -169,7 +169,7 @@ def _run_row(
         for prompted in kinds:
 
             def compute(prompted: bool = prompted) -> dict[str, float]:
-                from agents.priors.base import ScenePrior
+                from agents.priors.prior import ScenePrior
 
                 prior = ScenePrior.load(directory).to(settings.device).eval()
                 return sample_and_measure(prior, real, settings, prompted=prompted, pool=pool)

@@ -22,7 +22,7 @@ import yaml
 from agents.configuration.tree import changed
 from agents.post_training import PostTrainConfig, PostTrainer, regularisation
 from agents.post_training.algorithms import list_algorithms
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from scene_envs.envs.scoring import RewardScorer
 
 DEFAULTS = {"prior": "dimsum_table", "reward": "feasible_share", "iterations": "3"}

@@ -15,7 +15,7 @@ from benchmarks.reliability.figures import Figures
 from benchmarks.reliability.small_commands import place
 
 if TYPE_CHECKING:
-    from agents.priors.base import ScenePrior
+    from agents.priors.prior import ScenePrior
 
 _CUBE = """v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nv 1 0 1\nv 1 1 1\nv 0 1 1
 f 1 3 2\nf 1 4 3\nf 5 6 7\nf 5 7 8\nf 1 2 6\nf 1 6 5\nf 2 3 7\nf 2 7 6\nf 3 4 8\nf 3 8 7\nf 4 1 5\nf 4 5 8\n"""
@@ -70,7 +70,7 @@ def _kinds(folder: Path) -> list[_Kind]:
     import torch
 
     from agents.planning.tree_file import SearchRecord
-    from agents.priors.base import ScenePrior
+    from agents.priors.prior import ScenePrior
     from agents.utils.checkpoints import load_checkpoint, save_checkpoint
     from scene_envs import SceneBatch
     from scene_envs.assets import load_library

@@ -11,7 +11,7 @@ import torch
 import yaml
 
 from agents.cli import main
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from agents.utils.seeds import derived_seed
 from scene_envs.grammars import get_grammar

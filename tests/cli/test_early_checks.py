@@ -124,15 +124,15 @@ def test_words_of_groups_are_those_of_the_parts_they_are_for():
     from agents.diffusion.unmasking import UNMASKINGS
     from agents.diffusion.weighting import LOSS_WEIGHTINGS
     from agents.evaluation.measures import MEASURES
-    from agents.networks.mixed_denoiser import EMPTY_SLOTS
-    from agents.networks.mixed_flux_config import TEXT_REACHES
+    from agents.networks.denoisers import EMPTY_SLOTS
+    from agents.networks.flux import TEXT_REACHES
     from agents.post_training.algorithm_settings import LOG_PROB_REDUCTIONS
     from agents.post_training.losses import REDUCTIONS
     from agents.pretraining.initial_prior import MOMENTS
     from agents.pretraining.settings import LossSettings, NetworkSettings, ProcessSettings
     from agents.priors.config import PROCESSES
+    from agents.priors.continuous import ROTATION_WIDTHS
     from agents.priors.mixed import CATEGORY_LOSSES
-    from agents.priors.rotation_codes import ROTATION_WIDTHS
 
     assert tuple(MEASURES) == MEASURE_NAMES
     assert set(LOG_PROB_REDUCTIONS) == set(REDUCTIONS)

@@ -12,7 +12,7 @@ import torch
 from agents.diffusion import GaussianProcess, Preconditioning
 from agents.diffusion.schedules import make_schedule
 from agents.diffusion.weighting import check_weighting, loss_weights
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.grammars import get_grammar

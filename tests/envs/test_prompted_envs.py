@@ -15,7 +15,7 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from torchrl.envs.utils import check_env_specs
 
 import scene_envs.envs.spaces as env_spaces
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.datasets.prompts import parse_prompt
 from scene_envs.envs import DenoisingTorchRLEnv, SearchProblem

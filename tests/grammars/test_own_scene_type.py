@@ -14,7 +14,7 @@ import torch
 from agents.cli import main
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.initial_prior import build_prior
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards import RewardContext, check_reward, resolve_reward
 from scene_envs import SceneBatch, get_scene_type, list_scene_types, plugins

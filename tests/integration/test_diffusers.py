@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from agents.diffusion import GaussianProcess, Preconditioning, ResidualVariance, StepTable
 from agents.diffusion.schedules import make_schedule
 from agents.post_training import DenoisingPolicy
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.envs import DenoisingCore
 from scene_envs.errors import InvalidInputError

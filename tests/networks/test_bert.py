@@ -11,10 +11,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from agents.networks.bert import BertEncoder, BertTextConfig
-from agents.networks.bert_files import FOLDER_VARIABLE, load_bert
 from agents.networks.text import TextConfig, TextEncoder
-from agents.networks.text_encoders import text_config, text_config_from_state, text_encoder
+from agents.networks.text_encoders import (
+    FOLDER_VARIABLE,
+    BertEncoder,
+    BertTextConfig,
+    load_bert,
+    text_config,
+    text_config_from_state,
+    text_encoder,
+)
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from tests.helpers.small_bert import WORDS, write_bert
 

@@ -9,8 +9,8 @@ import torch
 from torch import nn
 
 from agents.networks import MixedFluxConfig
-from agents.networks.packing import pack
-from agents.networks.relations import RelationsConfig
+from agents.networks.denoisers import pack
+from agents.networks.geometry import RelationsConfig
 from agents.priors.mixed import MixedPrior
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError

@@ -1,9 +1,8 @@
-"""The modules of the Flux core: what leaving one out means, files of earlier versions, and wrong lists."""
+"""The modules of the Flux core: what leaving one out means, files, and wrong lists."""
 
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,14 +11,10 @@ from safetensors.torch import load_file
 
 from agents import PretrainConfig
 from agents.configuration.prior_names import SHIPPED, list_priors
-from agents.diffusion.gaussian import check_prediction
 from agents.networks import MixedFlux, MixedFluxConfig, build_network, network_config
-from agents.networks.contacts import ContactsConfig
-from agents.networks.mixed_flux_files import current_fields, current_name
-from agents.networks.observed_flags import ObservedFlagsConfig
-from agents.networks.registry import config_from_state, config_state
-from agents.networks.relations import RelationsConfig
-from agents.priors.base import ScenePrior
+from agents.networks.flux_modules import ObservedFlagsConfig
+from agents.networks.geometry import ContactsConfig, RelationsConfig
+from agents.priors.prior import ScenePrior
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 SIZES: dict[str, Any] = {"features": 20, "categories": 8, "hidden": 16, "depth": 2, "heads": 2}
@@ -70,33 +65,14 @@ def test_the_core_alone_is_the_network_of_the_paper() -> None:
         assert {name.partition(".")[0] for name in MixedFlux(paper).state_dict()} == first
 
 
-LATER = ("_continuous", "_feasible", "_completion")
-"""Ends of the names of shipped priors that are not mixed, or were saved under the present names."""
-
-
-@pytest.mark.parametrize("name", [name for name in list_priors() if not name.endswith(LATER)])
-def test_weights_of_shipped_priors_reach_the_modules_under_their_present_names(name: str) -> None:
-    """The files are of an earlier version; every tensor in them is found again, bit for bit."""
-    prior, state = ScenePrior.load(name), json.loads((SHIPPED / name / "config.json").read_text())["prior"]
-    assert "modules" not in state["network"]
-    loaded = prior.denoiser.network.state_dict()
-    (file,) = Path(SHIPPED / name).glob("*.safetensors")
-    stored = {key: value for key, value in load_file(file).items() if not key.startswith(("text_encoder.", "residual"))}
-    assert {current_name(key) for key in stored} == set(loaded)
-    assert all(
-        torch.equal(loaded[current_name(key)], value.to(loaded[current_name(key)])) for key, value in stored.items()
-    )
-    assert (state["prediction"], prior.denoiser.poses.prediction) == ("karras", "edm")
-    again = config_from_state(json.loads(json.dumps(config_state(prior.denoiser.network.config))), "mixed")
-    assert again == prior.denoiser.network.config
-
-
-def test_flat_fields_of_earlier_files_say_which_modules_there_are() -> None:
-    fields = {"categories": 8, "attention": "plain", "contacts": 1, "frequencies": 0, "flags": 0, "requests": 9}
-    assert current_fields(fields) == {"categories": 8, "modules": [], "time_input": "timestep"}
-    relative = current_fields({**fields, "attention": "relative", "relation_blur": "largest", "text_width": 4})
-    assert [module["name"] for module in relative["modules"]] == ["count_conditioning", "relations", "contacts"]
-    assert current_fields(relative) == relative
+@pytest.mark.parametrize("name", list_priors())
+def test_files_of_shipped_priors_have_the_present_fields_and_tensors(name: str) -> None:
+    prior = ScenePrior.load(name)
+    stored = json.loads((SHIPPED / name / "config.json").read_text())["prior"]
+    assert json.loads(json.dumps(prior.config_state())) == {"physics_guidance": 0.0, **stored}
+    tensors = load_file(SHIPPED / name / "model.safetensors")
+    assert {key for key in tensors if not key.startswith("residual.")} == set(prior.weights())
+    assert all(torch.equal(value, tensors[key].to(value)) for key, value in prior.weights().items())
 
 
 def test_wrong_lists_of_modules_are_named() -> None:
@@ -112,8 +88,3 @@ def test_wrong_lists_of_modules_are_named() -> None:
         MixedFluxConfig(8, modules=({"name": "relations", "blurr": "axis"},))  # type: ignore[arg-type]
     with pytest.raises(UnknownNameError, match="contacts"):
         MixedFluxConfig(8, modules=(ObservedFlagsConfig(),)).without("contacts")
-
-
-def test_an_earlier_name_of_a_prediction_says_the_present_one() -> None:
-    with pytest.raises(InvalidInputError, match="prediction='karras' has another name now: prediction='edm'"):
-        check_prediction("karras")

@@ -17,7 +17,6 @@ from agents import PretrainConfig
 from agents.networks import (
     NETWORKS,
     DiffuSceneConfig,
-    FluxConfig,
     MiDiffusionConfig,
     MixedDiffuSceneConfig,
     MixedFlux,
@@ -28,12 +27,9 @@ from agents.networks import (
     network_config,
     parameter_count,
 )
-from agents.networks.count_conditioning import CountConditioning, still_to_come
-from agents.networks.count_embedding import count_states
-from agents.networks.fourier_features import FourierFeaturesConfig
-from agents.networks.observed_flags import ObservedFlagsConfig
+from agents.networks.flux_modules import CountConditioning, count_states, still_to_come
+from agents.networks.geometry import RelationsConfig
 from agents.networks.registry import config_from_state, config_state
-from agents.networks.relations import RelationsConfig
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 FEATURES, CATEGORIES, TEXT = 20, 8, 12
@@ -317,11 +313,11 @@ def test_files_give_the_same_network_back(name: str, process: str) -> None:
     assert (run(again, process, arguments) == run(network, process, arguments)).all()
 
 
-def test_files_without_a_kind_hold_flux_networks() -> None:
-    assert config_from_state({"features": 20}, "continuous") == FluxConfig(20)
-    assert config_from_state({"categories": 8, "unit": [1.0, 2.0, 3.0]}, "mixed") == MixedFluxConfig(
-        8, unit=(1.0, 2.0, 3.0), time_input="log_noise", modules=(ObservedFlagsConfig(), FourierFeaturesConfig())
-    )
+def test_a_network_in_a_file_says_its_kind_and_lists_become_tuples() -> None:
+    fields = {"kind": "flux", "categories": 8, "unit": [1.0, 2.0, 3.0]}
+    assert config_from_state(fields, "mixed") == MixedFluxConfig(8, unit=(1.0, 2.0, 3.0))
+    with pytest.raises(UnknownNameError, match="network"):
+        config_from_state({"categories": 8}, "mixed")
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from agents.planning import (
     run_search,
 )
 from agents.planning.journal import _described
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards import RewardContext, RewardOutput
 from rewards.category_count import CategoryCount

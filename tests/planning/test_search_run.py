@@ -13,7 +13,7 @@ import yaml
 
 from agents.cli import main
 from agents.planning import SearchOutcome, run_search
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards import RewardContext, RewardOutput, register_reward
 from scene_envs.envs import SearchEnv

@@ -14,7 +14,7 @@ import torch
 
 from agents.cli import main
 from agents.planning import PlanResult, Session, run_search
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards import RewardContext, RewardOutput, register_reward
 from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError

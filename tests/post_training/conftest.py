@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from agents.post_training import scene_bank
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from scene_envs.scene import SceneBatch
 
 _DRAWN: dict[tuple[Any, ...], SceneBatch] = {}

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from agents.post_training import DDPO, DDPOSFSettings, DenoisingPolicy
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.errors import InvalidInputError

@@ -14,8 +14,7 @@ import torch
 from agents.post_training import post_train
 from agents.post_training.discriminative import DiscriminativeLoss
 from agents.post_training.trainer import PostTrainer
-from agents.priors.base import ScenePrior
-from agents.priors.forward import NoisedScenes
+from agents.priors.prior import NoisedScenes, ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.scene import SceneBatch
 from tests.helpers.small_runs import count_objects, small_config

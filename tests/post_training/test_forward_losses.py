@@ -11,7 +11,7 @@ from torch import Generator, Tensor
 
 from agents.post_training.forward_losses import AWMLoss, NFTLoss
 from agents.post_training.forward_process_loss import ForwardProcessLoss
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError
 

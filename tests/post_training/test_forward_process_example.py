@@ -17,7 +17,7 @@ from torch import Tensor
 
 from agents.post_training import NFTLoss, PostTrainer, compute_advantages
 from agents.post_training.expectation import Expectation
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from agents.utils.weight_average import WeightAverage
 from rewards import evaluate_reward, make_reward

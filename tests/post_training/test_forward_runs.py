@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from agents.post_training import PostTrainConfig, PostTrainer, PostTrainResult, post_train
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from tests.helpers.small_runs import count_objects

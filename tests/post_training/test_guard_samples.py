@@ -17,7 +17,7 @@ from agents.post_training.guard import Guard
 from agents.post_training.guard_report import guard_sections, guard_verdict
 from agents.post_training.sample_check import beyond
 from agents.post_training.trainer import PostTrainer
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch

@@ -15,7 +15,7 @@ from torch import Generator
 from agents import ScenePrior
 from agents.post_training import GuidanceDistillationLoss, PostTrainer
 from agents.post_training.guidance_distillation import GuidanceDistillation
-from agents.priors.hooks import position_std
+from agents.priors.guidance import position_std
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.physics.correction import corrections

@@ -12,7 +12,7 @@ import torch
 from agents.diffusion.reverse_steps import concatenate_steps
 from agents.post_training import PostTrainConfig, PostTrainer
 from agents.post_training.rollouts import finished_scenes
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError
 from tests.helpers.small_runs import count_objects

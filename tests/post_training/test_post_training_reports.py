@@ -20,7 +20,7 @@ from agents.post_training.demo import run_demo
 from agents.post_training.doctor import diagnose
 from agents.post_training.report import Page, Picture, Section, Tile, write_report
 from agents.post_training.trainer import post_train
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards import make_reward
 from rewards.base import RewardContext, RewardOutput

@@ -14,7 +14,7 @@ import torch
 from agents.configuration.tree import changed
 from agents.post_training import PostTrainer, post_train
 from agents.post_training import regularisation as regularisation_module
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.errors import CorruptFileError, InvalidInputError, TrainingError, UnknownNameError

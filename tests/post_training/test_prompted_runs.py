@@ -19,8 +19,8 @@ from agents.post_training import (
 from agents.post_training.doctor import diagnose
 from agents.post_training.prompts import PromptDeck
 from agents.post_training.rollouts import collect, text_of
-from agents.priors.base import ScenePrior
 from agents.priors.mixed import MixedPrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.datasets import SceneDataset, generate

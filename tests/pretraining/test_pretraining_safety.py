@@ -14,7 +14,7 @@ from agents.pretraining.config import PretrainConfig
 from agents.pretraining.data import SceneTable
 from agents.pretraining.setup import prepare
 from agents.pretraining.trainer import Pretrainer
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.datasets import generate
 from scene_envs.errors import InvalidInputError, TrainingError

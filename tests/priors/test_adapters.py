@@ -14,7 +14,7 @@ from agents.cli.keys import compose, help_text
 from agents.post_training import post_train
 from agents.priors import ScenePrior
 from agents.priors.card import card_page
-from agents.priors.facts import PriorFacts
+from agents.priors.files import PriorFacts
 from agents.priors.testing import tiny_prior
 from scene_envs.envs.resolvers import resolve_prior
 from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError

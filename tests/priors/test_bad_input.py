@@ -19,7 +19,7 @@ from agents.cli import main
 from agents.diffusion import StepTable
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.trainer import pretrain
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.datasets import SceneDataset
 from scene_envs.datasets.prompts import describe_all

@@ -12,15 +12,15 @@ import pytest
 import torch
 
 from agents.configuration.tree import changed
-from agents.networks.bert_files import FOLDER_VARIABLE, load_bert
+from agents.networks.text_encoders import FOLDER_VARIABLE, load_bert
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.initial_prior import build_prior
 from agents.pretraining.trainer import pretrain
-from agents.priors.base import ScenePrior
 from agents.priors.card import package_prior
 from agents.priors.checkpoint_import import import_checkpoint
-from agents.priors.facts import PriorFacts
+from agents.priors.files import PriorFacts
 from agents.priors.mixed import MixedPrior
+from agents.priors.prior import ScenePrior
 from scene_envs.datasets import SceneDataset
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.errors import InvalidInputError, MissingDependencyError

@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from agents.priors.base import ScenePrior
-from agents.priors.checkpoint_import import _reorder, import_checkpoint
-from agents.priors.lightning_files import read_lightning
+from agents.priors.checkpoint_import import _reorder, import_checkpoint, read_lightning
+from agents.priors.prior import ScenePrior
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, UnknownNameError
 from tests.helpers.authors_flux import DIMSUM, forward, random_state, write_checkpoint
 

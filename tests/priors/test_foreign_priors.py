@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from agents.priors import ScenePrior
-from agents.priors.storage import ASSET_FOLDERS
+from agents.priors.files import ASSET_FOLDERS
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
 

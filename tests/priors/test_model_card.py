@@ -10,9 +10,9 @@ import pytest
 from agents import PretrainConfig
 from agents.cli import main
 from agents.configuration import config_text
-from agents.priors.base import ScenePrior
 from agents.priors.card import OWN_LICENSE, package_prior, prior_digest, read_measures
-from agents.priors.facts import PriorFacts
+from agents.priors.files import PriorFacts
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
 

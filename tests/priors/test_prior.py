@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from agents.priors.base import ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
 from scene_envs.scene import SceneBatch

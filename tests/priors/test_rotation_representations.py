@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,9 +16,15 @@ from agents.networks import FluxConfig, MixedFluxConfig
 from agents.networks.registry import network_config
 from agents.post_training import DDPOSFLoss, DenoisingPolicy
 from agents.post_training.rollouts import collect
-from agents.priors.base import ScenePrior
-from agents.priors.continuous import ContinuousPrior
-from agents.priors.rotation_codes import ROTATION_WIDTHS, ROTATIONS, SceneCode, decode_rotations, encode_rotations
+from agents.priors.continuous import (
+    ROTATION_WIDTHS,
+    ROTATIONS,
+    ContinuousPrior,
+    SceneCode,
+    decode_rotations,
+    encode_rotations,
+)
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.envs import DenoisingTorchRLEnv, DenoisingVectorEnv
 from scene_envs.errors import InvalidInputError, UnknownNameError
@@ -198,19 +203,6 @@ def test_the_loss_and_the_residual_are_of_the_own_width(prior: ContinuousPrior, 
 def test_files_keep_the_representation(prior: ContinuousPrior, tmp_path: Path) -> None:
     loaded = ScenePrior.load(prior.save(tmp_path))
     assert loaded.config.rotation == prior.config.rotation
-    assert torch.equal(loaded.sample(2, num_steps=3).tensor, prior.sample(2, num_steps=3).tensor)
-
-
-def test_older_files_hold_matrices(scenes: SceneBatch, tmp_path: Path) -> None:
-    prior = _prior("matrix", scenes)
-    directory = prior.save(tmp_path)
-    state = json.loads((directory / "config.json").read_text())
-    for key in ("rotation", "timesteps", "loss_weighting", "noise_floor", "noise_ceiling", "clip"):
-        del state["prior"][key]
-    del state["prior"]["network"]["kind"], state["sha256"]
-    (directory / "config.json").write_text(json.dumps(state))
-    loaded = ScenePrior.load(directory)
-    assert loaded.config.rotation == "matrix"
     assert torch.equal(loaded.sample(2, num_steps=3).tensor, prior.sample(2, num_steps=3).tensor)
 
 

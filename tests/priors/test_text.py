@@ -13,9 +13,9 @@ from agents.networks import MixedFluxConfig, TextConfig, TextEncoder
 from agents.networks.text import number_features, vocabulary
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.initial_prior import build_prior
-from agents.priors.base import ScenePrior
 from agents.priors.config import MixedPriorConfig
 from agents.priors.mixed import MixedPrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.errors import InvalidInputError

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from agents.cli.run_folder import Run
-    from agents.priors.base import ScenePrior
+    from agents.priors.prior import ScenePrior
     from scene_envs.scene import SceneBatch
 
 _SAMPLES, _PROMPTED = "scenes.safetensors", "prompted.safetensors"
@@ -109,7 +109,7 @@ def run(settings: EvaluateConfig, run: Run) -> None:
     """Sample, measure group by group, tabulate."""
     from agents.evaluation.measures import EvaluationInputs, compute_measure
     from agents.evaluation.real_scenes import RealScenes
-    from agents.priors.base import ScenePrior
+    from agents.priors.prior import ScenePrior
     from scene_envs.files import write_text
     from scene_envs.physics import PhysicsPool
 

@@ -111,7 +111,7 @@ def export_scenes(
 def _scenes(settings: ExportConfig, run: Run) -> SceneBatch:
     """The scenes that ``scenes`` or ``prior`` names, at most ``count``."""
     if settings.prior:
-        from agents.priors.base import ScenePrior
+        from agents.priors.prior import ScenePrior
 
         prior = ScenePrior.load(settings.prior)
         count = 16 if settings.count is None else settings.count

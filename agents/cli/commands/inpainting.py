@@ -13,7 +13,7 @@ from scene_envs.scene_sources import load_scenes
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
-    from agents.priors.base import ScenePrior
+    from agents.priors.prior import ScenePrior
     from scene_envs.scene import SceneBatch
 
 
@@ -84,7 +84,7 @@ def check(settings: InpaintingConfig) -> None:
 
 def load_prior_and_scenes(command: str, settings: InpaintingConfig) -> tuple[ScenePrior, SceneBatch]:
     """The prior and the scenes that a command works on."""
-    from agents.priors.base import ScenePrior
+    from agents.priors.prior import ScenePrior
 
     if not settings.scenes:
         fresh = ScenePrior.load(settings.prior).to(settings.device)

@@ -56,7 +56,7 @@ def check(settings: PackagePriorConfig) -> None:
 def run(settings: PackagePriorConfig) -> None:
     """Write the folder. The folder is the prior itself, so no log is written into it."""
     from agents.priors.card import package_prior
-    from agents.priors.facts import PriorFacts
+    from agents.priors.files import PriorFacts
 
     keys = {**vars(settings), "evaluation": settings.evaluation or None}
     folder = package_prior(keys.pop("prior"), **keys)

@@ -60,7 +60,6 @@ def check(settings: SampleConfig) -> None:
 
 def run(settings: SampleConfig, run: Run) -> None:
     """Draw, score, save and picture the scenes."""
-    from agents.priors.base import ScenePrior
     from agents.priors.guidance import physics_strength
     from rewards.process import close_reward, run_reward
     from scene_envs.export.formats import resolve_formats

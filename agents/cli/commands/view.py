@@ -86,7 +86,7 @@ def _gather(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str]:
     if settings.scenes:
         return _read(settings)
     if settings.prior:
-        from agents.priors.base import ScenePrior
+        from agents.priors.prior import ScenePrior
 
         prior = ScenePrior.load(settings.prior).to(settings.device)
         batch = prior.sample(

@@ -1,8 +1,8 @@
-"""The denoiser of a mixed prior: a network together with its two diffusion processes."""
+"""Denoisers: a network together with the diffusion process of a continuous prior, or the two of a mixed prior."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -12,12 +12,43 @@ from torch.nn import functional as F
 from agents.diffusion import CategoricalProcess, GaussianProcess
 from agents.diffusion.gaussian import Moments
 from agents.diffusion.reverse_steps import state_of
-from agents.networks.bert import BertEncoder
-from agents.networks.denoiser import autocast
-from agents.networks.packing import run_packed, take_slots
 from agents.networks.text import Text, TextEncoder
+from agents.networks.text_encoders import BertEncoder
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.scene import POSE_FEATURES
+
+
+def autocast(like: Tensor, precision: torch.dtype) -> torch.autocast:
+    """The context in which a network runs in ``precision`` on the device of ``like``; does nothing for float32."""
+    return torch.autocast(like.device.type, precision, enabled=precision != torch.float32)
+
+
+class Denoiser(nn.Module):
+    """A network together with its process: x_t (B, N, D) and t (B,) to the denoised scene x_0 (B, N, D).
+
+    Attributes:
+        precision: number format of the network alone (``torch.bfloat16`` for autocast); the chain is always float32.
+    """
+
+    def __init__(self, network: nn.Module, process: GaussianProcess) -> None:
+        super().__init__()
+        self.network = network
+        self.process = process
+        self.precision = torch.float32
+
+    def output(self, x_t: Tensor, t: Tensor) -> Tensor:
+        """The raw network output (B, N, D), in the units of ``process.target``."""
+        process = self.process
+        alpha, _ = process.rates(t, x_t)
+        level = (process.sigma[t.cpu()] / process.alpha[t.cpu()]).to(x_t.device)
+        with autocast(x_t, self.precision):
+            result: Tensor = self.network(process.network_input(x_t, t), x_t / alpha, level)
+        return result.to(x_t.dtype)
+
+    def forward(self, x_t: Tensor, t: Tensor) -> Tensor:
+        """The denoised scene x_0 (B, N, D), normalised."""
+        return self.process.x0_from_output(x_t, t, self.output(x_t, t))
+
 
 EMPTY_SLOTS = ("attended", "dropped")
 """Treatments of slots that are known to be empty."""
@@ -117,7 +148,7 @@ class MixedDenoiser(nn.Module):
         Args:
             x_t: (B, N, 12 + K), observed entries in place.
             t: (B,) timesteps.
-            observed: which entries carry no noise.
+            observed: entries that carry no noise.
             text: (B, L, W) tokens and (B, L) their mask.
         """
         pose, states = x_t[..., :POSE_FEATURES], state_of(x_t[..., POSE_FEATURES:])
@@ -147,16 +178,9 @@ class MixedDenoiser(nn.Module):
         extra = {} if slot_mask is None else {"slot_mask": slot_mask}
         with autocast(scaled, self.precision):
             output, logits = self.network(
-                scaled,
-                states,
-                time,
-                text=tokens,
-                text_mask=mask,
-                position=position,
-                noise_level=level,
-                observed=flags[0] if flags else None,
-                **extra,
-            )
+                scaled, states, time, text=tokens, text_mask=mask, position=position, noise_level=level,
+                observed=flags[0] if flags else None, **extra,
+            )  # fmt: skip
         return output.to(scaled.dtype), logits.to(scaled.dtype)
 
     def _on_present(self, inputs: Sequence[Tensor], time: Tensor, text: Text | None) -> tuple[Tensor, Tensor]:
@@ -182,3 +206,62 @@ class MixedDenoiser(nn.Module):
         output, logits = self.output(x_t, t, observed, text)
         moments = self.moments(state_of(x_t[..., POSE_FEATURES:]), t)
         return self.poses.x0_from_output(x_t[..., :POSE_FEATURES], t, output, moments), logits
+
+
+# -- packing: slots that are known to be empty are left out of a batch ----------------------------
+
+
+_CHUNKS = 4
+"""Parts of a batch on the CPU, each as wide as its fullest scene."""
+
+
+def pack(active: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Parts of a batch: scenes with similar numbers of active slots, and which of their slots to keep.
+
+    Args:
+        active: (B, N) bool, slots that take part.
+
+    Yields:
+        rows (b,) int64 of the part, index (b, M) int64 of its slots with the active ones first, and mask (b, M) bool
+        that is False on padding. Every scene is in one part. M is the largest number of active slots of a scene in the
+        part, at least 1.
+    """
+    counts = active.sum(dim=1)
+    chunks = _CHUNKS if active.device.type == "cpu" and len(active) >= 4 * _CHUNKS else 1
+    for rows in torch.argsort(counts, stable=True).tensor_split(chunks):
+        width = max(1, int(counts[rows].max()))
+        index = torch.argsort(~active[rows], dim=1, stable=True)[:, :width]
+        yield rows, index, active[rows].gather(1, index)
+
+
+def run_packed(
+    active: Tensor, run: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]], widths: tuple[int, int]
+) -> tuple[Tensor, Tensor]:
+    """The two outputs of ``run`` on the active slots, (B, N, W) each, with zeros elsewhere.
+
+    Args:
+        active: (B, N) bool.
+        run: function of rows, index and mask of :func:`pack` that gives two tensors (b, M, W).
+        widths: W of the two outputs.
+    """
+    parts, order = [], []
+    for rows, index, mask in pack(active):
+        order.append(rows)
+        parts.append(
+            [_spread(part * mask[..., None], index, active.shape[1], width)
+             for part, width in zip(run(rows, index, mask), widths, strict=True)]
+        )  # fmt: skip
+    back = torch.argsort(torch.cat(order))
+    first, second = (torch.cat([part[side] for part in parts])[back] for side in (0, 1))
+    return first, second
+
+
+def take_slots(x: Tensor, rows: Tensor, index: Tensor) -> Tensor:
+    """(b, M, ...) slots ``index`` (b, M) of the scenes ``rows`` of x (B, N, ...)."""
+    return x[rows[:, None], index]
+
+
+def _spread(values: Tensor, index: Tensor, slots: int, width: int) -> Tensor:
+    """(b, slots, width) with ``values`` (b, M, width) at ``index``."""
+    empty = values.new_zeros(len(values), slots, width)
+    return empty.scatter(1, index[..., None].expand(-1, -1, width), values)

@@ -1,0 +1,473 @@
+"""Baseline networks: MiDiffusion and DiffuScene, with inputs for slots, time and text and outputs for slots in common.
+
+The *trunk* between inputs and outputs maps tokens (B, N, H), a time embedding (B, H) and text (B, L, H) with its mask
+(B, 1, 1, L), both None without text, to tokens (B, N, H).
+
+MiDiffusion (Hu et al. 2024, "Mixed Diffusion for 3D Indoor Scene Synthesis", section on the denoising network) is a
+transformer over the objects of a scene, without positional encoding. Each object is a token, made of the embedding of
+its category and an MLP of its pose. Every block has self-attention among objects, cross-attention to the condition and
+a feed-forward layer, each behind a layer norm whose scale and shift are functions of time. Separate heads predict
+categories and poses. The paper's condition is a floor plan; here it is text, as in the comparison of Pfaff et al. (CoRL
+2025).
+
+DiffuScene (Tang et al. 2024, "DiffuScene: Denoising Diffusion Models for Generative Indoor Scene Synthesis", section on
+the denoising network) is a U-Net of 1-D convolutions along the slots of a scene. MLPs that all objects share encode
+their attributes to channels and decode them. Between encoder and decoder there are residual blocks of convolutions, to
+which the time embedding is added. Each level has attention among slots and, with text, from slots to words. As in the
+U-Net of Ho et al. 2020, convolutions of stride 2 halve the resolution on the way down, and skip connections lead from
+each level on the way down to that on the way up. Convolutions mix neighbouring slots, so the network depends on the
+order of slots, although scenes have no order.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from agents.networks.flux import timestep_embedding
+from agents.networks.flux_modules import fourier_features
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import POSE_FEATURES
+
+_TIME_WIDTH = 256
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaselineConfig:
+    """Common part of the sizes of all baselines.
+
+    Attributes:
+        hidden: width of the tokens; a multiple of ``heads``.
+        heads: attention heads.
+        text_width: width of the text tokens; 0 for none.
+        frequencies: octaves of Fourier features of each translation, damped by the noise; 0 for none, as published.
+    """
+
+    hidden: int = 128
+    heads: int = 4
+    text_width: int = 0
+    frequencies: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("hidden", "heads"):
+            if getattr(self, name) < 1:
+                raise InvalidInputError(f"{name}={getattr(self, name)} is not positive")
+        if self.hidden % self.heads:
+            raise InvalidInputError(f"hidden={self.hidden} is not a multiple of heads={self.heads}")
+
+    @property
+    def time_input(self) -> str:
+        """The number that is embedded as time; see :class:`~agents.networks.MixedFluxConfig`."""
+        return "log_noise" if self.frequencies else "timestep"
+
+
+@dataclass(frozen=True, kw_only=True)
+class MixedBaselineConfig(BaselineConfig):
+    """Common part of the sizes of all baselines of mixed scenes.
+
+    Attributes:
+        categories: K = C + 1, assets and *empty*; the mask token is one more.
+        time_scale: factor on timesteps before they are embedded.
+        flags: 1 to tell the network which poses and categories are observed (inpainting), 0 as published.
+    """
+
+    categories: int
+    time_scale: float = 1.0
+    flags: int = 1
+
+
+class Attention(nn.Module):
+    """Multi-head attention of tokens (B, N, H) to ``source`` (B, M, H), which may be the same tokens.
+
+    >>> attention = Attention(hidden=16, heads=2)
+    >>> attention(torch.randn(2, 5, 16), torch.randn(2, 3, 16)).shape
+    torch.Size([2, 5, 16])
+    """
+
+    def __init__(self, hidden: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.query = nn.Linear(hidden, hidden)
+        self.key_value = nn.Linear(hidden, 2 * hidden)
+        self.out = nn.Linear(hidden, hidden)
+
+    def forward(self, tokens: Tensor, source: Tensor, mask: Tensor | None = None) -> Tensor:
+        """Attended (B, N, H); ``mask`` (B, 1, 1, M) is True where to attend."""
+        query = self.query(tokens).unflatten(-1, (self.heads, -1)).transpose(1, 2)
+        key, value = self.key_value(source).unflatten(-1, (2, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        attended = F.scaled_dot_product_attention(query, key, value, attn_mask=mask)
+        return self.out(attended.transpose(1, 2).flatten(-2))
+
+
+def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
+    """Two linear layers with a GELU between them."""
+    return nn.Sequential(nn.Linear(inputs, hidden), nn.GELU(), nn.Linear(hidden, outputs))
+
+
+def head(hidden: int, outputs: int) -> nn.Sequential:
+    """Layer norm and two layers, of which the last starts at zero."""
+    last = nn.Linear(hidden, outputs)
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)
+    return nn.Sequential(nn.LayerNorm(hidden), nn.Linear(hidden, hidden), nn.GELU(), last)
+
+
+class _Baseline(nn.Module):
+    """A trunk with inputs for time and text."""
+
+    def __init__(self, config: BaselineConfig, trunk: nn.Module) -> None:
+        super().__init__()
+        self.config = config
+        hidden = config.hidden
+        self.time_in = mlp(_TIME_WIDTH, hidden, hidden)
+        self.text_in = nn.Linear(config.text_width, hidden) if config.text_width else None
+        self.trunk = trunk
+        octaves = math.pi * 2.0 ** torch.arange(config.frequencies, dtype=torch.float32)
+        self.octaves: Tensor
+        self.register_buffer("octaves", octaves, persistent=False)
+
+    def _tokens(self, tokens: Tensor, time: Tensor, text: Tensor | None, text_mask: Tensor | None) -> Tensor:
+        """Tokens (B, N, H) through the trunk; ``time`` (B,)."""
+        condition = self.time_in(timestep_embedding(time, _TIME_WIDTH).to(tokens.dtype))
+        if self.text_in is None:
+            return self.trunk(tokens, condition, None, None)
+        if text is None:
+            text, text_mask = tokens.new_zeros(len(tokens), 1, self.text_in.in_features), None
+        mask = None
+        if text_mask is not None:
+            text = text * text_mask[..., None]
+            somewhere = text_mask.any(dim=-1, keepdim=True)
+            mask = (text_mask | ~somewhere)[:, None, None]  # a row of padding alone is read as no text
+        return self.trunk(tokens, condition, self.text_in(text), mask)
+
+    def _with_octaves(self, features: Tensor, position: Tensor | None, noise_level: Tensor | None) -> Tensor:
+        """Features (B, N, D), with Fourier features of the translations appended where the network has any.
+
+        The translations are the first three features of ``position``.
+        """
+        if not len(self.octaves):
+            return features
+        if position is None or noise_level is None:
+            raise InvalidInputError("a network with Fourier features needs position= and noise_level=")
+        return torch.cat([features, fourier_features(position, noise_level, self.octaves)], dim=-1)
+
+
+class ContinuousBaseline(_Baseline):
+    """Scenes (B, N, D) at a noise level (B,) to a prediction (B, N, D), which starts at zero."""
+
+    def __init__(self, config: BaselineConfig, features: int, trunk: nn.Module) -> None:
+        super().__init__(config, trunk)
+        self.scene_in = mlp(features + 6 * config.frequencies, config.hidden, config.hidden)
+        self.scene_out = head(config.hidden, features)
+
+    def forward(
+        self, x: Tensor, position: Tensor, noise_level: Tensor, *, text: Tensor | None = None,
+        text_mask: Tensor | None = None,
+    ) -> Tensor:  # fmt: skip
+        """Predict.
+
+        Args:
+            x: (B, N, D) network input, unit variance.
+            position: (B, N, D) the scene in signal units; its first three features are read, for Fourier features.
+            noise_level: (B,) noise-to-signal ratio of ``position``; its logarithm is the time that is embedded.
+            text: (B, L, W) text tokens; None for no text.
+            text_mask: (B, L) bool, True for real tokens.
+        """
+        levels = noise_level[:, None].expand(x.shape[:2])
+        tokens = self.scene_in(self._with_octaves(x, position, levels))
+        return self.scene_out(self._tokens(tokens, 250.0 * noise_level.log(), text, text_mask))
+
+
+class MixedBaseline(_Baseline):
+    """Poses (B, N, 12) and category states (B, N) to a pose output (B, N, 12) and logits (B, N, K), zero at first."""
+
+    def __init__(self, config: MixedBaselineConfig, trunk: nn.Module) -> None:
+        super().__init__(config, trunk)
+        hidden = config.hidden
+        self.time_scale = config.time_scale
+        self.pose_in = mlp(POSE_FEATURES + 6 * config.frequencies, hidden, hidden)
+        self.category_in = nn.Embedding(config.categories + 1, hidden)
+        self.given_in = nn.Embedding(4, hidden) if config.flags else None
+        if self.given_in is not None:
+            nn.init.zeros_(self.given_in.weight)
+        self.pose_out = head(hidden, POSE_FEATURES)
+        self.logits_out = head(hidden, config.categories)
+
+    def forward(
+        self, pose: Tensor, states: Tensor, time: Tensor, *, text: Tensor | None = None,
+        text_mask: Tensor | None = None, position: Tensor | None = None, noise_level: Tensor | None = None,
+        observed: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        """Predict; arguments and results as in :meth:`agents.networks.flux.MixedFlux.forward`."""
+        tokens = self.pose_in(self._with_octaves(pose, position, noise_level)) + self.category_in(states)
+        if self.given_in is not None and observed is not None:
+            tokens = tokens + self.given_in(observed)
+        tokens = self._tokens(tokens, time * self.time_scale, text, text_mask)
+        return self.pose_out(tokens), self.logits_out(tokens)
+
+
+# -- MiDiffusion ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class _MiDiffusionSize(BaselineConfig):
+    depth: int = 6
+    mlp_ratio: float = 4.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.depth < 1:
+            raise InvalidInputError(f"depth={self.depth} is not positive")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MiDiffusionConfig(_MiDiffusionSize):
+    """Size of a :class:`MiDiffusion`.
+
+    Further fields are those of :class:`BaselineConfig`.
+
+    Attributes:
+        features: D, numbers per slot.
+        depth: number of blocks.
+        mlp_ratio: width of the feed-forward layers over ``hidden``.
+    """
+
+    features: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class MixedMiDiffusionConfig(_MiDiffusionSize, MixedBaselineConfig):
+    """Size of a :class:`MixedMiDiffusion`: that of :class:`MiDiffusionConfig`, and :class:`MixedBaselineConfig`."""
+
+
+class _AdaptiveNorm(nn.Module):
+    """Layer norm whose scale and shift are linear in the time embedding (adaptive layer norm)."""
+
+    def __init__(self, hidden: int) -> None:
+        super().__init__()
+        self.hidden = hidden
+        self.modulation = nn.Linear(hidden, 2 * hidden)
+        nn.init.zeros_(self.modulation.weight)
+        nn.init.zeros_(self.modulation.bias)
+
+    def forward(self, tokens: Tensor, condition: Tensor) -> Tensor:
+        shift, scale = self.modulation(F.silu(condition)).unsqueeze(1).chunk(2, dim=-1)
+        return (1 + scale) * F.layer_norm(tokens, (self.hidden,)) + shift
+
+
+class _Block(nn.Module):
+    """Self-attention, cross-attention to the text when there is any, and a feed-forward layer."""
+
+    def __init__(self, config: _MiDiffusionSize) -> None:
+        super().__init__()
+        hidden = config.hidden
+        self.norm, self.feed_norm = _AdaptiveNorm(hidden), _AdaptiveNorm(hidden)
+        self.attention = Attention(hidden, config.heads)
+        self.text_norm = _AdaptiveNorm(hidden) if config.text_width else None
+        self.text_attention = Attention(hidden, config.heads) if config.text_width else None
+        self.feed = mlp(hidden, round(hidden * config.mlp_ratio), hidden)
+
+    def forward(self, tokens: Tensor, condition: Tensor, text: Tensor | None, mask: Tensor | None) -> Tensor:
+        normal = self.norm(tokens, condition)
+        tokens = tokens + self.attention(normal, normal)
+        if self.text_norm is not None and self.text_attention is not None and text is not None:
+            tokens = tokens + self.text_attention(self.text_norm(tokens, condition), text, mask)
+        return tokens + self.feed(self.feed_norm(tokens, condition))
+
+
+class _Transformer(nn.Module):
+    """The trunk: blocks, one after the other."""
+
+    def __init__(self, config: _MiDiffusionSize) -> None:
+        super().__init__()
+        self.blocks = nn.ModuleList(_Block(config) for _ in range(config.depth))
+
+    def forward(self, tokens: Tensor, condition: Tensor, text: Tensor | None, mask: Tensor | None) -> Tensor:
+        for block in self.blocks:
+            tokens = block(tokens, condition, text, mask)
+        return tokens
+
+
+class MiDiffusion(ContinuousBaseline):
+    """Scenes (B, N, D) at a noise level (B,) to a prediction (B, N, D); permutation-equivariant in N.
+
+    >>> network = MiDiffusion(MiDiffusionConfig(features=20, hidden=32, depth=2, heads=2))
+    >>> x = torch.randn(2, 34, 20)
+    >>> network(x, x, torch.tensor([0.1, 0.2])).shape
+    torch.Size([2, 34, 20])
+    """
+
+    def __init__(self, config: MiDiffusionConfig) -> None:
+        super().__init__(config, config.features, _Transformer(config))
+
+
+class MixedMiDiffusion(MixedBaseline):
+    """Poses (B, N, 12) and states (B, N) to a pose output (B, N, 12) and logits (B, N, K); permutation-equivariant.
+
+    >>> network = MixedMiDiffusion(MixedMiDiffusionConfig(categories=8, hidden=32, depth=2, heads=2, text_width=16))
+    >>> pose, states = torch.randn(2, 5, 12), torch.randint(9, (2, 5))
+    >>> out, logits = network(pose, states, torch.tensor([3.0, 7.0]), text=torch.randn(2, 4, 16))
+    >>> out.shape, logits.shape
+    (torch.Size([2, 5, 12]), torch.Size([2, 5, 8]))
+    """
+
+    def __init__(self, config: MixedMiDiffusionConfig) -> None:
+        super().__init__(config, _Transformer(config))
+
+
+# -- DiffuScene -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class _DiffuSceneSize(BaselineConfig):
+    hidden: int = 64
+    levels: int = 4
+    blocks: int = 2
+    inner_ratio: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("levels", "blocks"):
+            if getattr(self, name) < 1:
+                raise InvalidInputError(f"{name}={getattr(self, name)} is not positive")
+
+    @property
+    def inner(self) -> int:
+        """Channels between the two convolutions of a residual block, a multiple of ``heads``."""
+        return max(1, round(self.hidden * self.inner_ratio / self.heads)) * self.heads
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiffuSceneConfig(_DiffuSceneSize):
+    """Size of a :class:`DiffuScene`.
+
+    Attributes:
+        features: D, numbers per slot.
+        hidden: channels at every level; a multiple of ``heads``.
+        levels: resolutions along the slots, each half of the one before.
+        blocks: residual blocks per level, on the way down and again on the way up.
+        heads: attention heads, and groups of the group norms.
+        inner_ratio: channels between the two convolutions of a residual block, over ``hidden``.
+    """
+
+    features: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class MixedDiffuSceneConfig(_DiffuSceneSize, MixedBaselineConfig):
+    """Size of a :class:`MixedDiffuScene`: that of :class:`DiffuSceneConfig`, and :class:`MixedBaselineConfig`."""
+
+
+class _Residual(nn.Module):
+    """Two convolutions of width 3 with the time embedding between them (Ho et al. 2020)."""
+
+    def __init__(self, config: _DiffuSceneSize, channels: int) -> None:
+        super().__init__()
+        hidden, inner = config.hidden, config.inner
+        self.norm = nn.GroupNorm(config.heads, channels)
+        self.convolution = nn.Conv1d(channels, inner, 3, padding=1)
+        self.time = nn.Linear(hidden, inner)
+        self.inner_norm = nn.GroupNorm(config.heads, inner)
+        self.out = nn.Conv1d(inner, hidden, 3, padding=1)
+        self.skip = nn.Conv1d(channels, hidden, 1) if channels != hidden else nn.Identity()
+
+    def forward(self, x: Tensor, condition: Tensor) -> Tensor:
+        """Channels (B, C, N) and the time embedding (B, H) to (B, H, N)."""
+        h = self.convolution(F.silu(self.norm(x))) + self.time(F.silu(condition))[..., None]
+        return self.skip(x) + self.out(F.silu(self.inner_norm(h)))
+
+
+class _Attend(nn.Module):
+    """Attention among the slots of a level, then from them to the text when there is any."""
+
+    def __init__(self, config: _DiffuSceneSize) -> None:
+        super().__init__()
+        hidden, heads = config.hidden, config.heads
+        self.norm = nn.GroupNorm(heads, hidden)
+        self.attention = Attention(hidden, heads)
+        self.text_norm = nn.GroupNorm(heads, hidden) if config.text_width else None
+        self.text_attention = Attention(hidden, heads) if config.text_width else None
+
+    def forward(self, x: Tensor, text: Tensor | None, mask: Tensor | None) -> Tensor:
+        """Channels (B, H, N) to the same."""
+        normal = self.norm(x).transpose(1, 2)
+        x = x + self.attention(normal, normal).transpose(1, 2)
+        if self.text_norm is not None and self.text_attention is not None and text is not None:
+            x = x + self.text_attention(self.text_norm(x).transpose(1, 2), text, mask).transpose(1, 2)
+        return x
+
+
+class _Level(nn.Module):
+    """The residual blocks and the attention of one resolution, on the way down or on the way up."""
+
+    def __init__(self, config: _DiffuSceneSize, channels: int) -> None:
+        super().__init__()
+        widths = [channels] + [config.hidden] * (config.blocks - 1)
+        self.blocks = nn.ModuleList(_Residual(config, width) for width in widths)
+        self.attend = _Attend(config)
+
+    def forward(self, x: Tensor, condition: Tensor, text: Tensor | None, mask: Tensor | None) -> Tensor:
+        for block in self.blocks:
+            x = block(x, condition)
+        return self.attend(x, text, mask)
+
+
+class _UNet(nn.Module):
+    """The trunk, for any number of slots: halving rounds up, and doubling cuts off surplus slots."""
+
+    def __init__(self, config: _DiffuSceneSize) -> None:
+        super().__init__()
+        hidden = config.hidden
+        self.first = nn.Conv1d(hidden, hidden, 3, padding=1)
+        self.down = nn.ModuleList(_Level(config, hidden) for _ in range(config.levels))
+        self.to_coarse = nn.ModuleList(nn.Conv1d(hidden, hidden, 3, 2, 1) for _ in range(config.levels - 1))
+        self.middle_in, self.middle_out = _Residual(config, hidden), _Residual(config, hidden)
+        self.middle = _Attend(config)
+        self.to_fine = nn.ModuleList(nn.Conv1d(hidden, hidden, 3, padding=1) for _ in range(config.levels - 1))
+        self.up = nn.ModuleList(_Level(config, 2 * hidden) for _ in range(config.levels))
+
+    def forward(self, tokens: Tensor, condition: Tensor, text: Tensor | None, mask: Tensor | None) -> Tensor:
+        x = self.first(tokens.transpose(1, 2))
+        skips: list[Tensor] = []
+        for index, level in enumerate(self.down):
+            x = self.to_coarse[index - 1](x) if index else x
+            x = level(x, condition, text, mask)
+            skips.append(x)
+        x = self.middle_out(self.middle(self.middle_in(x, condition), text, mask), condition)
+        for index, level in enumerate(self.up):
+            skip = skips.pop()
+            if index:
+                x = self.to_fine[index - 1](x.repeat_interleave(2, dim=-1)[..., : skip.shape[-1]])
+            x = level(torch.cat([x, skip], dim=1), condition, text, mask)
+        return x.transpose(1, 2)
+
+
+class DiffuScene(ContinuousBaseline):
+    """Scenes (B, N, D) at a noise level (B,) to a prediction (B, N, D); depends on the order of slots.
+
+    >>> network = DiffuScene(DiffuSceneConfig(features=20, hidden=16, heads=2))
+    >>> x = torch.randn(2, 35, 20)
+    >>> network(x, x, torch.tensor([0.1, 0.2])).shape
+    torch.Size([2, 35, 20])
+    """
+
+    def __init__(self, config: DiffuSceneConfig) -> None:
+        super().__init__(config, config.features, _UNet(config))
+
+
+class MixedDiffuScene(MixedBaseline):
+    """Poses (B, N, 12) and states (B, N) to a pose output (B, N, 12) and logits (B, N, K); depends on slot order.
+
+    >>> network = MixedDiffuScene(MixedDiffuSceneConfig(categories=8, hidden=16, heads=2, text_width=16))
+    >>> pose, states = torch.randn(2, 5, 12), torch.randint(9, (2, 5))
+    >>> out, logits = network(pose, states, torch.tensor([3.0, 7.0]), text=torch.randn(2, 4, 16))
+    >>> out.shape, logits.shape
+    (torch.Size([2, 5, 12]), torch.Size([2, 5, 8]))
+    """
+
+    def __init__(self, config: MixedDiffuSceneConfig) -> None:
+        super().__init__(config, _UNet(config))

@@ -1,0 +1,437 @@
+"""Modules of the Flux core that read geometry: rotations, relations between slots, and contacts between objects.
+
+A denoiser of the nine entries of a matrix has to learn that they form a rotation, and that most objects stand upright.
+Both show in differences as small as the noise, which a network that reads the entries alone learns last: where objects
+of a category lie flat in one place and lean in another, its samples lie flat only to ten degrees. *Rotation features*
+are these differences in units of the noise.
+
+A transformer that reads positions slot by slot has to learn distances by itself. *Relations* are features of pairs of
+slots. They bias the attention logits, and attention sums them with the weights with which it sums the values, so that a
+head learns the offsets of its neighbours (as with the edges of graph transformers, Dwivedi and Bresson 2021, and in the
+structure module of AlphaFold, Jumper et al. 2021).
+
+Objects do not overlap, and stand on each other, to within a fraction of a millimetre. The distance between the centres
+of two touching objects depends on both categories and on the direction, and on hardly anything else. *Contacts* learn
+this distance with a small network on pairs of slots. A gap is the actual distance minus the learned one, in units of
+the noise, because a denoiser can move objects only on the scale of the noise. Messages and displacements are computed
+from the gaps.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from agents.networks.flux_modules import FluxModule, FluxSizes, ModuleConfig, Scene
+from scene_envs.errors import unknown_name
+from scene_envs.rotations import project_to_so3
+
+# -- rotations ------------------------------------------------------------------------------------
+
+
+ROTATION_FEATURES = 9 + 4
+"""Numbers per rotation."""
+_TILTS = (6, 7, 2, 5)
+"""Entries R_20, R_21, R_02 and R_12 of a row-major matrix."""
+_MIN_ROTATION_NOISE = 1e-4
+_TILT_REACH = 4.0
+"""Standard deviations at which the distance from upright saturates."""
+
+
+@dataclass(frozen=True)
+class RotationFeaturesConfig(ModuleConfig):
+    """Features of rotations, read with each pose and added, through gates, to the output of rotations."""
+
+    name = "rotation_features"
+    place = "output"
+    reads_geometry = True
+    reads_rotations = True
+
+    @property
+    def pose_width(self) -> int:
+        return ROTATION_FEATURES
+
+    def build(self, core: FluxSizes) -> RotationFeatures:
+        return RotationFeatures(core.embedding)
+
+
+class RotationFeatures(FluxModule):
+    """Features (B, N, :data:`ROTATION_FEATURES`) of rotations, and gates on them that start at zero."""
+
+    def __init__(self, embedding: int) -> None:
+        super().__init__()
+        self.gates = nn.Linear(embedding, ROTATION_FEATURES)
+        nn.init.zeros_(self.gates.weight)
+        nn.init.zeros_(self.gates.bias)
+
+    def pose_features(self, scene: Scene) -> Tensor | None:
+        if scene.noisy_rotation is None or scene.rotation is None or scene.rotation_noise is None:
+            return None
+        scene.kept[RotationFeaturesConfig.name] = rotation_features(
+            scene.noisy_rotation, scene.rotation, scene.rotation_noise
+        )
+        return scene.kept[RotationFeaturesConfig.name]
+
+    def pose_output(self, scene: Scene, features: Tensor) -> Tensor | None:
+        turns = scene.kept.get(RotationFeaturesConfig.name)
+        return None if turns is None else F.pad(gated_rotation(turns, self.gates(features)), (3, 0))
+
+
+@torch.no_grad()
+def nearest_rotations(rotation: Tensor) -> Tensor:
+    """The rotations that are nearest to noisy matrices (B, N, 3, 3); the identity where all entries are NaN."""
+    with torch.autocast(rotation.device.type, enabled=False):
+        wide = rotation if rotation.dtype == torch.float64 else rotation.float()
+        return project_to_so3(wide.nan_to_num())
+
+
+@torch.no_grad()
+def rotation_features(rotation: Tensor, nearest: Tensor, noise: Tensor) -> Tensor:
+    """Differences of matrices from SO(3), and of the nearest rotations from upright, (B, N, :data:`ROTATION_FEATURES`).
+
+    Args:
+        rotation: (B, N, 3, 3) noisy rotation matrices.
+        nearest: (B, N, 3, 3) their nearest rotations, from :func:`nearest_rotations`.
+        noise: (B, N) standard deviation of the noise on the entries of ``rotation``.
+
+    Returns:
+        The residual of the projection onto SO(3), row-major, divided by the noise; three of the nine dimensions of the
+        noise are not in it. Then R_20, R_21, R_02 and R_12 of the projection, divided by the noise and saturating. They
+        are 0 where the z-axes of object and world are parallel. No gradient passes.
+
+    >>> upright = torch.eye(3).expand(1, 2, 3, 3)
+    >>> rotation_features(upright, nearest_rotations(upright), torch.full((1, 2), 0.1)).abs().max() < 1e-5
+    tensor(True)
+    """
+    level = noise.to(nearest).clamp(min=_MIN_ROTATION_NOISE)[..., None]
+    off = (rotation.to(nearest) - nearest).flatten(-2) / level
+    tilt = nearest.flatten(-2)[..., list(_TILTS)]
+    return torch.cat([off, tilt / (level.square() + (tilt / _TILT_REACH).square()).sqrt()], dim=-1)
+
+
+def gated_rotation(features: Tensor, gates: Tensor) -> Tensor:
+    """Contribution of features (B, N, F) to the nine outputs of a rotation, each with a gate (B, N, F) of its own.
+
+    If the features had to pass through the blocks, the blocks would have to carry thirteen noisy numbers for every
+    object. With gates, the network only has to predict which features count. This depends on the category and on where
+    the object lies.
+    """
+    off, tilt = (features * gates).split([9, 4], dim=-1)
+    return off.index_add(-1, torch.tensor(_TILTS, device=off.device), tilt)
+
+
+# -- relations between slots ----------------------------------------------------------------------
+
+
+_SCALES = 8
+PAIR_FEATURES = 5 * _SCALES
+"""Numbers per pair of slots."""
+BLURS = ("axis", "largest")
+"""The noise that blurs the features of an axis: that of the axis itself, or the largest of all axes."""
+
+
+@dataclass(frozen=True)
+class RelationsConfig(ModuleConfig):
+    """Attention between slots that sees where the others stand.
+
+    Attributes:
+        blur: the noise that blurs features of an axis, one of :data:`BLURS`; see :class:`Relations`.
+    """
+
+    blur: str = "axis"
+
+    name = "relations"
+    place = "attention"
+    reads_geometry = True
+
+    def __post_init__(self) -> None:
+        if self.blur not in BLURS:
+            raise unknown_name("blur", self.blur, BLURS)
+
+    @property
+    def pair_width(self) -> int:
+        return PAIR_FEATURES
+
+    def build(self, core: FluxSizes) -> Relations:
+        return Relations(core.blocks, core.heads, core.unit, blur=self.blur)
+
+
+def pair_features(metres: Tensor, noise: Tensor, scales: Tensor) -> Tensor:
+    """Features of every pair of slots, (B, N, N, F); entry (i, j) is of the offset from slot j to slot i.
+
+    They are Gaussians of the horizontal distance and of the difference in height at every scale, then the offsets along
+    z, x and y, which saturate beyond each scale. All are blurred by the noise on the two positions: E exp(-d^2 / 2 l^2)
+    under Gaussian noise is a wider Gaussian.
+
+    Args:
+        metres: (B, N, 3) positions.
+        noise: (B, N, 3) standard deviation of the noise on them along x, y, z, metres; (B, N, 1) if equal for all axes.
+        scales: (8,) lengths, metres.
+    """
+    variance, wide = noise.square(), scales.square()
+    x, y, z = (metres.unsqueeze(2) - metres.unsqueeze(1)).unsqueeze(-1).unbind(dim=-2)  # (B, N, N, 1)
+    blurs = (variance.unsqueeze(2) + variance.unsqueeze(1)).unsqueeze(-1).unbind(dim=-2)
+    along_x, along_y, along_z = [blur + wide for blur in blurs] if len(blurs) == 3 else [blurs[0] + wide] * 3  # ..., 8
+    xx, yy, zz = x.square(), y.square(), z.square()
+    reach_x = (xx + yy + along_x).sqrt()
+    reach_y = reach_x if along_y is along_x else (xx + yy + along_y).sqrt()
+    parts = [torch.exp(-0.5 * (xx / along_x + yy / along_y)), torch.exp(-0.5 * zz / along_z)]
+    return torch.cat([*parts, z / (zz + along_z).sqrt(), x / reach_x, y / reach_y], dim=-1)
+
+
+class Relations(FluxModule):
+    """Features of pairs of slots, and the biases that every attention block makes of them.
+
+    Permutation-equivariant. Positions are read in normalised units; features are computed in metres.
+
+    Args:
+        blocks: attention blocks.
+        heads: heads per block.
+        unit: metres per normalised unit along x, y, z; 0 along an axis that never varies.
+        width: hidden width.
+        blur: the noise that blurs features of an axis: ``"axis"`` for the noise of the axis itself, ``"largest"`` for
+            the largest noise of all axes, which is too large for heights in rooms.
+
+    >>> relations = Relations(blocks=2, heads=4, unit=(0.5, 0.5, 0.5))
+    >>> bias, features = relations(torch.zeros(3, 5, 3), torch.ones(3, 5))
+    >>> bias.shape, features.shape
+    (torch.Size([2, 3, 4, 5, 5]), torch.Size([3, 5, 5, 40]))
+    """
+
+    def __init__(
+        self, blocks: int, heads: int, unit: tuple[float, float, float], width: int = 32, blur: str = "axis"
+    ) -> None:
+        super().__init__()
+        if blur not in BLURS:
+            raise unknown_name("blur", blur, BLURS)
+        self.blocks, self.heads, self.blur = blocks, heads, blur
+        largest = torch.tensor(max(*unit, 0.1))
+        self.unit: Tensor
+        self.scales: Tensor
+        self.register_buffer("unit", torch.tensor(unit), persistent=False)
+        self.register_buffer("scales", torch.logspace(-2, float(largest.log10()), _SCALES), persistent=False)
+        self.hidden = nn.Linear(3 * _SCALES, width)
+        self.out = nn.Linear(width, blocks * heads)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+    def relations(self, scene: Scene) -> tuple[Tensor, Tensor] | None:
+        if scene.position is None or scene.noise_level is None:
+            return None
+        biases, features = self(scene.position[..., :3], scene.noise_level)
+        return biases, features
+
+    def forward(self, position: Tensor, noise_level: Tensor) -> tuple[Tensor, Tensor]:
+        """Biases (blocks, B, heads, N, N) and features (B, N, N, :data:`PAIR_FEATURES`).
+
+        Args:
+            position: (B, N, 3), normalised.
+            noise_level: (B, N) noise on the positions, in the same units.
+        """
+        unit = self.unit.to(position)
+        blurred = unit if self.blur == "axis" else unit.max().reshape(1)
+        features = pair_features(position * unit, noise_level.unsqueeze(-1) * blurred, self.scales.to(position))
+        bias: Tensor = self.out(F.silu(self.hidden(features[..., : 3 * _SCALES])))
+        return bias.unflatten(-1, (self.blocks, self.heads)).permute(3, 0, 4, 1, 2).contiguous(), features
+
+
+def joint_attention(
+    query: Tensor,
+    key: Tensor,
+    value: Tensor,
+    mask: Tensor | None = None,
+    relations: Tensor | None = None,
+    gathered: nn.Linear | None = None,
+) -> Tensor:
+    """Attention over T tokens, (B, T, H), plus a linear map of ``relations``, summed with the attention weights.
+
+    Args:
+        query, key, value: (B, heads, T, H / heads).
+        mask: mask of :func:`torch.nn.functional.scaled_dot_product_attention`; a float one with ``relations``.
+        relations: (B, N, N, F) features of pairs of the last N tokens, the slots; None for none.
+        gathered: linear map from heads * F to H.
+    """
+    if relations is None or gathered is None or mask is None:
+        return F.scaled_dot_product_attention(query, key, value, attn_mask=mask).transpose(1, 2).flatten(-2)
+    weights = (query @ key.transpose(-1, -2) / query.shape[-1] ** 0.5 + mask).softmax(dim=-1)
+    slots = relations.shape[1]
+    among = weights[:, :, -slots:, -slots:].transpose(1, 2)  # (B, N, heads, N)
+    message = gathered((among @ relations).flatten(-2))
+    attended = (weights @ value).transpose(1, 2).flatten(-2)
+    return attended + F.pad(message, (0, 0, attended.shape[1] - slots, 0))
+
+
+# -- contacts -------------------------------------------------------------------------------------
+
+
+CHANNELS = 4
+"""Number of displacements of every slot."""
+_GAPS = 8  # of a pair: horizontal, in height, along the three axes of i, along those of j
+_DIRECTIONS = 6
+_BASIS = 3  # functions of each gap that a layer reads
+_GAP_REACH = 4.0
+_GAP_OF = (0, 0, 1, 2, 3, 4, 5, 5, 5, 6, 6, 6, 7, 7, 7)
+"""The gap of each component of ``ways``: x, y, z of the world, the axes of i, and x, y, z of each axis of j."""
+_TYPICAL = 0.1  # metres between the centres of objects that touch
+_MIN_NOISE = 2e-4  # metres
+
+
+@dataclass(frozen=True)
+class ContactsConfig(ModuleConfig):
+    """Displacements along the gaps between objects; reads the features of pairs that relations offer."""
+
+    name = "contacts"
+    place = "output"
+    requires = ("relations",)
+    reads_geometry = True
+    reads_rotations = True
+
+    def build(self, core: FluxSizes) -> Contacts:
+        return Contacts(core.categories, core.pair_width, core.hidden, core.embedding)
+
+
+class Contacts(FluxModule):
+    """Messages between slots about the gaps between them, and displacements along these gaps.
+
+    Permutation-equivariant. For slots i and j, a network predicts the distances at which the two objects touch:
+    horizontally, in height, and along the axes of each object. It reads the features of the pair, the horizontal
+    direction between the objects in the frame of each, and both categories. A gap is the actual distance minus the
+    predicted one, divided by the noise on both positions along the gap. This noise differs by axis, because normalised
+    units do. A second network computes the messages and the amplitudes of the displacements from the gaps. Each axis
+    takes the part of a displacement that corresponds to its share of the noise along the gap, as in the posterior mean
+    under such noise.
+
+    A slot whose category is masked gets no message. Otherwise the network would take a masked slot that overlaps
+    another object for empty. This is right in real scenes with noise on them. In samples, however, it removes objects
+    that are only slightly misplaced.
+
+    Args:
+        categories: K = C + 1; the mask token is one more.
+        features: numbers per pair of slots, from :class:`~agents.networks.geometry.Relations`.
+        hidden: width of the messages.
+        embedding: width of the features from which the gates of the displacements are computed.
+        width: width of the networks on pairs.
+        kind: width of the embedding of a category.
+
+    >>> contacts = Contacts(categories=3, features=40, hidden=16, embedding=16)
+    >>> metres, rotation = torch.randn(2, 5, 3), torch.eye(3).expand(2, 5, 3, 3)
+    >>> states, noise, features = torch.zeros(2, 5).long(), torch.full((2, 5, 3), 0.1), torch.zeros(2, 5, 5, 40)
+    >>> messages, displacements = contacts(metres, rotation, states, noise, features)
+    >>> messages.shape, displacements.shape
+    (torch.Size([2, 5, 16]), torch.Size([2, 5, 4, 3]))
+    """
+
+    def __init__(
+        self, categories: int, features: int, hidden: int, embedding: int, width: int = 32, kind: int = 16
+    ) -> None:
+        super().__init__()
+        self.kind = nn.Embedding(categories + 1, kind)
+        self.seen = nn.Linear(features + 2 * _DIRECTIONS, width)
+        self.own, self.other = (nn.Linear(kind, 2 * width, bias=False) for _ in range(2))
+        self.touch = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, _GAPS))
+        self.weigh = nn.Linear(width + _BASIS * _GAPS + 1, width)
+        self.second = nn.Linear(width, width)
+        self.amplitudes = nn.Linear(width, CHANNELS * 2 * _GAPS)
+        self.out = nn.Linear(width, hidden)
+        self.gates = nn.Linear(embedding, 3 * CHANNELS)
+        for layer in (self.out, self.gates):
+            nn.init.zeros_(layer.weight)
+            nn.init.zeros_(layer.bias)
+
+    def messages(self, scene: Scene) -> Tensor | None:
+        if scene.metres is None or scene.metres_noise is None or scene.rotation is None or scene.pairs is None:
+            return None
+        metres, rotation = scene.metres, scene.rotation.to(scene.metres)
+        with torch.autocast(metres.device.type, enabled=False):  # an error of half a percent of a metre is too large
+            messages, moves = self(metres, rotation, scene.states, scene.metres_noise, scene.pairs, scene.slot_mask)
+        scene.kept[ContactsConfig.name] = moves
+        return messages
+
+    def pose_output(self, scene: Scene, features: Tensor) -> Tensor | None:
+        moves = scene.kept.get(ContactsConfig.name)
+        return None if moves is None else F.pad(gated_displacement(moves, self.gates(features)), (0, 9))
+
+    def forward(
+        self, metres: Tensor, rotation: Tensor, states: Tensor, noise: Tensor, features: Tensor,
+        slot_mask: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        """Messages (B, N, H) to slots, and displacements (B, N, :data:`CHANNELS`, 3) in units of the noise.
+
+        Args:
+            metres: (B, N, 3) noisy positions.
+            rotation: (B, N, 3, 3) rotation matrices, such as the nearest to noisy matrices; their columns must be unit
+                vectors.
+            states: (B, N) int64 categories, mask tokens among them.
+            noise: (B, N, 3) standard deviation of the noise on positions along x, y, z, metres.
+            features: (B, N, N, F) of pairs of slots.
+            slot_mask: (B, N) bool, False for padding slots, which nothing may see; None where there are none.
+        """
+        offset = metres.unsqueeze(2) - metres.unsqueeze(1)  # (B, N, N, 3) from j to i
+        variance = noise.square().unsqueeze(2) + noise.square().unsqueeze(1) + _MIN_NOISE**2
+        sideways = offset[..., :2].square().sum(dim=-1, keepdim=True).add(1e-12).sqrt()
+        toward = offset[..., :2] / sideways
+        own = offset @ rotation  # the axes of i
+        others = torch.einsum("bijw,bjwk->bijk", offset, rotation)
+        along = torch.cat([sideways, offset[..., 2:], own, others], dim=-1)  # (B, N, N, GAPS)
+        level = (toward.square() * variance[..., :2]).sum(dim=-1, keepdim=True)
+        squared = rotation.square()
+        spread = [level, variance[..., 2:], variance @ squared, torch.einsum("bijw,bjwk->bijk", variance, squared)]
+        both = torch.cat(spread, dim=-1).clamp(min=_MIN_NOISE**2).sqrt()  # (B, N, N, GAPS) noise along each
+        sign = along / (along.square() + both.square()).sqrt()
+        aside = toward * sign[..., :1]
+        kinds = self.kind(states)
+        early, late = (self.own(kinds).unsqueeze(2) + self.other(kinds).unsqueeze(1)).chunk(2, dim=-1)
+        seen = F.silu(self.seen(torch.cat([features, *_as_seen(aside, rotation)], dim=-1)) + early)
+        gaps = (along.abs() - _TYPICAL * (1.0 + self.touch(seen))) / both
+        bounded = gaps / (1.0 + (gaps / _GAP_REACH).square()).sqrt()
+        basis = [bounded, torch.sigmoid(-2.0 * gaps), torch.exp(-0.5 * gaps.square()), both[..., :1].log()]
+        weighed = F.silu(self.weigh(torch.cat([seen, *basis], dim=-1)) + late)
+        weighed = F.silu(self.second(weighed))
+        there = (~torch.eye(states.shape[1], dtype=torch.bool, device=states.device))[None].to(weighed)
+        there = (there if slot_mask is None else there * slot_mask.unsqueeze(1)).unsqueeze(-1)
+        weighed = torch.cat([weighed * there, there.expand(*weighed.shape[:-1], 1)], dim=-1)  # (B, N, N, W + 1)
+        sign = sign / both
+        ways = [aside / both[..., :1], sign[..., 1:5], (sign[..., 5:, None] * rotation.mT.unsqueeze(1)).flatten(-2)]
+        moves = self._displacements(weighed, torch.cat(ways, dim=-1), bounded, rotation)
+        moves = math.sqrt(2) * noise.unsqueeze(-2) * moves
+        known = (states < self.kind.num_embeddings - 1).unsqueeze(-1)
+        return self.out(weighed[..., :-1].sum(dim=2)) * known, moves
+
+    def _displacements(self, weighed: Tensor, ways: Tensor, bounded: Tensor, rotation: Tensor) -> Tensor:
+        """Displacements (B, N, CHANNELS, 3): per gap one amplitude plus another times the gap, summed over other slots.
+
+        Amplitudes are linear in ``weighed`` (B, N, N, W + 1), so the sum over other slots is taken first. Then the cost
+        per pair does not grow with CHANNELS.
+        """
+        ways = torch.cat([ways, ways * bounded[..., _GAP_OF]], dim=-1)
+        gathered = weighed.mT @ ways  # (B, N, W + 1, 2 * 15)
+        amplitudes = torch.cat([self.amplitudes.weight, self.amplitudes.bias[:, None]], dim=1)
+        amplitudes = amplitudes.unflatten(0, (2, CHANNELS, _GAPS))[:, :, _GAP_OF]  # (2, CHANNELS, 15, W + 1)
+        moves = torch.einsum("biusq,scqu->bicq", gathered.unflatten(-1, (2, -1)), amplitudes)
+        level, own, others = moves.split([3, 3, 9], dim=-1)
+        return level + own @ rotation.mT + others.unflatten(-1, (3, 3)).sum(dim=-2)
+
+
+def gated_displacement(displacements: Tensor, gates: Tensor) -> Tensor:
+    """Contribution (B, N, 3) of displacements (B, N, :data:`CHANNELS`, 3) to the translation output.
+
+    Args:
+        displacements: displacements that :class:`Contacts` returns.
+        gates: (B, N, CHANNELS * 3), one for each entry of the displacements.
+    """
+    return (displacements * gates.unflatten(-1, (CHANNELS, 3))).sum(dim=-2)
+
+
+def _as_seen(aside: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
+    """Horizontal directions in the frames of i and of j, with their squares, (B, N, N, 6) each.
+
+    The first is from j to i in the frame of i, the second from i to j in the frame of j; ``aside`` (B, N, N, 2) is from
+    j to i in the world.
+    """
+    first = aside @ rotation[..., :2, :]
+    second = -torch.einsum("bijw,bjwk->bijk", aside, rotation[..., :2, :])
+    return torch.cat([first, first.square()], dim=-1), torch.cat([second, second.square()], dim=-1)

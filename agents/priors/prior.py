@@ -1,0 +1,805 @@
+"""Scene priors: trained denoisers with their process, layout and normalizer, which sample, inpaint, train and load."""
+
+from __future__ import annotations
+
+import math
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import torch
+from torch import Generator, Tensor, nn
+
+from agents.configuration.prior_names import joint_name, split_name
+from agents.diffusion import GaussianProcess, Preconditioning, ResidualVariance, ReverseStep, StepTable
+from agents.networks.denoisers import Observed
+from agents.networks.flux_modules import CountConditioning
+from agents.networks.registry import config_state
+from agents.networks.text import Text
+from agents.priors.adapters import AdapterSpec, merge_adapters, parse_adapters
+from agents.priors.files import StoredPrior, explained, read_stored, write_stored
+from agents.priors.guidance import Guide, Hook, Start, Watch, guidance_hook, physics_strength
+from scene_envs.datasets.prompts import parse_prompt
+from scene_envs.envs.settings import check_claim_guidance, check_physics_guidance
+from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.normalizer import Normalizer
+from scene_envs.protocols import StepTableLike
+from scene_envs.scene import CATEGORY, POSE, POSE_FEATURES, TRANSLATION, SceneBatch
+from scene_envs.scene_types import SceneType, get_scene_type
+
+UNIONS = ("one_type", "any")
+"""Assets that a scene of a union of scene types may hold: those of one of its types, or any."""
+
+Prompt = str | Sequence[str] | None
+"""One text for all scenes, one per scene, or None for anything."""
+
+Prior = TypeVar("Prior", bound="ScenePrior")
+
+_CLASSES: dict[str, type[ScenePrior]] = {}
+"""Classes of priors by the name of their process."""
+
+
+@dataclass(frozen=True)
+class NoisedScenes:
+    """B scenes of N slots at timesteps of the forward process, with the training targets of the denoiser.
+
+    Attributes:
+        x_t: (B, N, D) noised scenes; known entries carry no noise, nor do observed ones of a mixed prior.
+        t: (B,) int64 timesteps.
+        target: (B, N, F) of the continuous output; F is 12 (poses) for a mixed prior and D for a continuous one.
+        weight: (B, N, F) weights of its squared errors; 0 on known and on observed entries.
+        scale: (B,) weight of the timestep in the loss.
+        category: (B, N) int64, the clean categories.
+        drawn: (B, N) weights of the category losses, 0 where the category is seen; None for a continuous prior.
+        observed: entries that are observed; None where there are none.
+    """
+
+    x_t: Tensor
+    t: Tensor
+    target: Tensor
+    weight: Tensor
+    scale: Tensor
+    category: Tensor
+    drawn: Tensor | None = None
+    observed: Observed | None = None
+
+    def rows(self, rows: slice) -> NoisedScenes:
+        """Some of the scenes."""
+        named = ("x_t", "t", "target", "weight", "scale", "category")
+        return replace(
+            self,
+            **{name: getattr(self, name)[rows] for name in named},
+            drawn=None if self.drawn is None else self.drawn[rows],
+            observed=None if self.observed is None else self.observed.rows(rows),
+        )
+
+
+@dataclass(frozen=True)
+class DenoiserOutput:
+    """Output of the denoiser for noised scenes.
+
+    Attributes:
+        continuous: (B, N, F), in the units of :attr:`NoisedScenes.target`.
+        logits: (B, N, K) of the clean categories; None for a continuous prior.
+    """
+
+    continuous: Tensor
+    logits: Tensor | None = None
+
+
+class ScenePrior(nn.Module, ABC):
+    """A trained denoiser with its schedule, layout and normalizer. Tensors x are normalised scenes (B, N, D).
+
+    Fixed welded objects and constant features are *known*: clamped to their values while sampling and left
+    out of the loss and of every log-probability. The two kinds of prior are
+    :class:`~agents.priors.continuous.ContinuousPrior` and :class:`~agents.priors.mixed.MixedPrior`.
+
+    In inpainting, the network of a mixed prior reads the observed entries without noise. That of a continuous prior
+    reads them with the noise of each level (Lugmayr et al. 2022, Eq. 8).
+
+    >>> from agents.priors.testing import tiny_prior
+    >>> prior = tiny_prior("dimsum_table")
+    >>> prior.sample(2, num_steps=3, seed=0)
+    SceneBatch('dimsum_table', (2, 34, 20))
+    """
+
+    process_name = ""
+    """Name of the process in configuration files; a subclass that sets it can be loaded by :meth:`load`."""
+    config: Any
+    """Configuration of the prior, a dataclass."""
+    scene_type: SceneType
+    normalizer: Normalizer
+    preconditioning: Preconditioning
+    card: dict[str, Any]
+    """Facts about its training."""
+    residual: ResidualVariance | None
+    """Measured error of the denoiser, if it was measured."""
+    process: GaussianProcess
+    """Gaussian process of the poses, and of all other continuous features."""
+    denoiser: Any
+    """The network inside its process, a module with ``.network``."""
+    loaded_as: str = ""
+    """Name or path by which :meth:`load` found the prior, with its adapters; empty for one that was not loaded."""
+    _fixed: Tensor
+    _timestep_weights: Tensor
+
+    def __init_subclass__(cls, **settings: Any) -> None:
+        super().__init_subclass__(**settings)
+        if cls.process_name:
+            _CLASSES[cls.process_name] = cls
+
+    def _keep(
+        self,
+        config: Any,
+        normalizer: Normalizer,
+        preconditioning: Preconditioning,
+        card: dict[str, Any] | None,
+        residual: ResidualVariance | None,
+    ) -> None:
+        """Store the parts that priors of every process have."""
+        self.config = config
+        self.scene_type = get_scene_type(config.scene_type)
+        check_physics_guidance(config.physics_guidance, self.scene_type)
+        self.normalizer = normalizer
+        self.preconditioning = preconditioning
+        self.card = card or {}
+        self.residual = residual
+        fixed = SceneBatch.empty(self.scene_type, 1, len(self.scene_type.fixed) or 1)
+        self.register_buffer("_fixed", self.normalised(fixed)[0], persistent=False)
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the weights."""
+        return self._fixed.device
+
+    # -- files ------------------------------------------------------------------------------------
+
+    @classmethod
+    def load(cls: type[Prior], name: str | os.PathLike[str] | ScenePrior, adapter: AdapterSpec | None = None) -> Prior:
+        """A shipped prior by name, or one from a prior or run directory; in evaluation mode.
+
+        Args:
+            name: name or path of the prior; ``NAME with ADAPTER`` names its adapters as well.
+            adapter: updates that are added to its weights: priors that were trained from this one, or the folders of
+                such runs. Several are joined by ``+`` or in a list, each with a factor before ``*`` if need be.
+
+        Raises:
+            UnknownNameError: no shipped prior has that name.
+            InvalidInputError: an adapter is missing, or was trained on another prior.
+            CorruptFileError: its files are not those of a prior, or do not fit each other.
+        """
+        if isinstance(name, ScenePrior):
+            if adapter:
+                raise InvalidInputError(
+                    f"adapter={adapter!r} is added to a prior that is loaded by name; give its name or folder, not the "
+                    "prior itself"
+                )
+            return cast(Prior, name)
+        name, named = split_name(name)
+        terms = [term for spec in (named, adapter) if spec for term in parse_adapters(spec)]
+        stored = read_stored(name)
+        with explained(name):
+            prior = prior_class(stored.process).from_state(
+                stored.fields, stored.normalizer, stored.preconditioning, stored.card, stored.residual
+            )
+            prior.load_weights(stored.tensors)
+        if terms:
+            merge_adapters(prior, str(name), terms)
+        prior.loaded_as = joint_name(name, [spec for spec in (named, adapter) if spec])
+        return cast(Prior, prior.eval())
+
+    def save(self, directory: str | os.PathLike[str], precision: str = "float32") -> Path:
+        """Write ``config.json`` and ``model.safetensors`` into ``directory``.
+
+        Args:
+            directory: folder, made if need be.
+            precision: format of the weights in the file, ``"float32"`` or ``"float16"``; loading makes float32.
+        """
+        stored = StoredPrior(
+            self.process_name,
+            self.config_state(),
+            self.scene_type,
+            self.normalizer,
+            self.preconditioning,
+            self.card,
+            self.residual,
+            self.weights(),
+        )
+        return write_stored(directory, stored, precision)
+
+    def config_state(self) -> dict[str, Any]:
+        """The ``prior`` entry of the configuration file."""
+        return {**asdict(self.config), "network": config_state(self.config.network)}
+
+    @classmethod
+    @abstractmethod
+    def from_state(
+        cls: type[Prior],
+        fields: dict[str, Any],
+        normalizer: Normalizer,
+        preconditioning: Preconditioning,
+        card: dict[str, Any] | None,
+        residual: ResidualVariance | None,
+    ) -> Prior:
+        """From the ``prior`` entry of a configuration file."""
+
+    def weights(self) -> dict[str, Tensor]:
+        """Trained tensors by name, as a prior's file holds them."""
+        return dict(self.denoiser.network.state_dict())
+
+    def load_weights(self, tensors: dict[str, Tensor]) -> None:
+        """Inverse of :meth:`weights`; raises RuntimeError when names or shapes differ."""
+        self.denoiser.network.load_state_dict(tensors)
+
+    # -- text -------------------------------------------------------------------------------------
+
+    @property
+    def conditional(self) -> bool:
+        """Whether the prior reads prompts."""
+        return False
+
+    def encode_prompts(self, prompts: Sequence[str]) -> Text:
+        """Tokens (B, L, W) and mask (B, L) of prompts.
+
+        Raises:
+            InvalidInputError: the prior reads no prompts, or one is too long.
+        """
+        raise no_text(self.scene_type, next(iter(prompts), ""))
+
+    def warn_unknown_words(self, prompts: Iterable[str]) -> None:
+        """Warn of words in ``prompts`` that the prior cannot read; does nothing for a prior without prompts."""
+
+    def freeze_text(self) -> None:
+        """Freeze the text encoder, if there is one: training does not change it from then on."""
+
+    @property
+    def count_conditioning(self) -> CountConditioning | None:
+        """The part of the network that reads how many objects a prompt asks for; None if there is none."""
+        return None
+
+    # -- scenes and numbers -----------------------------------------------------------------------
+
+    @property
+    def features(self) -> int:
+        """D, numbers per slot of the denoised tensor."""
+        return self.scene_type.features
+
+    @property
+    def pose_width(self) -> int:
+        """Leading features of the continuous output that are poses; the others, if any, are categories."""
+        return POSE_FEATURES
+
+    @property
+    def is_constant(self) -> Tensor:
+        """(D,) bool: features that never vary."""
+        return self.normalizer.is_constant
+
+    def known(self, slots: int) -> Tensor:
+        """(slots, D) bool: entries that are clamped (fixed welded slots, constant features)."""
+        known = self.is_constant.to(self._fixed.device).expand(slots, -1).clone()
+        known[: len(self.scene_type.fixed)] = True
+        return known
+
+    def clamp(self, x: Tensor) -> Tensor:
+        """``x`` (B, N, D) with its known entries set to their values."""
+        count = len(self.scene_type.fixed)
+        x = torch.where(self.is_constant.to(x.device), torch.zeros_like(x), x)
+        if count:
+            x = torch.cat([self._fixed[:count].to(x).expand(x.shape[0], -1, -1), x[:, count:]], dim=1)
+        return x
+
+    def encode(self, batch: SceneBatch) -> Tensor:
+        """Normalised x_0 (B, N, D) of scenes.
+
+        Raises:
+            InvalidInputError: the first slots do not hold the scene type's fixed welded objects.
+        """
+        expected = [self.scene_type.assets.index(fixed.asset) for fixed in self.scene_type.fixed]
+        found = batch.categories[:, : len(expected)]
+        wrong = (found != torch.tensor(expected, dtype=found.dtype, device=found.device)).any(dim=1)
+        if bool(wrong.any()):
+            scene = int(torch.nonzero(wrong)[0])
+            names = [fixed.asset for fixed in self.scene_type.fixed]
+            raise InvalidInputError(
+                f"scene {scene} does not begin with the fixed objects {names}; reorder its slots so that it does"
+            )
+        return self.clamp(self.normalised(batch))
+
+    def decode(self, x: Tensor) -> SceneBatch:
+        """Scenes from normalised x_0 (B, N, D); known entries take their exact values."""
+        return SceneBatch.from_tensor(self.clamp(x), self.scene_type, normalised=self.normalizer)
+
+    def normalised(self, batch: SceneBatch) -> Tensor:
+        """(B, N, D) scenes as this process sees them, before known entries are clamped."""
+        return batch.to_tensor(normalised=self.normalizer)
+
+    # -- settings ---------------------------------------------------------------------------------
+
+    def with_union(self: Prior, union: str) -> Prior:
+        """This prior, whose scenes of a union of scene types hold the assets of ``"one_type"``, or ``"any"`` assets.
+
+        A prior with continuous categories has no such setting and is not changed.
+
+        Raises:
+            UnknownNameError: another word.
+        """
+        if union not in UNIONS:
+            raise unknown_name("union", union, UNIONS)
+        return self
+
+    def with_physics_guidance(self: Prior, strength: float) -> Prior:
+        """This prior; its samples have physics guidance of ``strength`` (0 to 1) where a caller gives none.
+
+        Raises:
+            InvalidInputError: not from 0 to 1, or the assets have no geometry.
+        """
+        strength = physics_strength(strength, self.config, self.scene_type)
+        self.config = replace(self.config, physics_guidance=strength)
+        return self
+
+    def with_open_empty(self: Prior, share: float) -> Prior:
+        """This prior; in its training, ``share`` of the masks of whole slots include every empty slot.
+
+        A prior whose network reads no observed entries has no such masks and is not changed.
+        """
+        return self
+
+    # -- the reverse chain ------------------------------------------------------------------------
+
+    def step_table(self, num_steps: int) -> StepTable:
+        """The reverse steps of a chain of ``num_steps``, any number in 1..T."""
+        return StepTable.spaced(self.config.num_timesteps, num_steps)
+
+    def initial(self, count: int, slots: int, generator: Generator | None = None) -> Tensor:
+        """x_T (count, slots, D): standard normal with the known entries clamped."""
+        noise = torch.randn(count, slots, self.features, generator=generator, device=self._fixed.device)
+        return self.clamp(noise)
+
+    @abstractmethod
+    def transition(self, x_t: Tensor, step: int, table: StepTableLike, *, eta: float = 1.0) -> ReverseStep:
+        """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters.
+
+        Known entries are certain; at the last step all entries are. ``eta`` scales the noise of the continuous
+        features, as in :meth:`sample`.
+        """
+
+    def estimate(self, step: int, table: StepTable) -> tuple[float, Tensor]:
+        """Weight of the denoised translations in x_{t-1}, and their standard deviation (3,), normalised."""
+        weight, std = self.process.estimate(int(table.timesteps[step]), int(table.previous[step]), self.residual)
+        return weight, std[TRANSLATION].to(self.device)
+
+    def sample(
+        self, count: int, *, prompt: str | Sequence[str] | None = None, guidance: float = 0.0,
+        claim_guidance: float = 0.0, physics_guidance: float | None = None, num_steps: int = 50,
+        slots: int | None = None, seed: int = 0, batch_size: int = 64, eta: float = 1.0,
+    ) -> SceneBatch:  # fmt: skip
+        """``count`` scenes by ancestral sampling (Ho et al. 2020, Algorithm 2) over ``num_steps`` strides.
+
+        Args:
+            count: number of scenes.
+            prompt: text that says what the scenes should hold, one for all or one per scene; None for anything.
+            guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional (Ho and Salimans 2022); it
+                needs a prompt.
+            claim_guidance: strength of guidance to the claims of the prompt, see
+                :class:`~agents.priors.claim_guidance.ClaimGuidance` and
+                :class:`~agents.priors.guidance.NumberGuidance`; 2 is a good choice. It needs a prompt.
+            physics_guidance: strength with which objects are moved out of overlaps and onto supports at the last steps,
+                0 to 1, see :class:`~agents.priors.guidance.PhysicsGuidance`. None takes the strength that the
+                prior was published with (``config.physics_guidance``): 1 for shipped priors whose names end in
+                ``_feasible``, otherwise 0.
+            num_steps: denoiser evaluations per scene, 1..T.
+            slots: slots per scene; more than trained is allowed.
+            seed: seed of the torch generator; the same seed and batch size give the same scenes.
+            batch_size: scenes denoised at once.
+            eta: noise of the continuous features in the reverse steps (Song et al. 2021, Eq. 16). 1 is the ancestral
+                chain. With 0, only x_T and the discrete categories of a mixed prior are random.
+        """
+        if count < 1:
+            raise InvalidInputError(f"count={count}: ask for at least one scene")
+        if batch_size < 1:
+            raise InvalidInputError(f"batch_size={batch_size}: at least one scene must be denoised at a time")
+        wide = self.config.slots if slots is None else slots
+        prompts = check_prompts(
+            prompt, guidance, count, scene_type=self.scene_type, slots=wide, conditional=self.conditional,
+            claim_guidance=claim_guidance,
+        )  # fmt: skip
+        strength = physics_strength(physics_guidance, self.config, self.scene_type)
+        generator = Generator(str(self._fixed.device)).manual_seed(seed)
+        chunks = []
+        for start in range(0, count, batch_size):
+            texts = None if prompts is None else prompts[start : start + batch_size]
+            size = min(batch_size, count - start)
+            x0 = self.sample_tensor(
+                size, prompts=texts, guidance=guidance, num_steps=num_steps, slots=slots, generator=generator, eta=eta,
+                hook=self.sampling_hook(
+                    size, wide, num_steps, prompts=texts, claim_guidance=claim_guidance,
+                    physics_guidance=strength,
+                ),
+            )  # fmt: skip
+            chunks.append(x0)
+        return self.decode(torch.cat(chunks))
+
+    @torch.no_grad()
+    def sample_tensor(
+        self, count: int, *, prompts: Sequence[str] | None = None, guidance: float = 0.0, num_steps: int = 50,
+        slots: int | None = None, generator: Generator | None = None, eta: float = 1.0, hook: Hook | None = None,
+    ) -> Tensor:  # fmt: skip
+        """``count`` denoised scenes x_0 (count, slots, D), normalised, from one batch; arguments as in :meth:`sample`.
+
+        ``hook`` is called at every step, before x_{t-1} is drawn.
+
+        Priors that read prompts override it.
+        """
+        table = self.step_table(num_steps)
+        x = self.initial(count, self.config.slots if slots is None else slots, generator)
+        for step in range(len(table)):
+            noise = torch.randn(x.shape, generator=generator, device=x.device)
+            reverse: ReverseStep = self.transition(x, step, table, eta=eta)
+            x = (reverse if hook is None else hook(step, x, reverse)).from_noise(noise)
+        return x
+
+    def sampling_hook(
+        self, count: int, slots: int, num_steps: int, *, prompts: Sequence[str] | None = None,
+        claim_guidance: float = 0.0, physics_guidance: float = 0.0,
+    ) -> Hook | None:  # fmt: skip
+        """Hook of a chain that samples whole scenes under guidance; None where nothing guides them.
+
+        Args:
+            count: scenes.
+            slots: slots per scene.
+            num_steps: steps of the chain.
+            prompts: one per scene; without prompts there is no claim guidance.
+            claim_guidance: strength of claim guidance, see :meth:`sample`.
+            physics_guidance: strength, 0 for none.
+        """
+        moved = torch.ones(count, slots, 1, dtype=torch.bool)
+        moved[:, : len(self.scene_type.fixed)] = False
+        return guidance_hook(
+            self, self.scene_type, self.step_table(num_steps), self.decode, moved,
+            prompts=prompts, claim_guidance=claim_guidance, physics_guidance=physics_guidance,
+        )  # fmt: skip
+
+    # -- inpainting -------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def inpaint(
+        self, batch: SceneBatch, mask: Tensor, *, prompt: str | Sequence[str] | None = None, guidance: float = 0.0,
+        claim_guidance: float = 0.0, physics_guidance: float | None = None, num_steps: int = 50,
+        generators: Sequence[Generator] | None = None, seed: int = 0, resample: int = 1, watch: Watch | None = None,
+        guide: Guide | None = None,
+    ) -> SceneBatch:  # fmt: skip
+        """Regenerate the masked entries, given the rest.
+
+        A room keeps its furniture: if generated welded objects are kept and none is masked, masked slots take no
+        welded asset.
+
+        Args:
+            batch: scenes to change.
+            mask: bool, True where something is regenerated: (B, N) for whole slots, or (B, N, 2) for the pose and the
+                category of each slot. Fixed welded slots are never regenerated.
+            prompt: text that says what the whole scenes should hold in the end, one for all or one per scene.
+            guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional; it needs a prompt.
+            claim_guidance: strength of guidance to the claims of the prompt, see
+                :class:`~agents.priors.claim_guidance.ClaimGuidance` and
+                :class:`~agents.priors.guidance.NumberGuidance`; it needs a prompt.
+            physics_guidance: strength with which regenerated objects are moved out of overlaps and onto supports at the
+                last steps, 0 to 1, see :class:`~agents.priors.guidance.PhysicsGuidance`. None takes the
+                strength of the prior, as :meth:`ScenePrior.sample` does.
+            num_steps: denoiser evaluations of one pass, 1..T.
+            generators: one per scene, so that a scene's result does not depend on its neighbours' noise.
+            seed: seed of the generators, where none are given.
+            resample: number of times that each step is taken, with noise added again in between (Lugmayr et al. 2022,
+                Algorithm 1).
+            watch: called at every step; chooses the scenes that continue. A scene may be replaced only by one with the
+                same rows of ``batch`` and ``mask``.
+            guide: moves the poses that are regenerated.
+
+        Returns:
+            Scenes on the device of ``batch``, whose unmasked entries are bit-identical to its own. Where the category
+            alone is regenerated, an object stays an object and an empty slot stays empty, as the pose is kept.
+
+        Raises:
+            InvalidInputError: a mask of the wrong shape or type, not one generator per scene, ``resample`` below 1, a
+                prompt for a prior that reads none, guidance without a prompt, ``claim_guidance`` below 0, or
+                ``physics_guidance`` outside 0 to 1.
+        """
+        both = check_mask(batch, mask, generators, resample).to(batch.tensor.device)
+        both[:, : len(self.scene_type.fixed)] = False
+        slots = batch.tensor.shape[1]
+        prompts = check_prompts(
+            prompt, guidance, len(batch), scene_type=self.scene_type, slots=slots, conditional=self.conditional,
+            claim_guidance=claim_guidance,
+        )  # fmt: skip
+        strength = physics_strength(physics_guidance, self.config, self.scene_type)
+        if generators is None:
+            generators = [Generator().manual_seed(seed + i) for i in range(len(batch))]
+        device, table = self.device, self.step_table(num_steps)
+        moved = both[..., :1]
+
+        def scenes(x: Tensor) -> SceneBatch:
+            return merge(batch, self.decode(x).to(batch.tensor.device), both)
+
+        hook = guidance_hook(
+            self, self.scene_type, table, scenes, moved, prompts=prompts, claim_guidance=claim_guidance,
+            physics_guidance=strength, guide=guide, watch=watch,
+        )  # fmt: skip
+        begins = getattr(watch, "start", None)
+        start = None if begins is None else begins(len(table))
+        x = self.regenerate(
+            batch.to(device), both.to(device), table, generators, resample, prompts, guidance, hook, start
+        )
+        return merge(batch, self.decode(x).to(batch.tensor.device), both)
+
+    def complete(
+        self, batch: SceneBatch, *, prompt: str | Sequence[str] | None = None, guidance: float = 0.0,
+        claim_guidance: float = 0.0, physics_guidance: float | None = None, slots: int | None = None,
+        fill: int | None = None, num_steps: int = 50, seed: int = 0,
+    ) -> SceneBatch:  # fmt: skip
+        """Fill the empty slots of ``batch``, keeping its objects.
+
+        With all empty slots open, a prior crowds a scene. With ``fill`` open slots, it adds at most that many objects.
+
+        Args:
+            batch: scenes.
+            prompt: text that says what the completed scenes should hold, one for all or one per scene.
+            guidance, claim_guidance, physics_guidance: arguments of :meth:`inpaint`.
+            slots: slots of the result, at least those of ``batch``; None keeps them.
+            fill: most objects to add to a scene; None for as many as there are empty slots.
+            num_steps: denoiser evaluations per scene.
+            seed: seed of the noise; scene i uses ``seed + i``.
+        """
+        wide = batch if slots is None else batch.with_slots(slots)
+        if fill is not None and fill < 0:
+            raise InvalidInputError(f"fill={fill}: give the most objects to add, at least 0, or None")
+        open_slots = wide.is_empty if fill is None else wide.is_empty & (wide.is_empty.cumsum(dim=1) <= fill)
+        return self.inpaint(
+            wide, open_slots, prompt=prompt, guidance=guidance, claim_guidance=claim_guidance,
+            physics_guidance=physics_guidance, num_steps=num_steps, seed=seed,
+        )  # fmt: skip
+
+    def rearrange(
+        self, batch: SceneBatch, *, prompt: str | Sequence[str] | None = None, guidance: float = 0.0,
+        claim_guidance: float = 0.0, physics_guidance: float | None = None, num_steps: int = 50, seed: int = 0,
+    ) -> SceneBatch:  # fmt: skip
+        """New poses for the free objects of ``batch``; all categories, and the poses of welded objects, stay.
+
+        Arguments as in :meth:`complete`.
+        """
+        free = batch.is_free
+        mask = torch.stack([free, torch.zeros_like(free)], dim=-1)
+        return self.inpaint(
+            batch, mask, prompt=prompt, guidance=guidance, claim_guidance=claim_guidance,
+            physics_guidance=physics_guidance, num_steps=num_steps, seed=seed,
+        )  # fmt: skip
+
+    @abstractmethod
+    def regenerate(
+        self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int,
+        prompts: Sequence[str] | None = None, guidance: float = 0.0, hook: Hook | None = None,
+        start: Start | None = None,
+    ) -> Tensor:  # fmt: skip
+        """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; used by :meth:`inpaint`."""
+
+    def closed_categories(self, batch: SceneBatch, mask: Tensor) -> Tensor:
+        """(B, K) bool: categories that the slots under ``mask`` (B, N, 2) must not take.
+
+        These are the welded assets, in scenes that keep generated furniture and regenerate none. No mask generator
+        masks furniture, so without this rule every further inpainting of empty slots would add furniture.
+        """
+        changed = mask[..., 1]
+        masked = self.closed_by_furniture(batch.categories, changed).any(dim=1)
+        return self.closed_by_furniture(batch.categories, ~changed) & ~masked[:, None]
+
+    def closed_by_furniture(self, categories: Tensor, slots: Tensor) -> Tensor:
+        """(B, K) bool: the welded assets, in scenes with generated furniture in ``slots``.
+
+        Args:
+            categories: (B, N) int64 index of each slot's asset.
+            slots: (B, N) bool.
+        """
+        welded = torch.zeros(self.scene_type.num_assets + 1, dtype=torch.bool, device=categories.device)
+        welded[list(self.scene_type.welded_categories)] = True
+        indices = torch.tensor(self.scene_type.welded_categories, device=categories.device, dtype=torch.long)
+        furniture = torch.isin(categories, indices) & slots
+        return furniture[:, len(self.scene_type.fixed) :].any(dim=1, keepdim=True) & welded
+
+    # -- training ---------------------------------------------------------------------------------
+
+    def pretraining_loss(
+        self,
+        x0: Tensor,
+        generator: Generator | None = None,
+        reduction: str = "mean",
+        t: Tensor | None = None,
+        text: Text | None = None,
+    ) -> Tensor:
+        """The training loss of scenes ``x0`` (B, N, D) as :meth:`encode` gives them, on entries that are not known.
+
+        Args:
+            x0: normalised scenes.
+            generator: source of timesteps and noise (CPU).
+            reduction: ``"mean"`` over scenes, or ``"none"`` for (B,); always the mean over entries.
+            t: (B,) timesteps, drawn when None.
+            text: tokens (B, L, W) and their mask (B, L), as :meth:`encode_prompts` gives them; None without prompts.
+        """
+        per_scene = self.noised_loss(self.noised(x0, generator, t), text)
+        return per_scene.mean() if reduction == "mean" else per_scene
+
+    @abstractmethod
+    def noised_loss(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
+        """(B,) training losses of scenes that :meth:`noised` has noised; arguments as for :meth:`output`."""
+
+    @abstractmethod
+    def noised(self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None) -> NoisedScenes:
+        """A draw of the forward process for scenes ``x0`` (B, N, D), as the pretraining loss takes it.
+
+        Args:
+            x0: normalised scenes.
+            generator: source of timesteps, noise and observed entries (CPU).
+            t: (B,) timesteps, drawn when None.
+        """
+
+    @abstractmethod
+    def output(self, noised: NoisedScenes, text: Text | None = None) -> DenoiserOutput:
+        """Output of the denoiser for noised scenes; differentiable in its parameters.
+
+        Args:
+            noised: scenes that :meth:`noised` gives.
+            text: tokens (B, L, W) and their mask (B, L), as :meth:`encode_prompts` gives them; None without prompts.
+        """
+
+    def denoised(self, noised: NoisedScenes, output: DenoiserOutput) -> Tensor:
+        """(B, N, F) estimate of x_0 from the continuous ``output`` of noised scenes."""
+        features = output.continuous.shape[-1]
+        return self.process.x0_from_output(noised.x_t[..., :features], noised.t, output.continuous)
+
+    def observed_entries(self, x: Tensor, observed: Observed | None = None) -> Observed | None:
+        """Observed entries of scenes ``x`` (B, N, D), without noise, as the network reads them; None for none."""
+        return observed
+
+    def draw_timesteps(self, count: int, generator: Generator | None = None) -> Tensor:
+        """(count,) int64 training timesteps, from the distribution that the configuration names."""
+        return torch.multinomial(self._timestep_weights, count, replacement=True, generator=generator)
+
+    def loss_weight(self, slots: int) -> Tensor:
+        """(slots, D) weights of the pretraining loss; 0 on known entries."""
+        weight = (~self.known(slots)).float()
+        weight[:, TRANSLATION] *= self.config.translation_weight
+        return weight
+
+    @abstractmethod
+    def fit_residual(self, x0: Tensor, levels: int = 40, seed: int = 0) -> ResidualVariance:
+        """Measure the denoiser's error on normalised scenes ``x0`` (B, N, D) at ``levels`` timesteps, and keep it."""
+
+
+def prior_class(process: str) -> type[Any]:
+    """The class of priors of a process: ``"continuous"``, ``"mixed"``, or the ``process_name`` of another subclass."""
+    if process not in _CLASSES:
+        raise unknown_name("process", process, _CLASSES)
+    return _CLASSES[process]
+
+
+def draw_noise(like: Tensor, generators: Sequence[Generator] | Generator | None) -> Tensor:
+    """Standard normal noise shaped as ``like`` (B, N, D), from one generator or one CPU generator per scene."""
+    if generators is None or isinstance(generators, Generator):
+        return torch.randn(like.shape, generator=generators, device=like.device)
+    return torch.stack([torch.randn(like.shape[1:], generator=g) for g in generators]).to(like.device)
+
+
+# -- masks -----------------------------------------------------------------------------------------
+
+
+def check_mask(
+    batch: SceneBatch, mask: Tensor, generators: Sequence[Generator] | None = None, resample: int = 1
+) -> Tensor:
+    """The mask as (B, N, 2), a copy; raises InvalidInputError when an argument does not fit ``batch``."""
+    expected = tuple(batch.tensor.shape[:2])
+    if tuple(mask.shape) not in (expected, (*expected, 2)) or mask.dtype != torch.bool:
+        raise InvalidInputError(
+            f"mask must be bool of shape {expected}, or {(*expected, 2)} for pose and category, "
+            f"got {mask.dtype} {tuple(mask.shape)}"
+        )
+    if generators is not None and len(generators) != len(batch):
+        raise InvalidInputError(f"{len(generators)} generators for {len(batch)} scenes; give one per scene")
+    if resample < 1:
+        raise InvalidInputError(f"resample={resample}: every step is taken at least once")
+    return (mask if mask.ndim == 3 else torch.stack([mask, mask], dim=-1)).clone()
+
+
+def merge(batch: SceneBatch, new: SceneBatch, mask: Tensor) -> SceneBatch:
+    """``batch`` with the poses and categories of ``new`` where ``mask`` (B, N, 2) says so."""
+    empty = batch.scene_type.num_assets
+    taken = mask[..., 1] & (mask[..., 0] | (new.is_empty == batch.is_empty))  # if the pose is kept, emptiness is too
+    category = torch.where(taken[..., None], new.tensor[..., CATEGORY], batch.tensor[..., CATEGORY])
+    pose = torch.where(mask[..., :1], new.tensor[..., POSE], batch.tensor[..., POSE])
+    gone = category.argmax(dim=-1, keepdim=True) == empty
+    return SceneBatch(torch.cat([torch.where(gone, torch.zeros_like(pose), pose), category], dim=-1), batch.scene_type)
+
+
+# -- prompts ---------------------------------------------------------------------------------------
+
+
+def check_prompts(
+    prompt: Prompt, guidance: float, count: int, *, scene_type: SceneType, slots: int, conditional: bool,
+    claim_guidance: float = 0.0,
+) -> list[str] | None:  # fmt: skip
+    """One prompt per scene, or None for scenes without.
+
+    Args:
+        prompt: one text for all scenes, one per scene, or None.
+        guidance: w of classifier-free guidance.
+        count: scenes.
+        scene_type: scene type of the scenes.
+        slots: slots per scene.
+        conditional: whether the prior reads prompts.
+        claim_guidance: strength of claim guidance.
+
+    Raises:
+        InvalidInputError: a prior that reads no prompts, not one prompt per scene, guidance without a prompt, claim
+            guidance below 0, or more objects asked for than there are slots.
+    """
+    if not math.isfinite(guidance):
+        raise InvalidInputError(f"guidance={guidance} must be a finite number; 0 follows the prompt as it is")
+    check_claim_guidance(prompt, claim_guidance)
+    if prompt is None:
+        check_guidance(prompt, guidance)
+        return None
+    texts = [prompt] if isinstance(prompt, str) else prompt
+    if not isinstance(texts, Sequence) or not all(isinstance(text, str) for text in texts):
+        raise InvalidInputError(f"prompt={str(prompt)[:80]!r} must be a text, a list of texts, or null")
+    prompts = [prompt] * count if isinstance(prompt, str) else list(prompt)
+    if len(prompts) != count:
+        raise InvalidInputError(f"{len(prompts)} prompts for {count} scenes; give one text, or one per scene")
+    if not conditional:
+        raise no_text(scene_type, next(iter(prompts), ""))
+    check_guidance("".join(prompts), guidance)
+    check_object_count(prompts, scene_type, slots)
+    return prompts
+
+
+def check_guidance(prompt: object, guidance: float) -> None:
+    """Refuse guidance without a prompt; ``""`` is no prompt."""
+    if guidance and not prompt:
+        raise InvalidInputError(
+            f"guidance={guidance:g} strengthens a prompt, and prompt={prompt!r} asks for none; "
+            "give prompt=, or leave guidance=0"
+        )
+
+
+def no_text(scene_type: SceneType, prompt: str) -> InvalidInputError:
+    """The error of a prompt for a prior that reads none."""
+    return InvalidInputError(
+        f"this prior of {scene_type.name!r} was trained without text and cannot follow the prompt {prompt!r}; "
+        "leave prompt= out, or load a prior that reads prompts"
+    )
+
+
+def asked_objects(prompt: str, scene_type: SceneType) -> int:
+    """Number of objects that a prompt asks for; 0 for free text.
+
+    >>> from scene_envs.scene_types import get_scene_type
+    >>> asked_objects("A scene with 12 objects.", get_scene_type("dimsum_table"))
+    12
+    """
+    try:
+        facts = parse_prompt(prompt, scene_type)
+    except InvalidInputError:
+        return 0
+    return max(facts.count or 0, sum((facts.objects or {}).values()))
+
+
+def check_object_count(prompts: Sequence[str], scene_type: SceneType, slots: int) -> None:
+    """Refuse prompts that ask for more objects than a scene has slots; free text is not checked.
+
+    Raises:
+        InvalidInputError: names the prompt, the number and the remedy.
+    """
+    for prompt in dict.fromkeys(prompts):
+        asked = asked_objects(prompt, scene_type)
+        if asked > slots:
+            raise InvalidInputError(
+                f"the prompt {prompt!r} asks for {asked} objects, a scene has {slots} slots; give slots={asked} or more"
+            )
