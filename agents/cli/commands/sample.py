@@ -61,6 +61,7 @@ def check(settings: SampleConfig) -> None:
 def run(settings: SampleConfig, run: Run) -> None:
     """Draw, score, save and picture the scenes."""
     from agents.priors.guidance import physics_strength
+    from agents.priors.prior import ScenePrior
     from rewards.process import close_reward, run_reward
     from scene_envs.export.formats import resolve_formats
     from scene_envs.physics import PhysicsPool
