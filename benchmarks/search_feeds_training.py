@@ -17,7 +17,7 @@ import statistics
 import sys
 from pathlib import Path
 
-from agents.cli.parser import main as scene_envs
+from agents.cli.main import main as scene_envs
 from benchmarks.post_training.rows import SCENES, Row
 from benchmarks.post_training.runs import kept_loss, measure, train
 from benchmarks.post_training.tables import markdown

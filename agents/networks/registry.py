@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import nn
 
-from agents.configuration.checks import check_types
+from agents.configuration import check_types
 from agents.networks.diffuscene import DiffuScene, DiffuSceneConfig, MixedDiffuScene, MixedDiffuSceneConfig
 from agents.networks.flux import FluxConfig, FluxDenoiser
 from agents.networks.flux_modules import ModuleConfig

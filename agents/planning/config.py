@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
-from agents.configuration.fields import composed, named, nested
-from agents.configuration.shared_keys import SamplingKeys
+from agents.configuration import SamplingKeys, composed, named, nested
 from agents.planning.gradient import GradientPlanner
 from agents.planning.registry import PlannerSettings, list_planners, planner_settings
 from scene_envs.errors import InvalidInputError
@@ -64,11 +62,6 @@ class SearchConfig(BudgetKeys, SamplingKeys):
             denoising.
         planner: the planner, which chooses the scenes to inpaint.
     """
-
-    RENAMED: ClassVar[Mapping[str, str]] = {
-        key: f"planner.{key}, of planner=uct" for key in ("exploration", "parallel")
-    }
-    """Keys of earlier versions, and their present names."""
 
     branching: int = 4
     max_depth: int = 1000

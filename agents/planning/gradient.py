@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from agents.configuration.tree import build
+from agents.configuration import build
 from agents.planning.ledger import PlanResult, Progress, Searchable, Steered
 from agents.planning.registry import (
     PlannerSettings,

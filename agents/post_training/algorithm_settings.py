@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-from agents.configuration.checks import at_least, one_of, positive
+from agents.configuration import require_at_least, require_one_of, require_positive
 from scene_envs.errors import InvalidInputError
 
 CREDITS = ("auto", "scene", "object")
@@ -37,7 +37,7 @@ class AlgorithmSettings:
     scenes_per_prompt: int = 8
 
     def __post_init__(self) -> None:
-        at_least(self, 2, "scenes_per_prompt")
+        require_at_least(self, 2, "scenes_per_prompt")
 
     @property
     def optimiser_steps(self) -> int:
@@ -75,14 +75,14 @@ class DDPOSFSettings(AlgorithmSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(self, 1, "gradient_steps")
-        positive(self, "advantage_clip", "min_std")
+        require_at_least(self, 1, "gradient_steps")
+        require_positive(self, "advantage_clip", "min_std")
         if not 0 <= self.skip_first < 1:
             raise InvalidInputError(f"skip_first={self.skip_first} must lie in [0, 1)")
-        one_of(self, "credit", CREDITS)
-        one_of(self, "baseline", BASELINES)
-        one_of(self, "step_weighting", STEP_WEIGHTINGS)
-        one_of(self, "log_prob_reduction", LOG_PROB_REDUCTIONS)
+        require_one_of(self, "credit", CREDITS)
+        require_one_of(self, "baseline", BASELINES)
+        require_one_of(self, "step_weighting", STEP_WEIGHTINGS)
+        require_one_of(self, "log_prob_reduction", LOG_PROB_REDUCTIONS)
 
 
 @dataclass
@@ -100,7 +100,7 @@ class DDPOISSettings(DDPOSFSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(self, 1, "updates")
+        require_at_least(self, 1, "updates")
         if not 0 < self.clip_epsilon < 1:
             raise InvalidInputError(f"clip_epsilon={self.clip_epsilon} must lie between 0 and 1")
 
@@ -142,11 +142,11 @@ class ForwardProcessSettings(AlgorithmSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(self, 1, "updates", "draws", "siblings")
+        require_at_least(self, 1, "updates", "draws", "siblings")
         if not 0 <= self.shared_steps < 1:
             raise InvalidInputError(f"shared_steps={self.shared_steps} must lie in [0, 1)")
-        one_of(self, "credit", CREDITS)
-        one_of(self, "category_credit", CATEGORY_CREDITS)
+        require_one_of(self, "credit", CREDITS)
+        require_one_of(self, "category_credit", CATEGORY_CREDITS)
         if not 0 <= self.sampler_decay < 1:
             raise InvalidInputError(f"sampler_decay={self.sampler_decay} must lie in [0, 1)")
 
@@ -169,8 +169,8 @@ class NFTSettings(ForwardProcessSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        positive(self, "beta", "advantage_clip")
-        at_least(self, 0, "expectation_lr")
+        require_positive(self, "beta", "advantage_clip")
+        require_at_least(self, 0, "expectation_lr")
 
 
 @dataclass
@@ -190,8 +190,8 @@ class AWMSettings(ForwardProcessSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        positive(self, "advantage_clip")
-        at_least(self, 0, "expectation_lr")
+        require_positive(self, "advantage_clip")
+        require_at_least(self, 0, "expectation_lr")
         if not self.beta > 1:
             raise InvalidInputError(f"beta={self.beta} must be above 1: below, a bad sample pushes without bound")
 
@@ -209,7 +209,7 @@ class RewardWeightedSettings(ForwardProcessSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        positive(self, "temperature")
+        require_positive(self, "temperature")
 
 
 @dataclass
@@ -235,8 +235,8 @@ class NeonSettings(AlgorithmSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(self, 1, "updates", "draws", "period")
-        positive(self, "w")
+        require_at_least(self, 1, "updates", "draws", "period")
+        require_positive(self, "w")
 
 
 @dataclass
@@ -264,8 +264,8 @@ class GuidanceDistillationSettings(AlgorithmSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(self, 1, "updates", "draws")
-        positive(self, "strength", "clip")
+        require_at_least(self, 1, "updates", "draws")
+        require_positive(self, "strength", "clip")
         if self.strength > 1:
             raise InvalidInputError(f"strength={self.strength:g} must lie in (0, 1]; 1 learns the whole moves")
         if not 0 <= self.sampler_decay < 1:

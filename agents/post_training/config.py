@@ -6,18 +6,28 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
-from agents.configuration.checks import at_least, one_of, positive
-from agents.configuration.fields import composed, moved, named, nested
-from agents.configuration.prior_names import split_name
-from agents.configuration.settings import LoggerSettings, OptimizerSettings
-from agents.configuration.shared_keys import RewardLimits, SamplingKeys, TrainingKeys
-from agents.configuration.tree import plain_tree
+from agents.configuration import (
+    LoggerSettings,
+    OptimizerSettings,
+    RewardLimits,
+    SamplingKeys,
+    TrainingKeys,
+    composed,
+    named,
+    nested,
+    plain_tree,
+    require_at_least,
+    require_one_of,
+    require_positive,
+)
 from agents.post_training.algorithm_settings import AlgorithmSettings, DDPOSFSettings, NeonSettings
 from agents.post_training.algorithms import algorithm_settings, list_algorithms
 from agents.post_training.inpaint_settings import InpaintSettings
 from agents.post_training.regularisation_settings import REAL_SCENES, AdapterSettings, RegularisationSettings
+from agents.prior_names import split_name
+from agents.utils.loggers import LOGGERS
 from scene_envs.envs.settings import PROMPT_SOURCES, check_claim_guidance
 from scene_envs.errors import InvalidInputError
 
@@ -40,7 +50,7 @@ class PostTrainOptimizerSettings(OptimizerSettings):
     chunk: int | None = None
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "chunk")
+        require_at_least(self, 1, "chunk")
         if self.lr is not None:
             super().__post_init__()
 
@@ -83,10 +93,10 @@ class GuardSettings:
     max_invalid: int = 3
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "every", "scenes", "max_invalid", "samples_every")
-        positive(self, "limit")
-        one_of(self, "action", ("report", "stop", "rollback"))
-        at_least(self, 0, "samples", "count_limit", "stack_limit", "category_limit", "classifier_limit")
+        require_at_least(self, 1, "every", "scenes", "max_invalid", "samples_every")
+        require_positive(self, "limit")
+        require_one_of(self, "action", ("report", "stop", "rollback"))
+        require_at_least(self, 0, "samples", "count_limit", "stack_limit", "category_limit", "classifier_limit")
 
     @property
     def sampled(self) -> int:
@@ -120,7 +130,7 @@ class PostTrainLoggerSettings(LoggerSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        one_of(self, "progress", ("bar", "lines", "none"))
+        require_one_of(self, "progress", ("bar", "lines", "none"))
         if self.report_scenes < 0:
             raise InvalidInputError(f"report_scenes={self.report_scenes} must not be negative; 0 writes no report")
 
@@ -183,21 +193,6 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
         logger: log files and progress display.
     """
 
-    RENAMED: ClassVar[Mapping[str, str]] = {
-        **moved("optimizer", "warmup", "weight_decay", "clip", "ema", "chunk", learning_rate="lr"),
-        **moved("algorithm", "gradient_steps", "min_std", "skip_first", "step_weighting", "log_prob_reduction"),
-        **moved("algorithm", "credit", "baseline", "advantage_clip", "scenes_per_prompt"),
-        **moved("guard", "max_invalid", guard_every="every", guard_scenes="scenes", guard_limit="limit"),
-        **moved("guard", guard_action="action"),
-        **moved("regularisation", "bank_size", regularisation_batch="batch_size", real_scenes="scenes"),
-        **moved("logger", "progress", "checkpoint_every", "report_scenes"),
-        "clip_epsilon": "algorithm.clip_epsilon, of algorithm=ddpo_is",
-        "updates": "algorithm.updates, of algorithm=ddpo_is",
-    }
-    """Keys of earlier versions, and their names."""
-    SHORT: ClassVar[Mapping[str, str]] = {"hold": "regularisation.hold"}
-    """Keys that may be written without their group."""
-
     prior: str = "dimsum_table_continuous"
     reward: Any = named("object_count", "reward")
     prompt: str | list[str] | None = None  # type: ignore[assignment]
@@ -205,18 +200,22 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
     algorithm: AlgorithmSettings = nested(
         DDPOSFSettings, folder="algorithm", option="ddpo_sf", kinds=algorithm_settings, registered=list_algorithms
     )
-    optimizer: PostTrainOptimizerSettings = nested(PostTrainOptimizerSettings, folder="optimizer", option="adamw")
+    optimizer: PostTrainOptimizerSettings = nested(
+        PostTrainOptimizerSettings, folder="optimizer", option="adamw", registered=lambda: OptimizerSettings.KNOWN
+    )
     regularisation: RegularisationSettings = nested(RegularisationSettings)
     guard: GuardSettings = nested(GuardSettings)
     adapter: AdapterSettings = nested(AdapterSettings)
     inpaint: InpaintSettings = nested(InpaintSettings)
-    logger: PostTrainLoggerSettings = nested(PostTrainLoggerSettings, folder="logger", option="csv")
+    logger: PostTrainLoggerSettings = nested(
+        PostTrainLoggerSettings, folder="logger", option="csv", registered=lambda: LOGGERS
+    )
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "iterations", "num_steps", "slots")
-        at_least(self, 0, "seed")
-        at_least(self, 2, "batch_size")
-        positive(self, "reward_timeout", "reward_memory")
+        require_at_least(self, 1, "iterations", "num_steps", "slots")
+        require_at_least(self, 0, "seed")
+        require_at_least(self, 2, "batch_size")
+        require_positive(self, "reward_timeout", "reward_memory")
         if not (isinstance(self.workers, int) and self.workers >= 0) and self.workers != "ray":
             raise InvalidInputError(
                 f"workers={self.workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"

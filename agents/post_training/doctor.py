@@ -8,7 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from agents.configuration.tree import changed
+from agents.configuration import changed
 from agents.post_training.algorithm_settings import GuidanceDistillationSettings, NeonSettings
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.gradients import accumulate_policy_gradient, gradient_norm

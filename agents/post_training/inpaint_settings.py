@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from agents.configuration.checks import one_of
+from agents.configuration import require_one_of
 from scene_envs.errors import InvalidInputError
 
 SOURCES = ("real", "samples")
@@ -37,5 +37,5 @@ class InpaintSettings:
                 f"inpaint.mask={self.mask!r} must be the name of a mask generator, a mapping with its name and "
                 "settings, or null; @register_mask gives a function a name"
             )
-        one_of(self, "scenes", SOURCES)
-        one_of(self, "entries", ENTRIES)
+        require_one_of(self, "scenes", SOURCES)
+        require_one_of(self, "entries", ENTRIES)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from agents.configuration.checks import at_least, one_of, positive
+from agents.configuration import require_at_least, require_one_of, require_positive
 from agents.post_training.hold import Target
 from scene_envs.errors import InvalidInputError
 
@@ -50,9 +50,9 @@ class RegularisationSettings:
     replay_share: float = 0.5
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "batch_size", "base_samples")
-        one_of(self, "objective", OBJECTIVES)
-        positive(self, "sharpness")
+        require_at_least(self, 1, "batch_size", "base_samples")
+        require_one_of(self, "objective", OBJECTIVES)
+        require_positive(self, "sharpness")
         if not 0 < self.replay_share <= 1:
             raise InvalidInputError(f"regularisation.replay_share={self.replay_share} must be in (0, 1]")
         if self.weight is not None and not self.weight >= 0:
@@ -100,8 +100,8 @@ class AdapterSettings:
     alpha: float = 16.0
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "rank")
-        positive(self, "alpha")
+        require_at_least(self, 0, "rank")
+        require_positive(self, "alpha")
 
     @property
     def scale(self) -> float:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
-from agents.configuration.checks import at_least
-from agents.configuration.fields import composed, moved, named, nested
-from agents.configuration.shared_keys import TrainingKeys
+from agents.configuration import TrainingKeys, composed, named, nested, require_at_least
 from agents.pretraining.settings import (
+    PROCESSES,
+    TEXT_ENCODERS,
     LossSettings,
     NetworkSettings,
     PretrainLoggerSettings,
@@ -19,6 +18,7 @@ from agents.pretraining.settings import (
     TextSettings,
     registered_networks,
 )
+from agents.utils.loggers import LOGGERS
 
 
 @dataclass
@@ -64,42 +64,27 @@ class PretrainConfig(SceneKeys, TrainingKeys):
         logger: log files.
     """
 
-    RENAMED: ClassVar[Mapping[str, str]] = {
-        **moved("network", "hidden", "depth", "heads", "frequencies", "text_reach"),
-        **moved("network.modules", "rotation_features", "contacts", "pooled_text", "count_embedding"),
-        **moved("network.modules", tally="count_embedding", relation_blur="relations"),
-        "attention": "network.modules.relations, none for plain attention",
-        "text=true": "text=vocabulary",
-        "text=false": "text=none",
-        **moved("process", "prediction", "schedule", "noise_floor", "noise_ceiling", "moments", "rotation", "kernel"),
-        **moved("process", "empty_slots", "unmasking", "denoised_clip"),
-        **moved("loss", "noise_mean", "noise_std", "timesteps", "translation_weight", "category_weight"),
-        **moved("loss", given_share="observed_share", loss_weighting="weighting", category_loss="category"),
-        **moved("text", text_encoder="encoder", text_width="width", text_depth="depth", text_latents="latents"),
-        **moved("text", text_window="window", text_learning_rate="lr_share", text_warmup="warmup"),
-        **moved("text", text_numbers="numbers", prompt_dropout="dropout"),
-        **moved("text", text_count_conditioning="count_conditioning", text_requests="count_conditioning"),
-        **moved("optimizer", "decay_share", "warmup", "weight_decay", "clip", "ema", "accumulate", "precision"),
-        **moved("optimizer", "matmul_precision", "compile", learning_rate="lr", final_learning_rate="final_lr"),
-        **moved("logger", "log_every", "evaluate_every", "checkpoint_every", "pictures_every"),
-        "tensorboard": "logger=tensorboard",
-    }
-    """Keys of earlier versions, and their names."""
-
     prior: str = ""
     iterations: int = 5000
     batch_size: int = 128
     seed: int = 0
     network: NetworkSettings = nested(NetworkSettings, folder="network", option="flux", registered=registered_networks)
-    process: ProcessSettings = nested(ProcessSettings, folder="process", option="mixed")
+    process: ProcessSettings = nested(ProcessSettings, folder="process", option="mixed", registered=lambda: PROCESSES)
     loss: LossSettings = nested(LossSettings)
-    text: TextSettings = nested(TextSettings, folder="text", option="none")
-    optimizer: PretrainOptimizerSettings = nested(PretrainOptimizerSettings, folder="optimizer", option="muon")
-    logger: PretrainLoggerSettings = nested(PretrainLoggerSettings, folder="logger", option="csv")
+    text: TextSettings = nested(TextSettings, folder="text", option="none", registered=lambda: TEXT_ENCODERS)
+    optimizer: PretrainOptimizerSettings = nested(
+        PretrainOptimizerSettings,
+        folder="optimizer",
+        option="muon",
+        registered=lambda: PretrainOptimizerSettings.KNOWN,
+    )
+    logger: PretrainLoggerSettings = nested(
+        PretrainLoggerSettings, folder="logger", option="csv", registered=lambda: LOGGERS
+    )
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "batch_size")
-        at_least(self, 0, "iterations")
+        require_at_least(self, 1, "batch_size")
+        require_at_least(self, 0, "iterations")
 
     @property
     def directory(self) -> Path:

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from agents.configuration.checks import at_least, finite, one_of, positive, shares
-from agents.configuration.fields import nested
-from agents.configuration.settings import LoggerSettings, OptimizerSettings
+from agents.configuration import (
+    LoggerSettings,
+    OptimizerSettings,
+    nested,
+    require_at_least,
+    require_finite,
+    require_one_of,
+    require_positive,
+    require_unit_interval,
+)
 from scene_envs.errors import InvalidInputError
+from scene_envs.plugins import plugin_entry_points
 
 
 @dataclass
@@ -28,8 +37,6 @@ class ModuleSettings:
             the noise; needs relations.
     """
 
-    RENAMED: ClassVar[Mapping[str, str]] = {"given_flags": "network.modules.observed_flags"}
-
     observed_flags: bool = True
     pooled_text: bool = True
     count_embedding: bool = True
@@ -38,13 +45,27 @@ class ModuleSettings:
     contacts: bool = True
 
     def __post_init__(self) -> None:
-        one_of(self, "relations", ("axis", "largest", "none"))
+        require_one_of(self, "relations", ("axis", "largest", "none"))
 
 
-def registered_networks() -> list[str]:
+NETWORKS = ("flux", "midiffusion", "diffuscene")
+"""Networks of this package."""
+PROCESSES = ("mixed", "continuous")
+TEXT_ENCODERS = {
+    "none": {"encoder": "none"},
+    "vocabulary": {"encoder": "vocabulary"},
+    "bert": {"encoder": "google-bert/bert-base-uncased"},
+}
+"""Options of ``text`` and their keys; ``text.encoder`` names another BERT."""
+
+
+def registered_networks() -> Sequence[str]:
+    """Names of networks; imports no torch, unless installed packages may have registered more."""
+    if "agents.networks.registry" not in sys.modules and not plugin_entry_points("scene_envs.networks"):
+        return NETWORKS
     from agents.networks.registry import NETWORK_PROCESSES, list_networks
 
-    return [name for process in NETWORK_PROCESSES for name in list_networks(process)]
+    return sorted({name for process in NETWORK_PROCESSES for name in list_networks(process)})
 
 
 @dataclass
@@ -79,11 +100,11 @@ class NetworkSettings:
     modules: ModuleSettings = nested(ModuleSettings)
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "hidden", "depth", "heads")
-        at_least(self, 0, "frequencies")
-        at_least(self, 1, "pose_head", "double_blocks", "embedding")
-        positive(self, "time_scale")
-        one_of(self, "text_reach", ("double", "all"), "reach of text")
+        require_at_least(self, 1, "hidden", "depth", "heads")
+        require_at_least(self, 0, "frequencies")
+        require_at_least(self, 1, "pose_head", "double_blocks", "embedding")
+        require_positive(self, "time_scale")
+        require_one_of(self, "text_reach", ("double", "all"), "reach of text")
 
 
 @dataclass
@@ -124,20 +145,18 @@ class ProcessSettings:
     denoised_clip: float = 0.0
 
     def __post_init__(self) -> None:
-        one_of(self, "name", ("mixed", "continuous"), "process")
-        if self.prediction == "karras":
-            raise InvalidInputError("prediction='karras' has another name now: prediction='edm'")
-        one_of(self, "prediction", ("edm", "epsilon", "x0", "v"))
-        one_of(self, "schedule", ("karras", "linear", "cosine"), "noise schedule")
-        one_of(self, "moments", ("category", "feature", "scene"))
-        one_of(self, "rotation", ("matrix", "quaternion", "axis_angle"))
+        require_one_of(self, "name", PROCESSES, "process")
+        require_one_of(self, "prediction", ("edm", "epsilon", "x0", "v"))
+        require_one_of(self, "schedule", ("karras", "linear", "cosine"), "noise schedule")
+        require_one_of(self, "moments", ("category", "feature", "scene"))
+        require_one_of(self, "rotation", ("matrix", "quaternion", "axis_angle"))
         kernels = ("mask_and_replace", "absorbing", "early_absorbing", "squared_absorbing", "uniform")
-        one_of(self, "kernel", kernels, "categorical kernel")
-        one_of(self, "empty_slots", ("attended", "dropped"), "treatment of empty slots")
-        one_of(self, "unmasking", ("systematic", "even", "independent"))
-        positive(self, "noise_floor", "noise_ceiling")
-        finite(self, "noise_ceiling")
-        at_least(self, 0, "denoised_clip")
+        require_one_of(self, "kernel", kernels, "categorical kernel")
+        require_one_of(self, "empty_slots", ("attended", "dropped"), "treatment of empty slots")
+        require_one_of(self, "unmasking", ("systematic", "even", "independent"))
+        require_positive(self, "noise_floor", "noise_ceiling")
+        require_finite(self, "noise_ceiling")
+        require_at_least(self, 0, "denoised_clip")
         if not self.noise_floor < self.noise_ceiling:
             raise InvalidInputError(
                 f"noise_floor={self.noise_floor} must be less than noise_ceiling={self.noise_ceiling}"
@@ -165,8 +184,6 @@ class LossSettings:
             are masked. A prior that is trained with 0 adds too many objects when all empty slots are masked.
     """
 
-    RENAMED: ClassVar[Mapping[str, str]] = {"given_share": "loss.observed_share"}
-
     noise_mean: float = -1.8
     noise_std: float = 2.1
     timesteps: str = "lognormal"
@@ -178,13 +195,13 @@ class LossSettings:
     open_empty_share: float = 0.5
 
     def __post_init__(self) -> None:
-        one_of(self, "timesteps", ("lognormal", "uniform", "both"), "distribution of timesteps")
-        one_of(self, "weighting", ("none", "min_snr"), "loss weighting")
-        one_of(self, "category", ("cross_entropy", "bound"), "category loss")
-        finite(self, "noise_mean")
-        positive(self, "noise_std")
-        at_least(self, 0, "translation_weight", "category_weight")
-        shares(self, "observed_share", "open_empty_share")
+        require_one_of(self, "timesteps", ("lognormal", "uniform", "both"), "distribution of timesteps")
+        require_one_of(self, "weighting", ("none", "min_snr"), "loss weighting")
+        require_one_of(self, "category", ("cross_entropy", "bound"), "category loss")
+        require_finite(self, "noise_mean")
+        require_positive(self, "noise_std")
+        require_at_least(self, 0, "translation_weight", "category_weight")
+        require_unit_interval(self, "observed_share", "open_empty_share")
 
 
 @dataclass
@@ -221,9 +238,9 @@ class TextSettings:
     dropout: float = 0.1
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "width", "depth", "window")
-        at_least(self, 0, "latents", "lr_share", "warmup")
-        shares(self, "dropout")
+        require_at_least(self, 1, "width", "depth", "window")
+        require_at_least(self, 0, "latents", "lr_share", "warmup")
+        require_unit_interval(self, "dropout")
 
     @property
     def is_read(self) -> bool:
@@ -247,7 +264,7 @@ class PretrainOptimizerSettings(OptimizerSettings):
         compile: compile the network with ``torch.compile`` (needs a C++ compiler on a CPU).
     """
 
-    KNOWN = ("adamw", "muon")
+    KNOWN: ClassVar[Sequence[str]] = ("adamw", "muon")
 
     name: str = "muon"
     warmup: int = 100
@@ -262,10 +279,10 @@ class PretrainOptimizerSettings(OptimizerSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        shares(self, "final_lr", "decay_share")
-        at_least(self, 1, "accumulate")
-        one_of(self, "precision", ("float32", "bfloat16"))
-        one_of(self, "matmul_precision", ("highest", "high", "medium"))
+        require_unit_interval(self, "final_lr", "decay_share")
+        require_at_least(self, 1, "accumulate")
+        require_one_of(self, "precision", ("float32", "bfloat16"))
+        require_one_of(self, "matmul_precision", ("highest", "high", "medium"))
 
 
 @dataclass
@@ -285,5 +302,5 @@ class PretrainLoggerSettings(LoggerSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(self, 1, "log_every", "evaluate_every")
-        at_least(self, 0, "pictures_every")
+        require_at_least(self, 1, "log_every", "evaluate_every")
+        require_at_least(self, 0, "pictures_every")

@@ -15,14 +15,14 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
-from agents.configuration.prior_names import short_name
-from agents.configuration.tree import config_text, dotted
+from agents.configuration import config_text, dotted
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.data import TrainingData
 from agents.pretraining.log import TrainingLog, draw_samples
 from agents.pretraining.optimizers import build_optimizer, learning_rate_at
 from agents.pretraining.setup import prepare
 from agents.pretraining.text_warmup import warm_up_text
+from agents.prior_names import short_name
 from agents.priors.base import ScenePrior
 from agents.utils.checkpoints import check_tensors, load_checkpoint, save_checkpoint
 from agents.utils.interrupts import Ending, finishing_steps

@@ -13,9 +13,9 @@ from typing import Any, Protocol, TypeVar
 
 from torch import Tensor
 
-from agents.configuration.prior_names import find_prior
 from agents.diffusion import Preconditioning
 from agents.networks.low_rank import add_low_rank, low_rank_tensors, merge, set_low_rank
+from agents.prior_names import find_prior
 from agents.priors.storage import StoredPrior, read_stored
 from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError
 from scene_envs.files import write_json

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from agents.configuration.prior_names import find_prior
+from agents.prior_names import find_prior
 from agents.priors.files import WEIGHTS_NAME, count_parameters, read_config
 from scene_envs.errors import CorruptFileError
 

@@ -10,10 +10,10 @@ from typing import Any, TypeVar, cast
 
 from torch import Tensor
 
-from agents.configuration.prior_names import joint_name, split_name
 from agents.diffusion import Preconditioning, ResidualVariance
 from agents.networks.low_rank import merged_weights
 from agents.networks.registry import config_state
+from agents.prior_names import joint_name, split_name
 from agents.priors.adapters import AdapterSpec, merge_adapters, parse_adapters
 from agents.priors.storage import StoredPrior, explained, read_stored, write_stored
 from scene_envs.errors import InvalidInputError, unknown_name

@@ -12,8 +12,8 @@ from typing import Any
 
 from torch import Tensor
 
-from agents.configuration.prior_names import find_prior
 from agents.diffusion import Preconditioning, ResidualVariance
+from agents.prior_names import find_prior
 from agents.priors.files import read_prior, to_precision, write_prior
 from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError, UnknownNameError
 from scene_envs.normalizer import Normalizer

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from agents.configuration.tree import dotted_values
+from agents.configuration import dotted_values
 from agents.pretraining.config import PretrainConfig
 from benchmarks.paper_tables.rows import COSTS, PAPER, Entry, Row, Table, plain_row
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from agents.configuration.tree import dotted_values
+from agents.configuration import dotted_values
 from agents.pretraining.config import PretrainConfig
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from agents.configuration.tree import dotted, dotted_values
+from agents.configuration import dotted, dotted_values
 from agents.pretraining.config import PretrainConfig
 from scene_envs.errors import InvalidInputError, unknown_name
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from agents.configuration.tree import changed, dotted_keys, dotted_values
+from agents.configuration import changed, dotted_keys, dotted_values
 from agents.pretraining.config import PretrainConfig
 from benchmarks.paper_tables.data import RowData, trained_numbers
 from benchmarks.paper_tables.rows import Row

@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from agents.cli.parser import main as scene_envs
+from agents.cli.main import main as scene_envs
 from benchmarks.post_training.rows import Row
 from scene_envs.errors import TrainingError
 

@@ -12,7 +12,6 @@ import signal
 import tempfile
 from collections.abc import Sequence
 from functools import cache
-from importlib import import_module
 
 from benchmarks.reliability.copies import Started, complete
 from benchmarks.reliability.figures import Figures
@@ -99,9 +98,10 @@ def _can_be_arguments(line: list[str]) -> bool:
 
 @cache
 def _keys(name: str) -> tuple[str, ...]:
-    from agents.cli.keys import describe_fields, keys_of
+    from agents.cli.commands import load_command
+    from agents.cli.main import describe_fields, keys_of
 
-    module = import_module(f"agents.cli.commands.{name.replace('-', '_')}")
+    module = load_command(name)
     return tuple(key.name for key in describe_fields(keys_of(module)) if key.name != "output")
 
 
@@ -124,9 +124,10 @@ def _line(rng: random.Random, output: str, run: bool) -> list[str]:
 
 @cache
 def _all_keys(name: str) -> tuple[str, ...]:
-    from agents.cli.keys import describe_fields, keys_of
+    from agents.cli.commands import load_command
+    from agents.cli.main import describe_fields, keys_of
 
-    module = import_module(f"agents.cli.commands.{name.replace('-', '_')}")
+    module = load_command(name)
     return tuple(key.name for key in describe_fields(keys_of(module)))
 
 

@@ -16,6 +16,12 @@ ACTION_MODES = ("next_sample", "noise")
 PROMPT_SOURCES = ("data", "grammar")
 """Values of ``prompt`` that stand for descriptions of scenes; any other text is a prompt itself."""
 
+MASKS = (
+    "balanced", "blamed_or_empty", "culprits", "empty", "explicit", "infeasible", "infeasible_or_empty",
+    "lowest_scoring", "off_prompt", "penetrating", "random", "region", "unstable",
+)  # fmt: skip
+"""Names of the mask generators of :mod:`scene_envs.envs.masks`."""
+
 _MOST_SLOTS = 100_000
 _LARGEST = 1e30
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.configuration.tree import dotted_values
+from agents.configuration import dotted_values
 from agents.pretraining.config import PretrainConfig
 from benchmarks.paper_tables import ALL_TABLES, Entry, Row, Table, TablesConfig, list_rows, make_tables
 from benchmarks.paper_tables.columns import COLUMNS, Column, error, expand, text

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import dataclasses
 import re
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,9 @@ import yaml
 
 from agents import PostTrainConfig, PretrainConfig, SearchConfig
 from agents.cli import main
-from agents.cli.commands import COMMANDS
-from agents.cli.keys import compose, help_text, keys_of
-from agents.cli.sweep import expand_sweeps
-from agents.configuration import changed, config_text, dotted_values, group_options
+from agents.cli.commands import COMMANDS, load_command
+from agents.cli.main import expand_sweeps, help_text, keys_of
+from agents.configuration import Sources, changed, compose, config_text, dotted_values, field_options
 from agents.planning import list_planners
 from agents.planning.registry import planner_settings
 from agents.post_training.algorithms import algorithm_settings, list_algorithms
@@ -26,21 +24,8 @@ from scene_envs.errors import InvalidInputError, UnknownNameError
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG_NAMES = ("Config", "Entry", "Keys", "Limits", "Names", "Planner", "Settings", "Size")
 """How the names of configuration dataclasses end."""
-CONFIGS = {name: keys_of(import_module(f"agents.cli.commands.{name.replace('-', '_')}")) for name in COMMANDS}
+CONFIGS = {name: keys_of(load_command(name)) for name in COMMANDS}
 SMALLEST_FIRST = sorted(CONFIGS, key=lambda name: len(dotted_values(CONFIGS[name]())))
-GROUPS = [
-    "algorithm",
-    "reward",
-    "network",
-    "process",
-    "text",
-    "optimizer",
-    "recipe",
-    "planner",
-    "mask",
-    "scene",
-    "logger",
-]
 
 
 @pytest.mark.slow
@@ -119,42 +104,18 @@ def test_a_recipe_is_the_same_in_python(kind: Any, recipe: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("folder", GROUPS)
-def test_every_group_has_options_that_compose(folder: str) -> None:
-    options = group_options(folder)
-    assert options
-    for option in options:
-        assert any(composes(command, folder, option) for command in SMALLEST_FIRST), option
-
-
-def composes(command: str, folder: str, option: str) -> bool:
-    """Whether a command has the group and takes the option."""
-    if folder not in {field.name for field in dataclasses.fields(CONFIGS[command])}:
-        return False
-    try:
-        return isinstance(compose(command, CONFIGS[command], [f"{folder}={option}"]), CONFIGS[command])
-    except (InvalidInputError, UnknownNameError):  # an option of another command
-        return False
-
-
-@pytest.mark.parametrize("command", ["pretrain", "post-train", "search"])
-def test_old_keys_name_the_new_ones(command: str) -> None:
-    kind = CONFIGS[command]
-    known = {*dotted_values(kind()), "algorithm.clip_epsilon", "algorithm.updates"}
-    known |= {"planner.exploration", "planner.parallel"}  # of planner=uct
-    for old, new in kind.RENAMED.items():
-        word = old if "=" in old else f"{old}=1"
-        with pytest.raises(InvalidInputError, match="has another name now: " + new.split(",")[0]):
-            compose(command, kind, [word])
-        assert new.split(",")[0].split("=")[0] in known | {"text", "logger"}
+@pytest.mark.parametrize("command", SMALLEST_FIRST)
+def test_every_option_of_a_group_composes(command: str) -> None:
+    for field in dataclasses.fields(CONFIGS[command]):
+        if field.metadata.get("folder"):
+            assert field_options(field)
+            for option in field_options(field):
+                assert isinstance(compose(command, CONFIGS[command], [f"{field.name}={option}"]), CONFIGS[command])
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: PretrainConfig(hidden=3), "another name now: network.hidden"),
-        (lambda: PretrainConfig(loss={"given_share": 0.1}), "another name now: loss.observed_share"),
-        (lambda: PretrainConfig(network={"modules": {"given_flags": False}}), "now: network.modules.observed_flags"),
         (lambda: PretrainConfig(network={"hiden": 3}), "did you mean 'network.hidden'"),
         (lambda: PretrainConfig(network={"hidden": "wide"}), "network.hidden=wide is not a whole number"),
         (lambda: PretrainConfig(optimizer="sgd"), "sgd"),
@@ -172,16 +133,12 @@ def test_wrong_values_in_python_are_named(make: Any, message: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_written_config_gives_the_same_settings(command: str, tmp_path: Path) -> None:
-    from agents.cli.keys import Sources
-
     kind = CONFIGS[command]
     (tmp_path / "config.yaml").write_text(config_text(kind()))
     assert compose(command, kind, [], Sources(config=str(tmp_path / "config.yaml"))) == kind()
 
 
 def test_words_win_over_a_file(tmp_path: Path) -> None:
-    from agents.cli.keys import Sources
-
     settings = PostTrainConfig(recipe="demo_clutter", algorithm="ddpo_is", reward={"name": "clip", "high": 3})
     (tmp_path / "config.yaml").write_text(config_text(settings))
     source = Sources(config=str(tmp_path / "config.yaml"))
@@ -193,28 +150,50 @@ def test_words_win_over_a_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "words",
+    ("words", "key", "value"),
     [
-        ["reward={name: weighted_sum, rewards: [object_count]}", "optimizer={lr: 0.1}", "optimizer.lr=1e-4"],
-        ["algorithm=nft", "algorithm={siblings: 2}", "seed=null", "prompt='${x}, y'"],
-        ["guard={action: rollback}", "hold=guard:1.05", "reward.name=clip"],
-        ["seed=range(1,3)"],
-        ["seed.x=3"],
-        ["reward=choice(a,b)"],
+        (["seed=${iterations}"], "seed", 60),
+        (["iterations=${algorithm.gradient_steps}"], "iterations", 8),
+        (["optimizer={lr: 0.1}", "optimizer.lr=1e-4"], "optimizer.lr", 1e-4),
+        (["optimizer.lr=1e-4", "optimizer={lr: 0.1}"], "optimizer.lr", 0.1),
+        (["algorithm={beta: 0.3}", "algorithm=nft"], "algorithm.beta", 0.5),
+        (["algorithm=nft", "algorithm={beta: 0.3}"], "algorithm.beta", 0.3),
+        (["reward={name: clip, high: 2}", "reward=clutter"], "reward", "clutter"),
+        (["reward=clutter", "reward={name: clip, high: 2}"], "reward", {"name": "clip", "high": 2}),
+        (["reward.averaged=true"], "reward", {"name": "object_count", "averaged": True}),
+        (["prompt=${seed}: 'a', b"], "prompt", "${seed}: 'a', b"),
+        (['prompt=["A cup, red: one.", "Two."]'], "prompt", ["A cup, red: one.", "Two."]),
     ],
 )
-def test_values_over_known_groups_are_what_hydra_makes_of_all_at_once(
-    words: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def made() -> str:
-        try:
-            return repr(compose("post-train", PostTrainConfig, words))
-        except (InvalidInputError, UnknownNameError) as error:
-            return str(error)
+def test_values_are_read_in_their_order(words: list[str], key: str, value: Any) -> None:
+    settings = compose("post-train", PostTrainConfig, words)
+    assert {"reward": settings.reward, **dotted_values(settings)}[key] == value
 
-    quick = made()
-    monkeypatch.setattr("agents.configuration.compose._quickly", lambda *_: None)
-    assert quick == made()
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("seed=range(1,3)", "a value cannot be read: seed=range"),
+        ("reward=choice(a,b)", "a value cannot be read: reward=choice"),
+        ("seed=${nothing}", "seed: Interpolation key 'nothing' not found"),
+        ("seed.x=3", "seed"),
+        ("+seed=3", "unknown post-train key '+seed'; did you mean 'seed'"),
+        ("reward={name: [}", "a value cannot be read: reward="),
+    ],
+)
+def test_values_that_cannot_be_read_are_named(word: str, message: str) -> None:
+    with pytest.raises((InvalidInputError, UnknownNameError), match=re.escape(message)):
+        compose("post-train", PostTrainConfig, [word])
+
+
+def test_an_experiment_reads_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ITERATIONS", "7")
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "env.yaml").write_text(
+        "# @package _global_\ndefaults: [{override /algorithm: nft}]\niterations: ${oc.env:ITERATIONS}\n"
+    )
+    found = compose("post-train", PostTrainConfig, ["+experiment=env"], Sources(config_dir=str(tmp_path)))
+    assert (found.iterations, found.algorithm.name) == (7, "nft")
 
 
 def test_cfg_job_prints_and_runs_nothing(

@@ -11,7 +11,6 @@ import torch
 from safetensors.torch import load_file
 
 from agents import PretrainConfig
-from agents.configuration.prior_names import SHIPPED, list_priors
 from agents.diffusion.gaussian import check_prediction
 from agents.networks import MixedFlux, MixedFluxConfig, build_network, network_config
 from agents.networks.contacts import ContactsConfig
@@ -19,6 +18,7 @@ from agents.networks.mixed_flux_files import current_fields, current_name
 from agents.networks.observed_flags import ObservedFlagsConfig
 from agents.networks.registry import config_from_state, config_state
 from agents.networks.relations import RelationsConfig
+from agents.prior_names import SHIPPED, list_priors
 from agents.priors.base import ScenePrior
 from scene_envs.errors import InvalidInputError, UnknownNameError
 

@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from agents.cli.keys import compose
-from agents.configuration.tree import changed
+from agents.configuration import changed, compose
 from agents.post_training import PostTrainConfig, post_train
 from agents.post_training.algorithms import algorithm_settings
 from agents.post_training.trainer import PostTrainer

@@ -13,8 +13,7 @@ import pytest
 import torch
 from torch import Generator, distributions
 
-from agents.cli.keys import compose
-from agents.configuration.tree import changed
+from agents.configuration import changed, compose
 from agents.diffusion import GaussianStep, MixedStep
 from agents.diffusion.divergence import step_kl
 from agents.post_training import DenoisingPolicy, PostTrainConfig, post_train, post_train_and_compare

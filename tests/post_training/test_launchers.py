@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch.distributed.elastic.multiprocessing.subprocess_handler import subprocess_handler
 
-from agents.cli.parser import main
+from agents.cli.main import main
 from agents.post_training.run_files import CHECKPOINT_NAME
 from agents.priors.testing import tiny_prior
 from agents.utils.process_group import ProcessGroup, is_first_process, launched_processes

@@ -11,7 +11,7 @@ import torch
 from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
 from agents.cli import main
-from agents.configuration.tree import changed
+from agents.configuration import changed
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.data import SceneTable
 from agents.pretraining.initial_prior import build_prior

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from agents.configuration.tree import changed as changed_config
+from agents.configuration import changed as changed_config
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.data import SceneTable
 from agents.pretraining.initial_prior import build_prior

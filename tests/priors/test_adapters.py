@@ -11,7 +11,8 @@ import torch
 from torch import Generator
 
 from agents.cli.commands.sample import SampleConfig
-from agents.cli.keys import compose, help_text
+from agents.cli.main import help_text
+from agents.configuration import compose
 from agents.networks import network_config
 from agents.networks.low_rank import low_rank_tensors, matrices
 from agents.networks.registry import build_network

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from agents.configuration.tree import changed
+from agents.configuration import changed
 from agents.networks.bert_files import FOLDER_VARIABLE, load_bert
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.initial_prior import build_prior

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from agents import ScenePrior
-from agents.configuration.prior_names import list_priors
+from agents.prior_names import list_priors
 from agents.priors.card import package_prior
 from agents.priors.files import read_config
 from agents.priors.physics_guidance import PhysicsGuidance

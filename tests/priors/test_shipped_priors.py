@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from agents.configuration.prior_names import SHIPPED, list_priors
+from agents.prior_names import SHIPPED, list_priors
 from agents.priors.base import ScenePrior
 from agents.priors.facts import PriorFacts
 from scene_envs.grammars import get_grammar

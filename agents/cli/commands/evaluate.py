@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.configuration.measure_names import choose_measures
-from agents.configuration.shared_keys import OutputKeys
+from agents.configuration import OutputKeys, choose_measures
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
 
 if TYPE_CHECKING:
@@ -100,7 +99,7 @@ def check(settings: EvaluateConfig) -> None:
             "are of; null takes all of them"
         )
     if settings.fid_weights and "fid" in groups:
-        from agents.cli.early_checks import check_files
+        from agents.cli.main import check_files
 
         check_files(settings.fid_weights)
 

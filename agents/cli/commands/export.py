@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.cli.commands.scenes import make_ready
-from agents.configuration.shared_keys import DrawKeys
+from agents.configuration import DrawKeys
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene_sources import load_scenes
 

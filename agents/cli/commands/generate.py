@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from agents.configuration.checks import one_of
-from agents.configuration.fields import named
+from agents.configuration import named, require_one_of
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
@@ -44,7 +43,7 @@ class GenerateConfig:
 
 def check(settings: GenerateConfig) -> None:
     """Refuse impossible settings before anything is imported."""
-    one_of(settings, "backend", ("processes", "ray"))
+    require_one_of(settings, "backend", ("processes", "ray"))
 
 
 def run(settings: GenerateConfig, run: Run) -> None:

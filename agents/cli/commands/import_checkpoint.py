@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from agents.configuration.fields import named
+from agents.configuration import named
 from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ class ImportCheckpointConfig:
 
 def check(settings: ImportCheckpointConfig) -> None:
     """Refuse files that are not there."""
-    from agents.cli.early_checks import check_files
+    from agents.cli.main import check_files
 
     if not settings.checkpoint or not settings.metadata:
         raise InvalidInputError("name the two files: scene-envs import-checkpoint FILE metadata.json")

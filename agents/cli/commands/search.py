@@ -8,8 +8,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.configuration.fields import composed, named
-from agents.configuration.shared_keys import RewardLimits
+from agents.configuration import RewardLimits, composed, named
 from agents.planning.config import SearchConfig
 from scene_envs.scene_sources import load_scenes
 

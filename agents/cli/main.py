@@ -1,0 +1,619 @@
+"""The command line: ``scene-envs COMMAND key=value …``.
+
+Exit status 0: done; 1: the work failed; 2: the input was wrong. An error is one paragraph on stderr, with a
+traceback only under ``--traceback`` or ``SCENE_ENVS_TRACEBACK=1``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import errno
+import inspect
+import itertools
+import math
+import os
+import re
+import shutil
+import sys
+import textwrap
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from agents.cli.commands import COMMANDS, load_command
+from agents.configuration import (
+    ADAPTER,
+    Sources,
+    as_command_line_text,
+    compose,
+    config_text,
+    field_options,
+    known_masks,
+    known_rewards,
+    known_scenes,
+    parts_of,
+)
+from agents.prior_names import find_prior, split_name
+from agents.utils.docstrings import attribute_meanings
+from agents.utils.interrupts import Terminated, terminable
+from scene_envs import __version__
+from scene_envs.errors import (
+    CorruptFileError,
+    InvalidInputError,
+    SceneEnvsError,
+    StorageError,
+    TrainingError,
+    UnknownNameError,
+    unknown_name,
+)
+from scene_envs.files import exists, is_file
+from scene_envs.scene_sources import find_scenes
+
+DONE, FAILED, WRONG_INPUT, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
+
+_SPINS = "3000"
+"""Turns that an idle thread of OpenMP waits before it sleeps (``GOMP_SPINCOUNT``)."""
+_MOST_TEXT = 4000
+"""Characters of an error message."""
+_USAGE = """\
+usage: scene-envs COMMAND key=value ...
+
+{commands}
+
+scene-envs COMMAND --help lists the keys of a command; --traceback shows where an error came from.
+--cfg job prints the keys and runs nothing; --config FILE starts the run of a config.yaml again;
+--config-dir FOLDER adds groups and experiments (+experiment=NAME); --multirun seed=0,1,2 makes a run of each.
+--allow-local allows reward=./my_rewards.py:clutter to run that file without a question.
+A command writes into output=FOLDER, by default runs/COMMAND-TIME.
+"""
+_FIRST = ("scene", "prior", "scenes", "data", "reward", "objective", "count")
+"""Keys that a listing starts with, in this order."""
+_LEAST = {
+    "count": 1,
+    "num_steps": 1,
+    "slots": 1,
+    "batch_size": 1,
+    "shard_size": 1,
+    "fill": 0,
+    "first": 0,
+    "pictures": 0,
+    "eta": 0,
+    "friction": 0,
+}
+"""The least that a number may be, where a config's ``LEAST`` does not say otherwise."""
+_POSITIVE = ("reward_timeout", "reward_memory")
+_DEVICES = ("cpu", "cuda", "mps", "xpu", "hpu", "mtia", "xla", "ipu", "hip", "ve", "vulkan", "maia", "lazy", "meta")
+_OTHER_DEVICES = ("privateuseone", "npu", "mlu", "musa", "mkldnn", "opengl", "opencl", "ideep", "fpga")
+_DATASETS = ("data", "heldout", "regularisation.scenes")
+_GRAMMAR = "grammar"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status.
+
+    Args:
+        argv: the words after ``scene-envs``; those of the process by default.
+    """
+    return _guarded(list(sys.argv[1:] if argv is None else argv), _dispatch)
+
+
+def main_of(command: str, meaning: str, module: ModuleType, argv: Sequence[str] | None = None) -> int:
+    """Run a program that consists of one command, and return its exit status.
+
+    Args:
+        command: its name in messages and in the name of its folder.
+        meaning: what it does, in one phrase.
+        module: has ``run(settings, run)``, as a module of :mod:`agents.cli.commands`.
+        argv: the words after the program; those of the process by default.
+    """
+    return _guarded(
+        list(sys.argv[1:] if argv is None else argv), lambda words: _run_or_help(command, meaning, module, words)
+    )
+
+
+def _guarded(words: list[str], work: Callable[[list[str]], int]) -> int:
+    """The exit status of ``work``, whose errors become one paragraph on stderr."""
+    show_traceback = os.environ.get("SCENE_ENVS_TRACEBACK", "") not in ("", "0")
+    if "--traceback" in words:
+        show_traceback = True
+        words.remove("--traceback")
+    signals: list[int] = []
+    try:
+        with terminable(signals):
+            _check_text(words)
+            return work(words)
+    except Terminated:
+        return _ended(TERMINATED)
+    except KeyboardInterrupt:
+        return _ended(INTERRUPTED)
+    except BrokenPipeError:  # the reader of our output has gone, as in `scene-envs rewards | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE
+    except RecursionError as error:
+        if show_traceback:
+            traceback.print_exc()
+        return _complain(f"a value or a file is nested too deeply ({_cut(error)}); write it flatter", WRONG_INPUT)
+    except Exception as error:
+        if show_traceback:
+            traceback.print_exc()
+        # some code turns Terminated into another error
+        if signals and not isinstance(error, StorageError | TrainingError):
+            return _ended(TERMINATED)
+        return _complain(*_verdict(error))
+
+
+def _check_text(words: Sequence[str]) -> None:
+    """Refuse words that cannot be written to a file as text, such as names of files in another encoding."""
+    for word in words:
+        if not word.isprintable() and ("\0" in word or word.encode(errors="replace").decode() != word):
+            raise InvalidInputError(f"{ascii(word)[:200]} is no text in UTF-8; give files and folders another name")
+
+
+def _ended(status: int) -> int:
+    what = "terminated" if status == TERMINATED else "interrupted"
+    return _complain(f"{what}; where the output can be resumed, the same command goes on", status)
+
+
+def entry_point() -> None:
+    """Run as a program, in which idle threads of OpenMP sleep after a short wait unless the environment says otherwise.
+
+    By default idle threads wait busily. Where other work shares the cores, they take processor time away from the
+    threads for which they wait.
+    """
+    if "OMP_WAIT_POLICY" not in os.environ:
+        os.environ.setdefault("GOMP_SPINCOUNT", _SPINS)  # read when torch loads OpenMP
+    sys.exit(main())
+
+
+def _dispatch(words: list[str]) -> int:
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(_USAGE.format(commands=format_rows(list(COMMANDS.items()))), end="")
+        return DONE if words else WRONG_INPUT
+    if words[0] == "--version":
+        print(f"scene-envs {__version__}")
+        return DONE
+    command, *rest = words
+    if command not in COMMANDS:
+        raise unknown_name("command", command, COMMANDS)
+    return _run_or_help(f"scene-envs {command}", COMMANDS[command], load_command(command), rest)
+
+
+def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str]) -> int:
+    words = list(words)
+    config_dir, file = _option(words, "--config-dir"), _option(words, "--config")
+    allow_local = _flag(words, "--allow-local")
+    shown, sweep, asked = _option(words, "--cfg", "-c"), _flag(words, "--multirun", "-m"), _flag(words, "-h", "--help")
+    if shown not in ("", "job"):
+        raise InvalidInputError(f"--cfg {shown}: only --cfg job is known, which prints the keys and runs nothing")
+    command, sources = program.removeprefix("scene-envs "), Sources(config_dir, file)
+    named = _named(words, getattr(module, "POSITIONAL", ()))
+    keys = keys_of(module)
+    if asked:
+        config = keys if sweep or not named else compose(command, keys, named, sources)
+        print(f"{program}: {meaning}.\n\n{help_text(config, named, config_dir)}")
+        return DONE
+    if not sweep:
+        settings = compose(command, keys, named, sources)
+        _check(settings, allow_local, bool(shown), module)
+        return _run(command, module, settings, bool(shown))
+    runs = [(compose(command, keys, variant, sources), label) for variant, label in expand_sweeps(named)]
+    for settings, _ in runs:
+        _check(settings, allow_local, bool(shown), module)
+    return _run_all(command, module, runs, bool(shown))
+
+
+def _check(settings: Any, allow_local: bool, only_show: bool, module: ModuleType) -> None:
+    """Refuse wrong values that early checks can find; ask before one of the user's files is run."""
+    if only_show:
+        return
+    check_early(settings, module)
+    for key in ("reward", "objective"):
+        if "/" in (text := str(getattr(settings, key, ""))) or ".py:" in text:
+            _ask_for_files(key, getattr(settings, key), allow_local)
+    if isinstance(seed := getattr(settings, "seed", 0), int) and not 0 <= seed < 2**63:
+        raise InvalidInputError(f"seed={seed} must be from 0 to 2^63 - 1")
+    if isinstance(device := getattr(settings, "device", "cpu"), str) and device != "cpu":
+        from agents.utils.devices import check_device
+
+        check_device(device)
+
+
+def _ask_for_files(key: str, reward: Any, allow_local: bool) -> None:
+    from rewards.local_files import allow_local_rewards, allowed_files, local_files
+
+    for path in local_files(reward):
+        if path in allowed_files():
+            continue
+        allowed = allow_local
+        if not allowed and sys.stdin is not None and sys.stdin.isatty():
+            print(f"{key}= runs the file {path}. Run it? [y/N] ", end="", file=sys.stderr, flush=True)
+            allowed = sys.stdin.readline().strip().lower() in ("y", "yes")
+        if not allowed:
+            raise InvalidInputError(f"{key}= would run the file {str(path)!r}; add --allow-local if you trust it")
+        allow_local_rewards(path)
+
+
+def _run(command: str, module: ModuleType, settings: Any, only_show: bool) -> int:
+    from agents.cli.run_folder import Run, fresh_directory
+
+    if only_show:
+        print(config_text(settings), end="")
+        return DONE
+    if not getattr(module, "WRITES", True):
+        module.run(settings)
+        return DONE
+    if not settings.output:
+        settings = replace(settings, output=fresh_directory(command))
+    with Run(command, settings) as run:
+        module.run(settings, run)
+    return DONE
+
+
+def _run_all(command: str, module: ModuleType, runs: Sequence[tuple[Any, str]], only_show: bool) -> int:
+    """One run after the other, each in a folder of its own below ``output``; the first that fails ends them."""
+    from agents.cli.run_folder import fresh_directory
+
+    if not getattr(module, "WRITES", True):
+        raise InvalidInputError(f"--multirun: {command} writes no folder; run it once for each value")
+    folder = ""
+    for settings, label in runs:
+        folder = settings.output or folder or fresh_directory(command)
+        own = replace(settings, output=str(Path(folder) / label))
+        print(f"{'# ' * only_show}{command} {label}", flush=True)
+        _run(command, module, own, only_show)
+    return DONE
+
+
+def _option(words: list[str], *names: str) -> str:
+    """The value of ``--name VALUE`` or ``--name=VALUE``, taken out of the words; empty where it is not given."""
+    for position, word in enumerate(words):
+        name, equals, value = word.partition("=")
+        if name not in names:
+            continue
+        del words[position]
+        if not equals:
+            if position == len(words):
+                raise InvalidInputError(f"{name} needs a value behind it, as in {name} VALUE")
+            value = words.pop(position)
+        return value
+    return ""
+
+
+def _flag(words: list[str], *names: str) -> bool:
+    """Whether a flag is among the words; takes it out."""
+    found = [word for word in words if word in names]
+    for word in found:
+        words.remove(word)
+    return bool(found)
+
+
+def _named(words: Sequence[str], keys: Sequence[str]) -> list[str]:
+    """The words; each one without ``=`` gets the next of ``keys`` in front, and stays as it is when none is left."""
+    left = iter(keys)
+    return [word if "=" in word else f"{key}={word}" if (key := next(left, "")) else word for word in words]
+
+
+def _verdict(error: Exception) -> tuple[str, int]:
+    """The message for the user, and the exit status."""
+    if isinstance(error, InvalidInputError | UnknownNameError | CorruptFileError):
+        return str(error), WRONG_INPUT
+    if isinstance(error, SceneEnvsError):
+        return str(error), FAILED
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f"the disk is full{_at(error)}; finished files are kept: make room and run again", FAILED
+    if isinstance(error, OSError) and error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return f"the operating system allows no access{_at(error)}; put that right, or give another output", FAILED
+    if isinstance(error, OSError):
+        return f"the operating system refused: {_cut(error)}", FAILED
+    if isinstance(error, MemoryError) or "can't allocate memory" in str(error) or "out of memory" in str(error):
+        return f"not enough memory ({_cut(error)}); give smaller sizes, such as batch_size=", FAILED
+    return (
+        f"something unexpected happened, {type(error).__name__}: {_cut(error)}. "
+        "Run again with --traceback to see where, and please report it",
+        FAILED,
+    )
+
+
+def _at(error: OSError) -> str:
+    return f" at {error.filename!r}" if error.filename else ""
+
+
+def _cut(error: BaseException) -> str:
+    text = str(error)
+    return text if len(text) <= _MOST_TEXT else f"{text[:_MOST_TEXT]}..."
+
+
+def _complain(text: str, status: int) -> int:
+    text = text if len(text) <= _MOST_TEXT else f"{text[:_MOST_TEXT]}..."
+    with contextlib.suppress(OSError):  # stderr may be closed
+        print(f"scene-envs: {text}".encode(errors="backslashreplace").decode(), file=sys.stderr)
+    return status
+
+
+# Help
+
+
+@dataclass(frozen=True)
+class KeyHelp:
+    """One key of a command.
+
+    Attributes:
+        name: the text before ``=``; a key of a group begins with the name of the group and a dot.
+        default: its default, as it would be typed.
+        meaning: one sentence.
+    """
+
+    name: str
+    default: str
+    meaning: str
+
+
+_ADAPTER = KeyHelp(
+    ADAPTER,
+    "",
+    "updates of the prior: the folder of a run from this prior, a prior that was trained from it, or an "
+    "adapter.safetensors; A+0.5*B adds two.",
+)
+"""The key that every command with ``prior=`` has besides its own."""
+
+
+def keys_of(command: Any) -> type:
+    """The dataclass of a command's keys, which is the annotation of the argument ``settings`` of its ``run``."""
+    annotation = command.run.__annotations__["settings"]
+    return command.run.__globals__[annotation] if isinstance(annotation, str) else annotation
+
+
+def describe_fields(config: type | Any, prefix: str = "") -> list[KeyHelp]:
+    """The keys of a config (the default one, if its class is given), part by part; the keys of groups come last.
+
+    Meanings stand under ``Attributes:`` in the docstrings.
+    """
+    made = config() if isinstance(config, type) else config
+    keys = _plain_keys(made, prefix) if prefix else [key for part in _parts(made).values() for key in part]
+    for field, value in _groups(made):
+        keys += describe_fields(value, f"{prefix}{field.name}.")
+    return keys
+
+
+def _groups(made: Any) -> list[tuple[dataclasses.Field[Any], Any]]:
+    """The fields that are groups of keys, and their values."""
+    values = [(field, getattr(made, field.name)) for field in dataclasses.fields(made)]
+    return [(field, value) for field, value in values if dataclasses.is_dataclass(value)]
+
+
+def _plain_keys(made: Any, prefix: str = "", fields: Sequence[dataclasses.Field[Any]] | None = None) -> list[KeyHelp]:
+    """The keys among ``fields``, by default among all fields, that are no groups."""
+    fields = dataclasses.fields(made) if fields is None else fields
+    meanings, values = attribute_meanings(type(made)), {field.name: getattr(made, field.name) for field in fields}
+    return [
+        KeyHelp(prefix + name, as_command_line_text(value), meanings.get(name, ""))
+        for name, value in values.items()
+        if not dataclasses.is_dataclass(value)
+    ]
+
+
+def _parts(made: Any) -> dict[type, list[KeyHelp]]:
+    """The keys of a command that are no groups, by the class that declares them, in the order of a listing."""
+    parts = {part: sorted(_plain_keys(made, fields=own), key=_place) for part, own in parts_of(type(made)).items()}
+    return dict(sorted(((part, keys) for part, keys in parts.items() if keys), key=lambda item: _place(item[1][0])))
+
+
+def _place(key: KeyHelp) -> int:
+    return _FIRST.index(key.name) if key.name in _FIRST else len(_FIRST)
+
+
+def help_text(config: type | Any, words: Sequence[str] = (), config_dir: str = "") -> str:
+    """All keys with their values and meanings, a paragraph for each part and for each group with its options.
+
+    Args:
+        config: the config that ``words`` make, or its class.
+        words: options of groups among them stand in the headings.
+        config_dir: a folder with further options.
+    """
+    chosen = dict(word.partition("=")[::2] for word in words)
+    made = config() if isinstance(config, type) else config
+    sections = []
+    parts = _parts(made)
+    for part, keys in parts.items():
+        after = next((place for place, key in enumerate(keys, 1) if key.name == "prior"), 0)
+        keys[after:after] = [_ADAPTER] if after else []
+        title = inspect.cleandoc(part.__doc__ or "").partition("\n")[0].rstrip(".")
+        sections.append(f"{title}:\n" * (len(parts) > 1) + _key_rows(keys))
+    for field, group in _groups(made):
+        sections.append(_heading(field, chosen.get(field.name, ""), config_dir))
+        sections[-1] += f"\n{_key_rows(_plain_keys(group, f'{field.name}.'))}"
+        for inner, value in _groups(group):
+            name = f"{field.name}.{inner.name}"
+            sections.append(f"{name}:\n{_key_rows(describe_fields(value, f'{name}.'))}")
+    return "\n\n".join(sections) or "  no keys"
+
+
+def _key_rows(keys: Sequence[KeyHelp]) -> str:
+    return format_rows([(f"{key.name}={key.default}", key.meaning) for key in keys])
+
+
+def _heading(field: dataclasses.Field[Any], chosen: str, config_dir: str) -> str:
+    if not field.metadata.get("folder"):
+        return f"{field.name}:"
+    option = chosen or field.metadata["option"]
+    others = [other for other in field_options(field, config_dir) if other != option]
+    return f"{field.name}={option}" + (f" (or {', '.join(others)}):" if others else ":")
+
+
+def format_rows(rows: Sequence[tuple[str, str]]) -> str:
+    """Two columns, the second wrapped to the terminal."""
+    width = max(60, min(shutil.get_terminal_size().columns, 120))
+    left = min(34, max(len(name) for name, _ in rows)) + 4
+    lines = []
+    for name, meaning in rows:
+        wrapped = textwrap.wrap(meaning, width - left) or [""]
+        head = f"  {name}"
+        if len(head) > left - 2:
+            lines.append(head)
+            head = ""
+        lines.append(head.ljust(left) + wrapped[0])
+        lines.extend(" " * left + line for line in wrapped[1:])
+    return "\n".join(line.rstrip() for line in lines)
+
+
+# Sweeps
+
+
+def expand_sweeps(words: Sequence[str]) -> list[tuple[list[str], str]]:
+    """All combinations of the values of swept words, as Hydra writes them, each with a name for its folder.
+
+    >>> expand_sweeps(["seed=0,1", "reward=object_count"])
+    [(['seed=0', 'reward=object_count'], 'seed=0'), (['seed=1', 'reward=object_count'], 'seed=1')]
+    """
+    choices = [_values(word) for word in words]
+    runs = []
+    for number, combination in enumerate(itertools.product(*choices)):
+        swept = [word for word, options in zip(combination, choices, strict=True) if len(options) > 1]
+        label = ",".join(swept)
+        plain = all(character.isalnum() or character in "=,._-+" for character in label)
+        runs.append((list(combination), label if swept and plain and len(label) < 100 else str(number)))
+    return runs
+
+
+def _values(word: str) -> list[str]:
+    """The word, once for every value that it sweeps over."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    try:
+        parsed = OverridesParser.create().parse_override(word)
+    except HydraException:  # a text that is no Hydra value
+        return [word]
+    if not parsed.is_sweep_override():
+        return [word]
+    key = word.partition("=")[0]
+    return [f"{key}={value}" for value in parsed.sweep_string_iterator()]
+
+
+# Checks of values that need no torch: names, paths and numbers
+
+
+def check_early(settings: Any, module: ModuleType | None = None) -> None:
+    """Refuse unknown names, wrong paths and numbers out of range.
+
+    Args:
+        settings: the config of a command.
+        module: module of the command, whose ``check(settings)`` is called where it has one.
+
+    Raises:
+        InvalidInputError: a number is outside its range, or nothing is at a path.
+        UnknownNameError: no such prior, reward, scene type or mask; the nearest known one is offered.
+    """
+    _check_numbers(settings)
+    if (own := getattr(module, "check", None)) is not None:
+        own(settings)
+    if (prior := getattr(settings, "prior", None)) and isinstance(prior, str):
+        _check_prior(prior)
+    for key in ("reward", "objective"):
+        _check_name("reward", getattr(settings, key, None), known_rewards)
+    if (scene := getattr(settings, "scene", None)) is not None and not isinstance(scene, str):
+        raise InvalidInputError(f"scene={str(scene)[:200]}: give the name of one scene type, or several joined by +")
+    for scene in str(getattr(settings, "scene", "") or "").split("+"):
+        _check_name("scene type", scene, known_scenes)
+    for mask in [getattr(settings, "mask", None), *(getattr(settings, "masks", None) or [])]:
+        _check_name("mask", mask, known_masks)
+    if isinstance(device := getattr(settings, "device", "cpu"), str):
+        _check_device(device)
+    if (scenes := getattr(settings, "scenes", None)) and isinstance(scenes, str):
+        find_scenes(Path(scenes))
+    resumed = exists(Path(str(getattr(settings, "output", "") or "."), "checkpoint.pt"))
+    kept = ("regularisation.scenes",) if resumed else ()  # a resumed run has them in its folder
+    if not resumed and isinstance(replay := _dotted(settings, "regularisation.replay"), str):
+        find_scenes(Path(replay), "regularisation.replay")
+    for key in set(_DATASETS) - set(kept) - set(getattr(settings, "NO_PATHS", ())):
+        _check_dataset(key, _dotted(settings, key))
+    _check_guidance(settings)
+
+
+def check_files(*paths: str) -> None:
+    """Refuse paths at which there is no file."""
+    for path in paths:
+        if not is_file(Path(path)):
+            raise InvalidInputError(f"{path[:200]!r} is no file; name one that is there")
+
+
+def _check_numbers(settings: Any) -> None:
+    workers = getattr(settings, "workers", 0)
+    if isinstance(workers, int) and workers < 0:
+        raise InvalidInputError(f"workers={workers}: give a number of processes, 0 for none")
+    for key, least in {**_LEAST, **getattr(settings, "LEAST", {})}.items():
+        value = getattr(settings, key, None)
+        if isinstance(value, int | float) and not least <= value < math.inf:
+            may_be_none = any(field.name == key and field.default is None for field in dataclasses.fields(settings))
+            null = ", or null" if may_be_none else ""
+            raise InvalidInputError(f"{key}={value} must be at least {least}{null}")
+    for key in _POSITIVE:
+        if isinstance(value := getattr(settings, key, None), int | float) and not value > 0:
+            raise InvalidInputError(f"{key}={value} must be more than 0")
+
+
+def _check_prior(name: str) -> None:
+    own, adapters = split_name(name)
+    find_prior(own)
+    if not adapters or exists(Path(adapters)):
+        return
+    for part in adapters.split("+"):
+        if not exists(Path(part.rpartition("*")[2].strip())):
+            raise InvalidInputError(
+                f"adapter={adapters[:200]!r}: nothing is at {part[:200]!r}; name the folder of a run with adapter.rank "
+                "or its adapter.safetensors"
+            )
+
+
+def _check_name(kind: str, value: Any, known: Callable[[], Sequence[str]]) -> None:
+    """Refuse a name that no component has."""
+    name = value.get("name") if isinstance(value, dict) else value
+    if isinstance(name, str) and name.isidentifier() and name not in (names := known()):
+        raise unknown_name(kind, name, names)
+
+
+def _check_device(device: str) -> None:
+    found = re.fullmatch(r"([a-z]+)(:\d{1,4})?", device)
+    if not found or found[1] not in (*_DEVICES, *_OTHER_DEVICES):
+        raise InvalidInputError(f"device={device[:60]!r} is no torch device; give cpu, cuda or cuda:1")
+
+
+def _check_dataset(key: str, value: Any) -> None:
+    if not isinstance(value, str):
+        return
+    parts = [part.strip() for part in value.split(",")]
+    if value and not any(parts):
+        raise InvalidInputError(f"{key}={value[:200]!r} names no dataset; scene-envs generate makes one")
+    for part in filter(None, parts):
+        if part != _GRAMMAR and not exists(Path(part)):
+            raise InvalidInputError(
+                f"{key}={value[:200]!r}: nothing is at {part[:200]!r}; name a dataset, as scene-envs generate makes one"
+            )
+
+
+def _check_guidance(settings: Any) -> None:
+    prompt, guidance = getattr(settings, "prompt", None), getattr(settings, "guidance", 0.0)
+    if not math.isfinite(guidance):
+        raise InvalidInputError(f"guidance={guidance} must be a finite number; 0 follows the prompt as it is")
+    if hasattr(settings, "prompt") and (guidance or prompt is not None):
+        from agents.post_training.config import check_prompt
+
+        check_prompt(prompt, guidance)
+    if strength := getattr(settings, "claim_guidance", 0.0):
+        from scene_envs.envs.settings import check_claim_guidance
+
+        check_claim_guidance(prompt if hasattr(settings, "prompt") else "those of real scenes", strength)
+    if strength := getattr(settings, "physics_guidance", 0.0):
+        from scene_envs.envs.settings import check_physics_guidance
+
+        check_physics_guidance(strength)
+
+
+def _dotted(settings: Any, key: str) -> Any:
+    for part in key.split("."):
+        settings = getattr(settings, part, None)
+    return settings
