@@ -478,13 +478,14 @@ def by_hydra(command: str, kind: type, choices: Mapping[str, str], config_dir: s
     Raises:
         InvalidInputError: Hydra cannot read a file.
     """
+    if not choices:
+        return {}
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
+    compose = _compose if config_dir else _compose_once
     try:
-        if config_dir or not choices:
-            return _compose(kind, tuple(choices.items()), config_dir) if choices else {}
-        return copy.deepcopy(_compose_once(kind, tuple(choices.items())))
+        return copy.deepcopy(compose(kind, tuple(choices.items()), config_dir))
     except (HydraException, OmegaConfBaseException) as error:
         if f"In 'recipe/{choices.get('recipe')}'" in str(error):
             raise InvalidInputError(
@@ -653,10 +654,9 @@ def _parsed(command: str, key: str, value: str) -> Any:
     from hydra.core.override_parser.types import Sweep
     from hydra.errors import HydraException
 
-    if "," in value and value[:1] not in _OPENING:
-        value = f"[{value}]"  # a,b is a list, where Hydra would see a sweep
+    text = f"[{value}]" if "," in value and value[:1] not in _OPENING else value  # a,b is a list; to Hydra, a sweep
     try:
-        found: Any = OverridesParser.create().parse_override(f"{key}={value}").value()
+        found: Any = OverridesParser.create().parse_override(f"{key}={text}").value()
         if not any(isinstance(item, Sweep) for item in (found if isinstance(found, list) else [found])):
             return found
     except (HydraException, ValueError):

@@ -13,6 +13,14 @@ from rewards.base import RewardContext, RewardOutput
 from scene_envs.scene import SceneBatch
 
 
+_PLACES = {
+    **{key: f"algorithm.{key}" for key in ("credit", "gradient_steps", "scenes_per_prompt")},
+    "chunk": "optimizer.chunk", "learning_rate": "optimizer.lr", "lr": "optimizer.lr", "max_invalid": "guard.max_invalid",
+    "real_scenes": "regularisation.scenes", "regularisation": "regularisation.weight",
+}  # fmt: skip
+"""Keys of groups by their short names."""
+
+
 def small_config(output: Path | str, **changes: Any) -> PostTrainConfig:
     """Four iterations in about a second; ``changes`` are keys, those of a group by one name."""
     config = PostTrainConfig(
@@ -28,8 +36,7 @@ def small_config(output: Path | str, **changes: Any) -> PostTrainConfig:
         optimizer={"lr": 1e-3},
         **{key: changes.pop(key) for key in ("prompt", "guidance") if key in changes},
     )
-    places = {**PostTrainConfig.RENAMED, "regularisation": "regularisation.weight", "lr": "optimizer.lr"}
-    return changed(config, {places.get(key, key): value for key, value in changes.items()})
+    return changed(config, {_PLACES.get(key, key): value for key, value in changes.items()})
 
 
 def count_objects(batch: SceneBatch, context: RewardContext) -> RewardOutput:
