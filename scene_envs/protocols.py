@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from torch import Generator, Tensor
@@ -124,42 +124,6 @@ class LikelihoodPriorLike(PriorLike, Protocol):
 
         All noise comes from ``generator``.
         """
-
-
-class ObservedScenesLike(Protocol):
-    """Scenes in which some entries are observed; a policy decides the others."""
-
-    @property
-    def entries(self) -> Tensor:
-        """(B, N, 2) bool, True where the pose, or the category, of a slot is observed."""
-
-    def write(self, x: Tensor, level: int, noise: Callable[[], Tensor] | None = None) -> Tensor:
-        """States (B, N, D) at timestep ``level`` with the observed entries in place.
-
-        ``noise`` gives standard normal noise (B, N, D) where it is needed.
-        """
-
-    def merge(self, scenes: SceneBatch) -> SceneBatch:
-        """Finished scenes with the observed entries, bit for bit."""
-
-
-class InpaintingPriorLike(PriorLike, Protocol):
-    """A prior whose reverse chain can be taken with some entries observed."""
-
-    def observe(self, batch: SceneBatch, mask: Tensor) -> ObservedScenesLike:
-        """Scenes that are regenerated where ``mask`` (B, N), or (B, N, 2) for pose and category, is True."""
-
-    def observed_transition(
-        self,
-        x_t: Tensor,
-        step: int,
-        table: StepTableLike,
-        observed: Tensor,
-        *,
-        text: Any = None,
-        guidance: float = 0.0,
-    ) -> Any:
-        """p(x_{t-1} | x_t), in which the entries ``observed`` (B, N, 2) are certain and do not count in log p."""
 
 
 class PromptedPriorLike(PriorLike, Protocol):

@@ -20,18 +20,15 @@ class ReverseStep(Protocol):
 
     @property
     def std(self) -> Tensor:
-        """(N, D) standard deviation of continuous entries; 0 where an entry is certain or discrete.
-
-        (B, N, D) where scenes have different observed entries.
-        """
+        """(N, D) standard deviation of continuous entries; 0 where an entry is certain or discrete."""
 
     @property
     def denoised(self) -> Tensor | None:
         """(B, N, D) the denoiser's estimate of x_0, where it is known."""
 
     @property
-    def entries(self) -> int | Tensor:
-        """Number of random variables of the step of each scene; (B,) where scenes have different observed entries."""
+    def entries(self) -> int:
+        """Number of random variables of the step of each scene."""
 
     def take(self, rows: Tensor) -> ReverseStep:
         """The step of scenes ``rows`` (K,), which may come more than once."""
@@ -53,7 +50,7 @@ def gaussian_log_prob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
     Args:
         x: (B, N, D) where it is evaluated.
         mean: (B, N, D).
-        std: (N, D) or (B, N, D), not negative. An entry with std 0 is certain: it carries no probability and no
+        std: (N, D), not negative. An entry with std 0 is certain: it carries no probability and no
             gradient.
 
     Returns:
@@ -75,7 +72,7 @@ class GaussianStep(NamedTuple):
 
     Attributes:
         mean: (B, N, D).
-        std: (N, D), or (B, N, D); 0 marks a certain entry.
+        std: (N, D); 0 marks a certain entry.
         denoised: (B, N, D) the denoiser's estimate of x_0, where it is known.
 
     >>> step = GaussianStep(torch.zeros(1, 1, 2), torch.tensor([[1.0, 0.0]]))
@@ -89,21 +86,16 @@ class GaussianStep(NamedTuple):
 
     def take(self, rows: Tensor) -> GaussianStep:
         """The step of scenes ``rows`` (K,), which may come more than once."""
-        return self._replace(mean=self.mean[rows], std=_of_rows(self.std, rows, 3), denoised=None)
-
-    def observing(self, entries: Tensor, x: Tensor) -> GaussianStep:
-        """The step whose ``entries`` (B, N, D) bool are certain to be as in ``x`` (B, N, D)."""
-        std = torch.where(entries, torch.zeros_like(self.std), self.std)
-        return self._replace(mean=torch.where(entries, x, self.mean), std=std)
+        return self._replace(mean=self.mean[rows], denoised=None)
 
     def shifted(self, shift: Tensor) -> GaussianStep:
         """The step with the means of the first features moved by ``shift`` (B, N, F)."""
         return self._replace(mean=_shifted(self.mean, shift))
 
     @property
-    def entries(self) -> int | Tensor:
-        """Random entries of a scene; (B,) where scenes have different observed entries."""
-        return _count(self.std > 0, 3)
+    def entries(self) -> int:
+        """Random entries of a scene."""
+        return int((self.std > 0).sum())
 
     def from_noise(self, noise: Tensor) -> Tensor:
         """``mean + std * noise``."""
@@ -121,9 +113,9 @@ class MixedStep(NamedTuple):
 
     Attributes:
         mean: (B, N, P) of the pose.
-        pose_std: (N, P), or (B, N, P); 0 marks a certain entry.
+        pose_std: (N, P); 0 marks a certain entry.
         probs: (B, N, K + 1) of the state, the mask token last.
-        random: (N,) bool, or (B, N), slots whose state is drawn; in the others the likeliest one is taken.
+        random: (N,) bool, slots whose state is drawn; in the others the likeliest one is taken.
         masked: (B, N) bool, masked slots that are unmasked together, so that their number is near the expected one
             (:mod:`agents.diffusion.unmasking`); None unmasks each slot independently.
         denoised: (B, N, P + K) the denoiser's estimate of x_0, categories by arg-max, where it is known.
@@ -148,27 +140,8 @@ class MixedStep(NamedTuple):
     def take(self, rows: Tensor) -> MixedStep:
         """The step of scenes ``rows`` (K,), which may come more than once."""
         masked = None if self.masked is None else self.masked[rows]
-        pose_std, random = _of_rows(self.pose_std, rows, 3), _of_rows(self.random, rows, 2)
         groups = None if self.groups is None else self.groups[rows]
-        return MixedStep(self.mean[rows], pose_std, self.probs[rows], random, masked, groups=groups)
-
-    def observing(self, pose: Tensor, category: Tensor, x: Tensor) -> MixedStep:
-        """The step in which some slots are certain to be as in ``x`` (B, N, P + K).
-
-        Args:
-            pose: (B, N) bool, where the pose is certain.
-            category: (B, N) bool, where the state is certain.
-            x: scenes.
-        """
-        width = self.mean.shape[-1]
-        certain = F.one_hot(state_of(x[..., width:]), self.probs.shape[-1]).to(self.probs)
-        return self._replace(
-            mean=torch.where(pose[..., None], x[..., :width], self.mean),
-            pose_std=torch.where(pose[..., None], torch.zeros_like(self.pose_std), self.pose_std),
-            probs=torch.where(category[..., None], certain, self.probs),
-            random=self.random & ~category,
-            masked=None if self.masked is None else self.masked & ~category,
-        )
+        return MixedStep(self.mean[rows], self.pose_std, self.probs[rows], self.random, masked, groups=groups)
 
     def shifted(self, shift: Tensor) -> MixedStep:
         """The step with the means of the first features moved by ``shift`` (B, N, F)."""
@@ -180,13 +153,13 @@ class MixedStep(NamedTuple):
 
     @property
     def std(self) -> Tensor:
-        """(N, P + K), or (B, N, P + K), standard deviation; 0 for the entries of the state."""
+        """(N, P + K) standard deviation; 0 for the entries of the state."""
         return F.pad(self.pose_std, (0, self.probs.shape[-1] - 1))
 
     @property
-    def entries(self) -> int | Tensor:
-        """Random pose entries and states of a scene; (B,) where scenes have different observed entries."""
-        return _count(self.pose_std > 0, 3) + _count(self.random, 2)
+    def entries(self) -> int:
+        """Random pose entries and states of a scene."""
+        return int((self.pose_std > 0).sum()) + int(self.random.sum())
 
     def from_noise(self, noise: Tensor) -> Tensor:
         """Poses by shifting and scaling noise; states by inverting their distribution function at Phi of a noise entry.
@@ -231,16 +204,6 @@ class MixedStep(NamedTuple):
         return continuous + torch.where(self.random, discrete, torch.zeros_like(discrete))
 
 
-def _count(random: Tensor, dims: int) -> int | Tensor:
-    """Number of True entries; of each scene where ``random`` has ``dims`` dimensions."""
-    return random.flatten(1).sum(dim=1) if random.ndim == dims else int(random.sum())
-
-
-def _of_rows(x: Tensor, rows: Tensor, dims: int) -> Tensor:
-    """``x[rows]`` where ``x`` differs among scenes (it then has ``dims`` dimensions), else ``x``."""
-    return x[rows] if x.ndim == dims else x
-
-
 def _shifted(mean: Tensor, shift: Tensor) -> Tensor:
     return mean + F.pad(shift, (0, mean.shape[-1] - shift.shape[-1]))
 
@@ -282,15 +245,13 @@ def concatenate_steps(parts: Sequence[ReverseStep]) -> ReverseStep:
         return first
     if isinstance(first, GaussianStep):
         normal = [part for part in parts if isinstance(part, GaussianStep)]
-        mean, std = torch.cat([part.mean for part in normal]), _joined([part.std for part in normal], 3)
-        return GaussianStep(mean, std, _all_estimates(parts))
+        return GaussianStep(torch.cat([part.mean for part in normal]), first.std, _all_estimates(parts))
     if isinstance(first, MixedStep):
         mixed = [part for part in parts if isinstance(part, MixedStep)]
         mean, probs = (torch.cat([getattr(part, name) for part in mixed]) for name in ("mean", "probs"))
         masked = None if first.masked is None else torch.cat([part.masked for part in mixed if part.masked is not None])
-        pose_std, random = _joined([part.pose_std for part in mixed], 3), _joined([part.random for part in mixed], 2)
         groups = None if first.groups is None else torch.cat([part.groups for part in mixed if part.groups is not None])
-        return MixedStep(mean, pose_std, probs, random, masked, _all_estimates(parts), groups)
+        return MixedStep(mean, first.pose_std, probs, first.random, masked, _all_estimates(parts), groups)
     raise TypeError(f"cannot concatenate steps of type {type(first).__name__}")
 
 
@@ -298,8 +259,3 @@ def _all_estimates(parts: Sequence[ReverseStep]) -> Tensor | None:
     """The denoised scenes of all parts; None if any part has none."""
     known = [part.denoised for part in parts if part.denoised is not None]
     return torch.cat(known) if len(known) == len(parts) else None
-
-
-def _joined(parts: Sequence[Tensor], dims: int) -> Tensor:
-    """Concatenated parts where they differ among scenes (they then have ``dims`` dimensions), else the first part."""
-    return torch.cat(list(parts)) if parts[0].ndim == dims else parts[0]

@@ -48,13 +48,10 @@ class Observed:
         """(B, N) int64 as the network reads them: 1 where the pose is observed, plus 2 where the category is."""
         return self.pose.long() + 2 * self.category.long()
 
-    def entries(self, pose_width: int = POSE_FEATURES) -> Tensor:
-        """(B, N, D) bool; the first ``pose_width`` features are the pose."""
-        categories = self.x.shape[-1] - pose_width
-        return torch.cat(
-            [self.pose[..., None].expand(-1, -1, pose_width), self.category[..., None].expand(-1, -1, categories)],
-            dim=-1,
-        )
+    def entries(self) -> Tensor:
+        """(B, N, D) bool."""
+        is_pose = torch.arange(self.x.shape[-1], device=self.x.device) < POSE_FEATURES
+        return torch.where(is_pose, self.pose[..., None], self.category[..., None])
 
     def write(self, x: Tensor) -> Tensor:
         """``x`` (B, N, D) with the observed entries in place."""

@@ -60,35 +60,6 @@ def compute_advantages(
     return advantage
 
 
-def sibling_advantages(reward: Tensor, valid: Tensor, siblings: int) -> Tensor:
-    """Rewards of slots minus those of the same slot in sibling scenes, over the root mean square of all differences.
-
-    Siblings are neighbouring rows whose chains share their first steps, so that slot n of each holds the same object.
-    The part of the reward that the shared steps decide cancels; the part that the later steps decide remains.
-
-    Args:
-        reward: (B, N) floats.
-        valid: (B, N) bool; False entries, and rewards that are not finite, get 0 and have no part in their slot's mean.
-        siblings: rows per group.
-
-    Returns:
-        (B, N) float32; 0 where fewer than two siblings are valid, or all differences vanish.
-
-    >>> sibling_advantages(torch.tensor([[1.0], [0.0], [1.0], [1.0]]), torch.ones(4, 1, dtype=torch.bool), 2)[:, 0]
-    tensor([ 1.4142, -1.4142,  0.0000,  0.0000])
-    """
-    valid = valid & torch.isfinite(reward)
-    grouped = torch.where(valid, reward, torch.zeros_like(reward)).double().view(-1, siblings, reward.shape[1])
-    present = valid.view_as(grouped)
-    count = present.sum(dim=1, keepdim=True)
-    others = (grouped.sum(dim=1, keepdim=True) - grouped) / (count - 1).clamp(min=1)
-    difference = ((grouped - others) * present * (count > 1)).view_as(reward)
-    taken = (present & (count > 1)).view_as(reward)
-    everywhere = gather_rows(difference)[gather_rows(taken)]
-    scale = everywhere.square().mean().sqrt() if len(everywhere) else everywhere.new_zeros(())
-    return (difference / scale if scale > _MIN_STD else torch.zeros_like(difference)).float()
-
-
 def _normalise(reward: Tensor, taken: Tensor, sample: Tensor, baseline: str, clip: float) -> Tensor:
     """Advantages of ``reward`` against the valid rewards ``sample`` (M,)."""
     count = sample.numel()

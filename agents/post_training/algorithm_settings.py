@@ -22,8 +22,7 @@ class AlgorithmSettings:
 
     Attributes:
         name: name of a registered algorithm.
-        scenes_per_prompt: number of scenes of a batch that share a prompt, or the observed part in inpainting;
-            advantages are computed within such a group.
+        scenes_per_prompt: number of scenes of a batch that share a prompt; advantages are computed within such a group.
     """
 
     learning_rate: ClassVar[float] = 5e-5
@@ -118,9 +117,6 @@ class ForwardProcessSettings(AlgorithmSettings):
             as they are, ``auto`` is ``none`` if poses have credit per object and the reward counts no objects, else
             ``scene``.
         sampler_decay: final decay of the averaged weights that sample, per iteration; it rises from 0.
-        siblings: number of neighbouring scenes that share the first steps of their chain and are compared with each
-            other; with 1 scenes share nothing and are compared with the whole batch.
-        shared_steps: share of the chain that siblings have in common; all categories should be drawn at its end.
     """
 
     learning_rate: ClassVar[float] = 2e-4
@@ -137,16 +133,12 @@ class ForwardProcessSettings(AlgorithmSettings):
     credit: str = "auto"
     category_credit: str = "auto"
     sampler_decay: float = 0.9
-    siblings: int = 1
-    shared_steps: float = 0.5
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_at_least(self, 1, "updates", "draws", "siblings")
-        if not 0 <= self.shared_steps < 1:
-            raise InvalidInputError(f"shared_steps={self.shared_steps} must lie in [0, 1)")
-        require_one_of(self, "credit", CREDITS)
-        require_one_of(self, "category_credit", CATEGORY_CREDITS)
+        at_least(self, 1, "updates", "draws")
+        one_of(self, "credit", CREDITS)
+        one_of(self, "category_credit", CATEGORY_CREDITS)
         if not 0 <= self.sampler_decay < 1:
             raise InvalidInputError(f"sampler_decay={self.sampler_decay} must lie in [0, 1)")
 

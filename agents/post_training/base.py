@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, Generic, TypeVar
 
 from torch import Generator
 from torchrl.objectives import LossModule
 
-from agents.post_training.base_kl import Parts, forward_kl
 from agents.post_training.gradients import BatchGradient
 from agents.post_training.policy import DenoisingPolicy
-from agents.post_training.rollouts import Branching, Rollout
+from agents.post_training.rollouts import Rollout
 from agents.priors.base import ScenePrior
 from agents.utils.weight_average import WeightAverage
 
@@ -34,11 +33,6 @@ class Algorithm(ABC, Generic[Credit]):
     def sampling_policy(self) -> DenoisingPolicy:
         """Policy that samples the scenes; the policy in training unless an algorithm keeps another."""
         return self.policy
-
-    @property
-    def branching(self) -> Branching:
-        """Groups of scenes that share the first steps of their chain; none unless an algorithm defines them."""
-        return Branching()
 
     @property
     def average(self) -> WeightAverage | None:
@@ -65,11 +59,6 @@ class Algorithm(ABC, Generic[Credit]):
             real: generator that is independent of ``own``, and that drew the real scenes.
         """
         return real
-
-    def kl(self, rollout: Rollout, base: ScenePrior, generator: Generator) -> Parts:
-        """Terms whose sum is the KL divergence of the prior in training from ``base``, nats per random variable."""
-        prior = cast(ScenePrior, self.policy.prior)
-        return forward_kl(prior, base, rollout, generator, self.policy.chunk)
 
     def learning_rate(self, rate: float, update: int) -> float:
         """Learning rate of an update.

@@ -8,33 +8,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from agents.configuration import (
-    LoggerSettings,
-    OptimizerSettings,
-    RewardLimits,
-    SamplingKeys,
-    TrainingKeys,
-    composed,
-    named,
-    nested,
-    plain_tree,
-    require_at_least,
-    require_one_of,
-    require_positive,
-)
+from agents.configuration.checks import at_least, one_of, positive
+from agents.configuration.fields import composed, named, nested
+from agents.configuration.settings import LoggerSettings, OptimizerSettings
+from agents.configuration.shared_keys import RewardLimits, SamplingKeys, TrainingKeys
+from agents.configuration.tree import plain_tree
 from agents.post_training.algorithm_settings import AlgorithmSettings, DDPOSFSettings, NeonSettings
 from agents.post_training.algorithms import algorithm_settings, list_algorithms
-from agents.post_training.inpaint_settings import InpaintSettings
-from agents.post_training.regularisation_settings import REAL_SCENES, AdapterSettings, RegularisationSettings
-from agents.prior_names import split_name
-from agents.utils.loggers import LOGGERS
+from agents.post_training.regularisation_settings import REAL_SCENES, RegularisationSettings
 from scene_envs.envs.settings import PROMPT_SOURCES, check_claim_guidance
 from scene_envs.errors import InvalidInputError
 
 RESUMABLE = ("recipe", "iterations", "output", "workers", "logger", "reward_timeout", "reward_memory")
 """Fields that may change between a run and its continuation."""
-_ADAPTER_RATE = 10.0
-"""Learning rate of low-rank updates, divided by that of all weights."""
 
 
 @dataclass
@@ -42,7 +28,7 @@ class PostTrainOptimizerSettings(OptimizerSettings):
     """The optimiser of a post-training run; its steps are updates.
 
     Attributes:
-        lr: peak learning rate; null takes the default of the algorithm, or ten times that with an adapter.
+        lr: peak learning rate; null takes the default of the algorithm.
         chunk: scenes per forward and backward pass; null takes the whole batch at once.
     """
 
@@ -156,7 +142,6 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
 
         - step_scale * sum over gradient steps of mean over scenes of  A * log p(x_{t-1} | x_t)
         + regularisation.weight * pretraining loss on real scenes
-        + regularisation.kl * KL divergence from the base prior
 
     where ``step_scale = steps with weight > 0 / gradient_steps``. ``algorithm.log_prob_reduction`` says how log p is
     reduced over a scene's entries. The pretraining loss is a mean over scenes and entries. The weight is meaningful
@@ -186,10 +171,8 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
         seed: seed of the initial noise, the chain's noise, the choice of steps and the real scenes.
         algorithm: the post-training algorithm.
         optimizer: the optimiser of the weights.
-        regularisation: losses that keep the prior near real scenes and near its base.
+        regularisation: losses that keep the prior near real scenes.
         guard: checks on held-out real scenes.
-        adapter: low-rank updates, off by default.
-        inpaint: post-training inside inpainting, off by default.
         logger: log files and progress display.
     """
 
@@ -205,8 +188,6 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
     )
     regularisation: RegularisationSettings = nested(RegularisationSettings)
     guard: GuardSettings = nested(GuardSettings)
-    adapter: AdapterSettings = nested(AdapterSettings)
-    inpaint: InpaintSettings = nested(InpaintSettings)
     logger: PostTrainLoggerSettings = nested(
         PostTrainLoggerSettings, folder="logger", option="csv", registered=lambda: LOGGERS
     )
@@ -229,14 +210,8 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
                 f"algorithm={self.algorithm.name} learns from the probability of its own draws; take algorithm=nft or "
                 "awm, or leave claim_guidance=0"
             )
-        if self.claim_guidance and self.inpaint.mask is not None:
-            raise InvalidInputError(
-                f"claim_guidance={self.claim_guidance:g} guides whole scenes, and inpaint.mask={self.inpaint.mask} "
-                "regenerates parts; leave one of them out"
-            )
         if self.optimizer.lr is None:
-            factor = _ADAPTER_RATE if self.adapter.rank else 1.0
-            self.optimizer = replace(self.optimizer, lr=factor * self.algorithm.learning_rate)
+            self.optimizer = replace(self.optimizer, lr=self.algorithm.learning_rate)
         if self.regularisation.weight is None:
             self.regularisation = replace(self.regularisation, weight=self.algorithm.regularisation_weight)
         if self.regularisation.batch_size is None:
@@ -249,19 +224,13 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
                 "algorithm=neon trains one copy on real scenes and one on samples, as many of each, with the same "
                 "noise; leave regularisation.batch_size out"
             )
-        prior, adapter = split_name(self.prior)
-        if self.adapter.rank and adapter:
-            raise InvalidInputError(
-                f"adapter.rank={self.adapter.rank} on {str(prior)!r} with {adapter!r}: an adapter has one prior; "
-                "start from the folder of the run that made the first, whose prior holds its updates"
-            )
         target = self.regularisation.target
         if target is not None and isinstance(self.algorithm, NeonSettings):
             raise InvalidInputError(
                 f"hold={self.regularisation.hold} adjusts regularisation.weight, and the size of this weight does not "
                 "change the steps of algorithm=neon; lower algorithm.w for a shorter step, or take another algorithm"
             )
-        if target is not None and target.figure == "guard" and target.value > self.guard.limit:
+        if target is not None and target > self.guard.limit:
             raise InvalidInputError(
                 f"hold={self.regularisation.hold} lies beyond guard.limit={self.guard.limit:g}, past which no prior is "
                 f"kept; raise guard.limit, or hold at most guard:{self.guard.limit:g}"

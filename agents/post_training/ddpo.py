@@ -7,12 +7,10 @@ from torch import Generator, Tensor
 from agents.post_training.advantages import compute_advantages
 from agents.post_training.algorithm_settings import DDPOISSettings, DDPOSFSettings
 from agents.post_training.base import Algorithm
-from agents.post_training.base_kl import Parts, chain_kl
 from agents.post_training.gradients import BatchGradient, accumulate_policy_gradient, credited_reward, draw_steps
 from agents.post_training.losses import DDPOSFLoss
 from agents.post_training.policy import DenoisingPolicy, gradient_weights
 from agents.post_training.rollouts import Rollout, rollout_groups
-from agents.priors.base import ScenePrior
 
 
 class DDPO(Algorithm[Tensor]):
@@ -40,7 +38,7 @@ class DDPO(Algorithm[Tensor]):
         ).to(next(policy.parameters()).device)
 
     def advantage(self, rollout: Rollout) -> Tensor:
-        """Advantages (B,) or (B, N), as ``credit`` says, within the scenes of one prompt or of one observed part."""
+        """Advantages (B,) or (B, N), as ``credit`` says, within the scenes of one prompt."""
         settings = self.settings
         reward, valid = credited_reward(rollout, settings.credit)
         groups = rollout_groups(rollout)
@@ -52,7 +50,3 @@ class DDPO(Algorithm[Tensor]):
         """Add the policy gradient of a batch to ``.grad``; ``generator`` draws the steps that enter it."""
         steps, scale = draw_steps(self.loss.step_weights.cpu(), self.settings.gradient_steps, generator)
         return accumulate_policy_gradient(self.loss, rollout, advantage, steps, scale=scale)
-
-    def kl(self, rollout: Rollout, base: ScenePrior, generator: Generator) -> Parts:
-        """Terms of the KL divergence of the chain, estimated at the cost of ``gradient_steps`` steps."""
-        return chain_kl(self.policy, base, rollout, self.settings.gradient_steps, generator)

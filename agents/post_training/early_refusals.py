@@ -13,26 +13,26 @@ from scene_envs.errors import InvalidInputError, TrainingError
 from scene_envs.scene import SceneBatch
 
 _PROBED = 2
-"""Real scenes on which the reward and the mask of a run are tried."""
+"""Real scenes on which the reward of a run is tried."""
 _PROBED_WITH_PROMPTS = 8
 """The same number in a run that uses the prompts of its real scenes."""
 
 
 def check_it_can_learn(learner: Learner, real: SceneBatch, prompts: PromptSets | None) -> None:
-    """Score real scenes as the scenes of the run will be scored, and try the mask of ``inpaint.mask`` on them.
+    """Score real scenes as the scenes of the run will be scored.
 
     Real scenes are scored with their own prompts if the run uses the prompts of real scenes, and with the prompts of
     the run otherwise. With prompts that are not their own, it may be that no real scene can be scored. A run with such
     prompts is therefore not refused if no real scene is scored.
 
     Args:
-        learner: learner of the run, which can already deal prompts and observed parts.
+        learner: learner of the run, which can already deal prompts.
         real: real scenes.
         prompts: prompts of each real scene; None for a prior that reads no prompts.
 
     Raises:
-        InvalidInputError: credit per object is asked of a reward that gives none, or the mask cannot be made, or leaves
-            nothing to regenerate in any scene, or the guard has a limit of stacks for assets without geometry.
+        InvalidInputError: credit per object is asked of a reward that gives none, or the guard has a limit of
+            stacks for assets without geometry.
         TrainingError: the reward scores none of the real scenes.
     """
     config, scene_type = learner.config, learner.prior.scene_type
@@ -49,12 +49,6 @@ def check_it_can_learn(learner: Learner, real: SceneBatch, prompts: PromptSets |
     if config.prompt in (None, "data") and not learner.processes.any(valid):
         pairs = "" if texts is None else " with a prompt"
         raise nothing_scored(config, f"none of {len(scenes)} real scenes{pairs}, so that nothing was sampled")
-    if learner.inpaint_deck is None:
-        return
-    if config.inpaint.scenes == "real":
-        learner.deal(0)
-    else:
-        learner.inpaint_deck.check(scenes, texts)
 
 
 def nothing_scored(config: PostTrainConfig, what: str) -> TrainingError:

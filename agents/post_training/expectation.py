@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from agents.networks.low_rank import LowRank
 from agents.networks.text import Text
 from agents.priors.base import ScenePrior
 from agents.priors.forward import NoisedScenes
@@ -74,8 +73,6 @@ class Expectation(TrainedCopy):
 
     def __init__(self, prior: ScenePrior, learning_rate: float = 3e-4) -> None:
         copy = deepcopy(prior).requires_grad_(True)
-        for update in (module for module in copy.modules() if isinstance(module, LowRank)):
-            update.requires_grad_(False)  # the copy trains all weights but these
         copy.freeze_text()
         super().__init__(copy, learning_rate)
 

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
-from agents.post_training.advantages import compute_advantages, sibling_advantages
+from agents.post_training.advantages import compute_advantages
 from agents.post_training.algorithm_settings import (
     AWMSettings,
     ForwardProcessSettings,
@@ -23,9 +23,8 @@ from agents.post_training.forward_process_loss import ForwardProcessLoss
 from agents.post_training.gradients import BatchGradient, credited_reward, judged_slots
 from agents.post_training.own_samples import OwnSampleAlgorithm
 from agents.post_training.policy import DenoisingPolicy
-from agents.post_training.rollouts import Branching, Rollout, rollout_groups
+from agents.post_training.rollouts import Rollout, rollout_groups
 from agents.priors.base import ScenePrior
-from agents.utils.process_group import ProcessGroup
 
 
 class ForwardProcess(OwnSampleAlgorithm):
@@ -59,19 +58,14 @@ class ForwardProcess(OwnSampleAlgorithm):
         assert isinstance(settings, RewardWeightedSettings)
         return RewardWeightedLoss(*pair, temperature=settings.temperature)
 
-    @property
-    def branching(self) -> Branching:
-        """Siblings share ``shared_steps`` of the chain."""
-        settings = self.settings
-        return Branching(settings.siblings, round(settings.shared_steps * len(self.policy)))
-
     def advantage(self, rollout: Rollout) -> TensorDict:
         """``advantage`` (B, 1) or (B, N) for poses and ``category_advantage`` (B, 1), as the credit settings say."""
         settings = self.settings
         reward, valid = credited_reward(rollout, settings.credit)
         per_object = reward.ndim == 2
-        if per_object:
-            poses = self._object_advantages(rollout, reward, valid)
+        if per_object:  # a table that is not judged has credit 0; with an advantage it would be repelled
+            valid = valid & judged_slots(rollout).to(valid.device)
+            poses = compute_advantages(reward, valid, clip=math.inf, groups=rollout_groups(rollout))
         else:
             poses = self._scene_advantages(rollout)
         poses_alone = per_object and not rollout.counts
@@ -81,27 +75,9 @@ class ForwardProcess(OwnSampleAlgorithm):
             categories = self._scene_advantages(rollout)
         return TensorDict({"advantage": poses, "category_advantage": categories}, [len(reward)])
 
-    def _object_advantages(self, rollout: Rollout, reward: Tensor, valid: Tensor) -> Tensor:
-        """(B, N) advantages; 0 for slots that are not judged, and for slots whose siblings hold different objects.
-
-        A table that is not judged has credit 0. With an advantage, it would be repelled like an object that is not
-        feasible.
-        """
-        valid = valid & judged_slots(rollout).to(valid.device)
-        siblings = self.settings.siblings
-        if siblings == 1:
-            return compute_advantages(reward, valid, clip=math.inf, groups=rollout_groups(rollout))
-        categories = rollout.batch.categories.to(valid.device).unflatten(0, (-1, siblings))
-        same = (categories == categories[:, :1]).all(dim=1)
-        return sibling_advantages(reward, valid & same.repeat_interleave(siblings, dim=0), siblings)
-
     def _scene_advantages(self, rollout: Rollout) -> Tensor:
-        """(B, 1) advantages; among siblings if there are any."""
+        """(B, 1) advantages of whole scenes."""
         groups = rollout_groups(rollout)
-        if self.settings.siblings > 1:
-            first = ProcessGroup.current().rank * len(rollout.reward)
-            rows = torch.arange(first, first + len(rollout.reward), device=rollout.reward.device)
-            groups = rows // self.settings.siblings
         return compute_advantages(rollout.reward, rollout.valid, clip=math.inf, groups=groups)[:, None]
 
     def measure(self, result: TensorDict) -> dict[str, float]:

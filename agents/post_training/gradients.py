@@ -167,35 +167,6 @@ def add_regularisation_gradient(
     return processes.sum_numbers(value)[0], norm
 
 
-def add_gradient(
-    parts: Iterable[Iterable[Tensor]], parameters: Iterable[nn.Parameter], coefficient: float
-) -> tuple[float, float]:
-    """Add ``coefficient`` times the gradient of a sum to ``.grad``, one term () and its graph at a time.
-
-    The gradient of a part of the batch is complete before it is added to that of others, so that two parts have the
-    same sum in one process as in two. With several processes, the mean of their sums takes the place of the sum.
-
-    Returns:
-        The sum, and the norm of ``coefficient`` times its gradient.
-    """
-    processes = ProcessGroup.current()
-    trained = [p for p in parameters if p.requires_grad]
-    value, gradients = 0.0, [torch.zeros_like(p) for p in trained]
-    for terms in parts:
-        of_part = [torch.zeros_like(p) for p in trained]
-        for term in terms:
-            value += float(term.detach())
-            for total, gradient in zip(of_part, torch.autograd.grad(term, trained, allow_unused=True), strict=True):
-                if gradient is not None:
-                    total.add_(gradient, alpha=coefficient / processes.size)
-        gradients = [total + gradient for total, gradient in zip(gradients, of_part, strict=True)]
-    gradients = processes.sum_tensors(gradients)
-    for parameter, gradient in zip(trained, gradients, strict=True):
-        parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
-    norm = float(torch.stack([gradient.norm() for gradient in gradients]).norm()) if gradients else 0.0
-    return processes.sum_numbers(value)[0] / processes.size, norm
-
-
 def prompted_loss(prior: ScenePrior, x0: Tensor, prompts: Sequence[str] | None, generator: Generator | None) -> Tensor:
     """(B,) pretraining losses of real scenes ``x0`` (B, N, D), given their prompts if there are any."""
     text = None if prompts is None else encoded(prior, prompts)
@@ -244,6 +215,4 @@ def credited_reward(rollout: Rollout, credit: str) -> tuple[Tensor, Tensor]:
     free[:, : len(rollout.batch.scene_type.fixed)] = False  # fixed slots are not drawn
     if rollout.averages:
         free &= judged_slots(rollout).to(free.device)
-    if rollout.observed is not None:
-        free &= ~rollout.observed.all(dim=-1)  # observed slots are not drawn
     return rollout.per_object.float(), free & rollout.valid.unsqueeze(-1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,8 +42,6 @@ class GuidanceDistillationLoss(PlainLoss):
         denoised: (B, N, 12) float, the teacher's estimate of the normalised poses of x_0. Default ``"denoised"``.
         trained: (B, N) bool, optional, slots whose poses are trained; without it, all. Default ``"trained"``.
         text, text_mask: (B, L, W) tokens and (B, L) their mask, optional. Default ``"text"`` and ``"text_mask"``.
-        observed: (B, N, 2) bool, optional, True where the pose, or the category, of a slot is observed. Default
-            ``"observed"``.
 
     Args:
         prior: prior that is trained.
@@ -68,7 +65,6 @@ class GuidanceDistillationLoss(PlainLoss):
         trained: NestedKey = "trained"
         text: NestedKey = "text"
         text_mask: NestedKey = "text_mask"
-        observed: NestedKey = "observed"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -93,11 +89,10 @@ class GuidanceDistillationLoss(PlainLoss):
         text = None if tokens is None or mask is None else (tokens.detach(), mask)
         weight = self.prior.loss_weight(x.shape[1]).to(x)[:, :POSE_FEATURES].expand(len(x), -1, -1)
         weight = weight if trained is None else weight * trained[..., None]
-        observed = self.prior.observed_by_mask(x, flat.get(keys.observed, None))
         noised = NoisedScenes(
             x_t=x, t=t, target=teacher, weight=weight, scale=x.new_ones(len(x)),
             category=x[..., POSE_FEATURES:].argmax(dim=-1),
-            observed=self.prior.observed_entries(x, observed),
+            observed=self.prior.observed_entries(x),
         )  # fmt: skip
         found = self.prior.denoised(noised, self.prior.output(noised, text))[..., :POSE_FEATURES]
         entries = ((found - teacher) / self._std(t, x)).square() * weight
@@ -205,17 +200,10 @@ class GuidanceDistillation(AveragedSampler):
         """The states of scenes ``rows`` (R,) at one step of their chains."""
         x = rollout.scenes[step][rows]
         text = None if rollout.text is None else (rollout.text[0][rows], rollout.text[1][rows])
-        observed = None if rollout.observed is None else rollout.observed[rows]
-        denoised = self._teacher.distribution(x, step, text, observed).denoised
+        denoised = self._teacher.distribution(x, step, text).denoised
         assert denoised is not None
         movable = torch.ones(x.shape[:2], dtype=torch.bool, device=x.device)
         movable[:, : len(self.sampler.scene_type.fixed)] = False
-        if observed is not None:
-            movable &= ~observed[..., 0]
-            is_pose = torch.arange(x.shape[-1], device=x.device) < POSE_FEATURES
-            known = torch.where(is_pose, observed[..., :1], observed[..., 1:])
-            finished = self.sampler.encode(rollout.batch[rows.cpu()].to(x.device))
-            denoised = torch.where(known, finished, denoised)
         scenes = self.sampler.decode(denoised)
         guidance, std = PhysicsGuidance(self.settings.strength, movable), self._stds[step]
         moves = guidance(step, len(self.policy), lambda: scenes, std)
@@ -232,9 +220,6 @@ class GuidanceDistillation(AveragedSampler):
             "trained": movable & ~scenes.is_empty.to(x.device),
             "moved": moves.norm(dim=-1),
         }
-        optional: Mapping[str, Tensor | None] = {
-            "text": None if text is None else text[0],
-            "text_mask": None if text is None else text[1],
-            "observed": observed,
-        }
-        return TensorDict(fields | {name: value for name, value in optional.items() if value is not None}, [len(x)])
+        if text is not None:
+            fields |= {"text": text[0], "text_mask": text[1]}
+        return TensorDict(fields, [len(x)])

@@ -7,39 +7,33 @@ from pathlib import Path
 from typing import Any
 
 from agents.post_training.curves import FAINT, GUARD_COLOR, REWARD_COLOR
-from agents.post_training.hold import Target
+from agents.post_training.hold import held_ratio
 from agents.post_training.report import Picture, Section
-
-_COLUMNS = {"guard": ("guard_ratio", "held-out loss over base"), "kl": ("kl", "KL from the base prior")}
 
 
 def hold_sections(hold: Mapping[str, Any] | None, history: Sequence[Mapping[str, float]], path: Path) -> list[Section]:
     """A section on the target, with its picture written to ``path``; no section for a run without a target."""
     if hold is None or hold["measured"] is None:
         return []
-    caption = "The figure with its target, and the weights of the regularisation as a multiple of their first value."
-    return [
-        Section(
-            "What was held", hold["verdict"], [Picture(_draw(Target.parse(hold["target"]), history, path), caption)]
-        )
-    ]
+    caption = "The held-out loss with its target, and the weight of the regularisation over its first value."
+    picture = Picture(_draw(held_ratio(hold["target"]), history, path), caption)
+    return [Section("What was held", hold["verdict"], [picture])]
 
 
-def _draw(target: Target, history: Sequence[Mapping[str, float]], path: Path) -> Path:
+def _draw(target: float, history: Sequence[Mapping[str, float]], path: Path) -> Path:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    column, label = _COLUMNS[target.figure]
-    measured = [(row["iteration"], row[column]) for row in history if column in row]
+    measured = [(row["iteration"], row["guard_ratio"]) for row in history if "guard_ratio" in row]
     weights = [(row["iteration"], row["hold_factor"]) for row in history if "hold_factor" in row]
     figure = Figure(figsize=(8.4, 4.2), dpi=130, layout="constrained")
     FigureCanvasAgg(figure)
     upper, lower = figure.subplots(2, 1, sharex=True)
     upper.plot(*zip(*measured, strict=True), ".-", color=GUARD_COLOR)
-    upper.axhline(target.value, color=FAINT, linestyle="--", linewidth=1)
-    upper.set_ylabel(label)
+    upper.axhline(target, color=FAINT, linestyle="--", linewidth=1)
+    upper.set_ylabel("held-out loss over base")
     lower.semilogy(*zip(*weights, strict=True), color=REWARD_COLOR)
-    lower.set_ylabel("factor on the weights")
+    lower.set_ylabel("factor on the weight")
     lower.set_xlabel("iteration")
     for axes in (upper, lower):
         axes.spines[["top", "right"]].set_visible(False)

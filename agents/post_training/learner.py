@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any
@@ -15,16 +14,14 @@ from agents.post_training.algorithms import make_algorithm
 from agents.post_training.base import Algorithm
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.gradients import gradient_norm
-from agents.post_training.inpaint_deck import InpaintDeck, Parts, real_parts, sampled_parts
 from agents.post_training.learned_rewards import FIRST_SAMPLES, LearnedRewards
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.processes import WholeBatchReward
-from agents.post_training.prompts import PromptDeck, PromptSets
+from agents.post_training.prompts import PromptDeck
 from agents.post_training.regularisation import Regularisation
 from agents.post_training.rollouts import Rollout, collect, stream_seed
 from agents.post_training.run_files import CHECKPOINT_NAME
 from agents.post_training.scene_bank import SceneBank
-from agents.priors.adapters import attach_adapter
 from agents.priors.base import ScenePrior
 from agents.priors.prompt_validation import no_text
 from agents.utils.checkpoints import check_tensors
@@ -33,7 +30,6 @@ from agents.utils.weight_average import AveragedWeights, WeightAverage
 from rewards import averages_objects, counts_objects, depends_on_batch
 from rewards.isolation import close_reward, run_reward
 from scene_envs.envs import DenoisingTorchRLEnv
-from scene_envs.envs.masks import resolve_mask
 from scene_envs.envs.scoring import RewardScorer
 from scene_envs.errors import InvalidInputError, RewardError
 from scene_envs.scene import SceneBatch
@@ -58,17 +54,12 @@ class Learner:
     def __init__(self, config: PostTrainConfig, prior: ScenePrior) -> None:
         self.config = config
         self.prior = deepcopy(prior).to(config.device).eval()
-        if config.inpaint.mask is not None:
-            resolve_mask(config.inpaint.mask)  # raises now, not later, if there is no such mask
         if config.prompt is not None and not self.prior.conditional:
             raise no_text(self.prior.scene_type, str(config.prompt))
         self.prior.freeze_text()
         self.processes = ProcessGroup.current()
         self.processes.share(self.prior.parameters())
         self.regularisation = Regularisation(config.regularisation, self.prior)
-        if config.adapter.rank:
-            adapter = config.adapter
-            attach_adapter(self.prior, prior.loaded_as, rank=adapter.rank, scale=adapter.scale, seed=config.seed)
         self.slots = self.prior.config.slots if config.slots is None else config.slots
         self.policy = DenoisingPolicy(
             self.prior, config.num_steps, chunk=config.optimizer.chunk, guidance=config.guidance,
@@ -97,7 +88,6 @@ class Learner:
         )
         self.scorer = RewardScorer(self.reward, config.workers) if shared else self.env.core.scorer
         self.deck: PromptDeck | None = None
-        self.inpaint_deck: InpaintDeck | None = None
         self.parameters = [p for p in self.prior.parameters() if p.requires_grad]
         self.lr = config.optimizer.lr or config.algorithm.learning_rate
         self.optimizer = torch.optim.AdamW(
@@ -126,60 +116,13 @@ class Learner:
                 self.prior, config.prompt, together, self.slots, scenes.prompts, len(scenes.train)
             )
 
-    def deal_parts(self, real: SceneBatch, prompts: PromptSets | None) -> None:
-        """Make the deck that deals the observed parts of batches; does nothing in a run that samples whole scenes.
-
-        Args:
-            real: real scenes that training may see.
-            prompts: prompts of each real scene; None for a prior that reads no prompts.
-        """
-        config, settings = self.config, self.config.inpaint
-        if settings.mask is None:
-            return
-        if settings.scenes == "real":
-            source = real_parts(real, self.slots, prompts if config.prompt == "data" else None)
-        else:
-            sampler: Any = self.algorithm.sampling_policy.prior
-            source = sampled_parts(sampler, config.num_steps, self.slots, config.guidance)
-        self.inpaint_deck = InpaintDeck(settings, source, self.scorer, config.algorithm.scenes_per_prompt)
-
-    def deal(self, iteration: int) -> tuple[Sequence[str] | None, Parts | None]:
-        """Prompts and observed parts of a batch, one per group of siblings; None where the run has none.
-
-        Raises:
-            InvalidInputError: the mask leaves nothing to regenerate in any scene.
-        """
-        units = self.algorithm.branching.groups(self.config.batch_size)
-        prompts: Sequence[str] | None = None
-        if self.deck is not None:
-            prompts = self.deck.deal(units, self._generator("prompts", iteration))
-        if self.inpaint_deck is None:
-            return prompts, None
-        parts = self.inpaint_deck.deal(units, prompts, stream_seed(self.config.seed, "inpaint", iteration))
-        return parts.prompts, parts
-
     def rollout(self, iteration: int) -> Rollout:
         """A batch of fresh scenes, or this process's share of it."""
-        algorithm, batch = self.algorithm, self.config.batch_size
-        branching, own = algorithm.branching, self.processes.rows(batch)
-        observed, groups = None, None
-        prompts, parts = self.deal(iteration)
-        if parts is not None:
-            units = branching.groups(batch)
-            parts = parts.take(torch.arange(units).repeat_interleave(branching.siblings)[own])
-            observed, groups = self.prior.observe(parts.scenes, parts.mask), parts.groups
-        if prompts is not None:
-            prompts = [text for text in prompts for _ in range(branching.siblings)][own]
-        rollout = collect(
-            self.env,
-            algorithm.sampling_policy,
-            seed=self.config.seed,
-            iteration=iteration,
-            prompts=prompts,
-            branching=branching,
-            observed=observed,
-            groups=groups,
-        )
+        batch, prompts = self.config.batch_size, None
+        if self.deck is not None:
+            prompts = self.deck.deal(batch, self._generator("prompts", iteration))[self.processes.rows(batch)]
+        policy = self.algorithm.sampling_policy
+        rollout = collect(self.env, policy, seed=self.config.seed, iteration=iteration, prompts=prompts)
         return replace(rollout, averages=averages_objects(self.reward), counts=counts_objects(self.reward))
 
     def begin_rewards(self, real: SceneBatch, *, first: bool) -> None:
@@ -216,18 +159,16 @@ class Learner:
         policy = self.algorithm.accumulate(rollout, advantage, self._generator("steps", index))
         self.processes.sum_gradients(self.parameters)
         policy_norm = gradient_norm(self.parameters)
-        held = self.regularisation.accumulate(self.algorithm, rollout, self._generator("kl", index))
         generator = self._generator("real", index)
         count = config.regularisation.real_scenes
         real = scenes.batch(count, generator)
         samples = None if scenes.base is None else scenes.base.batch(count, self._generator("base", index))
         noise = self.algorithm.real_generator(self._generator("steps", index), generator)
-        row = self.regularisation.accumulate_scenes(self.prior, real, samples, noise, config.optimizer.chunk)
+        row = self.regularisation.accumulate(self.prior, real, samples, noise, config.optimizer.chunk)
         return {
             "policy_loss": policy.loss,
             "policy_gradient_norm": policy_norm,
             **row,
-            **held,
             **policy.figures(),
         }
 
@@ -288,7 +229,7 @@ class Learner:
         if self.average is not None:
             self.average.restore(state["average"], state["average_updates"])
         self.algorithm.restore(state["algorithm"])
-        self.regularisation.load_state_dict(state.get("regularisation"))
+        self.regularisation.load_state_dict(state["regularisation"])
         self.learned.restore(state)
         torch.set_rng_state(state["random"])
 

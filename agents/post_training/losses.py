@@ -48,8 +48,6 @@ class DDPOSFLoss(PlainLoss):
         text, text_mask: (B, L, W) tokens and (B, L) their mask, optional, as the policy saw them. Default ``"text"``
             and ``"text_mask"``.
         prompt: (B, L) int64 token indices, optional, read where ``text`` is missing. Default ``"prompt"``.
-        observed: (B, N, 2) bool, optional, True where the pose, or the category, of a slot is observed. In
-            inpainting, only the other entries are actions. Default ``"observed"``.
 
     Args:
         policy: policy that is optimised.
@@ -83,7 +81,6 @@ class DDPOSFLoss(PlainLoss):
         text: NestedKey = "text"
         text_mask: NestedKey = "text_mask"
         prompt: NestedKey = "prompt"
-        observed: NestedKey = "observed"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -136,20 +133,18 @@ class DDPOSFLoss(PlainLoss):
         if old is None and self.clip_epsilon is not None:
             raise InvalidInputError(f"clipping needs the log-probabilities at sampling under {keys.sample_log_prob!r}")
         kept = self._kept(tensordict)
-        text, observed = self._text(flat), flat.get(keys.observed, None)
+        text = self._text(flat)
         total = scene.new_zeros(())
         largest, clipped = scene.new_zeros(()), scene.new_zeros(())
         for t in timestep.unique().tolist():
             rows = timestep == t
             step = self.policy.step_of(int(t))
             part_text = None if text is None else (text[0][rows], text[1][rows])
-            entry_flags = None if observed is None else observed[rows]
-            log_prob = self.policy.log_prob(scene[rows], step, action[rows], part_text, entry_flags)  # (b, N)
+            log_prob = self.policy.log_prob(scene[rows], step, action[rows], part_text)  # (b, N)
             earlier = None if old is None else old[rows].detach()
             if earlier is not None:
                 largest = torch.maximum(largest, (log_prob.detach() - earlier).sum(dim=-1).abs().max())
-            entries = self._count_entries(log_prob, entry_flags)
-            objective, beyond = self._objective(log_prob, advantage[rows], earlier, entries)
+            objective, beyond = self._objective(log_prob, advantage[rows], earlier)
             total = total + self.step_weights[step] * torch.where(kept[rows], objective, 0.0).sum()
             clipped = clipped + torch.where(kept[rows], beyond, 0.0).sum()
         count = kept.sum().clamp(min=1)
@@ -157,10 +152,9 @@ class DDPOSFLoss(PlainLoss):
             {"loss_objective": -total / count, "log_ratio": largest, "clip_fraction": clipped / count}, []
         )
 
-    def _objective(
-        self, log_prob: Tensor, advantage: Tensor, old: Tensor | None, entries: int | Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def _objective(self, log_prob: Tensor, advantage: Tensor, old: Tensor | None) -> tuple[Tensor, Tensor]:
         """(b,) objective and (b,) share of clipped terms, from (b, N) log-probabilities and advantages."""
+        entries = self._count_entries(log_prob.shape[1])
         if advantage.shape[1] == 1:  # credit per scene
             log_prob = log_prob.sum(dim=1, keepdim=True)
             old = None if old is None else old.sum(dim=1, keepdim=True)
@@ -206,13 +200,10 @@ class DDPOSFLoss(PlainLoss):
             )
         return advantage
 
-    def _count_entries(self, log_prob: Tensor, observed: Tensor | None) -> int | Tensor:
-        """Divisor of (b, N) log-probabilities; (b, 1) where scenes have different observed entries."""
+    def _count_entries(self, slots: int) -> int:
+        """Divisor of log-probabilities."""
         if self.reduction != "mean":
             return 1
-        if observed is not None:
-            return self.policy.unobserved_entries(observed).clamp(min=1).to(log_prob)[:, None]
-        slots = log_prob.shape[1]
         if slots not in self._entries:
             self._entries[slots] = self.policy.random_entries(slots)
         return self._entries[slots]

@@ -39,8 +39,6 @@ class OwnSampleLoss(PlainLoss):
         timestep: (B,) or (B, 1) int64, optional; without it, drawn as in pretraining. Default ``"timestep"``.
         valid: (B,) or (B, 1) bool, optional; False rows are left out of the mean. Default ``"valid"``.
         text, text_mask: (B, L, W) tokens and (B, L) their mask, optional. Default ``"text"`` and ``"text_mask"``.
-        observed: (B, N, 2) bool, optional, True where the pose, or the category, of a slot is observed. In inpainting,
-            only the other entries have a loss. Default ``"observed"``.
 
     Args:
         prior: noises the scenes.
@@ -57,7 +55,6 @@ class OwnSampleLoss(PlainLoss):
         valid: NestedKey = "valid"
         text: NestedKey = "text"
         text_mask: NestedKey = "text_mask"
-        observed: NestedKey = "observed"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -84,10 +81,8 @@ class OwnSampleLoss(PlainLoss):
         flat = tensordict.reshape(-1)
         timestep = flat.get(self.tensor_keys.timestep, None)
         scene = flat.get(self.tensor_keys.scene).detach()
-        observed = self.prior.observed_by_mask(scene, flat.get(self.tensor_keys.observed, None))
         t = None if timestep is None else timestep.reshape(-1)
-        noised = self.prior.noised(scene, self.generator, t, observed)
-        return self.of_noised(noised, flat)
+        return self.of_noised(self.prior.noised(scene, self.generator, t), flat)
 
     def of_noised(self, noised: NoisedScenes, flat: TensorDictBase) -> TensorDict:
         """The loss of a batch of shape [B] whose scenes the prior has noised already."""

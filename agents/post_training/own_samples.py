@@ -58,9 +58,7 @@ class OwnSampleAlgorithm(AveragedSampler):
         size, processes = self.policy.chunk or len(x0), ProcessGroup.current()
         valid = max(1.0, processes.sum_numbers(int(rollout.valid.sum()))[0])
         everything, own = gather_rows(x0), processes.rows(processes.size * len(x0))
-        mask = None if rollout.observed is None else gather_rows(rollout.observed)
-        observed = self.prior.observed_by_mask(everything, mask)
-        draws = [self.prior.noised(everything, generator, observed=observed).rows(own) for _ in range(self.draws)]
+        draws = [self.prior.noised(everything, generator).rows(own) for _ in range(self.draws)]
         total, sums = 0.0, defaultdict[str, float](float)
         learned = [] if self.copy is None else self.copy.trained
         gradient = GradientSum([*self.prior.parameters(), *learned])

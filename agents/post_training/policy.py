@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import cast
 
 import torch
 from tensordict import TensorDictBase
@@ -16,8 +16,7 @@ from agents.networks.text import Text
 from agents.priors.base import ScenePrior
 from agents.priors.hooks import Hook
 from scene_envs.errors import InvalidInputError
-from scene_envs.protocols import InpaintingPriorLike, PriorLike, PromptedPriorLike, StepTableLike
-from scene_envs.scene import POSE_FEATURES
+from scene_envs.protocols import PriorLike, PromptedPriorLike, StepTableLike
 
 
 class DenoisingPolicy(TensorDictModuleBase):
@@ -68,7 +67,6 @@ class DenoisingPolicy(TensorDictModuleBase):
         if prior.conditional:
             self.in_keys = [*self.in_keys, "prompt"]
         self.table: StepTableLike = prior.step_table(num_steps)
-        self._first_steps: dict[int, ReverseStep] = {}
         self._step_of = {int(t): step for step, t in enumerate(self.table.timesteps.tolist())}
 
     def __len__(self) -> int:
@@ -101,34 +99,19 @@ class DenoisingPolicy(TensorDictModuleBase):
             len(prompts), slots, len(self), prompts=prompts, claim_guidance=self.claim_guidance
         )
 
-    def distribution(
-        self, x_t: Tensor, step: int, text: Text | None = None, observed: Tensor | None = None
-    ) -> ReverseStep:
-        """p(x_{t-1} | x_t) of ``x_t`` (B, N, D) given ``text``; differentiable in the prior's parameters.
-
-        Entries that are ``observed`` (B, N, 2), the pose or the category of a slot, are known and are no actions.
-        """
+    def distribution(self, x_t: Tensor, step: int, text: Text | None = None) -> ReverseStep:
+        """p(x_{t-1} | x_t) of ``x_t`` (B, N, D) given ``text``; differentiable in the prior's parameters."""
         size = self.chunk or x_t.shape[0]
         return concatenate_steps(
             [
-                self._transition(
-                    x_t[rows],
-                    step,
-                    None if text is None else (text[0][rows], text[1][rows]),
-                    None if observed is None else observed[rows],
-                )
+                self._transition(x_t[rows], step, None if text is None else (text[0][rows], text[1][rows]))
                 for rows in (slice(start, start + size) for start in range(0, x_t.shape[0], size))
             ]
         )
 
-    def _transition(self, x_t: Tensor, step: int, text: Text | None, observed: Tensor | None) -> ReverseStep:
+    def _transition(self, x_t: Tensor, step: int, text: Text | None) -> ReverseStep:
         reverse: ReverseStep
-        if observed is not None:
-            inpainting = cast(InpaintingPriorLike, self.prior)
-            reverse = inpainting.observed_transition(
-                x_t, step, self.table, observed, text=text, guidance=0.0 if text is None else self.guidance
-            )
-        elif text is None:
+        if text is None:
             reverse = self.prior.transition(x_t, step, self.table)
         else:
             prior = cast(PromptedPriorLike, self.prior)
@@ -143,7 +126,6 @@ class DenoisingPolicy(TensorDictModuleBase):
         generator: Generator | None = None,
         text: Text | None = None,
         noise: Tensor | None = None,
-        observed: Tensor | None = None,
         hook: Hook | None = None,
     ) -> tuple[Tensor, Tensor]:
         """An action (B, N, D) and its log-probability per slot (B, N), without gradients.
@@ -151,7 +133,7 @@ class DenoisingPolicy(TensorDictModuleBase):
         The action is made from standard normal ``noise`` (B, N, D). If ``noise`` is None, ``generator`` draws it.
         ``hook`` may change the distribution; :meth:`log_prob` does not know of such changes.
         """
-        reverse = self.distribution(x_t, step, text, observed)
+        reverse = self.distribution(x_t, step, text)
         if hook is not None:
             reverse = hook(step, x_t, reverse)
         if noise is None:
@@ -159,29 +141,14 @@ class DenoisingPolicy(TensorDictModuleBase):
         action = reverse.from_noise(noise)
         return action, reverse.log_prob(action)
 
-    def log_prob(
-        self, x_t: Tensor, step: int, action: Tensor, text: Text | None = None, observed: Tensor | None = None
-    ) -> Tensor:
-        """(B, N) log-probability per slot of ``action``; states and actions are taken as constants.
-
-        Entries that are ``observed`` (B, N, 2) do not contribute to it.
-        """
-        return self.distribution(x_t.detach(), step, text, observed).log_prob(action.detach())
-
-    def random_entries(self, slots: int) -> int:
-        """Number of random variables that a step of the chain draws for a scene; the other entries are known."""
-        return int(self._first_step(slots).entries)
+    def log_prob(self, x_t: Tensor, step: int, action: Tensor, text: Text | None = None) -> Tensor:
+        """(B, N) log-probability per slot of ``action``; states and actions are taken as constants."""
+        return self.distribution(x_t.detach(), step, text).log_prob(action.detach())
 
     @torch.no_grad()
-    def unobserved_entries(self, observed: Tensor) -> Tensor:
-        """(B,) number of random variables that a step draws for scenes, without the entries ``observed`` (B, N, 2)."""
-        first: Any = self._first_step(observed.shape[1])
-        poses = first.std > 0  # (N, D); no categories for a mixed prior
-        width = getattr(self.prior, "pose_width", POSE_FEATURES)
-        count = (poses[:, :width] & ~observed[..., :1]).sum(dim=(1, 2))
-        count = count + (poses[:, width:] & ~observed[..., 1:]).sum(dim=(1, 2))
-        states = getattr(first, "random", None)
-        return count if states is None else count + (states & ~observed[..., 1]).sum(dim=1)
+    def random_entries(self, slots: int) -> int:
+        """Number of random variables that a step of the chain draws for a scene; the other entries are known."""
+        return self.distribution(self.prior.initial(1, slots, None), 0).entries
 
     def stds(self, slots: int) -> Tensor:
         """(S,) smallest sigma of every step over its random entries, normalised units; 0 where none is random."""
@@ -190,13 +157,6 @@ class DenoisingPolicy(TensorDictModuleBase):
             for std in (step.std for step in self._steps(slots))
         ]
         return torch.stack(smallest)
-
-    @torch.no_grad()
-    def _first_step(self, slots: int) -> ReverseStep:
-        """The first step of the chain for one scene, computed once for each number of slots."""
-        if slots not in self._first_steps:
-            self._first_steps[slots] = self.distribution(self.prior.initial(1, slots, None), 0)
-        return self._first_steps[slots]
 
     @torch.no_grad()
     def _steps(self, slots: int) -> list[ReverseStep]:

@@ -14,21 +14,17 @@ from scene_envs.scene import SceneBatch
 
 
 def check_shares(config: PostTrainConfig, processes: int) -> None:
-    """Refuse a batch that cannot be split among ``processes``, or into groups of siblings, without splitting siblings.
+    """Refuse a batch that cannot be split among ``processes``.
 
     Raises:
-        InvalidInputError: processes times siblings do not divide the batch.
+        InvalidInputError: the processes do not divide the batch.
     """
-    siblings = int(getattr(config.algorithm, "siblings", 1))
-    unit = processes * siblings
-    if config.batch_size % unit:
-        counts = [f"{processes} processes"] * (processes > 1) + [f"algorithm.siblings={siblings}"] * (siblings > 1)
-        among = " times ".join(counts)
-        lower = config.batch_size // unit * unit
-        nearest = f"{lower} or {lower + unit}" if lower else str(unit)
+    if config.batch_size % processes:
+        lower = config.batch_size // processes * processes
+        nearest = f"{lower} or {lower + processes}" if lower else str(processes)
         raise InvalidInputError(
-            f"batch_size={config.batch_size} is not a multiple of {unit}, the {among}; give batch_size={nearest}, or "
-            f"another {'number of processes' if processes > 1 else 'number of siblings'}"
+            f"batch_size={config.batch_size} is not a multiple of {processes}, the number of processes; give "
+            f"batch_size={nearest}, or another number of processes"
         )
 
 

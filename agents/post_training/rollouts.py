@@ -13,29 +13,27 @@ from torch import Generator, Tensor
 from agents.networks.text import Text
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.prompts import prompt_groups
-from agents.priors.observed_scenes import ObservedScenes
 from agents.utils.process_group import ProcessGroup, gather_rows
 from agents.utils.seeds import derived_seed
 from scene_envs.envs import DenoisingTorchRLEnv
-from scene_envs.errors import InvalidInputError, TrainingError
+from scene_envs.errors import TrainingError
 from scene_envs.scene import SceneBatch
 
-STREAMS = (
-    "start",
-    "noise",
-    "steps",
-    "real",
-    "bank",
-    "guard",
-    "prompts",
-    "samples",
-    "kl",
-    "inpaint",
-    "base",
-    "base_prompts",
-    "base_samples",
-    "discriminator",
-)
+STREAMS = {
+    "start": 0,
+    "noise": 1,
+    "steps": 2,
+    "real": 3,
+    "bank": 4,
+    "guard": 5,
+    "prompts": 6,
+    "samples": 7,
+    "base": 10,
+    "base_prompts": 11,
+    "base_samples": 12,
+    "discriminator": 13,
+}
+"""Purposes of random draws, and the number of each, which seeds depend on."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +55,6 @@ class Rollout:
         batch: the finished scenes.
         prompts: one per scene, or None without prompts.
         text: what the network attended to, tokens (B, L, W) and mask (B, L); None when the prior reads no prompts.
-        observed: (B, N, 2) bool, the poses and categories that were observed in inpainting; None for whole scenes.
-        groups: (B,) int64, equal for scenes with the same observed part, over all processes; None for whole scenes.
     """
 
     scenes: Tensor
@@ -75,8 +71,6 @@ class Rollout:
     averages: bool = False
     counts: bool = False
     judged: Tensor | None = None
-    observed: Tensor | None = None
-    groups: Tensor | None = None
 
     def transitions(self, step: int, advantage: Tensor, rows: slice = slice(None)) -> TensorDict:
         """The transitions of one step as ``DDPOSFLoss`` reads them."""
@@ -91,47 +85,17 @@ class Rollout:
         }
         if self.text is not None:
             fields |= {"text": self.text[0][rows], "text_mask": self.text[1][rows]}
-        if self.observed is not None:
-            fields["observed"] = self.observed[rows]
         return TensorDict(fields, [scene.shape[0]])
 
 
 def rollout_groups(rollout: Rollout) -> Tensor | None:
-    """(B,) int64 groups within which scenes are compared, per observed part or else per prompt; None for neither."""
-    if rollout.groups is not None:
-        return rollout.groups
+    """(B,) int64 groups of scenes with equal prompts, within which scenes are compared; None without prompts."""
     return None if rollout.prompts is None else prompt_groups(rollout.prompts).to(rollout.reward.device)
 
 
 def stream_seed(seed: int, stream: str, iteration: int = 0) -> int:
     """A seed below 2^31 for one purpose in one iteration, so that a resumed run needs no generator's state."""
-    return derived_seed(seed, STREAMS.index(stream), iteration)
-
-
-@dataclass(frozen=True)
-class Branching:
-    """Groups of episodes that share the first steps of their chain.
-
-    Attributes:
-        siblings: neighbouring episodes per group; 1 for episodes that share nothing.
-        steps: how many steps a group shares; they are denoised once per group.
-    """
-
-    siblings: int = 1
-    steps: int = 0
-
-    def groups(self, batch: int) -> int:
-        """Number of groups of ``batch`` episodes.
-
-        Raises:
-            InvalidInputError: the siblings do not divide the batch.
-        """
-        if batch % self.siblings:
-            raise InvalidInputError(
-                f"batch_size={batch} cannot be split into groups of algorithm.siblings={self.siblings}; "
-                f"take a multiple, such as {max(1, batch // self.siblings) * self.siblings}"
-            )
-        return batch // self.siblings
+    return derived_seed(seed, STREAMS[stream], iteration)
 
 
 def collect(
@@ -141,9 +105,6 @@ def collect(
     seed: int,
     iteration: int = 0,
     prompts: Sequence[str] | None = None,
-    branching: Branching = Branching(),
-    observed: ObservedScenes | None = None,
-    groups: Tensor | None = None,
 ) -> Rollout:
     """Run ``policy`` to the end of one episode in each of the environment's rows.
 
@@ -155,23 +116,14 @@ def collect(
         policy: draws x_{t-1}; must have the environment's number of steps.
         seed: seed of the run; x_T and the chain's noise depend only on it and on ``iteration``.
         iteration: which batch of the run this is.
-        prompts: one per row, equal among siblings; None lets the environment draw them. Text is encoded once, at the
-            start.
-        branching: which episodes share their first steps.
-        observed: one partly observed scene per row, equal among siblings; None for whole scenes.
-        groups: (rows,) int64, equal for rows with the same observed part.
+        prompts: one per row; None lets the environment draw them. Text is encoded once, at the start.
     """
-    branching.groups(env.core.num_envs)
-    together = branching.siblings
     start = stream_seed(seed, "start", iteration)
     processes, device = ProcessGroup.current(), env.core.device
     first_row = processes.rank * env.core.num_envs
-    rngs = [seeding.np_random(start + (first_row + row) // together)[0] for row in range(env.core.num_envs)]
+    rngs = [seeding.np_random(start + first_row + row)[0] for row in range(env.core.num_envs)]
     generator = Generator(device).manual_seed(stream_seed(seed, "noise", iteration))
-    entries = None if observed is None else observed.entries.to(device)
-    slots = env.core.slots
-    hook = policy.claim_hook(prompts, slots)
-    shared_hook = policy.claim_hook(None if prompts is None else prompts[::together], slots)
+    hook = policy.claim_hook(prompts, env.core.slots)
     log_probs: list[Tensor] = []
     texts: list[Text] = []
 
@@ -183,13 +135,7 @@ def collect(
         if step == 0 and env.core.prompting.reader is not None:
             texts.append(policy.read(env.core.observation()["prompt"]))
         text = texts[0] if texts else None
-        if together > 1 and step < branching.steps:
-            first = None if text is None else (text[0][::together], text[1][::together])
-            x_t, flags = x_t[::together], None if entries is None else entries[::together]
-            drawn = policy.draw(x_t, step, text=first, noise=noise(x_t), observed=flags, hook=shared_hook)
-            action, log_prob = (part.repeat_interleave(together, dim=0) for part in drawn)
-        else:
-            action, log_prob = policy.draw(x_t, step, text=text, noise=noise(x_t), observed=entries, hook=hook)
+        action, log_prob = policy.draw(x_t, step, text=text, noise=noise(x_t), hook=hook)
         if not bool(torch.isfinite(log_prob).all()):
             raise TrainingError(
                 f"the prior gave values that are not finite at step {step} of iteration {iteration + 1}; "
@@ -198,7 +144,7 @@ def collect(
         log_probs.append(log_prob)
         return action
 
-    result = env.core.collect(act, rngs, prompts, observed)
+    result = env.core.collect(act, rngs, prompts)
     rollout = Rollout(
         scenes=result.scenes,
         actions=result.actions,
@@ -212,8 +158,6 @@ def collect(
         batch=result.batch,
         prompts=result.prompts,
         text=texts[0] if texts else None,
-        observed=entries,
-        groups=None if groups is None else groups.to(device),
     )
     return _with_equal_parts(rollout, processes)
 

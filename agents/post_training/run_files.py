@@ -19,7 +19,6 @@ CHECKPOINT_NAME = "checkpoint.pt"
 LOG_NAME = "log.csv"
 METRICS_NAME = "metrics.json"
 SCENES_NAME = "real_scenes.safetensors"
-REPLAY_NAME = "replay.safetensors"
 BASE_SAMPLES_NAME = "base_samples.safetensors"
 
 
@@ -108,7 +107,5 @@ def load_resumable(directory: Path, config: PostTrainConfig) -> dict[str, Any] |
 
 
 def _flat(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration with nested keys joined by dots; reward and mask stay one value, even if they are mappings."""
-    inpaint = {**config.get("inpaint", {})}
-    whole = {"reward": config.get("reward"), "inpaint.mask": inpaint.pop("mask", None)}
-    return {**dotted({**config, "reward": None, "inpaint": inpaint}), **whole}
+    """The configuration with nested keys joined by dots; the reward stays one value, even if it is a mapping."""
+    return {**dotted({**config, "reward": None}), "reward": config.get("reward")}

@@ -30,7 +30,7 @@ from agents.post_training.run_files import (
     write_log,
     write_metrics,
 )
-from agents.post_training.scene_bank import SceneBank, kept_replay, kept_scenes
+from agents.post_training.scene_bank import SceneBank, kept_scenes
 from agents.priors.base import ScenePrior
 from agents.priors.prompt_validation import check_object_count
 from agents.utils.checkpoints import save_checkpoint
@@ -190,11 +190,8 @@ class PostTrainer:
                 large = torch.nonzero(batch.counts > slots)[:, 0].tolist()
                 check_object_count([text for i in large for text in prompts(i)], self.prior.scene_type, slots)
         x0 = self.prior.encode(batch.to(config.device))
-        bank = SceneBank.split(x0, config.guard.scenes, prompts)
-        replay = kept_replay(self.directory, self.prior, config.regularisation, x0.shape[1], reuse=reuse_scenes)
-        self.scenes = bank if replay is None else bank.with_replay(replay, config.regularisation.replay_share)
+        self.scenes = SceneBank.split(x0, config.guard.scenes, prompts)
         self.learner.deal_prompts(self.scenes)
-        self.learner.deal_parts(batch[: len(self.scenes.train)], prompts)
         self.learner.begin_rewards(batch[: len(self.scenes.train)], first=not reuse_scenes)
         if not reuse_scenes:
             check_it_can_learn(self.learner, batch, prompts)
@@ -228,7 +225,6 @@ class PostTrainer:
             except NonFiniteGradient as error:
                 raise self._not_finite(error.figures) from None
         self.learner.algorithm.end_iteration()
-        self.learner.regularisation.observe("kl", row.get("kl"), self.iteration + 1)
         return row
 
     # -- guard ----------------------------------------------------------------------------------
@@ -248,13 +244,13 @@ class PostTrainer:
             reading = self.guard.check(prior, self.iteration, reward, realism(scenes), sample=sample)
             if reading.kept:
                 self.files.keep(prior, self.guard, self.iteration)
-        self.learner.regularisation.observe("guard", reading.ratio, self.iteration)
+        self.learner.regularisation.observe(reading.ratio, self.iteration)
         figures = {f"guard_{name}": value for name, value in reading.samples.items()}
         self.history[-1] |= {"guard_loss": reading.loss, "guard_ratio": reading.ratio, **figures, **reading.realism}
         self.files.picture(self.guard, reading)
         if reading.beyond and self.config.guard.action == "rollback":
             self.rollbacks += 1
-            self.learner.return_to(self.files.best(self.prior))
+            self.learner.return_to(self.files.best())
             self.learner.regularisation.return_to_checkpoint(self.guard.best_ratio)
 
     def _count_invalid(self) -> None:

@@ -14,7 +14,6 @@ from agents.diffusion.gaussian import timestep_weights
 from agents.diffusion.schedules import make_schedule
 from agents.diffusion.weighting import check_weighting, loss_weights, timestep_distribution
 from agents.networks.denoiser import Denoiser
-from agents.networks.mixed_denoiser import Observed
 from agents.networks.registry import build_network, config_from_state
 from agents.networks.text import Text
 from agents.priors.base import ScenePrior
@@ -22,7 +21,6 @@ from agents.priors.config import PriorConfig, current_names
 from agents.priors.forward import DenoiserOutput, NoisedScenes
 from agents.priors.hooks import Hook, Start
 from agents.priors.inpainting import draw_noise
-from agents.priors.observed_scenes import Noise
 from agents.priors.prompt_validation import no_text
 from agents.priors.rotation_codes import SceneCode
 from scene_envs.errors import InvalidInputError, unknown_name
@@ -166,23 +164,6 @@ class ContinuousPrior(ScenePrior):
         std_map = std * (~self.known(x_t.shape[1])).to(x_t.dtype)
         return GaussianStep(self.clamp(mean), std_map, x0.detach())
 
-    def observed_transition(
-        self, x_t: Tensor, step: int, table: StepTableLike, observed: Tensor, *,
-        text: Text | None = None, guidance: float = 0.0,
-    ) -> GaussianStep:  # fmt: skip
-        """p(x_{t-1} | x_t) of scenes whose observed entries are certain; :class:`Inpainting` says more.
-
-        Observed entries stay as in x_t, with its noise; :meth:`write_observed` then writes those of the next level.
-        """
-        return self._reverse(x_t, step, table, 1.0).observing(self._entries(observed), x_t)
-
-    def write_observed(self, x: Tensor, x0: Tensor, observed: Tensor, level: int, noise: Noise | None = None) -> Tensor:
-        """``x`` with the observed entries of ``x0`` in place, to which the noise of ``level`` is added."""
-        if level > 0:
-            drawn = torch.randn_like(x0) if noise is None else noise()
-            x0 = self.process.add_noise(x0, torch.tensor(level), drawn)
-        return self.clamp(torch.where(self._entries(observed), x0, x))
-
     def _entries(self, observed: Tensor) -> Tensor:
         """(B, N, D) bool per feature, from (B, N, 2) bool for pose and category."""
         widths = torch.tensor([self.pose_width, self.features - self.pose_width], device=observed.device)
@@ -226,28 +207,20 @@ class ContinuousPrior(ScenePrior):
         Scenes are weighted by their timestep as ``config.loss_weighting`` says; ``text`` must be None.
         """
         error = self.output(noised, text).continuous - noised.target
-        if noised.observed is not None:
-            weight = noised.weight
-            total = weight.sum(dim=(1, 2)).clamp(min=1.0)
-            return (error.square() * weight).sum(dim=(1, 2)) / total * noised.scale
         weight = noised.weight[0]
         return (error.square() * weight).sum(dim=(1, 2)) / weight.sum() * noised.scale
 
-    def noised(
-        self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None, observed: Observed | None = None
-    ) -> NoisedScenes:
-        """Noised scenes, their targets and weights; observed entries have noise as well, and weight 0."""
+    def noised(self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None) -> NoisedScenes:
+        """Noised scenes, their targets and weights."""
         if t is None:
             t = self.draw_timesteps(x0.shape[0], generator).to(x0.device)
         noise = torch.randn(x0.shape, generator=generator).to(x0.device)
         x_t = self.clamp(self.process.add_noise(x0, t, noise))
         target = self.process.target(x0, x_t, t, noise)
         weight = self.loss_weight(x0.shape[1]).to(x0.device).expand(len(x0), -1, -1)
-        if observed is not None:
-            weight = weight * ~observed.entries(self.pose_width)
         scale = loss_weights(self.process.schedule, t, self.config.prediction, self.config.loss_weighting)
         category = x0[..., self.code.pose_width :].argmax(dim=-1)
-        return NoisedScenes(x_t, t, target, weight, scale.to(x0.device), category, observed=observed)
+        return NoisedScenes(x_t, t, target, weight, scale.to(x0.device), category)
 
     def output(self, noised: NoisedScenes, text: Text | None = None) -> DenoiserOutput:
         """The output (B, N, D) of noised scenes; ``text`` must be None."""

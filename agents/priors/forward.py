@@ -105,17 +105,13 @@ class Trainable(ABC):
         """(B,) training losses of scenes that :meth:`noised` has noised; arguments as for :meth:`output`."""
 
     @abstractmethod
-    def noised(
-        self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None, observed: Observed | None = None
-    ) -> NoisedScenes:
+    def noised(self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None) -> NoisedScenes:
         """A draw of the forward process for scenes ``x0`` (B, N, D), as the pretraining loss takes it.
 
         Args:
             x0: normalised scenes.
             generator: source of timesteps, noise and observed entries (CPU).
             t: (B,) timesteps, drawn when None.
-            observed: entries that have no part in the loss; None draws them as in pretraining. A continuous prior draws
-                none.
         """
 
     @abstractmethod
@@ -135,17 +131,6 @@ class Trainable(ABC):
     def observed_entries(self, x: Tensor, observed: Observed | None = None) -> Observed | None:
         """Observed entries of scenes ``x`` (B, N, D), without noise, as the network reads them; None for none."""
         return observed
-
-    def category_kl(self, noised: NoisedScenes, now: DenoiserOutput, then: DenoiserOutput) -> Tensor | None:
-        """(B, N) KL divergences between the categories' reverse steps t -> t - 1 under two outputs, nats.
-
-        ``None`` where categories are a part of the continuous output.
-        """
-        return None
-
-    def observed_by_mask(self, x: Tensor, observed: Tensor | None) -> Observed | None:
-        """Observed entries of scenes ``x`` (B, N, D) from flags (B, N, 2) for pose and category; None for None."""
-        return None if observed is None else Observed(x, observed[..., 0], observed[..., 1])
 
     @property
     def pose_width(self) -> int:

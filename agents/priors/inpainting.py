@@ -9,16 +9,13 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from agents.diffusion.reverse_steps import ReverseStep
 from agents.diffusion.step_tables import StepTable
-from agents.networks.text import Text
 from agents.priors.guidance import guidance_hook, physics_strength
 from agents.priors.hooks import Guide, Hook, Start, Watch
-from agents.priors.observed_scenes import Noise, ObservedScenes, check_mask, merge
+from agents.priors.observed_scenes import check_mask, merge
 from agents.priors.prompt_validation import check_prompts
 from scene_envs.errors import InvalidInputError
 from scene_envs.normalizer import Normalizer
-from scene_envs.protocols import StepTableLike
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
 
@@ -72,31 +69,6 @@ class Inpainting(ABC):
         """Weight of the denoised translations in x_{t-1}, and their standard deviation (3,), normalised."""
 
     @abstractmethod
-    def observed_transition(
-        self,
-        x_t: Tensor,
-        step: int,
-        table: StepTableLike,
-        observed: Tensor,
-        *,
-        text: Text | None = None,
-        guidance: float = 0.0,
-    ) -> ReverseStep:
-        """p(x_{t-1} | x_t) of scenes (B, N, D) whose observed entries are certain, and so add nothing to log p.
-
-        Args:
-            x_t: scenes with the observed entries in place, see :meth:`observe`.
-            step: index in the table.
-            table: the chain.
-            observed: (B, N, 2) bool, True where the pose, or the category, of a slot is observed.
-            text, guidance: tokens of a prompt and weight of its guidance, for priors that read prompts.
-        """
-
-    @abstractmethod
-    def write_observed(self, x: Tensor, x0: Tensor, observed: Tensor, level: int, noise: Noise | None = None) -> Tensor:
-        """States ``x`` (B, N, D) at timestep ``level`` with the entries ``observed`` (B, N, 2) of ``x0`` in place."""
-
-    @abstractmethod
     def encode(self, batch: SceneBatch) -> Tensor:
         """Normalised x_0 (B, N, D) of scenes."""
 
@@ -122,18 +94,6 @@ class Inpainting(ABC):
         indices = torch.tensor(self.scene_type.welded_categories, device=categories.device, dtype=torch.long)
         furniture = torch.isin(categories, indices) & slots
         return furniture[:, len(self.scene_type.fixed) :].any(dim=1, keepdim=True) & welded
-
-    def observe(self, batch: SceneBatch, mask: Tensor) -> ObservedScenes:
-        """Scenes that are regenerated where ``mask`` (B, N), or (B, N, 2) for pose and category, is True.
-
-        Fixed welded slots are always observed.
-
-        Raises:
-            InvalidInputError: the mask does not fit the batch.
-        """
-        both = check_mask(batch, mask).to(self.device)
-        both[:, : len(self.scene_type.fixed)] = False
-        return ObservedScenes(self, batch, both.to(batch.tensor.device), self.encode(batch.to(self.device)))
 
     @torch.no_grad()
     def inpaint(

@@ -37,7 +37,6 @@ from agents.priors.config import MixedPriorConfig, current_names
 from agents.priors.hooks import Hook, Start
 from agents.priors.inpainting import draw_noise
 from agents.priors.mixed_training import TrainableMixedPrior
-from agents.priors.observed_scenes import Noise
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
@@ -204,23 +203,6 @@ class MixedPrior(TrainableMixedPrior):
         return MixedStep(
             clamped[..., :POSE_FEATURES], std * (~known).to(mean.dtype), probs, random, masked, estimate, groups
         )
-
-    def observed_transition(
-        self, x_t: Tensor, step: int, table: StepTableLike, observed: Tensor, *,
-        text: Text | None = None, guidance: float = 0.0,
-    ) -> MixedStep:  # fmt: skip
-        """p(x_{t-1} | x_t) of scenes whose observed entries are certain; see :class:`Inpainting`.
-
-        A room that keeps generated furniture gets no further furniture.
-        """
-        entries = Observed(x_t, observed[..., 0], observed[..., 1])
-        closed = self.closed_by_furniture(state_of(x_t[..., POSE_FEATURES:]), observed[..., 1])
-        reverse = self.transition(x_t, step, table, observed=entries, text=text, guidance=guidance, closed=closed)
-        return reverse.observing(entries.pose, entries.category, x_t)
-
-    def write_observed(self, x: Tensor, x0: Tensor, observed: Tensor, level: int, noise: Noise | None = None) -> Tensor:
-        """States with the observed entries of ``x0``, without noise at every level."""
-        return Observed(x0, observed[..., 0], observed[..., 1]).write(x)
 
     def regenerate(
         self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int,

@@ -7,7 +7,6 @@ from torch import Generator, Tensor
 from torch.nn import functional as F
 
 from agents.diffusion import ResidualVariance, StepTable
-from agents.diffusion.divergence import categorical_kl
 from agents.diffusion.reverse_steps import state_of
 from agents.diffusion.weighting import loss_weights
 from agents.networks.mixed_denoiser import Observed
@@ -52,16 +51,13 @@ class TrainableMixedPrior(MixedStates):
             loss = loss + _COUNT_WEIGHT * conditioning.count_loss(text[0][:, : conditioning.things], noised.category)
         return loss
 
-    def noised(
-        self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None, observed: Observed | None = None
-    ) -> NoisedScenes:
+    def noised(self, x0: Tensor, generator: Generator | None = None, t: Tensor | None = None) -> NoisedScenes:
         """Noised scenes, their targets and weights; see :meth:`ScenePrior.noised`."""
         config, device = self.config, x0.device
         if t is None:
             t = self.draw_timesteps(x0.shape[0], generator).to(device)
         noise = torch.randn(x0.shape, generator=generator).to(device)
-        if observed is None and config.observed_share > 0:
-            observed = self.draw_observed(x0, generator)
+        observed = self.draw_observed(x0, generator) if config.observed_share > 0 else None
         x_t = self.add_noise(x0, t, noise)
         x_t = x_t if observed is None else observed.write(x_t)
         pose0, category = x0[..., :POSE_FEATURES], x0[..., POSE_FEATURES:].argmax(dim=-1)
@@ -91,18 +87,6 @@ class TrainableMixedPrior(MixedStates):
         poses, states = noised.x_t[..., :POSE_FEATURES], state_of(noised.x_t[..., POSE_FEATURES:])
         moments = self.denoiser.moments(states, noised.t)
         return self.process.x0_from_output(poses, noised.t, output.continuous, moments)
-
-    def category_kl(self, noised: NoisedScenes, now: DenoiserOutput, then: DenoiserOutput) -> Tensor:
-        """(B, N) KL divergences of the categories' reverse steps t -> t - 1, nats; 0 where ``drawn`` is 0."""
-        assert now.logits is not None
-        assert then.logits is not None
-        assert noised.drawn is not None
-        state = state_of(noised.x_t[..., POSE_FEATURES:])
-        probs, others = (
-            self.categories.posterior(state, logits.softmax(dim=-1), noised.t, noised.t - 1)
-            for logits in (now.logits, then.logits)
-        )
-        return categorical_kl(probs, others) * noised.drawn
 
     def draw_observed(self, x0: Tensor, generator: Generator | None) -> Observed:
         """Random observed entries: slots (completion), all categories (rearrangement), or any attribute of any slot.

@@ -3,8 +3,8 @@
     python -m benchmarks.post_training.frontier FOLDER [--output FILE] [--csv FILE]
 
 FOLDER is the output of ``python -m benchmarks.post_training table=frontier``. A point is a run: its colour is the
-algorithm, its shape the setting that was swept, and its label the value of the setting. The line joins the points that
-no other point beats in both figures.
+algorithm, and its label the weight of the regularisation. The line joins the points that no other point beats in both
+figures.
 """
 
 from __future__ import annotations
@@ -19,17 +19,14 @@ from pathlib import Path
 from benchmarks.post_training.rows import TABLES
 
 COLOURS = {"nft": "#1f77b4", "awm": "#d95f02", "ddpo_sf": "#2ca02c"}
-SHAPES = {"weight": "o", "kl": "^"}
-NAMES = {"weight": "regularisation.weight", "kl": "regularisation.kl"}
 
 
 @dataclass(frozen=True)
 class Point:
-    """A measured run: algorithm, swept setting and its value (all "" for the base prior), reward and accuracy."""
+    """A measured run: algorithm and weight (both "" for the base prior), reward and accuracy."""
 
     algorithm: str
-    setting: str
-    value: str
+    weight: str
     reward: float
     accuracy: float
 
@@ -41,15 +38,15 @@ def points(folder: Path) -> list[Point]:
         file = folder / f"{name}-figures" / "metrics.json"
         if file.exists():
             figures = json.loads(file.read_text(encoding="utf-8"))
-            algorithm, setting, value = name.split("-")[1:] if "-" in name else ("", "", "")
-            found.append(Point(algorithm, setting, value, figures["feasible_objects"], figures["classifier_accuracy"]))
+            algorithm, _, weight = name.split("-")[1:] if "-" in name else ("", "", "")
+            found.append(Point(algorithm, weight, figures["feasible_objects"], figures["classifier_accuracy"]))
     return found
 
 
 def frontier(found: Sequence[Point]) -> list[Point]:
     """Points that no other point beats in both figures, by increasing accuracy.
 
-    >>> a, b, c = (Point("nft", "kl", "1", reward, accuracy) for reward, accuracy in [(14, 0.6), (15, 0.7), (13, 0.7)])
+    >>> a, b, c = (Point("nft", "1", reward, accuracy) for reward, accuracy in [(14, 0.6), (15, 0.7), (13, 0.7)])
     >>> frontier([a, b, c]) == [a, b]
     True
     """
@@ -66,15 +63,12 @@ def draw(found: Sequence[Point], output: Path) -> None:
 
     figure, axes = plt.subplots(figsize=(8, 5))
     for algorithm, colour in COLOURS.items():
-        for setting, shape in SHAPES.items():
-            own = [point for point in found if (point.algorithm, point.setting) == (algorithm, setting)]
-            accuracies, rewards = [100 * point.accuracy for point in own], [point.reward for point in own]
-            label = f"{algorithm}, {NAMES[setting]}"
-            axes.scatter(accuracies, rewards, color=colour, marker=shape, s=45, label=label, zorder=3)
-            for point in own:
-                place = (100 * point.accuracy, point.reward)
-                below = (5, -11) if setting == "kl" else (5, 4)
-                axes.annotate(point.value, place, xytext=below, textcoords="offset points", fontsize=8, color=colour)
+        own = [point for point in found if point.algorithm == algorithm]
+        accuracies, rewards = [100 * point.accuracy for point in own], [point.reward for point in own]
+        axes.scatter(accuracies, rewards, color=colour, s=45, label=algorithm, zorder=3)
+        for point in own:
+            place = (100 * point.accuracy, point.reward)
+            axes.annotate(point.weight, place, xytext=(5, 4), textcoords="offset points", fontsize=8, color=colour)
     for point in found:
         if not point.algorithm:
             axes.scatter(
@@ -103,8 +97,8 @@ def main() -> None:
     if options.csv:
         with options.csv.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
-            writer.writerow(["algorithm", "setting", "value", "feasible_objects", "classifier_accuracy"])
-            writer.writerows([p.algorithm, p.setting, p.value, f"{p.reward:.3f}", f"{p.accuracy:.4f}"] for p in found)
+            writer.writerow(["algorithm", "weight", "feasible_objects", "classifier_accuracy"])
+            writer.writerows([p.algorithm, p.weight, f"{p.reward:.3f}", f"{p.accuracy:.4f}"] for p in found)
 
 
 if __name__ == "__main__":

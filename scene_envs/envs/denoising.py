@@ -29,7 +29,6 @@ from scene_envs.envs.spaces import (
 )
 from scene_envs.envs.trajectories import BoolArray, IntArray, StepResult, Trajectories, replace_rows, take_rows
 from scene_envs.errors import InvalidInputError
-from scene_envs.protocols import ObservedScenesLike
 from scene_envs.scene import SceneBatch
 
 
@@ -79,8 +78,6 @@ class DenoisingCore:
         self._steps: IntArray = np.full(num_envs, -1, dtype=np.int64)  # -1: never reset
         self._x = torch.zeros(num_envs, self.slots, self.features, device=self.device)
         self._prompts = [""] * num_envs
-        self._observed: ObservedScenesLike | None = None
-        self._noises: list[torch.Generator] = []
         self._read_prompts()
 
     @property
@@ -115,8 +112,7 @@ class DenoisingCore:
 
     def scenes(self) -> SceneBatch:
         """The current scenes, decoded and on the CPU: rotations in SO(3), arg-max categories."""
-        scenes = decode_scenes(self.prior, self._x)
-        return scenes if self._observed is None else self._observed.merge(scenes)
+        return decode_scenes(self.prior, self._x)
 
     def object_mask(self) -> Tensor:
         """(B, N) int8: slots whose arg-max category is not empty; slots that are not drawn yet count as empty."""
@@ -167,7 +163,6 @@ class DenoisingCore:
         rngs: Sequence[np.random.Generator],
         mask: BoolArray | None = None,
         prompts: Sequence[str] | None = None,
-        observed: ObservedScenesLike | None = None,
     ) -> None:
         """Start new episodes.
 
@@ -176,25 +171,11 @@ class DenoisingCore:
                 its prompt, if there are several.
             mask: (B,) bool, which environments; None means all.
             prompts: B prompts, in place of drawn ones; those of environments that are not reset are ignored.
-            observed: B scenes, on the CPU. Until the next reset all states have their observed entries, and actions
-                decide only the rest. None lets actions decide whole scenes.
-
-        Raises:
-            InvalidInputError: only some of the environments are reset, and observed scenes are given or were in use.
         """
-        partial = mask is not None and not bool(mask.all())
-        if partial and (observed is not None or self._observed is not None):
-            raise InvalidInputError("episodes with observed entries begin together; reset all environments at once")
         rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
         if len(rows) == 0:
             return
-        start = torch.cat([self._draw_start(rngs[row]) for row in rows.tolist()])
-        self._observed = observed
-        if observed is not None:
-            seeds = [int(rngs[row].integers(2**63)) for row in rows.tolist()]
-            self._noises = [torch.Generator().manual_seed(seed) for seed in seeds]
-            start = observed.write(start, self.first_timestep, self._draw_noise).clamp(-STATE_BOUND, STATE_BOUND)
-        self._x = replace_rows(self._x, rows, start)
+        self._x = replace_rows(self._x, rows, torch.cat([self._draw_start(rngs[row]) for row in rows.tolist()]))
         self._steps[rows] = 0
         if self.prompting.given:
             for row in rows.tolist():
@@ -215,11 +196,6 @@ class DenoisingCore:
         if self._text is None:
             self._text = tuple(reader.encode_tokens(self._tokens))
         return tuple(take_rows(part, rows) for part in self._text)
-
-    def _draw_noise(self) -> Tensor:
-        """Normal noise (B, N, D) of all episodes, each from its own generator."""
-        shape = self._x.shape[1:]
-        return torch.stack([torch.randn(shape, generator=noise) for noise in self._noises]).to(self.device)
 
     def _draw_start(self, rng: np.random.Generator) -> Tensor:
         generator = torch.Generator(self.device).manual_seed(int(rng.integers(2**63)))
@@ -245,11 +221,6 @@ class DenoisingCore:
         for step in np.unique(self._steps[rows]):
             group = rows[self._steps[rows] == step]
             moved = self._transition(take_rows(self._x, group), take_rows(given, group), int(step), group)
-            if self._observed is not None:
-                if len(group) < self.num_envs:
-                    raise InvalidInputError("episodes with observed entries go on together; step all environments")
-                level = int(self._schedule[step + 1])
-                moved = self._observed.write(moved, level, self._draw_noise).clamp(-STATE_BOUND, STATE_BOUND)
             self._x = replace_rows(self._x, group, moved)
         self._steps[rows] += 1
         return self._judge(rows[self.finished[rows]])
@@ -300,7 +271,6 @@ class DenoisingCore:
         policy: Callable[[Tensor, int], Tensor],
         rngs: Sequence[np.random.Generator],
         prompts: Sequence[str] | None = None,
-        observed: ObservedScenesLike | None = None,
     ) -> Trajectories:
         """Reset every environment and run ``policy`` to the end; the same episodes as single steps give.
 
@@ -308,9 +278,8 @@ class DenoisingCore:
             policy: ``(x_t (B, N, D), step) -> action (B, N, D)``; ``step`` indexes ``self.table``.
             rngs: one NumPy generator per environment, for x_T and prompts.
             prompts: one per environment, in place of drawn ones.
-            observed: as for :meth:`reset`.
         """
-        self.reset(rngs, prompts=prompts, observed=observed)
+        self.reset(rngs, prompts=prompts)
         scenes = torch.empty(self.num_steps + 1, *self._x.shape, device=self.device)
         actions = torch.empty(self.num_steps, *self._x.shape, device=self.device)
         scenes[0] = self._x

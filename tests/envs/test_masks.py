@@ -13,8 +13,6 @@ import pytest
 import torch
 
 from agents.planning.search_run import SearchConfig
-from agents.post_training.inpaint_deck import InpaintDeck
-from agents.post_training.inpaint_settings import InpaintSettings
 from agents.priors.testing import tiny_prior
 from rewards import RewardOutput
 from scene_envs.envs import SearchProblem, register_mask
@@ -206,17 +204,12 @@ class FirstWordMask:
         return torch.arange(scene.tensor.shape[1]) < 3 + self.letters
 
 
-def test_a_mask_that_reads_the_prompt_gets_that_of_the_search_and_of_the_run() -> None:
+def test_a_mask_that_reads_the_prompt_gets_that_of_the_search() -> None:
     prior = tiny_prior("dimsum_table", process="mixed", text=True)
     problem = SearchProblem(
         prior=prior, objective="object_count", num_steps=2, prompt="Three cups.", mask=FirstWordMask(), max_depth=1
     )
     assert int(problem.root(seed=0).mask.sum()) == 3 + len("Three") - len(problem.scene_type.fixed)
-    scenes = table_with(("teacup", 0.2, 0, 0))
-    settings = InpaintSettings(mask={"name": "off_prompt"})
-    deck = InpaintDeck(settings, lambda count, prompts, seed: (scenes, prompts), RewardScorer("object_count"), 1)
-    parts = deck.deal(1, ["A scene with five cups."], seed=0)
-    assert parts.mask[0, :, 0].sum() == 4
     own = mask_for_prompt(OffPromptMask("A scene with two cups."), "A scene with five cups.")
     assert own == OffPromptMask("A scene with two cups.")
 

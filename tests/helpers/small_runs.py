@@ -13,12 +13,14 @@ from rewards.base import RewardContext, RewardOutput
 from scene_envs.scene import SceneBatch
 
 
-_PLACES = {
-    **{key: f"algorithm.{key}" for key in ("credit", "gradient_steps", "scenes_per_prompt")},
-    "chunk": "optimizer.chunk", "learning_rate": "optimizer.lr", "lr": "optimizer.lr", "max_invalid": "guard.max_invalid",
-    "real_scenes": "regularisation.scenes", "regularisation": "regularisation.weight",
+PLACES = {
+    "regularisation": "regularisation.weight", "bank_size": "regularisation.bank_size",
+    "real_scenes": "regularisation.scenes", "lr": "optimizer.lr", "learning_rate": "optimizer.lr",
+    "chunk": "optimizer.chunk", "ema": "optimizer.ema", "gradient_steps": "algorithm.gradient_steps",
+    "credit": "algorithm.credit", "scenes_per_prompt": "algorithm.scenes_per_prompt",
+    "guard_limit": "guard.limit", "guard_action": "guard.action", "max_invalid": "guard.max_invalid",
 }  # fmt: skip
-"""Keys of groups by their short names."""
+"""Short names of keys of groups."""
 
 
 def small_config(output: Path | str, **changes: Any) -> PostTrainConfig:
@@ -36,7 +38,7 @@ def small_config(output: Path | str, **changes: Any) -> PostTrainConfig:
         optimizer={"lr": 1e-3},
         **{key: changes.pop(key) for key in ("prompt", "guidance") if key in changes},
     )
-    return changed(config, {_PLACES.get(key, key): value for key, value in changes.items()})
+    return changed(config, {PLACES.get(key, key): value for key, value in changes.items()})
 
 
 def count_objects(batch: SceneBatch, context: RewardContext) -> RewardOutput:

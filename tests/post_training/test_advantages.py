@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from agents.post_training import compute_advantages
-from agents.post_training.advantages import sibling_advantages
 from scene_envs.errors import InvalidInputError
 
 
@@ -64,20 +63,3 @@ def test_slots_share_one_baseline_and_scale() -> None:
 def test_unknown_baseline_is_named() -> None:
     with pytest.raises(InvalidInputError, match="median"):
         compute_advantages(torch.zeros(2), baseline="median")
-
-
-def test_siblings_are_compared_slot_by_slot() -> None:
-    # two groups of three; slot 0 differs in the first alone, slot 1 has one valid entry there
-    reward = torch.tensor([[1.0, 1.0], [0.0, 9.0], [0.0, 9.0], [5.0, 2.0], [5.0, 2.0], [5.0, 8.0]])
-    valid = torch.tensor([[True, True], [True, False], [True, False]] + [[True, True]] * 3)
-    # others' means: 0, 1/2, 1/2 of slot 0; 5, 5, 2 of slot 1 in the second group
-    differences = torch.tensor([[1.0, 0.0], [-0.5, 0.0], [-0.5, 0.0], [0.0, -3.0], [0.0, -3.0], [0.0, 6.0]])
-    scale = (differences.square().sum() / 9).sqrt()  # nine entries have a valid sibling
-    torch.testing.assert_close(sibling_advantages(reward, valid, 3), differences / scale)
-    broken = reward.index_put((torch.tensor([1]), torch.tensor([1])), torch.tensor(torch.nan))
-    broken[2, 1], valid[2, 1] = torch.nan, True  # a credit that is no number is not valid
-    torch.testing.assert_close(sibling_advantages(broken, valid, 3), differences / scale)
-
-
-def test_equal_siblings_have_no_advantage() -> None:
-    assert (sibling_advantages(torch.ones(4, 5), torch.ones(4, 5, dtype=torch.bool), 2) == 0).all()

@@ -34,13 +34,6 @@ def test_prompt_match_without_a_prompt_ends_before_anything_is_sampled(tmp_path:
             {"reward": "diversity", "algorithm.credit": "object", "prompt": "A scene with two cups."},
             r"take algorithm\.credit=scene, or auto",
         ),
-        ({"reward": "diversity", "inpaint": {"mask": "lowest_scoring"}}, "needs an objective with credit per object"),
-        (
-            {"reward": "diversity", "inpaint": {"mask": "lowest_scoring", "scenes": "samples"}},
-            "needs an objective with credit per object",
-        ),
-        ({"inpaint": {"mask": "off_prompt", "scenes": "samples"}}, "mask=off_prompt has no prompt"),
-        ({"inpaint": {"mask": {"name": "region", "low": [9, 9, 9], "high": [9, 9, 9], "empty": 0}}}, "leaves nothing"),
     ],
 )
 def test_what_a_run_lacks_is_told_before_anything_is_sampled(

@@ -137,22 +137,3 @@ def test_wrong_settings_are_named(tmp_path: Path) -> None:
         forward_config(tmp_path, "nft", algorithm_settings={"category_credit": "slot"})
     with pytest.raises(InvalidInputError, match=r"optimizer\.ema"):
         post_train(forward_config(tmp_path, "nft", optimizer={"ema": 0.9}), prior=tiny_prior())
-
-
-def test_siblings_share_the_first_steps_and_differ_after(tmp_path: Path) -> None:
-    settings = {"siblings": 3, "shared_steps": 0.6}
-    trainer = PostTrainer(forward_config(tmp_path, "nft", algorithm_settings=settings), prior=tiny_prior())
-    try:
-        trainer.prepare()
-        rollout = trainer.learner.rollout(0)
-    finally:
-        trainer.close()
-    groups = rollout.scenes.unflatten(1, (2, 3))  # (S + 1, groups, siblings, N, D)
-    assert torch.equal(groups[:4], groups[:4, :, :1].expand_as(groups[:4]))
-    assert not torch.equal(groups[4, :, 0], groups[4, :, 1])
-    assert not torch.equal(groups[0, 0, 0], groups[0, 1, 0])
-
-
-def test_siblings_must_divide_the_batch(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match=r"batch_size=6 is not a multiple of 4, the algorithm\.siblings=4"):
-        post_train(forward_config(tmp_path, "nft", algorithm_settings={"siblings": 4}), prior=tiny_prior())

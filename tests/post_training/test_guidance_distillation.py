@@ -120,18 +120,6 @@ def test_the_prior_comes_nearer_to_guided_samples(trainer: PostTrainer) -> None:
     assert float(loss(states)["loss_objective"].detach()) < 0.85 * before
 
 
-@pytest.mark.parametrize("trainer", [{"inpaint.mask": "random"}], indirect=True)
-def test_observed_objects_stay_where_they_are(trainer: PostTrainer) -> None:
-    learner, found = algorithm(trainer), trainer.learner.rollout(0)
-    assert found.observed is not None
-    states = learner.corrected(found, torch.full((6,), learner.steps[-1]))
-    observed = found.observed[..., 0]
-    assert not states["trained"][observed].any()
-    assert float(states["moved"][observed].abs().max()) == 0.0
-    x0 = learner.sampler.encode(found.batch)[..., :POSE_FEATURES]
-    torch.testing.assert_close(states["denoised"][observed], x0[observed])
-
-
 def test_a_prior_that_knows_no_position_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     prior = tiny_prior()
     monkeypatch.setattr(type(prior), "estimate", lambda *_: (0.5, torch.full((3,), 0.5)))

@@ -37,11 +37,8 @@ def config(output: Path, **changes: Any) -> PostTrainConfig:
 
 
 @pytest.mark.parametrize("chunk", [None, 3])
-@pytest.mark.parametrize("siblings", [1, 4])
-def test_the_scenes_of_a_batch_hold_the_numbers_of_their_prompts(
-    tmp_path: Path, chunk: int | None, siblings: int
-) -> None:
-    algorithm = {"name": "nft", "scenes_per_prompt": 4, "siblings": siblings, "shared_steps": 0.5}
+def test_the_scenes_of_a_batch_hold_the_numbers_of_their_prompts(tmp_path: Path, chunk: int | None) -> None:
+    algorithm = {"name": "nft", "scenes_per_prompt": 4}
     trainer = PostTrainer(config(tmp_path, algorithm=algorithm, optimizer={"lr": 1e-3, "chunk": chunk}), prior=reader())
     trainer.prepare()
     rollout = trainer.learner.rollout(0)
@@ -74,11 +71,6 @@ def test_steps_of_chunks_keep_the_scenes_that_the_network_expects() -> None:
 def test_algorithms_that_need_log_probabilities_are_refused(tmp_path: Path, algorithm: str) -> None:
     with pytest.raises(InvalidInputError, match=rf"claim_guidance=1 .*algorithm={algorithm} .*algorithm=nft or awm"):
         config(tmp_path, algorithm={"name": algorithm})
-
-
-def test_parts_of_scenes_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match=r"claim_guidance=1 guides whole scenes.*inpaint.mask=random"):
-        config(tmp_path, inpaint={"mask": "random"})
 
 
 @pytest.mark.parametrize("prompt", [None, ""])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 
-from agents.post_training.policy import DenoisingPolicy
 from agents.priors.base import ScenePrior
 from agents.priors.mixed import MixedPrior
 from agents.priors.testing import tiny_prior
@@ -72,22 +71,6 @@ def test_a_room_of_a_batch_does_not_depend_on_the_others(prior: ScenePrior, room
     alone = prior.inpaint(mixed[0], mask[:1], num_steps=4, generators=[torch.Generator().manual_seed(5)])
     torch.testing.assert_close(both[0].tensor, alone.tensor, atol=1e-5, rtol=0)
     assert bool(furniture(both)[1].any())
-
-
-@pytest.mark.parametrize("prior", ["mixed"], indirect=True)  # a continuous prior decides on categories at the end
-def test_post_training_of_a_furnished_room_adds_no_furniture(rooms: SceneBatch, prior: ScenePrior) -> None:
-    fixed = len(prior.scene_type.fixed)  # furniture moves to other slots, so some regenerated slots would prefer it
-    tensor = torch.cat([rooms.tensor[:, :fixed], rooms.tensor[:, fixed:].flip(1)], dim=1)
-    rooms = SceneBatch(tensor, prior.scene_type)
-    observed = prior.observe(rooms, ~rooms.is_welded)
-    policy, generator = DenoisingPolicy(prior, 4), torch.Generator().manual_seed(1)
-    x = observed.write(prior.initial(3, rooms.tensor.shape[1], generator), int(policy.table.timesteps[0]))
-    for step in range(len(policy)):
-        x, log_prob = policy.draw(x, step, generator, observed=observed.entries)
-        assert bool(torch.isfinite(log_prob).all())
-    scenes = observed.merge(prior.decode(x))
-    assert torch.equal(furniture(scenes), furniture(rooms))
-    assert bool(scenes.is_free.any())
 
 
 def test_a_search_furnishes_a_room_once(prior: ScenePrior) -> None:
