@@ -136,9 +136,9 @@ class ForwardProcessSettings(AlgorithmSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(self, 1, "updates", "draws")
-        one_of(self, "credit", CREDITS)
-        one_of(self, "category_credit", CATEGORY_CREDITS)
+        require_at_least(self, 1, "updates", "draws")
+        require_one_of(self, "credit", CREDITS)
+        require_one_of(self, "category_credit", CATEGORY_CREDITS)
         if not 0 <= self.sampler_decay < 1:
             raise InvalidInputError(f"sampler_decay={self.sampler_decay} must lie in [0, 1)")
 

@@ -8,14 +8,24 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from agents.configuration.checks import at_least, one_of, positive
-from agents.configuration.fields import composed, named, nested
-from agents.configuration.settings import LoggerSettings, OptimizerSettings
-from agents.configuration.shared_keys import RewardLimits, SamplingKeys, TrainingKeys
-from agents.configuration.tree import plain_tree
+from agents.configuration import (
+    LoggerSettings,
+    OptimizerSettings,
+    RewardLimits,
+    SamplingKeys,
+    TrainingKeys,
+    composed,
+    named,
+    nested,
+    plain_tree,
+    require_at_least,
+    require_one_of,
+    require_positive,
+)
 from agents.post_training.algorithm_settings import AlgorithmSettings, DDPOSFSettings, NeonSettings
 from agents.post_training.algorithms import algorithm_settings, list_algorithms
 from agents.post_training.regularisation_settings import REAL_SCENES, RegularisationSettings
+from agents.utils.loggers import LOGGERS
 from scene_envs.envs.settings import PROMPT_SOURCES, check_claim_guidance
 from scene_envs.errors import InvalidInputError
 

@@ -12,6 +12,7 @@ from agents.post_training.rollouts import stream_seed
 from agents.post_training.run_files import writing
 from agents.post_training.sample_check import SampleCheck
 from agents.post_training.scene_bank import SceneBank
+from agents.prior_names import short_name
 from agents.priors.base import ScenePrior
 from agents.utils.process_group import ProcessGroup
 

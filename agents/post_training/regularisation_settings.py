@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from agents.configuration.checks import at_least, one_of, positive
+from agents.configuration import require_at_least, require_one_of, require_positive
 from agents.post_training.hold import held_ratio
 from scene_envs.errors import InvalidInputError
 
@@ -42,9 +42,9 @@ class RegularisationSettings:
     bank_size: int = 4096
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "batch_size", "base_samples")
-        one_of(self, "objective", OBJECTIVES)
-        positive(self, "sharpness")
+        require_at_least(self, 1, "batch_size", "base_samples")
+        require_one_of(self, "objective", OBJECTIVES)
+        require_positive(self, "sharpness")
         if self.weight is not None and not self.weight >= 0:
             raise InvalidInputError(f"regularisation.weight={self.weight} must not be negative")
         if self.target is not None and self.weight == 0:

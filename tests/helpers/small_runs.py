@@ -12,7 +12,6 @@ from agents.post_training import PostTrainConfig
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.scene import SceneBatch
 
-
 PLACES = {
     "regularisation": "regularisation.weight", "bank_size": "regularisation.bank_size",
     "real_scenes": "regularisation.scenes", "lr": "optimizer.lr", "learning_rate": "optimizer.lr",
