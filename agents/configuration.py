@@ -313,6 +313,8 @@ def as_command_line_text(value: Any) -> str:
         return {None: "null", True: "true", False: "false"}[value]
     if isinstance(value, list | tuple):
         return ",".join(map(as_command_line_text, value))
+    if dataclasses.is_dataclass(value):
+        return f"{{{', '.join(f'{key}: {as_command_line_text(item)}' for key, item in vars(value).items())}}}"
     return str(value)
 
 
@@ -459,7 +461,7 @@ def _group(field: dataclasses.Field[Any], name: str, value: Any, base: Mapping[s
     tree = value
     if isinstance(value, Mapping):
         same = value.get("name", base.get("name")) in (None, getattr(default, "name", None))
-        tree = {**(plain_tree(default) if same and not field.metadata.get("kinds") else {}), **base, **value}
+        tree = _merged(_merged(plain_tree(default) if same and not field.metadata.get("kinds") else {}, base), value)
     return convert(field, type(default), tree, name)
 
 
@@ -727,6 +729,10 @@ def _reason(error: BaseException) -> str:
 # Keys that several commands share
 
 
+MAX_GRADIENT_NORM = 1.0
+"""Largest norm of a gradient in training; longer gradients are scaled down."""
+
+
 @dataclass
 class OptimizerSettings:
     """An optimiser of weights.
@@ -734,10 +740,6 @@ class OptimizerSettings:
     Attributes:
         name: name of the optimiser: ``adamw``.
         lr: peak learning rate.
-        warmup: steps over which the learning rate rises linearly.
-        weight_decay: decoupled weight decay.
-        clip: largest norm of a gradient; longer gradients are scaled down.
-        ema: decay of the averaged weights, which are evaluated and saved; 0 uses the weights themselves.
     """
 
     KNOWN: ClassVar[Sequence[str]] = ("adamw",)
@@ -745,17 +747,10 @@ class OptimizerSettings:
 
     name: str = "adamw"
     lr: float = 1e-3
-    warmup: int = 0
-    weight_decay: float = 0.0
-    clip: float = 1.0
-    ema: float = 0.0
 
     def __post_init__(self) -> None:
         require_one_of(self, "name", self.KNOWN, "optimizer")
-        require_positive(self, "lr", "clip")
-        require_at_least(self, 0, "warmup", "weight_decay")
-        if not 0 <= self.ema < 1:
-            raise InvalidInputError(f"ema={self.ema} must lie in [0, 1)")
+        require_positive(self, "lr")
 
 
 @dataclass
@@ -774,6 +769,28 @@ class LoggerSettings:
     def __post_init__(self) -> None:
         require_one_of(self, "name", LOGGERS, "logger")
         require_at_least(self, 1, "checkpoint_every")
+
+
+@dataclass
+class DeviceKeys:
+    """Device of the networks.
+
+    Attributes:
+        device: torch device, such as cpu, cuda or cuda:1.
+    """
+
+    device: str = "cpu"
+
+
+@dataclass
+class ProgressKeys:
+    """Progress of the work.
+
+    Attributes:
+        progress: progress display: ``bar`` (lines where there is no terminal), ``lines`` or ``none``.
+    """
+
+    progress: str = "bar"
 
 
 @dataclass
@@ -799,7 +816,7 @@ class SamplingKeys:
 
 
 @dataclass
-class DrawKeys:
+class DrawKeys(DeviceKeys):
     """Sampling from a prior, with prior=.
 
     Attributes:
@@ -828,7 +845,7 @@ class RewardLimits:
 
 
 @dataclass
-class OutputKeys:
+class OutputKeys(DeviceKeys):
     """Computation and output.
 
     Attributes:
@@ -836,30 +853,26 @@ class OutputKeys:
         pictures: number of scenes in the galleries; 0 draws none.
         batch_size: scenes denoised at once.
         workers: physics worker processes; 0 computes physics in this process.
-        device: torch device.
     """
 
     output: str = ""
     pictures: int = 12
     batch_size: int = 64
     workers: int = 2
-    device: str = "cpu"
 
 
 @dataclass
-class TrainingKeys:
-    """Recipe, output and device of a training run.
+class TrainingKeys(DeviceKeys):
+    """Recipe and output of a training run.
 
     Attributes:
         recipe: a named set of values for the other keys; keys that are given as well override it.
         output: run folder; a run that was interrupted there is resumed; empty for runs/COMMAND-TIME on the command
             line.
-        device: torch device.
     """
 
     recipe: str = "ours"
     output: str = ""
-    device: str = "cpu"
 
 
 MEASURE_NAMES = ("layout", "physics", "ready", "fsd", "novelty", "prompts", "classifier", "renders", "fid")

@@ -366,16 +366,14 @@ def keys_of(command: Any) -> type:
     return command.run.__globals__[annotation] if isinstance(annotation, str) else annotation
 
 
-def describe_fields(config: type | Any, prefix: str = "") -> list[KeyHelp]:
+def describe_fields(config: type | Any) -> list[KeyHelp]:
     """The keys of a config (the default one, if its class is given), part by part; the keys of groups come last.
 
     Meanings stand under ``Attributes:`` in the docstrings.
     """
     made = config() if isinstance(config, type) else config
-    keys = _plain_keys(made, prefix) if prefix else [key for part in _parts(made).values() for key in part]
-    for field, value in _groups(made):
-        keys += describe_fields(value, f"{prefix}{field.name}.")
-    return keys
+    keys = [key for part in _parts(made).values() for key in part]
+    return keys + [key for field, value in _groups(made) for key in _keys(value, f"{field.name}.")]
 
 
 def _groups(made: Any) -> list[tuple[dataclasses.Field[Any], Any]]:
@@ -384,20 +382,27 @@ def _groups(made: Any) -> list[tuple[dataclasses.Field[Any], Any]]:
     return [(field, value) for field, value in values if dataclasses.is_dataclass(value)]
 
 
-def _plain_keys(made: Any, prefix: str = "", fields: Sequence[dataclasses.Field[Any]] | None = None) -> list[KeyHelp]:
-    """The keys among ``fields``, by default among all fields, that are no groups."""
-    fields = dataclasses.fields(made) if fields is None else fields
-    meanings, values = attribute_meanings(type(made)), {field.name: getattr(made, field.name) for field in fields}
-    return [
-        KeyHelp(prefix + name, as_command_line_text(value), meanings.get(name, ""))
-        for name, value in values.items()
-        if not dataclasses.is_dataclass(value)
-    ]
+def _keys(made: Any, prefix: str = "", fields: Sequence[dataclasses.Field[Any]] | None = None) -> list[KeyHelp]:
+    """The keys among ``fields``, by default among all fields.
+
+    A group inside a group is one key, whose value is a mapping. The name of a component is no key of its own, as
+    ``algorithm=NAME`` gives it.
+    """
+    meanings, keys = attribute_meanings(type(made)), []
+    for field in dataclasses.fields(made) if fields is None else fields:
+        value, meaning = getattr(made, field.name), meanings.get(field.name, "")
+        if dataclasses.is_dataclass(value) and prefix:
+            inner = attribute_meanings(type(value))
+            meaning = " ".join([f"a mapping: {meaning}", *(f"{name}: {text}" for name, text in inner.items())])
+        elif dataclasses.is_dataclass(value) or (prefix and field.name == "name"):
+            continue
+        keys.append(KeyHelp(prefix + field.name, as_command_line_text(value), meaning))
+    return keys
 
 
 def _parts(made: Any) -> dict[type, list[KeyHelp]]:
     """The keys of a command that are no groups, by the class that declares them, in the order of a listing."""
-    parts = {part: sorted(_plain_keys(made, fields=own), key=_place) for part, own in parts_of(type(made)).items()}
+    parts = {part: sorted(_keys(made, fields=own), key=_place) for part, own in parts_of(type(made)).items()}
     return dict(sorted(((part, keys) for part, keys in parts.items() if keys), key=lambda item: _place(item[1][0])))
 
 
@@ -424,10 +429,7 @@ def help_text(config: type | Any, words: Sequence[str] = (), config_dir: str = "
         sections.append(f"{title}:\n" * (len(parts) > 1) + _key_rows(keys))
     for field, group in _groups(made):
         sections.append(_heading(field, chosen.get(field.name, ""), config_dir))
-        sections[-1] += f"\n{_key_rows(_plain_keys(group, f'{field.name}.'))}"
-        for inner, value in _groups(group):
-            name = f"{field.name}.{inner.name}"
-            sections.append(f"{name}:\n{_key_rows(describe_fields(value, f'{name}.'))}")
+        sections[-1] += f"\n{_key_rows(_keys(group, f'{field.name}.'))}"
     return "\n\n".join(sections) or "  no keys"
 
 

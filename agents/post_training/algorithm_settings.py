@@ -11,9 +11,6 @@ from scene_envs.errors import InvalidInputError
 
 CREDITS = ("auto", "scene", "object")
 CATEGORY_CREDITS = ("auto", "scene", "none")
-BASELINES = ("leave_one_out", "mean")
-STEP_WEIGHTINGS = ("uniform", "std", "variance")
-LOG_PROB_REDUCTIONS = ("mean", "sum")
 
 
 @dataclass
@@ -53,35 +50,20 @@ class DDPOSFSettings(AlgorithmSettings):
             steps.
         min_std: smallest sigma of an eligible step, in normalised units; steps with less noise are excluded from the
             gradient.
-        skip_first: first fraction of the chain, with the most noise, that is excluded from the gradient.
-        step_weighting: weight of a step: ``uniform``, or proportional to its ``std`` or ``variance``.
-        log_prob_reduction: reduction of log p over the random entries of a scene: ``mean`` or ``sum``.
         credit: ``scene`` gives every slot the advantage of the scene, ``object`` gives it its own (for rewards with
             ``per_object``), ``auto`` uses ``object`` if the reward allows it.
-        baseline: baseline of the advantages: ``leave_one_out`` or ``mean``.
-        advantage_clip: largest absolute value of an advantage.
     """
 
     name: str = "ddpo_sf"
     gradient_steps: int = 8
     min_std: float = 0.03
-    skip_first: float = 0.0
-    step_weighting: str = "uniform"
-    log_prob_reduction: str = "mean"
     credit: str = "auto"
-    baseline: str = "leave_one_out"
-    advantage_clip: float = 5.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_at_least(self, 1, "gradient_steps")
-        require_positive(self, "advantage_clip", "min_std")
-        if not 0 <= self.skip_first < 1:
-            raise InvalidInputError(f"skip_first={self.skip_first} must lie in [0, 1)")
+        require_positive(self, "min_std")
         require_one_of(self, "credit", CREDITS)
-        require_one_of(self, "baseline", BASELINES)
-        require_one_of(self, "step_weighting", STEP_WEIGHTINGS)
-        require_one_of(self, "log_prob_reduction", LOG_PROB_REDUCTIONS)
 
 
 @dataclass

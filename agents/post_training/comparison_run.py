@@ -114,5 +114,5 @@ def _measured_prompts(config: PostTrainConfig, prior: ScenePrior, count: int) ->
 
 def say_stage(config: PostTrainConfig, text: str) -> None:
     """Tell on stderr what is done next, unless the run shows no progress."""
-    if config.logger.progress != "none":
+    if config.progress != "none":
         print(text, file=sys.stderr, flush=True)

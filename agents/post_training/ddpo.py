@@ -29,22 +29,16 @@ class DDPO(Algorithm[Tensor]):
 
     def __init__(self, settings: DDPOSFSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
         self.settings, self.policy = settings, policy
-        weights = gradient_weights(
-            stds, min_std=settings.min_std, skip_first=settings.skip_first, weighting=settings.step_weighting
-        )
+        weights = gradient_weights(stds, min_std=settings.min_std)
         clip = settings.clip_epsilon if isinstance(settings, DDPOISSettings) else None
-        self.loss = DDPOSFLoss(
-            policy, step_weights=weights, reduction=settings.log_prob_reduction, clip_epsilon=clip
-        ).to(next(policy.parameters()).device)
+        self.loss = DDPOSFLoss(policy, step_weights=weights, reduction="mean", clip_epsilon=clip).to(
+            next(policy.parameters()).device
+        )
 
     def advantage(self, rollout: Rollout) -> Tensor:
         """Advantages (B,) or (B, N), as ``credit`` says, within the scenes of one prompt."""
-        settings = self.settings
-        reward, valid = credited_reward(rollout, settings.credit)
-        groups = rollout_groups(rollout)
-        return compute_advantages(
-            reward, valid, baseline=settings.baseline, clip=settings.advantage_clip, groups=groups
-        )
+        reward, valid = credited_reward(rollout, self.settings.credit)
+        return compute_advantages(reward, valid, groups=rollout_groups(rollout))
 
     def accumulate(self, rollout: Rollout, advantage: Tensor, generator: Generator) -> BatchGradient:
         """Add the policy gradient of a batch to ``.grad``; ``generator`` draws the steps that enter it."""

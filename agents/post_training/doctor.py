@@ -193,8 +193,7 @@ def _advice(report: DoctorReport, config: PostTrainConfig) -> list[str]:
         if report.gradient_ratio < QUIET:
             advice.append(
                 f"Regularisation drowns the policy gradient (ratio {report.gradient_ratio:.2g}): "
-                f"lower regularisation.weight from {weight:g}, or change "
-                "algorithm.log_prob_reduction."
+                f"lower regularisation.weight from {weight:g}."
             )
         if report.gradient_ratio > LOUD:
             advice.append(
@@ -208,7 +207,7 @@ def _advice(report: DoctorReport, config: PostTrainConfig) -> list[str]:
     if total > 0 and worst.gradient_norm**2 > DOMINANT * total and sum(row.weight > 0 for row in report.steps) > 2:
         advice.append(
             f"Step {worst.step} (sigma {worst.std:.3g}) alone is {worst.gradient_norm**2 / total:.0%} of the squared "
-            f"policy gradient: raise algorithm.min_std or set algorithm.step_weighting=std."
+            f"policy gradient: raise algorithm.min_std."
         )
     return advice
 

@@ -35,7 +35,7 @@ def make_guard(config: PostTrainConfig, learner: Learner, scenes: SceneBank) -> 
             config.guidance,
             config.claim_guidance,
         )
-    limits = config.guard.limits(config.algorithm.sample_limits)
+    limits = config.guard.sample_limits(config.algorithm.sample_limits)
     held = config.regularisation.target
     target = math.inf if held is None else held
     seed, learns = stream_seed(config.seed, "guard"), bool(learner.learned)

@@ -31,7 +31,7 @@ _SHAPING = (
     "process.name",
     "text.encoder",
     "process.rotation",
-    "network.frequencies",
+    "network.flux.frequencies",
     "network.modules.relations",
     "network.modules.rotation_features",
     "network.modules.contacts",

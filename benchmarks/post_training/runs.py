@@ -34,7 +34,7 @@ def train(row: Row, directory: Path, iterations: int, extra: Sequence[str]) -> P
     if not (folder / "metrics.json").exists():
         _call(
             "post-train", f"prior={row.prior}", *row.keys, f"iterations={iterations}", f"output={folder}",
-            "logger.progress=none", "logger.report_scenes=0", *extra,
+            "progress=none", "logger.report_scenes=0", *extra,
         )  # fmt: skip
     return folder
 

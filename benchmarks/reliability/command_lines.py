@@ -29,7 +29,7 @@ NASTY = (
 _SMALL = {
     "count": "1", "num_steps": "3", "workers": "0", "pictures": "0", "slots": "6", "budget": "2", "branching": "2",
     "iterations": "1", "batch_size": "2", "algorithm.gradient_steps": "1", "regularisation.bank_size": "6",
-    "regularisation.batch_size": "2", "guard.scenes": "2", "logger.report_scenes": "0", "logger.progress": "none",
+    "regularisation.batch_size": "2", "guard.scenes": "2", "logger.report_scenes": "0", "progress": "none",
     "reward": "object_count", "objective": "object_count", "prior": "PLACE/mixed", "scenes": "PLACE/data",
     "data": "PLACE/data", "measures": "layout", "network.hidden": "16", "network.depth": "1", "network.heads": "2",
     "formats": "npz", "shard_size": "1", "verify": "false",

@@ -18,7 +18,7 @@ _PRIORS = ("prior=PLACE/prior", "prior=PLACE/mixed")
 _TRAINING = (
     "reward=object_count", "num_steps=3", "batch_size=4", "iterations=6", "slots=6", "regularisation.batch_size=2",
     "regularisation.bank_size=6", "guard.scenes=2", "guard.every=2", "logger.checkpoint_every=1",
-    "logger.report_scenes=0", "logger.progress=none", "workers=0",
+    "logger.report_scenes=0", "progress=none", "workers=0",
 )  # fmt: skip
 _SEARCHING = ("objective=object_count", "objective_scale=30", "branching=3", "num_steps=3", "slots=6")
 

@@ -80,7 +80,7 @@ def test_generate_pretrain_post_train_and_sample_the_result(tmp_path, capsys):
         "guard.scenes=2",
         "slots=6",
         "logger.report_scenes=1",
-        "logger.progress=none",
+        "progress=none",
         "reward={name: clip, reward: object_count, high: 30}",
     ]
     assert main(["post-train", f"prior={trained}", *words, f"output={steered}"]) == 0

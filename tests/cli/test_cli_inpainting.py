@@ -108,7 +108,7 @@ def test_search_and_post_training_take_prompts(reader: Path, tmp_path: Path) -> 
         "prompt=[A scene with two cups., A scene with 9 objects.]",
         "algorithm.scenes_per_prompt=2",
         "algorithm.min_std=0.0001",
-        "logger.progress=none",
+        "progress=none",
         "logger.report_scenes=0",
     ]
     assert main([*words, f"output={tmp_path / 'run'}"]) == 0

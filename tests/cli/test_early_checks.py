@@ -22,7 +22,7 @@ LINES = {
     "generate scene={a:b}": "give the name of one scene type",
     "evaluate data=,": "names no dataset",
     f"sample guidance={'9' * 400}": "guidance=",
-    f"pretrain loss.noise_mean={'9' * 400}": "noise_mean=",
+    f"pretrain loss.noise.mean={'9' * 400}": "noise_mean=",
     "evaluate workers=-1": "workers=-1: give a number of processes",
     "evaluate prior=dimsum_tabel": "did you mean 'dimsum_table'",
     "evaluate prior=runs/nowhere": "'runs/nowhere' holds no prior",

@@ -81,8 +81,8 @@ SMALL_KEYS: dict[str, dict[str, str]] = {
         "network.hidden": "32",
         "network.depth": "2",
         "network.heads": "2",
-        "text.width": "16",
-        "text.warmup": "2",
+        "text.vocabulary.width": "16",
+        "text.vocabulary.warmup": "2",
     },
     "post-train": {
         "iterations": "1",

@@ -24,7 +24,7 @@ from tests.helpers.processes import in_processes
 KEYS = (
     "post-train reward=object_count iterations=1 batch_size=4 num_steps=4 "
     "algorithm.gradient_steps=2 regularisation.bank_size=20 regularisation.batch_size=4 guard.scenes=8 guard.samples=0 "
-    "logger.progress=none logger.report_scenes=0 device=cpu"
+    "progress=none logger.report_scenes=0 device=cpu"
 )
 LAUNCHER = (
     "accelerate.commands.launch --multi_gpu --num_processes 2 --num_machines 1 --mixed_precision no "

@@ -72,7 +72,8 @@ def test_the_same_seed_learns_the_same_and_nothing_else_changes() -> None:
 
 
 @pytest.mark.parametrize(
-    "keys", [{"text.count_conditioning": False}, {"network.name": "midiffusion", "process.empty_slots": "attended"}]
+    "keys",
+    [{"text.vocabulary.count_conditioning": False}, {"network.name": "midiffusion", "process.empty_slots": "attended"}],
 )
 def test_a_network_without_count_conditioning_has_nothing_to_learn(keys: dict[str, object]) -> None:
     prior, data = fresh(**keys)
