@@ -27,6 +27,7 @@ from typing import Any
 from agents.cli.commands import COMMANDS, load_command
 from agents.configuration import (
     ADAPTER,
+    PROGRESS_STYLES,
     Sources,
     as_command_line_text,
     compose,
@@ -36,6 +37,7 @@ from agents.configuration import (
     known_rewards,
     known_scenes,
     parts_of,
+    require_one_of,
 )
 from agents.prior_names import find_prior, split_name
 from agents.utils.docstrings import attribute_meanings
@@ -524,6 +526,8 @@ def check_early(settings: Any, module: ModuleType | None = None) -> None:
         _check_name("mask", mask, known_masks)
     if isinstance(device := getattr(settings, "device", "cpu"), str):
         _check_device(device)
+    if hasattr(settings, "progress"):
+        require_one_of(settings, "progress", PROGRESS_STYLES)
     if (scenes := getattr(settings, "scenes", None)) and isinstance(scenes, str):
         find_scenes(Path(scenes))
     resumed = exists(Path(str(getattr(settings, "output", "") or "."), "checkpoint.pt"))

@@ -163,8 +163,8 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
         - step_scale * sum over gradient steps of mean over scenes of  A * log p(x_{t-1} | x_t)
         + regularisation.weight * pretraining loss on real scenes
 
-    where ``step_scale = steps with weight > 0 / gradient_steps``. log p is a mean over the random entries of a scene, the
-    pretraining loss a mean over scenes and entries. The weight is meaningful only together with these reductions.
+    where ``step_scale = steps with weight > 0 / gradient_steps``. log p is a mean over the random entries of a scene,
+    and the pretraining loss is a mean over scenes and entries. The weight is meaningful only with these reductions.
 
     Keys that are not listed are those of :class:`~agents.configuration.SamplingKeys`,
     :class:`~agents.configuration.TrainingKeys` and :class:`~agents.configuration.RewardLimits`.

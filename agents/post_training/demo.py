@@ -28,6 +28,8 @@ def run_demo(
     seed: int = 0,
     workers: int = 2,
     *,
+    device: str = "cpu",
+    progress: str = "bar",
     scenes: int = 24,
     num_steps: int = 50,
     recipes: Mapping[str, PostTrainConfig] | None = None,
@@ -43,6 +45,8 @@ def run_demo(
             ``feasible``, which ``prior=`` loads. An interrupted demonstration is resumed.
         seed: seed of training, from which the seed of the measured samples is derived.
         workers: physics worker processes, of both runs together while they train.
+        device: torch device of the networks.
+        progress: style of the progress display of both runs, as in :class:`~scene_envs.progress.Progress`.
         scenes: fresh samples measured of each prior.
         num_steps: denoiser evaluations per measured sample.
         recipes: the runs by name, in place of ``configs/recipe/demo_clutter.yaml`` and ``demo_feasible.yaml``.
@@ -58,7 +62,8 @@ def run_demo(
     recipes = recipes or {name: PostTrainConfig(recipe=f"demo_{name}") for name in RUNS}
     each = -(-workers // len(recipes))
     configs = {
-        name: replace(recipe, output=str(directory / name), seed=seed, workers=each) for name, recipe in recipes.items()
+        name: replace(recipe, output=str(directory / name), seed=seed, workers=each, device=device, progress=progress)
+        for name, recipe in recipes.items()
     }
     base = ScenePrior.load(next(iter(configs.values())).prior if prior is None else prior)
     for name, config in configs.items():

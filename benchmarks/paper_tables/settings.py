@@ -39,7 +39,9 @@ _OF_SIZE = ("network.depth", "network.heads", "optimizer.rate.warmup", "optimize
 
 SIZES: dict[str, Size] = {
     "tiny": Size(3, 4, 60_000, 6, 2, 1, {"network.depth": 1, "network.heads": 2, "optimizer.rate.warmup": 1}),
-    "small": Size(600, 64, 700_000, 256, pretraining={"network.depth": 4, "network.heads": 4, "optimizer.rate.warmup": 50}),
+    "small": Size(
+        600, 64, 700_000, 256, pretraining={"network.depth": 4, "network.heads": 4, "optimizer.rate.warmup": 50}
+    ),
     "paper": Size(
         _PAPER["iterations"], _PAPER["batch_size"], 88_300_000, 2000,
         pretraining={**{key: _PAPER[key] for key in _OF_SIZE}, "optimizer.compute.matmul_precision": "high"},

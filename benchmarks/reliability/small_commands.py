@@ -40,7 +40,7 @@ _TRAINED = ("prior/model.safetensors", "log.csv")
 _SEARCHED = ("best.safetensors", "metrics.json")
 RESUMABLE = {
     "generate": Command(
-        ("generate", "count=16", "shard_size=4", "workers=0", "verify=false", "progress=false"),
+        ("generate", "count=16", "shard_size=4", "workers=0", "verify=false", "progress=none"),
         ("scenes-00000.parquet", "scenes-00003.parquet", "metadata.json"),
     ),
     "pretrain": Command(

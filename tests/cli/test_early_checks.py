@@ -22,7 +22,7 @@ LINES = {
     "generate scene={a:b}": "give the name of one scene type",
     "evaluate data=,": "names no dataset",
     f"sample guidance={'9' * 400}": "guidance=",
-    f"pretrain loss.noise.mean={'9' * 400}": "noise_mean=",
+    f"pretrain loss.noise.mean={'9' * 400}": "mean=",
     "evaluate workers=-1": "workers=-1: give a number of processes",
     "evaluate prior=dimsum_tabel": "did you mean 'dimsum_table'",
     "evaluate prior=runs/nowhere": "'runs/nowhere' holds no prior",
@@ -34,10 +34,11 @@ LINES = {
     "evaluate guidance=nan": "guidance=nan must be a finite number",
     "doctor reward=object_cuont": "did you mean 'object_count'",
     "doctor regularisation.scenes=nowhere": "regularisation.scenes='nowhere': nothing is at 'nowhere'",
-    "doctor algorithm.step_weighting=stds": "did you mean 'std'",
+    "doctor algorithm.credit=objects": "did you mean 'object'",
+    "generate progress=bars": "did you mean 'bar'",
     "doctor slots=0": "slots=0 must be at least 1",
     "post-train device=cuad": "device='cuad' is no torch device",
-    "post-train optimizer.weight_decay=nan": "weight_decay=nan must be at least 0",
+    "post-train optimizer.lr=nan": "lr=nan must be positive",
     "search objective=object_cuont": "did you mean 'object_count'",
     "search scenes=nowhere": "no scene file, run or dataset is there",
     "search planner=baem": "did you mean 'beam'",
@@ -131,16 +132,13 @@ def test_words_of_groups_are_those_of_the_parts_they_are_for():
     from agents.evaluation.measures import MEASURES
     from agents.networks.mixed_denoiser import EMPTY_SLOTS
     from agents.networks.mixed_flux_config import TEXT_REACHES
-    from agents.post_training.algorithm_settings import LOG_PROB_REDUCTIONS
-    from agents.post_training.losses import REDUCTIONS
     from agents.pretraining.initial_prior import MOMENTS
-    from agents.pretraining.settings import LossSettings, NetworkSettings, ProcessSettings
+    from agents.pretraining.settings import FluxSettings, LossSettings, ProcessSettings
     from agents.priors.config import PROCESSES
     from agents.priors.mixed import CATEGORY_LOSSES
     from agents.priors.rotation_codes import ROTATION_WIDTHS
 
     assert tuple(MEASURES) == MEASURE_NAMES
-    assert set(LOG_PROB_REDUCTIONS) == set(REDUCTIONS)
     for make, key, known in (
         (ProcessSettings, "name", PROCESSES),
         (ProcessSettings, "prediction", PREDICTIONS),
@@ -153,7 +151,7 @@ def test_words_of_groups_are_those_of_the_parts_they_are_for():
         (LossSettings, "timesteps", TIMESTEP_DISTRIBUTIONS),
         (LossSettings, "weighting", LOSS_WEIGHTINGS),
         (LossSettings, "category", CATEGORY_LOSSES),
-        (NetworkSettings, "text_reach", TEXT_REACHES),
+        (FluxSettings, "text_reach", TEXT_REACHES),
     ):
         for word in known:
             assert getattr(make(**{key: word}), key) == word

@@ -23,7 +23,7 @@ def fresh(count: int = 24, **keys: object) -> tuple[MixedPrior, SceneTable]:
     """A prior without training, and ``count`` scenes with prompts."""
     scenes = get_grammar("living_room_shelf").sample(np.random.default_rng(0), count)
     prompts = describe_all(scenes, np.random.default_rng(0))
-    text = {"encoder": "vocabulary", "width": 48, "depth": 1, "latents": 2}
+    text = {"encoder": "vocabulary", "vocabulary": {"width": 48, "depth": 1, "latents": 2}}
     small = PretrainConfig(scene="living_room_shelf", text=text, network={"hidden": 32, "depth": 2, "heads": 2})
     config = changed_config(small, keys)
     prior = build_prior(config, scenes.tensor, Normalizer.fit(scenes.tensor), prompts)

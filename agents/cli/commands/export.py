@@ -113,11 +113,11 @@ def _scenes(settings: ExportConfig, run: Run) -> SceneBatch:
     if settings.prior:
         from agents.priors.base import ScenePrior
 
-        prior = ScenePrior.load(settings.prior)
+        prior = ScenePrior.load(settings.prior).to(settings.device)
         count = 16 if settings.count is None else settings.count
         batch = prior.sample(
             count, num_steps=settings.num_steps, physics_guidance=settings.physics_guidance, seed=settings.seed
-        )
+        ).to("cpu")
         batch.save(run.directory / "scenes.safetensors")
         return batch
     return load_scenes(Path(settings.scenes), settings.count)

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from agents.cli.commands.scenes import draw_scenes
+from agents.configuration import DeviceKeys
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene_sources import load_scenes
 
@@ -25,7 +26,7 @@ _AT_ONCE = 64
 
 
 @dataclass
-class InpaintingConfig:
+class InpaintingConfig(DeviceKeys):
     """Scenes that a prior completes or rearranges.
 
     Attributes:
@@ -42,7 +43,6 @@ class InpaintingConfig:
         num_steps: denoising steps per scene.
         seed: seed of the noise.
         pictures: number of scenes in the galleries; 0 draws none.
-        device: torch device.
         output: folder for scenes.safetensors, before.png and gallery.png.
     """
 
@@ -56,7 +56,6 @@ class InpaintingConfig:
     num_steps: int = 50
     seed: int = 0
     pictures: int = 12
-    device: str = "cpu"
     output: str = ""
 
     def sampling(self, first: int = 0) -> dict[str, Any]:

@@ -30,7 +30,6 @@ class ViewConfig(DrawKeys):
         title: heading of the page; null for a heading that names the source of the scenes.
         pictures: number of scenes in gallery.png; 0 draws none.
         open: also open the page in the browser.
-        device: torch device, with prior=.
         output: folder for viewer.html and gallery.png.
     """
 
@@ -43,7 +42,6 @@ class ViewConfig(DrawKeys):
     title: str | None = None
     pictures: int = 12
     open: bool = False
-    device: str = "cpu"
     output: str = ""
 
 
