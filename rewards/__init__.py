@@ -17,7 +17,6 @@ from rewards.feasible_share import FeasibleShare
 from rewards.isolation import IsolatedReward
 from rewards.learned import LearnedReward, learned_parts
 from rewards.local_files import allow_local_rewards
-from rewards.normalised import Normalised
 from rewards.object_count import ObjectCount
 from rewards.penetration import Penetration
 from rewards.prompt_match import PromptMatch
@@ -48,7 +47,6 @@ __all__ = [
     "Gate",
     "IsolatedReward",
     "LearnedReward",
-    "Normalised",
     "ObjectCount",
     "Penetration",
     "Product",

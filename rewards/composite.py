@@ -40,6 +40,7 @@ class WeightedSum:
     Args:
         rewards: the parts.
         weights: one number per part; all 1 by default.
+        offset: number that is added to the sum, such as one that lifts an objective of a search above 0.
 
     >>> reward = WeightedSum(["object_count", "object_count"], weights=[1.0, 0.5])
     >>> reward(SceneBatch.empty("dimsum_table", 1), RewardContext()).value
@@ -48,11 +49,12 @@ class WeightedSum:
 
     name: ClassVar[str] = "weighted_sum"
 
-    def __init__(self, rewards: Sequence[Any], weights: Sequence[float] | None = None) -> None:
+    def __init__(self, rewards: Sequence[Any], weights: Sequence[float] | None = None, offset: float = 0.0) -> None:
         self.rewards = _resolve_parts(self.name, rewards)
         self.weights = tuple(1.0 for _ in self.rewards) if weights is None else tuple(float(w) for w in weights)
         if len(self.weights) != len(self.rewards):
             raise InvalidInputError(f"weighted_sum: {len(self.rewards)} rewards need as many weights, got {weights!r}")
+        self.offset = float(offset)
         self.averages_objects = averages_objects(*self.rewards)
         self.counts_objects = counts_objects(*self.rewards)
 
@@ -67,7 +69,8 @@ class WeightedSum:
         pairs = zip(self.rewards, outputs.values(), strict=True)
         credits = [self._credit(reward, output, batch) for reward, output in pairs if output.per_object is not None]
         per_object = self._add_up(credits) if len(credits) == len(outputs) else None
-        total = _combine(self._add_up([output.value for output in outputs.values()]), outputs, per_object)
+        value = self._add_up([output.value for output in outputs.values()]) + self.offset
+        total = _combine(value, outputs, per_object)
         if not any("judged" in output.object_flags for output in outputs.values()):
             return total
         judged = [output.object_flags.get("judged", batch.is_free) for output in outputs.values()]
@@ -85,7 +88,7 @@ class WeightedSum:
         return torch.stack([weight * tensor for weight, tensor in zip(self.weights, tensors, strict=True)]).sum(dim=0)
 
     def __repr__(self) -> str:
-        return f"WeightedSum({list(self.rewards)}, weights={list(self.weights)})"
+        return f"WeightedSum({list(self.rewards)}, weights={list(self.weights)}, offset={self.offset})"
 
 
 @register_reward("product")

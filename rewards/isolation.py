@@ -63,8 +63,7 @@ class IsolatedReward:
             raise InvalidInputError(f"only a reward given by name or as a mapping can be isolated, got {reward!r}")
         check_limits(timeout, memory)
         self.name = self.__name__ = reward_name(reward)
-        self.depends_on_batch = self.averages_objects = self.counts_objects = self.has_open_statistics = False
-        self.statistics: Sequence[Any] | None = None
+        self.depends_on_batch = self.averages_objects = self.counts_objects = False
         self.seed = seed
         self.timeout, self.memory, self.workers = timeout, memory, workers
         self._reward = reward
@@ -83,15 +82,12 @@ class IsolatedReward:
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score in the worker; the batch may be on any device."""
-        with self._lock:
-            body = self._started().ask(("score", *self._scenes(batch, context)), self.timeout)
-        return unpacked(body, batch.tensor.device)
-
-    def _scenes(self, batch: SceneBatch, context: RewardContext) -> tuple[Any, ...]:
-        """A batch and its context, as the worker reads them."""
         scenes = batch.tensor.detach().cpu().contiguous().numpy()
         seed = self.seed if context.seed == 0 else context.seed
-        return replace(batch.scene_type), scenes, (context.prompts, seed, current_draw())
+        with self._lock:
+            message = ("score", replace(batch.scene_type), scenes, (context.prompts, seed, current_draw()))
+            body = self._started().ask(message, self.timeout)
+        return unpacked(body, batch.tensor.device)
 
     def maximum(self, slots: int, free_slots: int) -> float | None:
         """The largest value that the reward declares; see :func:`rewards.base.declared_maximum`."""
@@ -107,17 +103,6 @@ class IsolatedReward:
             digest.update(path.read_bytes() if path.is_file() else b"")
         return [self._reward, digest.hexdigest()]
 
-    def fit_statistics(self, batch: SceneBatch, context: RewardContext) -> None:
-        """See :func:`rewards.statistics.fit_statistics`."""
-        with self._lock:
-            self.statistics = self._started().ask(("fit", *self._scenes(batch, context)), self.timeout)
-
-    def load_statistics(self, statistics: Sequence[Any] | None) -> None:
-        """See :func:`rewards.statistics.load_statistics`; the next call starts another worker with them."""
-        if statistics != self.statistics:
-            self.statistics = statistics
-            self.close()
-
     def close(self) -> None:
         """End the worker; the next call starts another."""
         if self._worker is not None:
@@ -129,10 +114,8 @@ class IsolatedReward:
             self._worker = RewardProcess(self.name, self.timeout, self.memory)
             try:
                 message = ("make", self._reward, allowed_targets(), allowed_files(), self.workers, self.seed)
-                facts: tuple[bool, bool, bool, bool] = self._worker.ask(message, self.timeout)
-                self.depends_on_batch, self.averages_objects, self.counts_objects, self.has_open_statistics = facts
-                if self.statistics is not None:
-                    self._worker.ask(("load", self.statistics), self.timeout)
+                facts: tuple[bool, bool, bool] = self._worker.ask(message, self.timeout)
+                self.depends_on_batch, self.averages_objects, self.counts_objects = facts
             except BaseException:
                 self.close()
                 raise

@@ -24,7 +24,6 @@ from rewards.local_files import allow_local_rewards
 from rewards.registry import RewardInfo, allow_reward_targets, resolve_reward, reward_info, reward_name
 from rewards.reward_process import packed
 from rewards.seeding import other_draw, seeded_generators
-from rewards.statistics import fit_statistics, has_open_statistics, load_statistics, statistics_of
 from scene_envs.errors import InvalidInputError, SceneEnvsError
 from scene_envs.physics import PhysicsPool
 from scene_envs.scene import SceneBatch
@@ -79,7 +78,7 @@ class _Answers:
     def make(self, reward: Any, targets: list[str], files: list[Any], workers: int, seed: int) -> tuple[bool, ...]:
         """Make the reward, with generators seeded from the run's.
 
-        Returns whether it depends on the batch, averages objects, counts objects, and has open statistics.
+        Returns whether it depends on the batch, averages objects, and counts objects.
         """
         for target in targets:
             allow_reward_targets(target)
@@ -94,18 +93,7 @@ class _Answers:
             )
         self.pool = PhysicsPool(workers=workers) if workers else None
         made = self.reward
-        return depends_on_batch(made), averages_objects(made), counts_objects(made), has_open_statistics(made)
-
-    def load(self, statistics: Any) -> None:
-        """Take the statistics of normalised parts."""
-        load_statistics(self.reward, statistics)
-
-    def fit(self, scene_type: Any, scenes: Any, facts: tuple[Any, int, int]) -> Any:
-        """Fix the open statistics of normalised parts; returns all of them."""
-        batch, context = self._batch(scene_type, scenes, facts)
-        with other_draw(facts[2]):
-            fit_statistics(self.reward, batch, context)
-        return statistics_of(self.reward)
+        return depends_on_batch(made), averages_objects(made), counts_objects(made)
 
     def maximum(self, slots: int, free_slots: int) -> float | None:
         """The largest value that the reward declares."""
@@ -117,18 +105,15 @@ class _Answers:
 
     def score(self, scene_type: Any, scenes: Any, facts: tuple[Any, int, int]) -> dict[str, Any]:
         """Score one batch."""
-        batch, context = self._batch(scene_type, scenes, facts)
-        with other_draw(facts[2]):
-            return packed(evaluate_reward(self.reward, batch, context, strict=True))
-
-    def _batch(self, scene_type: Any, scenes: Any, facts: tuple[Any, int, int]) -> tuple[SceneBatch, RewardContext]:
-        prompts, seed, _ = facts
+        prompts, seed, draw = facts
         try:
             known = get_scene_type(scene_type.name)
         except SceneEnvsError:
             known = register_scene_type(scene_type)
         batch = SceneBatch(torch.from_numpy(scenes), known if known == scene_type else scene_type)
-        return batch, RewardContext(prompts=prompts, pool=self.pool, seed=seed)
+        context = RewardContext(prompts=prompts, pool=self.pool, seed=seed)
+        with other_draw(draw):
+            return packed(evaluate_reward(self.reward, batch, context, strict=True))
 
 
 def _watch(inbox: int) -> None:

@@ -13,13 +13,12 @@ if TYPE_CHECKING:
     from agents.post_training.config import PostTrainConfig
     from agents.post_training.ddpo import DDPO
     from agents.post_training.discriminator import Discriminator
-    from agents.post_training.forward_losses import AWMLoss, NFTLoss, RewardWeightedLoss
+    from agents.post_training.forward_losses import AWMLoss, NFTLoss
     from agents.post_training.forward_process import ForwardProcess
     from agents.post_training.forward_process_loss import ForwardProcessLoss
     from agents.post_training.guard import Guard
     from agents.post_training.guidance_distillation import GuidanceDistillation, GuidanceDistillationLoss
     from agents.post_training.losses import DDPOSFLoss
-    from agents.post_training.neon import Neon, SelfTrainingLoss
     from agents.post_training.policy import DenoisingPolicy
     from agents.post_training.trainer import PostTrainer, PostTrainResult, post_train
 
@@ -38,12 +37,9 @@ __all__ = [
     "GuidanceDistillation",
     "GuidanceDistillationLoss",
     "NFTLoss",
-    "Neon",
     "PostTrainConfig",
     "PostTrainResult",
     "PostTrainer",
-    "RewardWeightedLoss",
-    "SelfTrainingLoss",
     "compute_advantages",
     "list_algorithms",
     "post_train",

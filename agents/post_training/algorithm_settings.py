@@ -171,49 +171,6 @@ class AWMSettings(ForwardProcessSettings):
 
 
 @dataclass
-class RewardWeightedSettings(ForwardProcessSettings):
-    """Reward-weighted fine-tuning: good samples pull, none pushes; the baseline of the other algorithms.
-
-    Attributes:
-        temperature: temperature of the weights exp(A / temperature), in standard deviations of the reward.
-    """
-
-    name: str = "reward_weighted"
-    temperature: float = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_positive(self, "temperature")
-
-
-@dataclass
-class NeonSettings(AlgorithmSettings):
-    """Neon: negative extrapolation from self-training (Alemohammad et al. 2025); the reward is reported only.
-
-    Attributes:
-        updates: optimiser steps per batch.
-        draws: number of timesteps and noises of every own sample per optimiser step.
-        w: length of the step away from the copy that is trained on own samples.
-        period: number of iterations of a round; a round ends with an extrapolation.
-    """
-
-    learning_rate: ClassVar[float] = 1e-4
-    regularisation_weight: ClassVar[float] = 1.0
-    sample_limits: ClassVar[Mapping[str, float]] = ForwardProcessSettings.sample_limits
-
-    name: str = "neon"
-    updates: int = 8
-    draws: int = 1
-    w: float = 1.0
-    period: int = 20
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_at_least(self, 1, "updates", "draws", "period")
-        require_positive(self, "w")
-
-
-@dataclass
 class GuidanceDistillationSettings(AlgorithmSettings):
     """Guidance distillation: the prior learns to place objects as physics guidance does; the reward is reported only.
 

@@ -13,9 +13,7 @@ from agents.post_training.algorithm_settings import (
     DDPOISSettings,
     DDPOSFSettings,
     GuidanceDistillationSettings,
-    NeonSettings,
     NFTSettings,
-    RewardWeightedSettings,
 )
 from scene_envs.registry import Registry
 
@@ -44,8 +42,6 @@ _ALGORITHMS = Registry(
         ),
         "nft": _Entry(NFTSettings, _FORWARD),
         "awm": _Entry(AWMSettings, _FORWARD),
-        "neon": _Entry(NeonSettings, "agents.post_training.neon:Neon"),
-        "reward_weighted": _Entry(RewardWeightedSettings, _FORWARD),
     },
 )
 

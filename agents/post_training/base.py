@@ -51,24 +51,6 @@ class Algorithm(ABC, Generic[Credit]):
         The training loop sums these parts.
         """
 
-    def real_generator(self, own: Generator, real: Generator) -> Generator:
-        """Source of the timesteps and noise of real scenes in an update (CPU).
-
-        Args:
-            own: generator in the same state as the one that :meth:`accumulate` got in this update.
-            real: generator that is independent of ``own``, and that drew the real scenes.
-        """
-        return real
-
-    def learning_rate(self, rate: float, update: int) -> float:
-        """Learning rate of an update.
-
-        Args:
-            rate: ``optimizer.lr``, after its warm-up.
-            update: number of the update in the run.
-        """
-        return rate
-
     def end_iteration(self) -> None:
         """Called after the last update of every batch."""
         return

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from typing import Any
 
 from torch import Generator
@@ -67,7 +66,7 @@ def post_train_and_compare(
     )
     with make_pool(config.workers, PHYSICS_TIMEOUT) as pool, ExitStack() as stack:
         stack.callback(close_reward, reward)
-        stack.enter_context(trained_reward(reward, config))
+        load_learned_rewards(reward, config)
 
         def measure(prior: ScenePrior) -> Measured:
             return measure_prior(
@@ -86,18 +85,13 @@ def post_train_and_compare(
     return write_comparison(result, before, after, title=title, extra=extra)
 
 
-@contextmanager
-def trained_reward(reward: Any, config: PostTrainConfig) -> Iterator[None]:
-    """Context in which the parts of ``reward`` that learn, or are normalised, are those of the end of a run."""
+def load_learned_rewards(reward: Any, config: PostTrainConfig) -> None:
+    """Give the parts of ``reward`` that learn their state at the end of a run."""
     learned = LearnedRewards(reward, config)
-    if learned.needs_samples:
+    if learned:
         real = SceneBatch.load(config.directory / SCENES_NAME)
         learned.begin(real[: len(real) - config.guard.scenes])
         learned.restore(load_checkpoint(config.directory / CHECKPOINT_NAME)["learner"])
-    try:
-        yield
-    finally:
-        learned.end()
 
 
 def _measured_prompts(config: PostTrainConfig, prior: ScenePrior, count: int) -> list[str] | None:

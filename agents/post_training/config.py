@@ -23,9 +23,9 @@ from agents.configuration import (
     require_one_of,
     require_positive,
 )
-from agents.post_training.algorithm_settings import AlgorithmSettings, DDPOSFSettings, NeonSettings
+from agents.post_training.algorithm_settings import AlgorithmSettings, DDPOSFSettings
 from agents.post_training.algorithms import algorithm_settings, list_algorithms
-from agents.post_training.regularisation_settings import REAL_SCENES, RegularisationSettings
+from agents.post_training.regularisation_settings import RegularisationSettings
 from agents.utils.loggers import LOGGERS
 from scene_envs.envs.settings import PROMPT_SOURCES, check_claim_guidance
 from scene_envs.errors import InvalidInputError
@@ -232,22 +232,7 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
             self.optimizer = replace(self.optimizer, lr=self.algorithm.learning_rate)
         if self.regularisation.weight is None:
             self.regularisation = replace(self.regularisation, weight=self.algorithm.regularisation_weight)
-        if self.regularisation.batch_size is None:
-            own = self.batch_size if isinstance(self.algorithm, NeonSettings) else REAL_SCENES
-            self.regularisation = replace(self.regularisation, batch_size=own)
-        compared = isinstance(self.algorithm, NeonSettings) and self.regularisation.pretraining_weight > 0
-        if compared and self.regularisation.batch_size != self.batch_size:
-            raise InvalidInputError(
-                f"regularisation.batch_size={self.regularisation.batch_size} with batch_size={self.batch_size}: "
-                "algorithm=neon trains one copy on real scenes and one on samples, as many of each, with the same "
-                "noise; leave regularisation.batch_size out"
-            )
         target = self.regularisation.target
-        if target is not None and isinstance(self.algorithm, NeonSettings):
-            raise InvalidInputError(
-                f"hold={self.regularisation.hold} adjusts regularisation.weight, and the size of this weight does not "
-                "change the steps of algorithm=neon; lower algorithm.w for a shorter step, or take another algorithm"
-            )
         if target is not None and target > self.guard.limit:
             raise InvalidInputError(
                 f"hold={self.regularisation.hold} lies beyond guard.limit={self.guard.limit:g}, past which no prior is "

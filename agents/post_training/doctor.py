@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from agents.configuration import changed
-from agents.post_training.algorithm_settings import GuidanceDistillationSettings, NeonSettings
+from agents.post_training.algorithm_settings import GuidanceDistillationSettings
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.gradients import accumulate_policy_gradient, gradient_norm
 from agents.post_training.learner import Learner
@@ -111,7 +111,7 @@ def diagnose(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> Doc
     """
     with TemporaryDirectory() as scratch:
         real = config.regularisation
-        bank = min(real.bank_size, config.guard.scenes + 4 * real.real_scenes)
+        bank = min(real.bank_size, config.guard.scenes + 4 * real.batch_size)
         small = changed(config, {"output": str(Path(scratch) / "run"), "regularisation.bank_size": bank})
         trainer = PostTrainer(small, prior=prior)
         try:
@@ -177,7 +177,7 @@ def _advice(report: DoctorReport, config: PostTrainConfig) -> list[str]:
         )
     if report.valid_fraction < 1:
         advice.append(f"{1 - report.valid_fraction:.0%} of the scenes have no valid reward; see the log for why.")
-    rewarded = not isinstance(config.algorithm, NeonSettings | GuidanceDistillationSettings)
+    rewarded = not isinstance(config.algorithm, GuidanceDistillationSettings)
     if rewarded and report.valid_fraction > 0 and not report.reward_std > 0:
         advice.append("All rewards are equal: there is nothing to learn from. Use a graded reward or more scenes.")
     if rewarded and report.reward_std > 0 and report.policy_gradient_norm == 0:

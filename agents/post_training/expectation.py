@@ -1,4 +1,4 @@
-"""Copies of a denoiser that are trained beside it, such as one that learns the mean target of own samples."""
+"""Copy of a denoiser that learns the mean target of own samples."""
 
 from __future__ import annotations
 
@@ -14,43 +14,7 @@ from agents.priors.forward import NoisedScenes
 from agents.utils.process_group import ProcessGroup
 
 
-class TrainedCopy(nn.Module):
-    """Copy of a prior with an optimiser of its own, for the parameters that the prior trains.
-
-    Args:
-        prior: prior that is copied; it is not changed.
-        learning_rate: of AdamW.
-    """
-
-    def __init__(self, prior: ScenePrior, learning_rate: float) -> None:
-        super().__init__()
-        self.prior = deepcopy(prior)
-        self.trained = [p for p in self.prior.parameters() if p.requires_grad]
-        self.optimizer = torch.optim.AdamW(self.trained, lr=learning_rate, weight_decay=0.0)
-
-    def step(self, clip: float = 1.0) -> None:
-        """Apply the gradient that all processes accumulated; one that is not finite is dropped."""
-        ProcessGroup.current().sum_gradients(self.trained)
-        if bool(torch.isfinite(nn.utils.clip_grad_norm_(self.trained, clip))):
-            self.optimizer.step()
-        self.optimizer.zero_grad(set_to_none=True)
-
-    def return_to(self, prior: ScenePrior) -> None:
-        """Take the weights of ``prior``, and forget the optimiser's state."""
-        self.prior.load_state_dict(prior.state_dict())
-        self.optimizer.state.clear()
-
-    def state(self) -> dict[str, Any]:
-        """For a checkpoint."""
-        return {"weights": self.prior.state_dict(), "optimizer": self.optimizer.state_dict()}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Inverse of :meth:`state`."""
-        self.prior.load_state_dict(state["weights"])
-        self.optimizer.load_state_dict(state["optimizer"])
-
-
-class Expectation(TrainedCopy):
+class Expectation(nn.Module):
     """Mean target of a denoiser at a noised scene, over the scenes that the sampling policy makes.
 
     A forward-process loss attracts the output to the targets of good samples, repels it from the targets of bad
@@ -72,10 +36,33 @@ class Expectation(TrainedCopy):
     """
 
     def __init__(self, prior: ScenePrior, learning_rate: float = 3e-4) -> None:
-        copy = deepcopy(prior).requires_grad_(True)
-        copy.freeze_text()
-        super().__init__(copy, learning_rate)
+        super().__init__()
+        self.prior = deepcopy(prior).requires_grad_(True)
+        self.prior.freeze_text()
+        self.trained = [p for p in self.prior.parameters() if p.requires_grad]
+        self.optimizer = torch.optim.AdamW(self.trained, lr=learning_rate, weight_decay=0.0)
 
     def forward(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
         """(B, N, F) expected targets."""
         return self.prior.output(noised, text).continuous
+
+    def step(self, clip: float = 1.0) -> None:
+        """Apply the gradient that all processes accumulated; one that is not finite is dropped."""
+        ProcessGroup.current().sum_gradients(self.trained)
+        if bool(torch.isfinite(nn.utils.clip_grad_norm_(self.trained, clip))):
+            self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+
+    def return_to(self, prior: ScenePrior) -> None:
+        """Take the weights of ``prior``, and forget the optimiser's state."""
+        self.prior.load_state_dict(prior.state_dict())
+        self.optimizer.state.clear()
+
+    def state(self) -> dict[str, Any]:
+        """For a checkpoint."""
+        return {"weights": self.prior.state_dict(), "optimizer": self.optimizer.state_dict()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Inverse of :meth:`state`."""
+        self.prior.load_state_dict(state["weights"])
+        self.optimizer.load_state_dict(state["optimizer"])

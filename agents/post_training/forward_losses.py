@@ -1,4 +1,4 @@
-"""Losses of forward-process reinforcement learning: NFT, AWM and reward-weighted fine-tuning."""
+"""Losses of forward-process reinforcement learning: NFT and AWM."""
 
 from __future__ import annotations
 
@@ -110,43 +110,6 @@ class AWMLoss(ForwardProcessLoss):
         bounded = (advantage / self.clip).clamp(-1.0, 1.0)
         pull = F.kl_div(logits.log_softmax(-1), old.log_softmax(-1), reduction="none", log_target=True).sum(dim=-1)
         return bounded * _cross_entropy(logits, category) + self.beta * pull
-
-
-class RewardWeightedLoss(ForwardProcessLoss):
-    """Reward-weighted fine-tuning: the pretraining loss of own samples, weighted by exp(A / temperature).
-
-    This is a baseline to compare with the other losses (Peters and Schaal 2007; Lee et al. 2023). Good samples attract
-    the output, and no sample repels it. Weights are bounded by ``largest``.
-
-    Args:
-        prior, sampler, generator: as in :class:`ForwardProcessLoss`.
-        temperature: of the weights.
-        largest: largest weight.
-    """
-
-    def __init__(
-        self,
-        prior: ScenePrior,
-        sampler: ScenePrior,
-        *,
-        temperature: float = 1.0,
-        largest: float = 10.0,
-        generator: Generator | None = None,
-    ) -> None:
-        super().__init__(prior, sampler, generator=generator)
-        _positive(temperature=temperature, largest=largest)
-        self.temperature, self.largest = temperature, largest
-
-    def continuous_loss(self, output: Tensor, old: Tensor, target: Tensor, advantage: Tensor) -> Tensor:
-        """See :class:`ForwardProcessLoss`."""
-        return self._weight(advantage) * (output - target).square()
-
-    def category_loss(self, logits: Tensor, old: Tensor, category: Tensor, advantage: Tensor) -> Tensor:
-        """See :class:`ForwardProcessLoss`."""
-        return self._weight(advantage) * _cross_entropy(logits, category)
-
-    def _weight(self, advantage: Tensor) -> Tensor:
-        return (advantage / self.temperature).exp().clamp(max=self.largest)
 
 
 def _cross_entropy(logits: Tensor, category: Tensor) -> Tensor:

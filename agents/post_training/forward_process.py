@@ -11,14 +11,9 @@ from tensordict import TensorDict
 from torch import Generator, Tensor
 
 from agents.post_training.advantages import compute_advantages
-from agents.post_training.algorithm_settings import (
-    AWMSettings,
-    ForwardProcessSettings,
-    NFTSettings,
-    RewardWeightedSettings,
-)
+from agents.post_training.algorithm_settings import AWMSettings, NFTSettings
 from agents.post_training.expectation import Expectation
-from agents.post_training.forward_losses import AWMLoss, NFTLoss, RewardWeightedLoss
+from agents.post_training.forward_losses import AWMLoss, NFTLoss
 from agents.post_training.forward_process_loss import ForwardProcessLoss
 from agents.post_training.gradients import BatchGradient, credited_reward, judged_slots
 from agents.post_training.own_samples import OwnSampleAlgorithm
@@ -28,7 +23,7 @@ from agents.priors.base import ScenePrior
 
 
 class ForwardProcess(OwnSampleAlgorithm):
-    """Algorithm of NFT, AWM and reward weighting, which differ in their loss; see :class:`ForwardProcessLoss`.
+    """Algorithm of NFT and AWM, which differ in their loss; see :class:`ForwardProcessLoss`.
 
     A slower copy of the prior in training, an average of its weights, samples the scenes. This copy is also evaluated
     and saved.
@@ -40,23 +35,19 @@ class ForwardProcess(OwnSampleAlgorithm):
     """
 
     loss: ForwardProcessLoss
-    copy: Expectation | None
 
-    def __init__(self, settings: ForwardProcessSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
+    def __init__(self, settings: NFTSettings | AWMSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
         super().__init__(policy, draws=settings.draws, sampler_decay=settings.sampler_decay)
         self.settings = settings
-        rate = getattr(settings, "expectation_lr", 0.0)
+        rate = settings.expectation_lr
         self.copy = Expectation(self.sampler, rate) if rate else None
         self.loss = self.make_loss()
 
     def make_loss(self) -> ForwardProcessLoss:
         """The loss that the settings name."""
-        settings, pair = self.settings, (self.prior, self.sampler)
-        if isinstance(settings, NFTSettings | AWMSettings):
-            kind = NFTLoss if isinstance(settings, NFTSettings) else AWMLoss
-            return kind(*pair, beta=settings.beta, clip=settings.advantage_clip, expectation=self.copy)
-        assert isinstance(settings, RewardWeightedSettings)
-        return RewardWeightedLoss(*pair, temperature=settings.temperature)
+        settings = self.settings
+        kind = NFTLoss if isinstance(settings, NFTSettings) else AWMLoss
+        return kind(self.prior, self.sampler, beta=settings.beta, clip=settings.advantage_clip, expectation=self.copy)
 
     def advantage(self, rollout: Rollout) -> TensorDict:
         """``advantage`` (B, 1) or (B, N) for poses and ``category_advantage`` (B, 1), as the credit settings say."""

@@ -95,7 +95,6 @@ class Learner:
 
     def close(self) -> None:
         """Stop the workers of physics and of the reward, if any."""
-        self.learned.end()
         self.env.close()
         self.scorer.close()
         close_reward(self.reward)
@@ -119,15 +118,14 @@ class Learner:
         return replace(rollout, averages=averages_objects(self.reward), counts=counts_objects(self.reward))
 
     def begin_rewards(self, real: SceneBatch, *, first: bool) -> None:
-        """Give real scenes to the rewards that learn; does nothing if no reward learns or is normalised.
+        """Give real scenes to the rewards that learn; does nothing if no reward learns.
 
         Args:
             real: real scenes that training may see.
-            first: also train them on samples of the base prior, and fix the statistics of normalised rewards; False for
-                a run whose state is restored.
+            first: also train them on samples of the base prior; False for a run whose state is restored.
         """
         self.learned.begin(real)
-        if self.learned.needs_samples and first:
+        if self.learned and first:
             prompts = None if self.deck is None else self.deck.deal(FIRST_SAMPLES, self._generator("discriminator", 0))
             self.learned.learn_from_prior(self.prior, self.slots, prompts)
 
@@ -153,11 +151,10 @@ class Learner:
         self.processes.sum_gradients(self.parameters)
         policy_norm = gradient_norm(self.parameters)
         generator = self._generator("real", index)
-        count = config.regularisation.real_scenes
+        count = config.regularisation.batch_size
         real = scenes.batch(count, generator)
         samples = None if scenes.base is None else scenes.base.batch(count, self._generator("base", index))
-        noise = self.algorithm.real_generator(self._generator("steps", index), generator)
-        row = self.regularisation.accumulate(self.prior, real, samples, noise, config.optimizer.chunk)
+        row = self.regularisation.accumulate(self.prior, real, samples, generator, config.optimizer.chunk)
         return {
             "policy_loss": policy.loss,
             "policy_gradient_norm": policy_norm,
@@ -171,7 +168,7 @@ class Learner:
         Raises:
             NonFiniteGradient: the gradient is not finite; the weights in training are unchanged.
         """
-        rate = self.algorithm.learning_rate(self.lr, index)
+        rate = self.lr
         row = self.accumulate(rollout, advantage, scenes, index)
         row["gradient_norm"] = float(nn.utils.clip_grad_norm_(self.parameters, MAX_GRADIENT_NORM))
         if not all(math.isfinite(row[name]) for name in ("gradient_norm", "policy_loss", "pretraining_loss")):

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torch import Generator
 
 from agents.post_training.averaged_sampler import AveragedSampler
-from agents.post_training.expectation import TrainedCopy
+from agents.post_training.expectation import Expectation
 from agents.post_training.gradients import BatchGradient, GradientSum
 from agents.post_training.own_sample_loss import OwnSampleLoss
 from agents.post_training.policy import DenoisingPolicy
@@ -31,7 +31,7 @@ class OwnSampleAlgorithm(AveragedSampler):
     """
 
     loss: OwnSampleLoss
-    copy: TrainedCopy | None
+    copy: Expectation | None
 
     def __init__(self, policy: DenoisingPolicy, *, draws: int, sampler_decay: float) -> None:
         super().__init__(policy, sampler_decay=sampler_decay)

@@ -12,8 +12,6 @@ SHARPNESS = 20.0
 """Scale of the discriminative loss; with a larger value the prior moves less far from its base."""
 OBJECTIVES = ("pretraining", "discriminative")
 """Losses of the regularisation."""
-REAL_SCENES = 48
-"""Real scenes per update where neither the settings nor the algorithm name another number."""
 
 
 @dataclass
@@ -27,7 +25,7 @@ class RegularisationSettings:
         base_samples: number of samples of the base prior in the discriminative loss; they are drawn once.
         hold: target that the run holds by adjusting the coefficient: ``guard:1.05`` is the held-out loss as a ratio to
             the base prior's; null keeps the coefficient constant.
-        batch_size: real scenes per update; null takes 48, or the run's ``batch_size`` with ``algorithm=neon``.
+        batch_size: real scenes per update.
         scenes: source of the real scenes: ``grammar``, or a dataset folder.
         bank_size: number of real scenes that are drawn from the grammar or read from the dataset, including the
             held-out scenes.
@@ -37,7 +35,7 @@ class RegularisationSettings:
     weight: float | None = None
     base_samples: int = 1024
     hold: str | None = None
-    batch_size: int | None = None
+    batch_size: int = 48
     scenes: str = "grammar"
     bank_size: int = 4096
 
@@ -48,11 +46,6 @@ class RegularisationSettings:
             raise InvalidInputError(f"regularisation.weight={self.weight} must not be negative")
         if self.target is not None and self.weight == 0:
             raise InvalidInputError(f"hold={self.hold} adjusts regularisation.weight, which is 0; give a weight")
-
-    @property
-    def real_scenes(self) -> int:
-        """``batch_size``, or its default for null; the config of a run has replaced null."""
-        return REAL_SCENES if self.batch_size is None else self.batch_size
 
     @property
     def target(self) -> float | None:

@@ -11,10 +11,10 @@ TYPES = (
     "dimsum_table", "living_room_shelf", "pantry_shelf", "breakfast_table_low_clutter", "breakfast_table_high_clutter",
     "restaurant_low_clutter", "restaurant_high_clutter",
 )  # fmt: skip
-FORWARD, CHAIN, BASELINE, NEON = "nft", "ddpo_sf", "reward_weighted", "neon"
+FORWARD, CHAIN = "nft", "ddpo_sf"
 DISTILLATION = "guidance_distillation"
 LENGTH = 300
-"""Iterations of a row, but for Neon, which needs fewer."""
+"""Iterations of a row."""
 
 
 @dataclass(frozen=True)
@@ -70,11 +70,11 @@ def _stability() -> tuple[Row, ...]:
 
 
 def _placement() -> tuple[Row, ...]:
-    """Three algorithms at equal sampled scenes and Neon, three seeds on Dimsum and one on the other types."""
+    """Two algorithms at equal sampled scenes, three seeds on Dimsum and one on the other types."""
     return tuple(
-        Row(f"{prior}-{name}-{seed}", prior, _keys(name, "feasible_share", seed), 20 if name == NEON else LENGTH)
+        Row(f"{prior}-{name}-{seed}", prior, _keys(name, "feasible_share", seed), LENGTH)
         for prior in TYPES
-        for name in (FORWARD, CHAIN, BASELINE, NEON)
+        for name in (FORWARD, CHAIN)
         for seed in range(3 if prior == "dimsum_table" else 1)
     )
 
@@ -85,7 +85,7 @@ def _equal_scenes() -> tuple[Row, ...]:
     return tuple(
         Row(f"{prior}-{name}-{seed}", prior, (*_keys(name, "feasible_share", seed), "batch_size=24", *guard), 40)
         for prior in TYPES
-        for name in (FORWARD, CHAIN, BASELINE, DISTILLATION)
+        for name in (FORWARD, CHAIN, DISTILLATION)
         for seed in range(3 if prior == "dimsum_table" else 1)
     )
 

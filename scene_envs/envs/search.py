@@ -152,7 +152,7 @@ class SearchProblem:
         if self.scorer.depends_on_batch:
             raise InvalidInputError(
                 f"objective={chosen.objective!r} scores a scene by the other scenes of its batch, and a search "
-                "compares scenes of different batches; take another objective, or give normalised both mean= and std="
+                "compares scenes of different batches; take another objective"
             )
         free_slots = self.slots - len(self.scene_type.fixed)
         declared = self.scorer.maximum(self.slots, free_slots) if chosen.objective_scale is None else None
@@ -307,7 +307,7 @@ class SearchProblem:
             self._told_of_zero = True
             _LOGGER.warning(
                 "the objective is %.4g: below 0 the search tells no scenes apart; shift it, as with "
-                "{name: normalised, reward: ..., mean: the value that becomes 0, std: 1}",
+                "{name: weighted_sum, rewards: [...], offset: minus the value that becomes 0}",
                 objective,
             )
         return self.state_type(

@@ -185,9 +185,10 @@ def test_an_objective_below_zero_is_said_with_a_shift_that_works(
     assert metrics["below_zero"]
     assert set(metrics["search"]["curve"]) == {0.0}
     said = " ".join(capsys.readouterr().out.split())
-    shifted = re.search(r"objective='(\{name: normalised.*?\})' objective_scale=1", said)
+    shifted = re.search(r"objective='(\{name: weighted_sum.*?\})' objective_scale=(\S+)", said)
     assert shifted is not None
-    assert main([*words, f"objective={shifted[1]}", "objective_scale=1", f"output={tmp_path / 'shifted'}"]) == 0
+    words += [f"objective={shifted[1]}", f"objective_scale={shifted[2]}"]
+    assert main([*words, f"output={tmp_path / 'shifted'}"]) == 0
     metrics = json.loads((tmp_path / "shifted" / "metrics.json").read_text())
     assert not metrics["below_zero"]
     assert 0 < metrics["search"]["value"] < 1

@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
-from agents.post_training.forward_losses import AWMLoss, NFTLoss, RewardWeightedLoss
+from agents.post_training.forward_losses import AWMLoss, NFTLoss
 from agents.post_training.forward_process_loss import ForwardProcessLoss
 from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
@@ -64,11 +64,6 @@ class TestGaussianMixture:
             float(((weights * self.target).sum() + 2.0 * self.old) / (weights.sum() + 2.0)), abs=1e-9
         )
 
-    def test_reward_weighting_is_the_tilted_posterior_mean(self, prior: ScenePrior) -> None:
-        found = minimum(self.expected(RewardWeightedLoss(prior, prior, temperature=0.5)), self.old)
-        tilted = self.probability * (self.advantage / 0.5).exp()
-        assert found == pytest.approx(float((tilted * self.target).sum() / tilted.sum()), abs=1e-9)
-
     def test_advantages_beyond_the_clip_count_as_the_clip(self, prior: ScenePrior) -> None:
         loss = NFTLoss(prior, prior, clip=0.5)
         assert loss.optimality(torch.tensor([-9.0, -0.5, 0.0, 0.25, 9.0])).tolist() == [0.0, 0.0, 0.5, 0.75, 1.0]
@@ -105,10 +100,6 @@ class TestTwoCategories:
         assert self.log_odds_at_minimum(NFTLoss(prior, prior, beta=beta)) == pytest.approx(exact, abs=1e-6)
         assert exact < 0  # the better category gains
 
-    def test_reward_weighting_is_the_tilted_posterior(self, prior: ScenePrior) -> None:
-        change = self.log_odds_at_minimum(RewardWeightedLoss(prior, prior))
-        assert change == pytest.approx(-0.5 - 1.0, abs=1e-6)
-
 
 def gradient(loss: ForwardProcessLoss, scenes: TensorDict) -> Tensor:
     loss.prior.zero_grad()
@@ -129,15 +120,6 @@ def test_nft_and_awm_have_the_same_gradient_at_the_sampling_policy(prior: SceneP
     awm = gradient(AWMLoss(prior, prior, beta=2.0), scenes)
     assert nft.norm() > 0
     torch.testing.assert_close(nft, 0.25 * awm, rtol=1e-4, atol=1e-7)
-
-
-def test_reward_weighting_without_advantages_is_the_pretraining_loss(prior: ScenePrior) -> None:
-    scenes = own_scenes(prior, advantage=torch.zeros(4, 1))
-    found = gradient(RewardWeightedLoss(prior, prior), scenes)
-    prior.zero_grad()
-    prior.pretraining_loss(scenes["scene"], Generator().manual_seed(3)).backward()
-    exact = torch.cat([p.grad.flatten().double() for p in prior.parameters() if p.grad is not None])
-    torch.testing.assert_close(found, exact, rtol=1e-3, atol=1e-7)
 
 
 def test_no_advantage_at_the_sampling_policy_gives_no_gradient(prior: ScenePrior) -> None:

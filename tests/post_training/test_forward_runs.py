@@ -40,8 +40,6 @@ def forward_config(
     [
         ("nft", "mixed"),
         ("awm", "continuous"),
-        ("reward_weighted", "mixed"),
-        ("neon", "mixed"),
         ("guidance_distillation", "continuous"),
     ],
 )

@@ -98,7 +98,6 @@ def test_the_target_is_the_same_in_python() -> None:
         (["regularisation.hold=gard:1.05"], "must be guard:RATIO"),
         (["regularisation.hold=guard:1.05", "regularisation.weight=0"], "which is 0"),
         (["regularisation.hold=guard:1.6"], "guard.limit"),
-        (["algorithm=neon", "regularisation.hold=guard:1.05"], "does not change the steps of algorithm=neon"),
     ],
 )
 def test_nonsense_is_refused(words: list[str], said: str) -> None:

@@ -14,7 +14,7 @@ from PIL import Image
 from rich.console import Console
 
 from agents.post_training import learned_rewards, post_train_and_compare
-from agents.post_training.comparison_run import trained_reward
+from agents.post_training.comparison_run import load_learned_rewards
 from agents.post_training.curves import draw_curve
 from agents.post_training.demo import run_demo
 from agents.post_training.doctor import diagnose
@@ -145,8 +145,8 @@ def test_a_reward_that_learns_is_measured_as_the_run_left_it(tmp_path: Path, mon
     prior = tiny_prior(process="mixed", slots=6)
     post_train(config, prior=prior)
     reward, batch = make_reward("discriminator"), prior.sample(3, num_steps=4)
-    with trained_reward(reward, config):
-        assert bool((reward(batch, RewardContext()).value != 0.5).all())  # that of a network that has seen no samples
+    load_learned_rewards(reward, config)
+    assert bool((reward(batch, RewardContext()).value != 0.5).all())  # that of a network that has seen no samples
 
 
 def test_doctor_says_when_no_advantage_differs(tmp_path: Path) -> None:
@@ -157,5 +157,10 @@ def test_doctor_says_when_no_advantage_differs(tmp_path: Path) -> None:
 
 
 def test_doctor_asks_nothing_of_the_reward_of_an_algorithm_that_does_not_use_it(tmp_path: Path) -> None:
-    report = diagnose(small_config(tmp_path / "run", algorithm={"name": "neon"}), prior=tiny_prior(process="mixed"))
+    algorithm = {"name": "guidance_distillation", "draws": 1}
+    config = small_config(
+        tmp_path / "run", algorithm=algorithm, reward=lambda batch: RewardOutput(torch.ones(len(batch)))
+    )
+    report = diagnose(config, prior=tiny_prior(process="mixed", slots=8))
+    assert report.reward_std == 0
     assert not any("nothing to learn" in line for line in report.advice)

@@ -26,7 +26,11 @@ from tests.helpers.small_runs import small_config
 TWO = ["A scene with two cups.", "A scene with 9 objects."]
 CASES: dict[str, tuple[str, torch.dtype, dict[str, Any]]] = {
     "ddpo_sf": ("continuous", torch.float64, {"algorithm": {"gradient_steps": 2}}),
-    "ddpo_is": ("mixed", torch.float64, {"algorithm": {"updates": 2, "scenes_per_prompt": 3}, "prompt": TWO}),
+    "ddpo_is": (
+        "mixed",
+        torch.float64,
+        {"algorithm": {"updates": 2, "scenes_per_prompt": 3}, "prompt": TWO, "reward": "diversity"},
+    ),
     "nft": (
         "mixed",
         torch.float64,
@@ -47,8 +51,6 @@ CASES: dict[str, tuple[str, torch.dtype, dict[str, Any]]] = {
         torch.float64,
         {"algorithm": {"updates": 1, "draws": 1}, "prompt": TWO, "iterations": 1, "slots": 12},
     ),
-    "neon": ("mixed", torch.float64, {"algorithm": {"updates": 2, "period": 2}}),
-    "reward_weighted": ("mixed", torch.float32, {"reward": "diversity"}),
 }
 """Algorithm: the process of the prior, the dtype, and further keys."""
 

@@ -17,7 +17,6 @@ from rewards import (
     Coverage,
     Diversity,
     Gate,
-    Normalised,
     Penetration,
     RewardContext,
     RewardOutput,
@@ -30,7 +29,7 @@ from rewards import (
 from scene_envs import SceneBatch, get_grammar, get_scene_type
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
-COMPOSITES = {"clip", "gate", "product", "weighted_sum", "normalised"}
+COMPOSITES = {"clip", "gate", "product", "weighted_sum"}
 SHELF = ["clutter", "penetration", "stability", "category_count", "coverage", "diversity", "feasible_share"]
 
 
@@ -190,29 +189,15 @@ def test_composites_depend_on_the_batch_when_a_part_does() -> None:
     assert len(check_reward({"name": "weighted_sum", "rewards": ["object_count", "coverage"]})) == 5
 
 
-# -- normalised --------------------------------------------------------------------------------------
-
-
-def test_normalised_values_have_mean_zero_and_spread_one(cups: SceneBatch) -> None:
-    """Four and two objects; a scene that cannot be scored says nothing of the mean."""
-    output = score(Normalised("object_count"), cups)
-    torch.testing.assert_close(output.value, torch.tensor([1.0, -1.0]))
-    assert output.terms["object_count"].tolist() == [4.0, 2.0]
-    torch.testing.assert_close(output.per_object[0], torch.tensor([1.0, 1, 1, 1, 0, 0]))
-    assert score(Normalised("object_count", mean=2.0, std=4.0), cups).value.tolist() == [0.5, 0.0]
-    three = SceneBatch.concatenate([cups, cups[0]])
-
-    def last_fails(batch: SceneBatch, context: RewardContext) -> RewardOutput:
-        return RewardOutput(torch.tensor([4.0, 2.0, 1e9]), valid=torch.tensor([True, True, False]))
-
-    torch.testing.assert_close(score(Normalised(last_fails), three).value[:2], torch.tensor([1.0, -1.0]))
-    assert score(Normalised("object_count"), three[[0, 2]]).value.tolist() == [0.0, 0.0]
+def test_an_offset_is_added_to_the_value_of_a_sum(cups: SceneBatch) -> None:
+    plain, lifted = (score(WeightedSum(["object_count"], [2.0], offset), cups) for offset in (0.0, -3.0))
+    assert (lifted.value - plain.value).tolist() == [-3.0, -3.0]
+    assert torch.equal(lifted.per_object, plain.per_object)
 
 
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: Normalised("object_count", std=0.0),
         lambda: Clutter(lines=0),
         lambda: Stability(scale=0.0),
         lambda: Coverage((0, 1, 1)),

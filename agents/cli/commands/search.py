@@ -78,8 +78,8 @@ def run(settings: SearchKeys, run: Run) -> None:
         low = 2 * metrics["search"]["objective"]
         run.say(
             "that is below 0, where the search tells no scenes apart, so that it was chance; shift the objective, as "
-            f"objective='{{name: normalised, reward: {metrics['objective']}, mean: {low:.4g}, std: {-1.1 * low:.4g}}}' "
-            "objective_scale=1"
+            f"objective='{{name: weighted_sum, rewards: [{metrics['objective']}], offset: {-low:.4g}}}' "
+            f"objective_scale={-1.1 * low:.4g}"
         )
     if metrics["stopped"] == "time":
         run.say(f"ended after max_seconds={search.max_seconds:g}; the same command with more time goes on")
