@@ -203,7 +203,7 @@ class Learner:
         """Inverse of :meth:`state`.
 
         Raises:
-            InvalidInputError: the weights are of another network, such as an earlier version's.
+            InvalidInputError: the weights are of another network.
         """
         check_tensors(self.prior, state["prior"], self.config.directory / CHECKPOINT_NAME)
         self.prior.load_state_dict(state["prior"])

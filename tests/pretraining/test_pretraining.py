@@ -205,7 +205,7 @@ def test_learning_rate_stays_at_its_peak_until_the_decay_begins() -> None:
 
 
 def test_a_decay_share_that_is_none_is_refused(config: PretrainConfig, raw: torch.Tensor) -> None:
-    with pytest.raises(InvalidInputError, match=r"decay_share=1\.5 is outside 0\.\.1"):
+    with pytest.raises(InvalidInputError, match=r"decay=1\.5 is outside 0\.\.1"):
         make_run(changed(config, {"optimizer.rate.decay": 1.5}), raw)
 
 
