@@ -1,4 +1,4 @@
-"""Configuration: nested dataclasses checked by type, and their values from words, registries and files by Hydra."""
+"""Configuration: nested dataclasses checked by type, and their values from registries and files by Hydra."""
 
 from __future__ import annotations
 
@@ -19,17 +19,14 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, ClassVar, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from agents.prior_names import adapted_name
 from agents.utils.loggers import LOGGERS
-from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
+from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.plugins import load_plugins, plugin_entry_points
 
 Config = TypeVar("Config")
 Kind = TypeVar("Kind", bound=type)
 
 _WANTED: dict[Any, str] = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
-_OPENING = "[{('\""
-"""First characters of values that are no list without brackets."""
 PROGRESS_STYLES = ("bar", "lines", "none")
 """How progress is shown, as in :data:`scene_envs.progress.STYLES`."""
 
@@ -461,7 +458,7 @@ def _group(field: dataclasses.Field[Any], name: str, value: Any, base: Mapping[s
     tree = value
     if isinstance(value, Mapping):
         same = value.get("name", base.get("name")) in (None, getattr(default, "name", None))
-        tree = _merged(_merged(plain_tree(default) if same and not field.metadata.get("kinds") else {}, base), value)
+        tree = merged(merged(plain_tree(default) if same and not field.metadata.get("kinds") else {}, base), value)
     return convert(field, type(default), tree, name)
 
 
@@ -493,7 +490,7 @@ def by_hydra(command: str, kind: type, choices: Mapping[str, str], config_dir: s
             raise InvalidInputError(
                 f"recipe={choices['recipe']} is not for {command}: it chooses from groups that {command} does not have"
             ) from error
-        raise InvalidInputError(f"{command}: {_reason(error)}") from error
+        raise InvalidInputError(f"{command}: {reason_of(error)}") from error
 
 
 def _compose(kind: type, choices: tuple[tuple[str, str], ...], config_dir: str = "") -> dict[str, Any]:
@@ -526,201 +523,13 @@ def _compose(kind: type, choices: tuple[tuple[str, str], ...], config_dir: str =
 _compose_once = functools.lru_cache(maxsize=256)(_compose)
 
 
-@dataclass(frozen=True)
-class Sources:
-    """Sources of a command's values, besides its words.
-
-    Attributes:
-        config_dir: folder with further groups and experiments; empty for none.
-        config: ``config.yaml`` whose values take the place of the defaults; empty for none.
-    """
-
-    config_dir: str = ""
-    config: str = ""
-
-
-ADAPTER = "adapter"
-"""The key that every command with ``prior=`` has besides its own."""
-
-
-def compose(command: str, config: type, words: Sequence[str], sources: Sources = Sources()) -> Any:
-    """An instance of ``config`` from ``key=value`` words, options of groups and ``+experiment=NAME``.
-
-    Values are written as in Hydra: numbers, ``true``, ``null``, ``[1, 2]``, ``{name: clip, high: 20}``, ``${seed}``;
-    the brackets of a list may be left out. The value of a key that takes one text is that text as it stands.
-
-    Raises:
-        UnknownNameError: no such key or option; the nearest one is offered.
-        InvalidInputError: a word is not ``key=value``, or the value is not of the key's type.
-    """
-    fields = {field.name: field for field in dataclasses.fields(config)}
-    if sources.config_dir and not Path(sources.config_dir).is_dir():
-        raise InvalidInputError(f"--config-dir {sources.config_dir}: no such folder")
-    tree = read_config(sources.config) if sources.config else {}
-    tree.pop("output", None)  # a run that is started again has a folder of its own
-    choices: dict[str, str] = {}
-    values: dict[str, Any] = {}
-    texts: dict[str, Any] = {}
-    adapter = ""
-    for word in words:
-        key, equals, value = word.partition("=")
-        head = key.partition(".")[0]
-        if not equals or not key:
-            raise InvalidInputError(f"{command}: expected key=value, got {word!r}; --help lists the keys")
-        if key == "+experiment":
-            check_option("experiment", value, group_options("experiment", sources.config_dir))
-            choices[key] = value
-        elif key == ADAPTER and "prior" in fields:
-            adapter = value
-        elif head not in fields:
-            raise unknown_name(f"{command} key", key, dotted_keys(config()))
-        elif key == "recipe":
-            check_option(key, value, group_options(key))
-            choices[key] = value
-        elif _is_option(fields[head], key, value, sources.config_dir):
-            choices[key] = value
-            values.pop(key, None)
-        elif (hint := _hint(config, key)) and _is_text(hint, value):
-            texts[key] = None if value == "null" and NoneType in get_args(hint) else value
-        else:
-            values.pop(key, None)  # later words come later
-            values[key] = _parsed(command, key, value)
-            if fields[head].metadata.get("named") and key == head:
-                choices.pop(key, None)
-    if sources.config and "recipe" in choices:
-        raise InvalidInputError("recipe= and --config exclude each other: the file says everything already")
-    tree = {key: value for key, value in tree.items() if key not in choices}
-    made = by_hydra(command, config, choices, sources.config_dir)
-    for key, value in values.items():
-        made = _with(made, key, value, config, tree)
-    made = _resolved(command, config, made, {**plain_tree(config()), **tree})
-    for key, value in texts.items():
-        made = _with(made, key, value, config, tree)
-    settings: Any = build(config, _merged(tree, made), command=command)
-    if not adapter:
-        return settings
-    if not settings.prior:
-        raise InvalidInputError(f"{command}: adapter={adapter} needs prior=, the prior that the adapter was trained on")
-    return dataclasses.replace(settings, prior=adapted_name(settings.prior, adapter.strip("[]").replace(",", "+")))
-
-
-def read_config(path: str) -> dict[str, Any]:
-    """The values of a ``config.yaml``.
-
-    Raises:
-        InvalidInputError: there is no such file.
-        CorruptFileError: it holds no mapping.
-    """
-    import yaml
-
-    try:
-        found = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InvalidInputError(f"--config {path}: {error.strerror}; name the config.yaml of a run") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise CorruptFileError(f"--config {path} is not YAML ({str(error).splitlines()[0]})") from error
-    if not isinstance(found, dict):
-        raise CorruptFileError(f"--config {path} holds no keys")
-    return found
-
-
-def _is_option(field: dataclasses.Field[Any], key: str, value: str, config_dir: str) -> bool:
-    """Whether the word chooses an option; refuses a value that can be nothing else and is none."""
-    if key != field.name or not field.metadata.get("folder") or value.startswith("{"):
-        return False
-    known = field_options(field, config_dir)
-    if not field.metadata.get("named"):
-        check_option(field.name, value, known)
-    return value in known
-
-
-def _hint(config: type, key: str) -> Any:
-    """The type of a dotted key, Any where only the component knows it."""
-    kind: Any = config
-    for part in key.split("."):
-        if not dataclasses.is_dataclass(kind) or part not in (hints := get_type_hints(kind)):
-            return Any
-        kind = hints[part]
-    return kind
-
-
-def _is_text(hint: Any, value: str) -> bool:
-    """Whether a value is one text, which needs no quotes."""
-    options = (hint,) if get_origin(hint) in (list, dict) else get_args(hint) or (hint,)
-    return str in options and not (value.startswith("[") and any(get_origin(option) is list for option in options))
-
-
-def _parsed(command: str, key: str, value: str) -> Any:
-    """The value of a word, read by Hydra."""
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.core.override_parser.types import Sweep
-    from hydra.errors import HydraException
-
-    text = f"[{value}]" if "," in value and value[:1] not in _OPENING else value  # a,b is a list; to Hydra, a sweep
-    try:
-        found: Any = OverridesParser.create().parse_override(f"{key}={text}").value()
-        if not any(isinstance(item, Sweep) for item in (found if isinstance(found, list) else [found])):
-            return found
-    except (HydraException, ValueError):
-        pass
-    raise InvalidInputError(f"{command}: a value cannot be read: {key}={value[:200]}")
-
-
-def _with(made: Mapping[str, Any], key: str, value: Any, config: type, tree: Mapping[str, Any]) -> dict[str, Any]:
-    """The values with one more, by dotted key."""
-    *groups, last = key.split(".")
-    head = (groups or [last])[0]
-    (field,) = (field for field in dataclasses.fields(config) if field.name == head)
-    if not groups and not dataclasses.is_dataclass(get_type_hints(config)[head]):
-        return {**made, key: value}
-    if groups and field.metadata.get("named") and not isinstance(made.get(head), Mapping):
-        before = made.get(head, tree.get(head, field.default))
-        made = {**made, head: before if isinstance(before, Mapping) else {"name": before}}
-    return _merged(made, _nested(key, value))
-
-
-def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
     """Nested values, those of ``second`` over those of ``first``."""
     both = [key for key, value in second.items() if isinstance(value, Mapping) and isinstance(first.get(key), Mapping)]
-    return {**first, **second, **{key: _merged(first[key], second[key]) for key in both}}
+    return {**first, **second, **{key: merged(first[key], second[key]) for key in both}}
 
 
-def _nested(key: str, value: Any) -> dict[str, Any]:
-    """Nested mappings that hold one value, by its dotted key."""
-    for part in reversed(key.split(".")):
-        value = {part: value}
-    return value
-
-
-def _resolved(command: str, config: type, made: dict[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
-    """The values, interpolations such as ``${seed}`` replaced by other values, or by the environment, by OmegaConf."""
-    found = {key: value for key, value in dotted(made).items() if "${" in str(value)}
-    if not found:
-        return made
-    from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
-
-    plain = {key: value for key, value in dotted(others).items() if "${" not in str(value)}
-    context = OmegaConf.create({})
-    try:
-        for key, value in {**plain, **dotted(made)}.items():
-            OmegaConf.update(context, key, value, force_add=True)
-        for key in found:
-            value = OmegaConf.select(context, key)
-            if OmegaConf.is_config(value):
-                value = OmegaConf.to_container(value, resolve=True)
-            elif isinstance(value, str) and not _is_text(_hint(config, key), value):
-                value = _parsed(command, key, value)  # the environment has texts alone
-            made = _merged(made, _nested(key, value))
-    except OmegaConfBaseException as error:
-        raise InvalidInputError(
-            f"{command}: {error.full_key}: {_reason(error)}; ${{KEY}} is the value of another key, ${{oc.env:NAME}} "
-            "that of the environment"
-        ) from error
-    return made
-
-
-def _reason(error: BaseException) -> str:
+def reason_of(error: BaseException) -> str:
     while error.__cause__ is not None:
         error = error.__cause__
     return str(error).splitlines()[0].strip().rstrip(".")
@@ -877,30 +686,3 @@ class TrainingKeys(DeviceKeys):
 
 MEASURE_NAMES = ("layout", "physics", "ready", "fsd", "novelty", "prompts", "classifier", "renders", "fid")
 """Groups of measures, in the order in which they are computed: cheap ones first."""
-
-
-def choose_measures(measures: str | Iterable[str], *, project: bool = True) -> list[str]:
-    """Names of groups, in their order.
-
-    Args:
-        measures: ``"all"``, a name, names joined by commas, or a list of names.
-        project: whether ``"all"`` includes ``ready``.
-
-    Raises:
-        UnknownNameError: a name that is no group.
-        InvalidInputError: no name, or something else than names.
-
-    >>> choose_measures("novelty, layout")
-    ['layout', 'novelty']
-    """
-    if not isinstance(measures, str | Iterable):
-        raise InvalidInputError(f"measures={measures!r} is no list of names; known: all, {', '.join(MEASURE_NAMES)}")
-    names = [name.strip() for name in measures.split(",")] if isinstance(measures, str) else [*map(str, measures)]
-    if "all" in names and all(name == "all" or name in MEASURE_NAMES for name in names):
-        return [name for name in MEASURE_NAMES if project or name != "ready"]
-    if not names:
-        raise InvalidInputError(f"measures is empty; give all, or some of {', '.join(MEASURE_NAMES)}")
-    for name in names:
-        if name not in MEASURE_NAMES:
-            raise unknown_name("measure", name, ["all", *MEASURE_NAMES])
-    return [name for name in MEASURE_NAMES if name in names]

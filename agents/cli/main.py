@@ -9,38 +9,29 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import errno
-import inspect
 import itertools
 import math
 import os
 import re
-import shutil
 import sys
-import textwrap
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from agents.cli.commands import COMMANDS, load_command
+from agents.cli.keys import Sources, compose, format_rows, help_text, keys_of
 from agents.configuration import (
-    ADAPTER,
     PROGRESS_STYLES,
-    Sources,
-    as_command_line_text,
-    compose,
     config_text,
-    field_options,
     known_masks,
     known_rewards,
     known_scenes,
-    parts_of,
     require_one_of,
 )
 from agents.prior_names import find_prior, split_name
-from agents.utils.docstrings import attribute_meanings
 from agents.utils.interrupts import Terminated, terminable
 from scene_envs import __version__
 from scene_envs.errors import (
@@ -72,8 +63,6 @@ scene-envs COMMAND --help lists the keys of a command; --traceback shows where a
 --allow-local allows reward=./my_rewards.py:clutter to run that file without a question.
 A command writes into output=FOLDER, by default runs/COMMAND-TIME.
 """
-_FIRST = ("scene", "prior", "scenes", "data", "reward", "objective", "count")
-"""Keys that a listing starts with, in this order."""
 _LEAST = {
     "count": 1,
     "num_steps": 1,
@@ -334,136 +323,6 @@ def _complain(text: str, status: int) -> int:
     with contextlib.suppress(OSError):  # stderr may be closed
         print(f"scene-envs: {text}".encode(errors="backslashreplace").decode(), file=sys.stderr)
     return status
-
-
-# Help
-
-
-@dataclass(frozen=True)
-class KeyHelp:
-    """One key of a command.
-
-    Attributes:
-        name: the text before ``=``; a key of a group begins with the name of the group and a dot.
-        default: its default, as it would be typed.
-        meaning: one sentence.
-    """
-
-    name: str
-    default: str
-    meaning: str
-
-
-_ADAPTER = KeyHelp(
-    ADAPTER,
-    "",
-    "updates of the prior: a prior that was trained from it, or the folder of such a run; A+0.5*B adds two.",
-)
-"""The key that every command with ``prior=`` has besides its own."""
-
-
-def keys_of(command: Any) -> type:
-    """The dataclass of a command's keys, which is the annotation of the argument ``settings`` of its ``run``."""
-    annotation = command.run.__annotations__["settings"]
-    return command.run.__globals__[annotation] if isinstance(annotation, str) else annotation
-
-
-def describe_fields(config: type | Any) -> list[KeyHelp]:
-    """The keys of a config (the default one, if its class is given), part by part; the keys of groups come last.
-
-    Meanings stand under ``Attributes:`` in the docstrings.
-    """
-    made = config() if isinstance(config, type) else config
-    keys = [key for part in _parts(made).values() for key in part]
-    return keys + [key for field, value in _groups(made) for key in _keys(value, f"{field.name}.")]
-
-
-def _groups(made: Any) -> list[tuple[dataclasses.Field[Any], Any]]:
-    """The fields that are groups of keys, and their values."""
-    values = [(field, getattr(made, field.name)) for field in dataclasses.fields(made)]
-    return [(field, value) for field, value in values if dataclasses.is_dataclass(value)]
-
-
-def _keys(made: Any, prefix: str = "", fields: Sequence[dataclasses.Field[Any]] | None = None) -> list[KeyHelp]:
-    """The keys among ``fields``, by default among all fields.
-
-    A group inside a group is one key, whose value is a mapping. The name of a component is no key of its own, as
-    ``algorithm=NAME`` gives it.
-    """
-    meanings, keys = attribute_meanings(type(made)), []
-    for field in dataclasses.fields(made) if fields is None else fields:
-        value, meaning = getattr(made, field.name), meanings.get(field.name, "")
-        if dataclasses.is_dataclass(value) and prefix:
-            inner = attribute_meanings(type(value))
-            meaning = " ".join([f"a mapping: {meaning}", *(f"{name}: {text}" for name, text in inner.items())])
-        elif dataclasses.is_dataclass(value) or (prefix and field.name == "name"):
-            continue
-        keys.append(KeyHelp(prefix + field.name, as_command_line_text(value), meaning))
-    return keys
-
-
-def _parts(made: Any) -> dict[type, list[KeyHelp]]:
-    """The keys of a command that are no groups, by the class that declares them, in the order of a listing."""
-    parts = {part: sorted(_keys(made, fields=own), key=_place) for part, own in parts_of(type(made)).items()}
-    return dict(sorted(((part, keys) for part, keys in parts.items() if keys), key=lambda item: _place(item[1][0])))
-
-
-def _place(key: KeyHelp) -> int:
-    return _FIRST.index(key.name) if key.name in _FIRST else len(_FIRST)
-
-
-def help_text(config: type | Any, words: Sequence[str] = (), config_dir: str = "") -> str:
-    """All keys with their values and meanings, a paragraph for each part and for each group with its options.
-
-    Args:
-        config: the config that ``words`` make, or its class.
-        words: options of groups among them stand in the headings.
-        config_dir: a folder with further options.
-    """
-    chosen = dict(word.partition("=")[::2] for word in words)
-    made = config() if isinstance(config, type) else config
-    sections = []
-    parts = _parts(made)
-    for part, keys in parts.items():
-        after = next((place for place, key in enumerate(keys, 1) if key.name == "prior"), 0)
-        keys[after:after] = [_ADAPTER] if after else []
-        title = inspect.cleandoc(part.__doc__ or "").partition("\n")[0].rstrip(".")
-        sections.append(f"{title}:\n" * (len(parts) > 1) + _key_rows(keys))
-    for field, group in _groups(made):
-        sections.append(_heading(field, chosen.get(field.name, ""), config_dir))
-        sections[-1] += f"\n{_key_rows(_keys(group, f'{field.name}.'))}"
-    return "\n\n".join(sections) or "  no keys"
-
-
-def _key_rows(keys: Sequence[KeyHelp]) -> str:
-    return format_rows([(f"{key.name}={key.default}", key.meaning) for key in keys])
-
-
-def _heading(field: dataclasses.Field[Any], chosen: str, config_dir: str) -> str:
-    if not field.metadata.get("folder"):
-        return f"{field.name}:"
-    option = chosen or field.metadata["option"]
-    others = [other for other in field_options(field, config_dir) if other != option]
-    return f"{field.name}={option}" + (f" (or {', '.join(others)}):" if others else ":")
-
-
-def format_rows(rows: Sequence[tuple[str, str]]) -> str:
-    """Two columns, the second wrapped to the terminal."""
-    width = max(60, min(shutil.get_terminal_size().columns, 120))
-    left = min(34, max(len(name) for name, _ in rows)) + 4
-    lines = []
-    for name, meaning in rows:
-        wrapped = textwrap.wrap(meaning, width - left) or [""]
-        head = f"  {name}"
-        if len(head) > left - 2:
-            lines.append(head)
-            head = ""
-        lines.append(head.ljust(left) + wrapped[0])
-        lines.extend(" " * left + line for line in wrapped[1:])
-    return "\n".join(line.rstrip() for line in lines)
-
-
-# Sweeps
 
 
 def expand_sweeps(words: Sequence[str]) -> list[tuple[list[str], str]]:

@@ -88,7 +88,7 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> P
     >>> with TemporaryDirectory() as output:
     ...     config = PostTrainConfig(output=output, iterations=2, batch_size=4, num_steps=4,
     ...         algorithm={"gradient_steps": 2}, regularisation={"bank_size": 20, "batch_size": 4},
-    ...         guard={"scenes": 8}, logger={"progress": "none"})
+    ...         guard={"scenes": 8}, progress="none")
     ...     result = post_train(config, prior=tiny_prior())
     >>> len(result.history), result.history[0]["log_ratio"]
     (2, 0.0)

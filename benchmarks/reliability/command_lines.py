@@ -99,7 +99,7 @@ def _can_be_arguments(line: list[str]) -> bool:
 @cache
 def _keys(name: str) -> tuple[str, ...]:
     from agents.cli.commands import load_command
-    from agents.cli.main import describe_fields, keys_of
+    from agents.cli.keys import describe_fields, keys_of
 
     module = load_command(name)
     return tuple(key.name for key in describe_fields(keys_of(module)) if key.name != "output")
@@ -125,7 +125,7 @@ def _line(rng: random.Random, output: str, run: bool) -> list[str]:
 @cache
 def _all_keys(name: str) -> tuple[str, ...]:
     from agents.cli.commands import load_command
-    from agents.cli.main import describe_fields, keys_of
+    from agents.cli.keys import describe_fields, keys_of
 
     module = load_command(name)
     return tuple(key.name for key in describe_fields(keys_of(module)))

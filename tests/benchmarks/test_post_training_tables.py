@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.configuration import compose
+from agents.cli.keys import compose
 from agents.post_training.config import PostTrainConfig
 from benchmarks.post_training.__main__ import main
 from benchmarks.post_training.rows import TABLES

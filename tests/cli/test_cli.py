@@ -11,7 +11,7 @@ import pytest
 
 from agents.cli import main
 from agents.cli.commands import COMMANDS, load_command
-from agents.cli.main import describe_fields, keys_of
+from agents.cli.keys import describe_fields, keys_of
 from scene_envs.errors import PhysicsError
 
 MAIN = import_module("agents.cli.main")

@@ -14,8 +14,9 @@ import yaml
 from agents import PostTrainConfig, PretrainConfig, SearchConfig
 from agents.cli import main
 from agents.cli.commands import COMMANDS, load_command
-from agents.cli.main import expand_sweeps, help_text, keys_of
-from agents.configuration import Sources, changed, compose, config_text, dotted_values, field_options
+from agents.cli.keys import Sources, compose, help_text, keys_of
+from agents.cli.main import expand_sweeps
+from agents.configuration import changed, config_text, dotted_values, field_options
 from agents.planning import list_planners
 from agents.planning.registry import planner_settings
 from agents.post_training.algorithms import algorithm_settings, list_algorithms

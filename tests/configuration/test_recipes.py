@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from agents.configuration import compose
+from agents.cli.keys import compose
 from agents.networks import parameter_count
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.initial_prior import build_prior

@@ -15,7 +15,7 @@ import yaml
 
 from agents import PostTrainConfig, PretrainConfig
 from agents.cli import main
-from agents.configuration import Sources, compose
+from agents.cli.keys import Sources, compose
 from agents.planning.registry import planner_settings
 from agents.post_training import DDPOSFLoss, DenoisingPolicy, compute_advantages
 from agents.post_training.algorithms import algorithm_settings, make_algorithm

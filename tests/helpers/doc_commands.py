@@ -8,7 +8,7 @@ from types import ModuleType
 
 from agents import cli
 from agents.cli.commands import COMMANDS, load_command
-from agents.cli.main import describe_fields, keys_of
+from agents.cli.keys import describe_fields, keys_of
 from tests.helpers.doc_folders import prepare
 from tests.helpers.doc_pages import INSTEAD, NOT_RUN, ROOT, ROWS, SMALL_KEYS
 

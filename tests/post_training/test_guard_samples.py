@@ -185,7 +185,7 @@ def test_a_check_compares_stacks_with_those_of_real_scenes(tmp_path: Path) -> No
 
 def test_a_limit_on_stacks_needs_geometry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SceneType, "has_geometry", property(lambda self: False))
-    with pytest.raises(InvalidInputError, match=r"guard\.stack_limit=0\.5 needs the geometry"):
+    with pytest.raises(InvalidInputError, match=r"guard\.limits\.stack=0\.5 needs the geometry"):
         trainer(tmp_path, **{"guard.limits.stack": 0.5})
 
 

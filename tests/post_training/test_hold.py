@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 import torch
 
-from agents.configuration import changed, compose
+from agents.cli.keys import compose
+from agents.configuration import changed
 from agents.post_training import PostTrainConfig, post_train, post_train_and_compare
 from agents.post_training.algorithms import algorithm_settings
 from agents.post_training.hold import HIGHEST, LOWEST, HoldState, adjust

@@ -10,8 +10,7 @@ import torch
 from torch import Generator
 
 from agents.cli.commands.sample import SampleConfig
-from agents.cli.main import help_text
-from agents.configuration import compose
+from agents.cli.keys import compose, help_text
 from agents.post_training import post_train
 from agents.priors import ScenePrior
 from agents.priors.card import card_page

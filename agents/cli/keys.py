@@ -1,0 +1,348 @@
+"""Keys of a command: their meaning from the docstrings, their values from words."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import shutil
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import NoneType
+from typing import Any, get_args, get_origin, get_type_hints
+
+from agents.configuration import (
+    as_command_line_text,
+    build,
+    by_hydra,
+    check_option,
+    dotted,
+    dotted_keys,
+    field_options,
+    group_options,
+    merged,
+    parts_of,
+    plain_tree,
+    reason_of,
+)
+from agents.prior_names import adapted_name
+from agents.utils.docstrings import attribute_meanings
+from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
+
+_FIRST = ("scene", "prior", "scenes", "data", "reward", "objective", "count")
+"""Keys that a listing starts with, in this order."""
+_OPENING = "[{('\""
+"""First characters of values that are no list without brackets."""
+
+
+ADAPTER = "adapter"
+"""The key that every command with ``prior=`` has besides its own."""
+
+
+@dataclass(frozen=True)
+class KeyHelp:
+    """One key of a command.
+
+    Attributes:
+        name: the text before ``=``; a key of a group begins with the name of the group and a dot.
+        default: its default, as it would be typed.
+        meaning: one sentence.
+    """
+
+    name: str
+    default: str
+    meaning: str
+
+
+_ADAPTER = KeyHelp(
+    ADAPTER,
+    "",
+    "updates of the prior: a prior that was trained from it, or the folder of such a run; A+0.5*B adds two.",
+)
+"""The key that every command with ``prior=`` has besides its own."""
+
+
+def keys_of(command: Any) -> type:
+    """The dataclass of a command's keys, which is the annotation of the argument ``settings`` of its ``run``."""
+    annotation = command.run.__annotations__["settings"]
+    return command.run.__globals__[annotation] if isinstance(annotation, str) else annotation
+
+
+def describe_fields(config: type | Any) -> list[KeyHelp]:
+    """The keys of a config (the default one, if its class is given), part by part; the keys of groups come last.
+
+    Meanings stand under ``Attributes:`` in the docstrings.
+    """
+    made = config() if isinstance(config, type) else config
+    keys = [key for part in _parts(made).values() for key in part]
+    return keys + [key for field, value in _groups(made) for key in _keys(value, f"{field.name}.")]
+
+
+def _groups(made: Any) -> list[tuple[dataclasses.Field[Any], Any]]:
+    """The fields that are groups of keys, and their values."""
+    values = [(field, getattr(made, field.name)) for field in dataclasses.fields(made)]
+    return [(field, value) for field, value in values if dataclasses.is_dataclass(value)]
+
+
+def _keys(made: Any, prefix: str = "", fields: Sequence[dataclasses.Field[Any]] | None = None) -> list[KeyHelp]:
+    """The keys among ``fields``, by default among all fields.
+
+    A group inside a group is one key, whose value is a mapping. The name of a component is no key of its own, as
+    ``algorithm=NAME`` gives it.
+    """
+    meanings, keys = attribute_meanings(type(made)), []
+    for field in dataclasses.fields(made) if fields is None else fields:
+        value, meaning = getattr(made, field.name), meanings.get(field.name, "")
+        if dataclasses.is_dataclass(value) and prefix:
+            inner = attribute_meanings(type(value))
+            meaning = " ".join([f"a mapping: {meaning}", *(f"{name}: {text}" for name, text in inner.items())])
+        elif dataclasses.is_dataclass(value) or (prefix and field.name == "name"):
+            continue
+        keys.append(KeyHelp(prefix + field.name, as_command_line_text(value), meaning))
+    return keys
+
+
+def _parts(made: Any) -> dict[type, list[KeyHelp]]:
+    """The keys of a command that are no groups, by the class that declares them, in the order of a listing."""
+    parts = {part: sorted(_keys(made, fields=own), key=_place) for part, own in parts_of(type(made)).items()}
+    return dict(sorted(((part, keys) for part, keys in parts.items() if keys), key=lambda item: _place(item[1][0])))
+
+
+def _place(key: KeyHelp) -> int:
+    return _FIRST.index(key.name) if key.name in _FIRST else len(_FIRST)
+
+
+def help_text(config: type | Any, words: Sequence[str] = (), config_dir: str = "") -> str:
+    """All keys with their values and meanings, a paragraph for each part and for each group with its options.
+
+    Args:
+        config: the config that ``words`` make, or its class.
+        words: options of groups among them stand in the headings.
+        config_dir: a folder with further options.
+    """
+    chosen = dict(word.partition("=")[::2] for word in words)
+    made = config() if isinstance(config, type) else config
+    sections = []
+    parts = _parts(made)
+    for part, keys in parts.items():
+        after = next((place for place, key in enumerate(keys, 1) if key.name == "prior"), 0)
+        keys[after:after] = [_ADAPTER] if after else []
+        title = inspect.cleandoc(part.__doc__ or "").partition("\n")[0].rstrip(".")
+        sections.append(f"{title}:\n" * (len(parts) > 1) + _key_rows(keys))
+    for field, group in _groups(made):
+        sections.append(_heading(field, chosen.get(field.name, ""), config_dir))
+        sections[-1] += f"\n{_key_rows(_keys(group, f'{field.name}.'))}"
+    return "\n\n".join(sections) or "  no keys"
+
+
+def _key_rows(keys: Sequence[KeyHelp]) -> str:
+    return format_rows([(f"{key.name}={key.default}", key.meaning) for key in keys])
+
+
+def _heading(field: dataclasses.Field[Any], chosen: str, config_dir: str) -> str:
+    if not field.metadata.get("folder"):
+        return f"{field.name}:"
+    option = chosen or field.metadata["option"]
+    others = [other for other in field_options(field, config_dir) if other != option]
+    return f"{field.name}={option}" + (f" (or {', '.join(others)}):" if others else ":")
+
+
+def format_rows(rows: Sequence[tuple[str, str]]) -> str:
+    """Two columns, the second wrapped to the terminal."""
+    width = max(60, min(shutil.get_terminal_size().columns, 120))
+    left = min(34, max(len(name) for name, _ in rows)) + 4
+    lines = []
+    for name, meaning in rows:
+        wrapped = textwrap.wrap(meaning, width - left) or [""]
+        head = f"  {name}"
+        if len(head) > left - 2:
+            lines.append(head)
+            head = ""
+        lines.append(head.ljust(left) + wrapped[0])
+        lines.extend(" " * left + line for line in wrapped[1:])
+    return "\n".join(line.rstrip() for line in lines)
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Sources of a command's values, besides its words.
+
+    Attributes:
+        config_dir: folder with further groups and experiments; empty for none.
+        config: ``config.yaml`` whose values take the place of the defaults; empty for none.
+    """
+
+    config_dir: str = ""
+    config: str = ""
+
+
+def compose(command: str, config: type, words: Sequence[str], sources: Sources = Sources()) -> Any:
+    """An instance of ``config`` from ``key=value`` words, options of groups and ``+experiment=NAME``.
+
+    Values are written as in Hydra: numbers, ``true``, ``null``, ``[1, 2]``, ``{name: clip, high: 20}``, ``${seed}``;
+    the brackets of a list may be left out. The value of a key that takes one text is that text as it stands.
+
+    Raises:
+        UnknownNameError: no such key or option; the nearest one is offered.
+        InvalidInputError: a word is not ``key=value``, or the value is not of the key's type.
+    """
+    fields = {field.name: field for field in dataclasses.fields(config)}
+    if sources.config_dir and not Path(sources.config_dir).is_dir():
+        raise InvalidInputError(f"--config-dir {sources.config_dir}: no such folder")
+    tree = read_config(sources.config) if sources.config else {}
+    tree.pop("output", None)  # a run that is started again has a folder of its own
+    choices: dict[str, str] = {}
+    values: dict[str, Any] = {}
+    texts: dict[str, Any] = {}
+    adapter = ""
+    for word in words:
+        key, equals, value = word.partition("=")
+        head = key.partition(".")[0]
+        if not equals or not key:
+            raise InvalidInputError(f"{command}: expected key=value, got {word!r}; --help lists the keys")
+        if key == "+experiment":
+            check_option("experiment", value, group_options("experiment", sources.config_dir))
+            choices[key] = value
+        elif key == ADAPTER and "prior" in fields:
+            adapter = value
+        elif head not in fields:
+            raise unknown_name(f"{command} key", key, dotted_keys(config()))
+        elif key == "recipe":
+            check_option(key, value, group_options(key))
+            choices[key] = value
+        elif _is_option(fields[head], key, value, sources.config_dir):
+            choices[key] = value
+            values.pop(key, None)
+        elif (hint := _hint(config, key)) and _is_text(hint, value):
+            texts[key] = None if value == "null" and NoneType in get_args(hint) else value
+        else:
+            values.pop(key, None)  # later words come later
+            values[key] = _parsed(command, key, value)
+            if fields[head].metadata.get("named") and key == head:
+                choices.pop(key, None)
+    if sources.config and "recipe" in choices:
+        raise InvalidInputError("recipe= and --config exclude each other: the file says everything already")
+    tree = {key: value for key, value in tree.items() if key not in choices}
+    made = by_hydra(command, config, choices, sources.config_dir)
+    for key, value in values.items():
+        made = _with(made, key, value, config, tree)
+    made = _resolved(command, config, made, {**plain_tree(config()), **tree})
+    for key, value in texts.items():
+        made = _with(made, key, value, config, tree)
+    settings: Any = build(config, merged(tree, made), command=command)
+    if not adapter:
+        return settings
+    if not settings.prior:
+        raise InvalidInputError(f"{command}: adapter={adapter} needs prior=, the prior that the adapter was trained on")
+    return dataclasses.replace(settings, prior=adapted_name(settings.prior, adapter.strip("[]").replace(",", "+")))
+
+
+def read_config(path: str) -> dict[str, Any]:
+    """The values of a ``config.yaml``.
+
+    Raises:
+        InvalidInputError: there is no such file.
+        CorruptFileError: it holds no mapping.
+    """
+    import yaml
+
+    try:
+        found = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InvalidInputError(f"--config {path}: {error.strerror}; name the config.yaml of a run") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise CorruptFileError(f"--config {path} is not YAML ({str(error).splitlines()[0]})") from error
+    if not isinstance(found, dict):
+        raise CorruptFileError(f"--config {path} holds no keys")
+    return found
+
+
+def _is_option(field: dataclasses.Field[Any], key: str, value: str, config_dir: str) -> bool:
+    """Whether the word chooses an option; refuses a value that can be nothing else and is none."""
+    if key != field.name or not field.metadata.get("folder") or value.startswith("{"):
+        return False
+    known = field_options(field, config_dir)
+    if not field.metadata.get("named"):
+        check_option(field.name, value, known)
+    return value in known
+
+
+def _hint(config: type, key: str) -> Any:
+    """The type of a dotted key, Any where only the component knows it."""
+    kind: Any = config
+    for part in key.split("."):
+        if not dataclasses.is_dataclass(kind) or part not in (hints := get_type_hints(kind)):
+            return Any
+        kind = hints[part]
+    return kind
+
+
+def _is_text(hint: Any, value: str) -> bool:
+    """Whether a value is one text, which needs no quotes."""
+    options = (hint,) if get_origin(hint) in (list, dict) else get_args(hint) or (hint,)
+    return str in options and not (value.startswith("[") and any(get_origin(option) is list for option in options))
+
+
+def _parsed(command: str, key: str, value: str) -> Any:
+    """The value of a word, read by Hydra."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.core.override_parser.types import Sweep
+    from hydra.errors import HydraException
+
+    text = f"[{value}]" if "," in value and value[:1] not in _OPENING else value  # a,b is a list; to Hydra, a sweep
+    try:
+        found: Any = OverridesParser.create().parse_override(f"{key}={text}").value()
+        if not any(isinstance(item, Sweep) for item in (found if isinstance(found, list) else [found])):
+            return found
+    except (HydraException, ValueError):
+        pass
+    raise InvalidInputError(f"{command}: a value cannot be read: {key}={value[:200]}")
+
+
+def _with(made: Mapping[str, Any], key: str, value: Any, config: type, tree: Mapping[str, Any]) -> dict[str, Any]:
+    """The values with one more, by dotted key."""
+    *groups, last = key.split(".")
+    head = (groups or [last])[0]
+    (field,) = (field for field in dataclasses.fields(config) if field.name == head)
+    if not groups and not dataclasses.is_dataclass(get_type_hints(config)[head]):
+        return {**made, key: value}
+    if groups and field.metadata.get("named") and not isinstance(made.get(head), Mapping):
+        before = made.get(head, tree.get(head, field.default))
+        made = {**made, head: before if isinstance(before, Mapping) else {"name": before}}
+    return merged(made, _nested(key, value))
+
+
+def _nested(key: str, value: Any) -> dict[str, Any]:
+    """Nested mappings that hold one value, by its dotted key."""
+    for part in reversed(key.split(".")):
+        value = {part: value}
+    return value
+
+
+def _resolved(command: str, config: type, made: dict[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
+    """The values, interpolations such as ``${seed}`` replaced by other values, or by the environment, by OmegaConf."""
+    found = {key: value for key, value in dotted(made).items() if "${" in str(value)}
+    if not found:
+        return made
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    plain = {key: value for key, value in dotted(others).items() if "${" not in str(value)}
+    context = OmegaConf.create({})
+    try:
+        for key, value in {**plain, **dotted(made)}.items():
+            OmegaConf.update(context, key, value, force_add=True)
+        for key in found:
+            value = OmegaConf.select(context, key)
+            if OmegaConf.is_config(value):
+                value = OmegaConf.to_container(value, resolve=True)
+            elif isinstance(value, str) and not _is_text(_hint(config, key), value):
+                value = _parsed(command, key, value)  # the environment has texts alone
+            made = merged(made, _nested(key, value))
+    except OmegaConfBaseException as error:
+        raise InvalidInputError(
+            f"{command}: {error.full_key}: {reason_of(error)}; ${{KEY}} is the value of another key, ${{oc.env:NAME}} "
+            "that of the environment"
+        ) from error
+    return made
