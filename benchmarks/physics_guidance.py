@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 
 from agents import ScenePrior
-from agents.cli.parser import main as scene_envs
+from agents.cli.main import main as scene_envs
 from scene_envs.physics import feasibility
 from scene_envs.render import gallery, picture_camera, render
 from scene_envs.scene import SceneBatch

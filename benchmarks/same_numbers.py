@@ -127,10 +127,11 @@ def pretraining(process: str) -> Figures:
     encoder = "vocabulary" if process == "mixed" else "none"
     with TemporaryDirectory() as output:
         config = PretrainConfig(
-            data="grammar", output=output, iterations=5, batch_size=8, seed=7, process=process, optimizer={"warmup": 2},
+            data="grammar", output=output, iterations=5, batch_size=8, seed=7, process=process,
+            optimizer={"rate": {"warmup": 2}},
             network={"hidden": 32, "depth": 2, "heads": 2},
             logger={"log_every": 1, "evaluate_every": 5, "checkpoint_every": 5},
-            text={"encoder": encoder, "width": 32, "depth": 1, "latents": 4, "warmup": 3},
+            text={"encoder": encoder, "vocabulary": {"width": 32, "depth": 1, "latents": 4, "warmup": 3}},
         )  # fmt: skip
         pretrain(config)
         prior = ScenePrior.load(output)
@@ -143,7 +144,7 @@ def post_training(name: str) -> Figures:
         config = PostTrainConfig(
             prior=name, reward="object_count", output=output, iterations=2, batch_size=4, num_steps=4, seed=11,
             algorithm={"gradient_steps": 2}, regularisation={"batch_size": 4, "bank_size": 24},
-            guard={"scenes": 8, "every": 1, "limit": 100.0}, logger={"checkpoint_every": 2, "progress": "none"},
+            guard={"scenes": 8, "every": 1, "limit": 100.0}, logger={"checkpoint_every": 2}, progress="none",
         )  # fmt: skip
         result = post_train(config)
         return log_figures(Path(output) / "log.csv") | weight_figures(result.prior)

@@ -1,5 +1,5 @@
 """The command line: ``scene-envs COMMAND key=value …``."""
 
-from agents.cli.parser import entry_point, main
+from agents.cli.main import entry_point, main
 
 __all__ = ["entry_point", "main"]

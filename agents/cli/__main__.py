@@ -1,5 +1,5 @@
 """``python -m agents.cli``, which is ``scene-envs``."""
 
-from agents.cli.parser import entry_point
+from agents.cli.main import entry_point
 
 entry_point()

@@ -1,25 +1,43 @@
-"""Keys of a command: their meaning from the docstrings, their values from Hydra."""
+"""Keys of a command: their meaning from the docstrings, their values from words."""
 
 from __future__ import annotations
 
 import dataclasses
 import inspect
-import re
 import shutil
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import NoneType
 from typing import Any, get_args, get_origin, get_type_hints
 
-from agents.configuration.compose import check_option, choice_word, compose_tree, group_options, hidden, shown
-from agents.configuration.tree import build, check_not_moved, dotted_keys, parts_of, typed
+from agents.configuration import (
+    as_command_line_text,
+    build,
+    by_hydra,
+    check_option,
+    dotted,
+    dotted_keys,
+    field_options,
+    group_options,
+    merged,
+    parts_of,
+    plain_tree,
+    reason_of,
+)
+from agents.prior_names import adapted_name
 from agents.utils.docstrings import attribute_meanings
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
 
 _FIRST = ("scene", "prior", "scenes", "data", "reward", "objective", "count")
 """Keys that a listing starts with, in this order."""
 _OPENING = "[{('\""
+"""First characters of values that are no list without brackets."""
+
+
+ADAPTER = "adapter"
+"""The key that every command with ``prior=`` has besides its own."""
 
 
 @dataclass(frozen=True)
@@ -37,25 +55,12 @@ class KeyHelp:
     meaning: str
 
 
-ADAPTER = KeyHelp(
-    "adapter",
+_ADAPTER = KeyHelp(
+    ADAPTER,
     "",
     "updates of the prior: a prior that was trained from it, or the folder of such a run; A+0.5*B adds two.",
 )
 """The key that every command with ``prior=`` has besides its own."""
-
-
-@dataclass(frozen=True)
-class Sources:
-    """Sources of a command's values, beside its words.
-
-    Attributes:
-        config_dir: a folder with further groups and experiments; empty for none.
-        config: a ``config.yaml`` whose values take the place of the defaults; empty for none.
-    """
-
-    config_dir: str = ""
-    config: str = ""
 
 
 def keys_of(command: Any) -> type:
@@ -64,16 +69,14 @@ def keys_of(command: Any) -> type:
     return command.run.__globals__[annotation] if isinstance(annotation, str) else annotation
 
 
-def describe_fields(config: type | Any, prefix: str = "") -> list[KeyHelp]:
+def describe_fields(config: type | Any) -> list[KeyHelp]:
     """The keys of a config (the default one, if its class is given), part by part; the keys of groups come last.
 
     Meanings stand under ``Attributes:`` in the docstrings.
     """
     made = config() if isinstance(config, type) else config
-    keys = _plain_keys(made, prefix) if prefix else [key for part in _parts(made).values() for key in part]
-    for field, value in _groups(made):
-        keys += describe_fields(value, f"{prefix}{field.name}.")
-    return keys
+    keys = [key for part in _parts(made).values() for key in part]
+    return keys + [key for field, value in _groups(made) for key in _keys(value, f"{field.name}.")]
 
 
 def _groups(made: Any) -> list[tuple[dataclasses.Field[Any], Any]]:
@@ -82,20 +85,27 @@ def _groups(made: Any) -> list[tuple[dataclasses.Field[Any], Any]]:
     return [(field, value) for field, value in values if dataclasses.is_dataclass(value)]
 
 
-def _plain_keys(made: Any, prefix: str = "", fields: Sequence[dataclasses.Field[Any]] | None = None) -> list[KeyHelp]:
-    """The keys among ``fields``, by default among all fields, that are no groups."""
-    fields = dataclasses.fields(made) if fields is None else fields
-    meanings, values = attribute_meanings(type(made)), {field.name: getattr(made, field.name) for field in fields}
-    return [
-        KeyHelp(prefix + name, typed(value), meanings.get(name, ""))
-        for name, value in values.items()
-        if not dataclasses.is_dataclass(value)
-    ]
+def _keys(made: Any, prefix: str = "", fields: Sequence[dataclasses.Field[Any]] | None = None) -> list[KeyHelp]:
+    """The keys among ``fields``, by default among all fields.
+
+    A group inside a group is one key, whose value is a mapping. The name of a component is no key of its own, as
+    ``algorithm=NAME`` gives it.
+    """
+    meanings, keys = attribute_meanings(type(made)), []
+    for field in dataclasses.fields(made) if fields is None else fields:
+        value, meaning = getattr(made, field.name), meanings.get(field.name, "")
+        if dataclasses.is_dataclass(value) and prefix:
+            inner = attribute_meanings(type(value))
+            meaning = " ".join([f"a mapping: {meaning}", *(f"{name}: {text}" for name, text in inner.items())])
+        elif dataclasses.is_dataclass(value) or (prefix and field.name == "name"):
+            continue
+        keys.append(KeyHelp(prefix + field.name, as_command_line_text(value), meaning))
+    return keys
 
 
 def _parts(made: Any) -> dict[type, list[KeyHelp]]:
     """The keys of a command that are no groups, by the class that declares them, in the order of a listing."""
-    parts = {part: sorted(_plain_keys(made, fields=own), key=_place) for part, own in parts_of(type(made)).items()}
+    parts = {part: sorted(_keys(made, fields=own), key=_place) for part, own in parts_of(type(made)).items()}
     return dict(sorted(((part, keys) for part, keys in parts.items() if keys), key=lambda item: _place(item[1][0])))
 
 
@@ -117,16 +127,12 @@ def help_text(config: type | Any, words: Sequence[str] = (), config_dir: str = "
     parts = _parts(made)
     for part, keys in parts.items():
         after = next((place for place, key in enumerate(keys, 1) if key.name == "prior"), 0)
-        keys[after:after] = [ADAPTER] if after else []
+        keys[after:after] = [_ADAPTER] if after else []
         title = inspect.cleandoc(part.__doc__ or "").partition("\n")[0].rstrip(".")
         sections.append(f"{title}:\n" * (len(parts) > 1) + _key_rows(keys))
     for field, group in _groups(made):
-        known = getattr(field.default_factory, "KNOWN", ())
-        sections.append(_heading(field, chosen.get(field.name, ""), known, config_dir))
-        sections[-1] += f"\n{_key_rows(_plain_keys(group, f'{field.name}.'))}"
-        for inner, value in _groups(group):
-            name = f"{field.name}.{inner.name}"
-            sections.append(f"{name}:\n{_key_rows(describe_fields(value, f'{name}.'))}")
+        sections.append(_heading(field, chosen.get(field.name, ""), config_dir))
+        sections[-1] += f"\n{_key_rows(_keys(group, f'{field.name}.'))}"
     return "\n\n".join(sections) or "  no keys"
 
 
@@ -134,13 +140,11 @@ def _key_rows(keys: Sequence[KeyHelp]) -> str:
     return format_rows([(f"{key.name}={key.default}", key.meaning) for key in keys])
 
 
-def _heading(field: dataclasses.Field[Any], chosen: str, known: Sequence[str], config_dir: str) -> str:
-    folder = field.metadata.get("folder")
-    if not folder:
+def _heading(field: dataclasses.Field[Any], chosen: str, config_dir: str) -> str:
+    if not field.metadata.get("folder"):
         return f"{field.name}:"
     option = chosen or field.metadata["option"]
-    offered = [other for other in group_options(folder, config_dir) if not known or other in known]
-    others = [other for other in offered if other != option]
+    others = [other for other in field_options(field, config_dir) if other != option]
     return f"{field.name}={option}" + (f" (or {', '.join(others)}):" if others else ":")
 
 
@@ -160,60 +164,75 @@ def format_rows(rows: Sequence[tuple[str, str]]) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
+@dataclass(frozen=True)
+class Sources:
+    """Sources of a command's values, besides its words.
+
+    Attributes:
+        config_dir: folder with further groups and experiments; empty for none.
+        config: ``config.yaml`` whose values take the place of the defaults; empty for none.
+    """
+
+    config_dir: str = ""
+    config: str = ""
+
+
 def compose(command: str, config: type, words: Sequence[str], sources: Sources = Sources()) -> Any:
     """An instance of ``config`` from ``key=value`` words, options of groups and ``+experiment=NAME``.
 
-    Values are written as in Hydra: numbers, ``true``, ``null``, ``[1, 2]``, ``{name: clip, high: 20}``; the brackets of
-    a list may be left out.
+    Values are written as in Hydra: numbers, ``true``, ``null``, ``[1, 2]``, ``{name: clip, high: 20}``, ``${seed}``;
+    the brackets of a list may be left out. The value of a key that takes one text is that text as it stands.
 
     Raises:
         UnknownNameError: no such key or option; the nearest one is offered.
         InvalidInputError: a word is not ``key=value``, or the value is not of the key's type.
     """
     fields = {field.name: field for field in dataclasses.fields(config)}
-    base = read_config(sources.config) if sources.config else None
-    if base is not None:
-        base.pop("output", None)  # a run that is started again has a folder of its own
-    late: dict[str, Any] = {}
-    read = []
+    if sources.config_dir and not Path(sources.config_dir).is_dir():
+        raise InvalidInputError(f"--config-dir {sources.config_dir}: no such folder")
+    tree = read_config(sources.config) if sources.config else {}
+    tree.pop("output", None)  # a run that is started again has a folder of its own
+    choices: dict[str, str] = {}
+    values: dict[str, Any] = {}
+    texts: dict[str, Any] = {}
     adapter = ""
     for word in words:
         key, equals, value = word.partition("=")
+        head = key.partition(".")[0]
         if not equals or not key:
             raise InvalidInputError(f"{command}: expected key=value, got {word!r}; --help lists the keys")
-        if key.startswith("+experiment"):
-            check_option("experiment", value, sources.config_dir)
-            read.append(word)
-            continue
-        if key == ADAPTER.name and "prior" in fields and not value.startswith("{"):
+        if key == "+experiment":
+            check_option("experiment", value, group_options("experiment", sources.config_dir))
+            choices[key] = value
+        elif key == ADAPTER and "prior" in fields:
             adapter = value
-            continue
-        key = getattr(config, "SHORT", {}).get(key, key)
-        word = f"{key}={value}"
-        check_not_moved(config, word, command)
-        head = key.partition(".")[0]
-        if head not in fields or head != key:
-            check_not_moved(config, key, command)
-        if head not in fields:
+        elif head not in fields:
             raise unknown_name(f"{command} key", key, dotted_keys(config()))
-        if key == head and fields[key].metadata.get("folder"):
-            read += _component(command, fields[key], value, sources.config_dir, late)
         elif key == "recipe":
-            check_option("recipe", value, sources.config_dir)
-            read.append(word)
-        elif group_options(key, sources.config_dir):  # a plain key that is called like a group of other commands
-            late[key] = _parsed(command, key, _override(word, _hint(config, key)).partition("=")[2])
+            check_option(key, value, group_options(key))
+            choices[key] = value
+        elif _is_option(fields[head], key, value, sources.config_dir):
+            choices[key] = value
+            values.pop(key, None)
+        elif (hint := _hint(config, key)) and _is_text(hint, value):
+            texts[key] = None if value == "null" and NoneType in get_args(hint) else value
         else:
-            read.append(_override(word, _hint(config, key)))
-    tree = compose_tree(command, config, read, base=base, config_dir=sources.config_dir)
-    settings: Any = build(config, {**tree, **late}, command=command)
-    return _with_adapter(command, settings, adapter) if adapter else settings
-
-
-def _with_adapter(command: str, settings: Any, adapter: str) -> Any:
-    """Settings whose ``prior`` also names its adapters, so that code that loads the prior by name loads them too."""
-    from agents.configuration.prior_names import adapted_name
-
+            values.pop(key, None)  # later words come later
+            values[key] = _parsed(command, key, value)
+            if fields[head].metadata.get("named") and key == head:
+                choices.pop(key, None)
+    if sources.config and "recipe" in choices:
+        raise InvalidInputError("recipe= and --config exclude each other: the file says everything already")
+    tree = {key: value for key, value in tree.items() if key not in choices}
+    made = by_hydra(command, config, choices, sources.config_dir)
+    for key, value in values.items():
+        made = _with(made, key, value, config, tree)
+    made = _resolved(command, config, made, {**plain_tree(config()), **tree})
+    for key, value in texts.items():
+        made = _with(made, key, value, config, tree)
+    settings: Any = build(config, merged(tree, made), command=command)
+    if not adapter:
+        return settings
     if not settings.prior:
         raise InvalidInputError(f"{command}: adapter={adapter} needs prior=, the prior that the adapter was trained on")
     return dataclasses.replace(settings, prior=adapted_name(settings.prior, adapter.strip("[]").replace(",", "+")))
@@ -239,38 +258,14 @@ def read_config(path: str) -> dict[str, Any]:
     return found
 
 
-def _component(
-    command: str, field: dataclasses.Field[Any], value: str, config_dir: str, late: dict[str, Any]
-) -> list[str]:
-    """The word that chooses a component; a value that is no name goes into ``late`` instead."""
-    name = field.name
-    if value in group_options(field.metadata["folder"], config_dir):
-        return [f"{name}={value}"]
-    if field.metadata.get("named"):
-        if value.isidentifier() and value not in ("null", "true", "false"):
-            return [f"{name}={{name: {value}}}"]
-        if not value.startswith("{"):
-            late[name] = _parsed(command, name, value)
-            return []
-        _parsed(command, name, value)
-    elif not value.startswith("{"):
-        return [choice_word(field, value, config_dir)]
-    return [f"{name}={value}"]
-
-
-def _parsed(command: str, key: str, value: str) -> Any:
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.errors import HydraException
-    from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
-
-    if "," in value and value[:1] not in _OPENING:
-        value = f"[{value}]"  # a,b is a list, where Hydra would see a sweep
-    try:
-        found = OverridesParser.create().parse_override(hidden(f"{key}={value}")).value()
-        return shown(OmegaConf.to_container(OmegaConf.create({"value": found}))["value"])  # type: ignore[index, call-overload]
-    except (HydraException, OmegaConfBaseException, ValueError):
-        raise InvalidInputError(f"{command}: a value cannot be read: {key}={value[:200]}") from None
+def _is_option(field: dataclasses.Field[Any], key: str, value: str, config_dir: str) -> bool:
+    """Whether the word chooses an option; refuses a value that can be nothing else and is none."""
+    if key != field.name or not field.metadata.get("folder") or value.startswith("{"):
+        return False
+    known = field_options(field, config_dir)
+    if not field.metadata.get("named"):
+        check_option(field.name, value, known)
+    return value in known
 
 
 def _hint(config: type, key: str) -> Any:
@@ -283,35 +278,71 @@ def _hint(config: type, key: str) -> Any:
     return kind
 
 
-def _override(word: str, hint: Any) -> str:
-    """The word as Hydra reads it, text quoted so that any character may stand in it."""
-    key, _, value = word.partition("=")
+def _is_text(hint: Any, value: str) -> bool:
+    """Whether a value is one text, which needs no quotes."""
     options = (hint,) if get_origin(hint) in (list, dict) else get_args(hint) or (hint,)
-    is_list = any(get_origin(option) is list for option in options) and value.startswith("[")
-    if str in options and not is_list and not (type(None) in options and value == "null"):
-        value = _quoted(value)
-    elif is_list and str in options:
-        value = _text_list(word, value)
-    elif "," in value and value[0] not in _OPENING:
-        value = f"[{value}]"  # a,b is a list, where Hydra would see a sweep
-    return f"{key}={value}"
+    return str in options and not (value.startswith("[") and any(get_origin(option) is list for option in options))
 
 
-def _text_list(word: str, value: str) -> str:
-    """A list of texts in YAML as Hydra reads it."""
-    import yaml
+def _parsed(command: str, key: str, value: str) -> Any:
+    """The value of a word, read by Hydra."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.core.override_parser.types import Sweep
+    from hydra.errors import HydraException
 
+    text = f"[{value}]" if "," in value and value[:1] not in _OPENING else value  # a,b is a list; to Hydra, a sweep
     try:
-        texts = yaml.safe_load(value)
-    except yaml.YAMLError:
-        texts = None
-    if not isinstance(texts, list) or not all(isinstance(text, str) for text in texts):
+        found: Any = OverridesParser.create().parse_override(f"{key}={text}").value()
+        if not any(isinstance(item, Sweep) for item in (found if isinstance(found, list) else [found])):
+            return found
+    except (HydraException, ValueError):
+        pass
+    raise InvalidInputError(f"{command}: a value cannot be read: {key}={value[:200]}")
+
+
+def _with(made: Mapping[str, Any], key: str, value: Any, config: type, tree: Mapping[str, Any]) -> dict[str, Any]:
+    """The values with one more, by dotted key."""
+    *groups, last = key.split(".")
+    head = (groups or [last])[0]
+    (field,) = (field for field in dataclasses.fields(config) if field.name == head)
+    if not groups and not dataclasses.is_dataclass(get_type_hints(config)[head]):
+        return {**made, key: value}
+    if groups and field.metadata.get("named") and not isinstance(made.get(head), Mapping):
+        before = made.get(head, tree.get(head, field.default))
+        made = {**made, head: before if isinstance(before, Mapping) else {"name": before}}
+    return merged(made, _nested(key, value))
+
+
+def _nested(key: str, value: Any) -> dict[str, Any]:
+    """Nested mappings that hold one value, by its dotted key."""
+    for part in reversed(key.split(".")):
+        value = {part: value}
+    return value
+
+
+def _resolved(command: str, config: type, made: dict[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
+    """The values, interpolations such as ``${seed}`` replaced by other values, or by the environment, by OmegaConf."""
+    found = {key: value for key, value in dotted(made).items() if "${" in str(value)}
+    if not found:
+        return made
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    plain = {key: value for key, value in dotted(others).items() if "${" not in str(value)}
+    context = OmegaConf.create({})
+    try:
+        for key, value in {**plain, **dotted(made)}.items():
+            OmegaConf.update(context, key, value, force_add=True)
+        for key in found:
+            value = OmegaConf.select(context, key)
+            if OmegaConf.is_config(value):
+                value = OmegaConf.to_container(value, resolve=True)
+            elif isinstance(value, str) and not _is_text(_hint(config, key), value):
+                value = _parsed(command, key, value)  # the environment has texts alone
+            made = merged(made, _nested(key, value))
+    except OmegaConfBaseException as error:
         raise InvalidInputError(
-            f'{word} is no list of texts; write \'["A scene with two cups.", "A scene with 9 objects."]\''
-        )
-    return f"[{','.join(map(_quoted, texts))}]"
-
-
-def _quoted(text: str) -> str:
-    """``text`` in Hydra's quotes, where backslashes count only before a quote."""
-    return "'" + re.sub(r"(\\*)('|$)", lambda found: 2 * found[1] + ("\\'" if found[2] else ""), text) + "'"
+            f"{command}: {error.full_key}: {reason_of(error)}; ${{KEY}} is the value of another key, ${{oc.env:NAME}} "
+            "that of the environment"
+        ) from error
+    return made

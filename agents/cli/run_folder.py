@@ -12,7 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from agents.configuration.tree import config_text, dotted
+from agents.configuration import config_text, dotted
 from agents.utils.process_group import is_first_process, launched_processes
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.files import read_sealed, sealed, storage_error, write_json, write_text

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from agents.configuration.measure_names import MEASURE_NAMES
+from agents.configuration import MEASURE_NAMES
 from agents.evaluation.measure import FLOOR_PREFIX, layout_figures
 from agents.evaluation.novelty import Neighbors, nearest_scenes, novelty
 from agents.evaluation.physics_figures import physics_figures, ready_figures

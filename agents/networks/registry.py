@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from agents.configuration.checks import check_types
+from agents.configuration import check_types
 from agents.networks.baselines import (
     DiffuScene,
     DiffuSceneConfig,

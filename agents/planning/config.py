@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from agents.configuration.fields import composed, named, nested
-from agents.configuration.shared_keys import SamplingKeys
+from agents.configuration import SamplingKeys, composed, named, nested
 from agents.planning.gradient import GradientPlanner
 from agents.planning.registry import PlannerSettings, list_planners, planner_settings
 from scene_envs.errors import InvalidInputError

@@ -6,9 +6,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from agents.configuration.tree import build
+from agents.configuration import build
 from agents.planning.ledger import PlanResult, Progress, Searchable, SteeredProblem
-from agents.planning.registry import PlannerSettings, check_at_least, list_planners, planner_settings, register_planner
+from agents.planning.registry import (
+    PlannerSettings,
+    check_at_least,
+    list_planners,
+    planner_settings,
+    register_planner,
+)
 from scene_envs.errors import InvalidInputError, unknown_name
 
 if TYPE_CHECKING:

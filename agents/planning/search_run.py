@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from agents.configuration.tree import config_text, plain_tree
+from agents.configuration import config_text, plain_tree
 from agents.planning.best_of import BestOfPlanner
 from agents.planning.config import SearchConfig
 from agents.planning.journal import Journal

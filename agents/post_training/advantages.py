@@ -7,10 +7,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from agents.post_training.algorithm_settings import BASELINES
 from agents.utils.process_group import ProcessGroup, gather_rows
 from scene_envs.errors import InvalidInputError
 
+BASELINES = ("leave_one_out", "mean")
 _MIN_STD = 1e-8
 
 

@@ -107,6 +107,6 @@ def _measured_prompts(config: PostTrainConfig, prior: ScenePrior, count: int) ->
 
 
 def say_stage(config: PostTrainConfig, text: str) -> None:
-    """Print ``text``, the next stage, to stderr unless the run shows no progress."""
-    if config.logger.progress != "none":
+    """Tell on stderr what is done next, unless the run shows no progress."""
+    if config.progress != "none":
         print(text, file=sys.stderr, flush=True)

@@ -6,20 +6,31 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
-from agents.configuration.checks import at_least, one_of, positive
-from agents.configuration.fields import composed, named, nested
-from agents.configuration.settings import LoggerSettings, OptimizerSettings
-from agents.configuration.shared_keys import RewardLimits, SamplingKeys, TrainingKeys
-from agents.configuration.tree import plain_tree
+from agents.configuration import (
+    LoggerSettings,
+    OptimizerSettings,
+    ProgressKeys,
+    RewardLimits,
+    SamplingKeys,
+    TrainingKeys,
+    composed,
+    named,
+    nested,
+    plain_tree,
+    require_at_least,
+    require_one_of,
+    require_positive,
+)
 from agents.post_training.algorithm_settings import AlgorithmSettings, DDPOSFSettings
 from agents.post_training.algorithms import algorithm_settings, list_algorithms
 from agents.post_training.regularisation_settings import RegularisationSettings
+from agents.utils.loggers import LOGGERS
 from scene_envs.envs.settings import PROMPT_SOURCES, check_claim_guidance
 from scene_envs.errors import InvalidInputError
 
-RESUMABLE = ("recipe", "iterations", "output", "workers", "logger", "reward_timeout", "reward_memory")
+RESUMABLE = ("recipe", "iterations", "output", "workers", "logger", "progress", "reward_timeout", "reward_memory")
 """Fields that may change between a run and its continuation."""
 
 
@@ -36,13 +47,34 @@ class PostTrainOptimizerSettings(OptimizerSettings):
     chunk: int | None = None
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "chunk")
+        require_at_least(self, 1, "chunk")
         if self.lr is not None:
             super().__post_init__()
 
 
 FEWEST_SAMPLES = 20
 """Samples that the guard's classifier needs."""
+
+
+@dataclass
+class GuardLimits:
+    """Limits of figures of samples; null takes the default of the algorithm.
+
+    Attributes:
+        count: number of objects by which the Wasserstein-1 distance between object counts of samples and of real scenes
+            may exceed the base prior's.
+        stack: the same for the distance between the heights of the tallest stacks, in objects.
+        category: the same for the KL divergence of the categories, in nats.
+        classifier: the same for the accuracy of a classifier that tells samples from real scenes.
+    """
+
+    count: float | None = None
+    stack: float | None = None
+    category: float | None = None
+    classifier: float | None = None
+
+    def __post_init__(self) -> None:
+        require_at_least(self, 0, "count", "stack", "category", "classifier")
 
 
 @dataclass
@@ -58,12 +90,7 @@ class GuardSettings:
         samples: number of scenes that a check samples, always from the same noise, for the limits below; at most as
             many as ``scenes``. With fewer than 20, a check measures the loss alone.
         samples_every: iterations between checks that sample.
-        count_limit: limit of the Wasserstein-1 distance between object counts of samples and of real scenes: the number
-            of objects by which it may exceed the base prior's distance; null takes the default of the algorithm.
-        stack_limit: the same limit for the distance between the heights of the tallest stacks, in objects.
-        category_limit: the same limit for the KL divergence of the categories, in nats.
-        classifier_limit: the same limit for the accuracy of a classifier that tells samples from real scenes.
-        max_invalid: number of consecutive batches without a valid reward after which the run stops.
+        limits: limits of the figures of samples.
     """
 
     every: int = 5
@@ -72,17 +99,13 @@ class GuardSettings:
     action: str = "report"
     samples: int = 128
     samples_every: int = 20
-    count_limit: float | None = None
-    stack_limit: float | None = None
-    category_limit: float | None = None
-    classifier_limit: float | None = None
-    max_invalid: int = 3
+    limits: GuardLimits = nested(GuardLimits)
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "every", "scenes", "max_invalid", "samples_every")
-        positive(self, "limit")
-        one_of(self, "action", ("report", "stop", "rollback"))
-        at_least(self, 0, "samples", "count_limit", "stack_limit", "category_limit", "classifier_limit")
+        require_at_least(self, 1, "every", "scenes", "samples_every")
+        require_positive(self, "limit")
+        require_one_of(self, "action", ("report", "stop", "rollback"))
+        require_at_least(self, 0, "samples")
 
     @property
     def sampled(self) -> int:
@@ -90,33 +113,30 @@ class GuardSettings:
         count = min(self.samples, self.scenes)
         return count if count >= FEWEST_SAMPLES else 0
 
-    def limits(self, defaults: Mapping[str, float]) -> dict[str, float]:
+    def sample_limits(self, defaults: Mapping[str, float]) -> dict[str, float]:
         """Limits of figures of samples by name; ``defaults`` are the algorithm's."""
         own = {
-            "count_distance": self.count_limit,
-            "stack_distance": self.stack_limit,
-            "category_kl": self.category_limit,
-            "classifier_accuracy": self.classifier_limit,
+            "count_distance": self.limits.count,
+            "stack_distance": self.limits.stack,
+            "category_kl": self.limits.category,
+            "classifier_accuracy": self.limits.classifier,
         }
         return {**defaults, **{name: limit for name, limit in own.items() if limit is not None}}
 
 
 @dataclass
 class PostTrainLoggerSettings(LoggerSettings):
-    """Settings of the progress display and the report of a post-training run.
+    """Files and report of a post-training run.
 
     Attributes:
-        progress: progress display: ``bar``, ``lines`` or ``none``.
         report_scenes: number of fresh samples, before and after the run, that report.html measures and shows; 0 for no
             report.
     """
 
-    progress: str = "bar"
     report_scenes: int = 256
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        one_of(self, "progress", ("bar", "lines", "none"))
         if self.report_scenes < 0:
             raise InvalidInputError(f"report_scenes={self.report_scenes} must not be negative; 0 writes no report")
 
@@ -135,7 +155,7 @@ class BatchKeys:
 
 @composed
 @dataclass
-class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
+class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, RewardLimits):
     """One post-training run.
 
     With DDPO-SF, the gradient that AdamW sees is that of
@@ -143,10 +163,8 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
         - step_scale * sum over gradient steps of mean over scenes of  A * log p(x_{t-1} | x_t)
         + regularisation.weight * pretraining loss on real scenes
 
-    where ``step_scale = steps with weight > 0 / gradient_steps``. ``algorithm.log_prob_reduction`` says how log p is
-    reduced over a scene's entries. The pretraining loss is a mean over scenes and entries. The weight is meaningful
-    only together with these reductions: with ``"sum"`` the same balance needs a weight larger by the number of random
-    entries of a scene.
+    where ``step_scale = steps with weight > 0 / gradient_steps``. log p is a mean over the random entries of a scene,
+    and the pretraining loss is a mean over scenes and entries. The weight is meaningful only with these reductions.
 
     Keys that are not listed are those of :class:`~agents.configuration.SamplingKeys`,
     :class:`~agents.configuration.TrainingKeys` and :class:`~agents.configuration.RewardLimits`.
@@ -173,11 +191,8 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
         optimizer: the optimiser of the weights.
         regularisation: losses that keep the prior near real scenes.
         guard: checks on held-out real scenes.
-        logger: log files and progress display.
+        logger: log files and report.
     """
-
-    SHORT: ClassVar[Mapping[str, str]] = {"hold": "regularisation.hold"}
-    """Keys that may be written without their group."""
 
     prior: str = "dimsum_table_continuous"
     reward: Any = named("object_count", "reward")
@@ -186,16 +201,20 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
     algorithm: AlgorithmSettings = nested(
         DDPOSFSettings, folder="algorithm", option="ddpo_sf", kinds=algorithm_settings, registered=list_algorithms
     )
-    optimizer: PostTrainOptimizerSettings = nested(PostTrainOptimizerSettings, folder="optimizer", option="adamw")
+    optimizer: PostTrainOptimizerSettings = nested(
+        PostTrainOptimizerSettings, folder="optimizer", option="adamw", registered=lambda: OptimizerSettings.KNOWN
+    )
     regularisation: RegularisationSettings = nested(RegularisationSettings)
     guard: GuardSettings = nested(GuardSettings)
-    logger: PostTrainLoggerSettings = nested(PostTrainLoggerSettings, folder="logger", option="csv")
+    logger: PostTrainLoggerSettings = nested(
+        PostTrainLoggerSettings, folder="logger", option="csv", registered=lambda: LOGGERS
+    )
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "iterations", "num_steps", "slots")
-        at_least(self, 0, "seed")
-        at_least(self, 2, "batch_size")
-        positive(self, "reward_timeout", "reward_memory")
+        require_at_least(self, 1, "iterations", "num_steps", "slots")
+        require_at_least(self, 0, "seed")
+        require_at_least(self, 2, "batch_size")
+        require_positive(self, "reward_timeout", "reward_memory")
         if not (isinstance(self.workers, int) and self.workers >= 0) and self.workers != "ray":
             raise InvalidInputError(
                 f"workers={self.workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"

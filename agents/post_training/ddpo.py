@@ -29,14 +29,12 @@ class DDPO(Algorithm):
 
     def __init__(self, settings: DDPOSFSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
         self.settings, self.policy = settings, policy
-        self.advantage = Advantage(credit=settings.credit, baseline=settings.baseline, clip=settings.advantage_clip)
-        weights = gradient_weights(
-            stds, min_std=settings.min_std, skip_first=settings.skip_first, weighting=settings.step_weighting
-        )
+        self.advantage = Advantage(credit=settings.credit)
+        weights = gradient_weights(stds, min_std=settings.min_std)
         clip = settings.clip_epsilon if isinstance(settings, DDPOISSettings) else None
-        self.loss = DDPOSFLoss(
-            policy, step_weights=weights, reduction=settings.log_prob_reduction, clip_epsilon=clip
-        ).to(next(policy.parameters()).device)
+        self.loss = DDPOSFLoss(policy, step_weights=weights, reduction="mean", clip_epsilon=clip).to(
+            next(policy.parameters()).device
+        )
 
     def accumulate(self, batch: TensorDictBase, generator: Generator) -> BatchGradient:
         """Add the policy gradient of a batch to ``.grad``; ``generator`` draws the steps that enter it."""

@@ -31,6 +31,8 @@ def run_demo(
     seed: int = 0,
     workers: int = 2,
     *,
+    device: str = "cpu",
+    progress: str = "bar",
     scenes: int = 24,
     num_steps: int = 50,
     runs: Mapping[str, Sequence[str]] = RUNS,
@@ -45,6 +47,8 @@ def run_demo(
             ``feasible``, which ``prior=`` loads. An interrupted demonstration is resumed.
         seed: seed of training, from which the seed of the measured samples is derived.
         workers: physics worker processes, of both runs together while they train.
+        device: torch device of the networks.
+        progress: style of the progress display of both runs, as in :class:`~scene_envs.progress.Progress`.
         scenes: number of fresh samples of each prior.
         num_steps: denoiser evaluations per measured sample.
         runs: names of the runs, and their keys of ``post-train`` besides output, seed and workers.
@@ -60,6 +64,7 @@ def run_demo(
 
     directory, started = Path(output), time.perf_counter()
     keys = [f"seed={seed}", f"workers={-(-workers // len(runs))}", "logger.report_scenes=0"]
+    keys += [f"device={device}", f"progress={progress}"]
     commands = {name: [*words, *keys, f"output={directory / name}"] for name, words in runs.items()}
     base: ScenePrior | None = None
     results: dict[str, _Finished] = {}

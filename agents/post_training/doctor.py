@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from tensordict import TensorDictBase
 
-from agents.configuration.tree import changed
+from agents.configuration import changed
 from agents.post_training.advantages import final_reward
 from agents.post_training.algorithm_settings import GuidanceDistillationSettings
 from agents.post_training.config import PostTrainConfig
@@ -189,7 +189,7 @@ def _advice(report: DoctorReport, config: PostTrainConfig) -> list[str]:
         if report.gradient_ratio < MIN_RATIO:
             advice.append(
                 f"Regularisation dominates the policy gradient (ratio {report.gradient_ratio:.2g}): lower "
-                f"regularisation.weight from {weight:g}, or change algorithm.log_prob_reduction."
+                f"regularisation.weight from {weight:g}."
             )
         if report.gradient_ratio > MAX_RATIO:
             advice.append(
@@ -207,7 +207,7 @@ def _advice(report: DoctorReport, config: PostTrainConfig) -> list[str]:
     ):
         advice.append(
             f"Step {worst.step} (sigma {worst.std:.3g}) alone is {worst.gradient_norm**2 / total:.0%} of the squared "
-            f"policy gradient: raise algorithm.min_std or set algorithm.step_weighting=std."
+            f"policy gradient: raise algorithm.min_std."
         )
     return advice
 

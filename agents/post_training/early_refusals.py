@@ -36,9 +36,9 @@ def check_it_can_learn(learner: Learner, real: SceneBatch, prompts: PromptSets |
         TrainingError: the reward scores none of the real scenes.
     """
     config, scene_type = learner.config, learner.prior.scene_type
-    if config.guard.stack_limit is not None and not scene_type.has_geometry:
+    if config.guard.limits.stack is not None and not scene_type.has_geometry:
         raise InvalidInputError(
-            f"guard.stack_limit={config.guard.stack_limit} needs the geometry of the assets, and those of "
+            f"guard.limits.stack={config.guard.limits.stack} needs the geometry of the assets, and those of "
             f"{scene_type.name!r} have none here; leave it out"
         )
     scenes, texts = _tried(learner, real, prompts)

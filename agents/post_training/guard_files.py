@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from agents.configuration.prior_names import short_name
 from agents.post_training.config import PostTrainConfig
 from agents.post_training.guard import Guard, GuardReading
 from agents.post_training.learner import Learner
@@ -13,6 +12,7 @@ from agents.post_training.rollouts import stream_seed
 from agents.post_training.run_files import writing
 from agents.post_training.sample_check import SampleCheck
 from agents.post_training.scene_bank import SceneBank
+from agents.prior_names import short_name
 from agents.priors.prior import ScenePrior
 from agents.utils.process_group import ProcessGroup
 
@@ -35,7 +35,7 @@ def make_guard(config: PostTrainConfig, learner: Learner, scenes: SceneBank) -> 
             config.guidance,
             config.claim_guidance,
         )
-    limits = config.guard.limits(config.algorithm.sample_limits)
+    limits = config.guard.sample_limits(config.algorithm.sample_limits)
     held = config.regularisation.target
     target = math.inf if held is None else held
     seed, learns = stream_seed(config.seed, "guard"), bool(learner.learned)

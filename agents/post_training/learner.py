@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Generator, nn
 
+from agents.configuration import MAX_GRADIENT_NORM
 from agents.post_training.algorithms import make_algorithm
 from agents.post_training.base import Algorithm
 from agents.post_training.config import PostTrainConfig
@@ -26,12 +27,12 @@ from agents.post_training.scene_bank import SceneBank
 from agents.priors.prior import ScenePrior, no_text
 from agents.utils.checkpoints import check_tensors
 from agents.utils.process_group import ProcessGroup
-from agents.utils.weight_average import AveragedWeights, WeightAverage
+from agents.utils.weight_average import AveragedWeights
 from rewards import depends_on_batch
 from rewards.process import close_reward, run_reward
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.envs.scoring import RewardScorer
-from scene_envs.errors import InvalidInputError, RewardError
+from scene_envs.errors import RewardError
 from scene_envs.scene import SceneBatch
 
 
@@ -90,15 +91,7 @@ class Learner:
         self.deck: PromptDeck | None = None
         self.parameters = [p for p in self.prior.parameters() if p.requires_grad]
         self.lr = config.optimizer.lr or config.algorithm.learning_rate
-        self.optimizer = torch.optim.AdamW(
-            self.parameters, lr=self.lr, weight_decay=config.optimizer.weight_decay, betas=(0.9, 0.999)
-        )
-        self.average = WeightAverage(self.prior, config.optimizer.ema) if config.optimizer.ema else None
-        if self.average is not None and self.algorithm.average is not None:
-            raise InvalidInputError(
-                f"optimizer.ema={config.optimizer.ema}: algorithm={config.algorithm.name} evaluates and saves its "
-                "sampling policy, which is an average already; leave optimizer.ema=0"
-            )
+        self.optimizer = torch.optim.AdamW(self.parameters, lr=self.lr, weight_decay=0.0, betas=(0.9, 0.999))
 
     def close(self) -> None:
         """Stop the workers of physics and of the reward, if any."""
@@ -178,10 +171,9 @@ class Learner:
         Raises:
             NonFiniteGradient: the gradient is not finite; the weights in training are unchanged.
         """
-        config = self.config.optimizer
-        rate = self.lr * min(1.0, (index + 1) / max(1, config.warmup))
+        rate = self.lr
         row = self.accumulate(batch, scenes, index)
-        row["gradient_norm"] = float(nn.utils.clip_grad_norm_(self.parameters, config.clip))
+        row["gradient_norm"] = float(nn.utils.clip_grad_norm_(self.parameters, MAX_GRADIENT_NORM))
         if not all(math.isfinite(row[name]) for name in ("gradient_norm", "policy_loss", "pretraining_loss")):
             self.optimizer.zero_grad(set_to_none=True)
             raise NonFiniteGradient(row)
@@ -189,16 +181,12 @@ class Learner:
         for group in self.optimizer.param_groups:
             group["lr"] = row["learning_rate"]
         self.optimizer.step()
-        if self.average is not None:
-            self.average.update(self.prior)
         return row
 
     def return_to(self, prior: ScenePrior) -> None:
         """Take the weights of an earlier checkpoint, forget the optimiser's state, and halve the learning rate."""
         self.prior.load_state_dict(prior.state_dict())
         self.algorithm.return_to(self.prior)
-        if self.average is not None:
-            self.average = WeightAverage(self.prior, self.average.decay)
         self.lr *= 0.5
         self.optimizer.state.clear()
 
@@ -208,8 +196,6 @@ class Learner:
             "learning_rate": self.lr,
             "prior": self.prior.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "average": None if self.average is None else self.average.tensors,
-            "average_updates": 0 if self.average is None else self.average.updates,
             "algorithm": self.algorithm.state(),
             "regularisation": self.regularisation.state_dict(),
             **self.learned.state(),
@@ -226,8 +212,6 @@ class Learner:
         self.prior.load_state_dict(state["prior"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.lr = state["learning_rate"]
-        if self.average is not None:
-            self.average.restore(state["average"], state["average_updates"])
         self.algorithm.restore(state["algorithm"])
         self.regularisation.load_state_dict(state["regularisation"])
         self.learned.restore(state)
@@ -235,7 +219,7 @@ class Learner:
 
     def averaged(self) -> AveragedWeights[ScenePrior]:
         """Context in which the prior holds the weights that are evaluated and saved: the average, when there is one."""
-        return AveragedWeights(self.prior, self.algorithm.average or self.average)
+        return AveragedWeights(self.prior, self.algorithm.average)
 
     def _generator(self, stream: str, index: int) -> Generator:
         return Generator().manual_seed(stream_seed(self.config.seed, stream, index))

@@ -12,7 +12,7 @@ from torch import Generator
 from agents.post_training.discriminative import DiscriminativeLoss
 from agents.post_training.gradients import SceneLoss, add_regularisation_gradient
 from agents.post_training.hold import FAR, HIGHEST, HoldState, adjust, relative_error
-from agents.post_training.regularisation_settings import RegularisationSettings
+from agents.post_training.regularisation_settings import SHARPNESS, RegularisationSettings
 from agents.post_training.scene_bank import PromptedScenes
 from agents.priors.prior import ScenePrior
 
@@ -68,7 +68,7 @@ class Regularisation:
         if base is None or self.base is None:
             value, norm = add(real, generator, None)
             return {"pretraining_loss": value, "pretraining_gradient_norm": norm, **held}
-        loss = DiscriminativeLoss(prior, self.base, self.settings.sharpness)
+        loss = DiscriminativeLoss(prior, self.base, SHARPNESS)
         same = Generator().set_state(generator.get_state())
         value, norm = add(real, generator, loss.of_real)
         base_value, base_norm = add(base, same, loss.of_base)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from agents.configuration.checks import at_least, one_of, positive
+from agents.configuration import require_at_least, require_one_of
 from agents.post_training.hold import held_ratio
 from scene_envs.errors import InvalidInputError
 
+SHARPNESS = 20.0
+"""Scale of the discriminative loss; with a larger value the prior moves less far from its base."""
 OBJECTIVES = ("pretraining", "discriminative")
 """Losses of the regularisation."""
 
@@ -20,7 +22,6 @@ class RegularisationSettings:
         objective: ``pretraining`` is the pretraining loss on real scenes. ``discriminative`` raises the likelihood of
             real scenes relative to the base prior and lowers that of samples of the base prior.
         weight: coefficient of this loss; null takes the default of the algorithm.
-        sharpness: scale of the discriminative loss; with a larger value the prior moves less far from its base.
         base_samples: number of samples of the base prior in the discriminative loss; they are drawn once.
         hold: target that the run holds by adjusting the coefficient: ``guard:1.05`` is the held-out loss as a ratio to
             the base prior's; null keeps the coefficient constant.
@@ -32,7 +33,6 @@ class RegularisationSettings:
 
     objective: str = "pretraining"
     weight: float | None = None
-    sharpness: float = 20.0
     base_samples: int = 1024
     hold: str | None = None
     batch_size: int = 48
@@ -40,9 +40,8 @@ class RegularisationSettings:
     bank_size: int = 4096
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "batch_size", "base_samples")
-        one_of(self, "objective", OBJECTIVES)
-        positive(self, "sharpness")
+        require_at_least(self, 1, "batch_size", "base_samples")
+        require_one_of(self, "objective", OBJECTIVES)
         if self.weight is not None and not self.weight >= 0:
             raise InvalidInputError(f"regularisation.weight={self.weight} must not be negative")
         if self.target is not None and self.weight == 0:

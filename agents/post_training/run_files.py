@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from agents.configuration.tree import config_text, dotted
+from agents.configuration import config_text, dotted
 from agents.post_training.config import RESUMABLE, PostTrainConfig
 from agents.utils.checkpoints import load_checkpoint
 from scene_envs import files

@@ -41,6 +41,8 @@ from rewards import reward_label
 from scene_envs.errors import TrainingError
 from scene_envs.folders import claimed
 
+MAX_INVALID = 3
+"""Consecutive batches without a valid reward after which a run stops."""
 _MAX_ROLLBACKS = 3
 """Number of returns to the best checkpoint that a run may make; one more ends it."""
 
@@ -86,7 +88,7 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> P
     >>> with TemporaryDirectory() as output:
     ...     config = PostTrainConfig(output=output, iterations=2, batch_size=4, num_steps=4,
     ...         algorithm={"gradient_steps": 2}, regularisation={"bank_size": 20, "batch_size": 4},
-    ...         guard={"scenes": 8}, logger={"progress": "none"})
+    ...         guard={"scenes": 8}, progress="none")
     ...     result = post_train(config, prior=tiny_prior())
     >>> len(result.history), result.history[0]["log_ratio"]
     (2, 0.0)
@@ -149,7 +151,7 @@ class PostTrainer:
         title = f"post-train {self.prior.scene_type.name}"
         started = time.perf_counter() - self.seconds
         self._write_log()  # removes the rows of an earlier run, or rows beyond the checkpoint
-        style = config.logger.progress if self.processes.is_first else "none"
+        style = config.progress if self.processes.is_first else "none"
         with (
             run_progress(title, config.iterations, style, self.iteration) as report,
             finishing_steps() as end,
@@ -179,7 +181,7 @@ class PostTrainer:
     def prepare(self, *, reuse_scenes: bool = False) -> None:
         """Draw the real scenes, or reuse those in the folder of a resumed run, and make the guard."""
         config, seed, slots = self.config, stream_seed(self.config.seed, "bank"), self.learner.slots
-        shown = config.logger.progress if self.processes.is_first else "none"
+        shown = config.progress if self.processes.is_first else "none"
         batch = kept_scenes(
             self.directory, self.prior, config.regularisation, seed, slots, reuse=reuse_scenes, progress=shown
         )
@@ -257,7 +259,7 @@ class PostTrainer:
         self.invalid_streak += 1
         if self.iteration == 0:
             raise nothing_scored(self.config, "no scene of the first batch")
-        if self.invalid_streak >= self.config.guard.max_invalid:
+        if self.invalid_streak >= MAX_INVALID:
             raise nothing_scored(
                 self.config,
                 f"no scene in {self.invalid_streak} batches in a row, the last at iteration {self.iteration + 1}",

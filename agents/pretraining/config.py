@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from agents.configuration.checks import at_least
-from agents.configuration.fields import composed, named, nested
-from agents.configuration.shared_keys import TrainingKeys
+from agents.configuration import TrainingKeys, composed, named, nested, require_at_least
 from agents.pretraining.settings import (
+    PROCESSES,
+    TEXT_ENCODERS,
     LossSettings,
     NetworkSettings,
     PretrainLoggerSettings,
@@ -18,6 +18,7 @@ from agents.pretraining.settings import (
     TextSettings,
     registered_networks,
 )
+from agents.utils.loggers import LOGGERS
 
 
 @dataclass
@@ -65,15 +66,22 @@ class PretrainConfig(SceneKeys, TrainingKeys):
     batch_size: int = 128
     seed: int = 0
     network: NetworkSettings = nested(NetworkSettings, folder="network", option="flux", registered=registered_networks)
-    process: ProcessSettings = nested(ProcessSettings, folder="process", option="mixed")
+    process: ProcessSettings = nested(ProcessSettings, folder="process", option="mixed", registered=lambda: PROCESSES)
     loss: LossSettings = nested(LossSettings)
-    text: TextSettings = nested(TextSettings, folder="text", option="none")
-    optimizer: PretrainOptimizerSettings = nested(PretrainOptimizerSettings, folder="optimizer", option="muon")
-    logger: PretrainLoggerSettings = nested(PretrainLoggerSettings, folder="logger", option="csv")
+    text: TextSettings = nested(TextSettings, folder="text", option="none", registered=lambda: TEXT_ENCODERS)
+    optimizer: PretrainOptimizerSettings = nested(
+        PretrainOptimizerSettings,
+        folder="optimizer",
+        option="muon",
+        registered=lambda: PretrainOptimizerSettings.KNOWN,
+    )
+    logger: PretrainLoggerSettings = nested(
+        PretrainLoggerSettings, folder="logger", option="csv", registered=lambda: LOGGERS
+    )
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "batch_size")
-        at_least(self, 0, "iterations")
+        require_at_least(self, 1, "batch_size")
+        require_at_least(self, 0, "iterations")
 
     @property
     def directory(self) -> Path:

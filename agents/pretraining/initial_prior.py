@@ -154,8 +154,8 @@ def _chain(config: PretrainConfig) -> dict[str, Any]:
         "prediction": process.prediction,
         "noise_floor": process.noise_floor,
         "noise_ceiling": process.noise_ceiling,
-        "noise_mean": loss.noise_mean,
-        "noise_std": loss.noise_std,
+        "noise_mean": loss.noise.mean,
+        "noise_std": loss.noise.std,
         "timesteps": loss.timesteps,
         "loss_weighting": loss.weighting,
         "translation_weight": loss.translation_weight,
@@ -164,10 +164,10 @@ def _chain(config: PretrainConfig) -> dict[str, Any]:
 
 
 def _text(config: PretrainConfig, prompts: Sequence[Sequence[str]]) -> AnyTextConfig | None:
-    text = config.text
-    if not text.is_read:
+    if not config.text.is_read:
         return None
-    encoder = text_config(text.encoder, (prompt for group in prompts for prompt in group))
+    text = config.text.vocabulary
+    encoder = text_config(config.text.encoder, (prompt for group in prompts for prompt in group))
     if isinstance(encoder, TextConfig):
         return replace(
             encoder,
@@ -189,7 +189,9 @@ def _network(
         features=features,
         categories=get_scene_type(config.scene).num_assets + 1,
         text_width=text_width,
-        **{**vars(config.network), "modules": _modules(config, slots, text_width)},
+        **{key: value for key, value in vars(config.network).items() if key not in ("flux", "modules")},
+        **vars(config.network.flux),
+        modules=_modules(config, slots, text_width),
         unit=_unit(normalizer),
         rotations=_rotations(normalizer),
     )
@@ -221,10 +223,10 @@ def _kinds(scene: str) -> tuple[int, ...]:
 def _conditions_counts(config: PretrainConfig) -> bool:
     """Whether the network reads how many objects of each kind a prompt asks for."""
     return (
-        config.text.count_conditioning
+        config.text.vocabulary.count_conditioning
         and config.network.name == "flux"
         and config.text.encoder == VOCABULARY
-        and config.text.latents > 0
+        and config.text.vocabulary.latents > 0
     )
 
 

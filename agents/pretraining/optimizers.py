@@ -23,14 +23,14 @@ _COEFFICIENTS = (3.4445, -4.7750, 2.0315)
 
 
 def learning_rate_at(step: int, config: PretrainConfig) -> float:
-    """Linear warm-up, then the peak, then a cosine to ``final_lr`` over the last ``decay_share`` of the steps."""
-    optimizer = config.optimizer
-    if step < optimizer.warmup:
-        return optimizer.lr * (step + 1) / optimizer.warmup
-    start = max(optimizer.warmup, config.iterations * (1.0 - optimizer.decay_share))
+    """Linear warm-up, then the peak, then a cosine to ``final`` over the last part ``decay`` of the steps."""
+    peak, rate = config.optimizer.lr, config.optimizer.rate
+    if step < rate.warmup:
+        return peak * (step + 1) / rate.warmup
+    start = max(rate.warmup, config.iterations * (1.0 - rate.decay))
     progress = (step - start) / max(1.0, config.iterations - start)
     cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, max(0.0, progress))))
-    return optimizer.lr * (optimizer.final_lr + (1 - optimizer.final_lr) * cosine)
+    return peak * (rate.final + (1 - rate.final) * cosine)
 
 
 def build_optimizer(

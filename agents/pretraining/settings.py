@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
-from agents.configuration.checks import at_least, finite, one_of, positive, shares
-from agents.configuration.fields import nested
-from agents.configuration.settings import LoggerSettings, OptimizerSettings
+from agents.configuration import (
+    LoggerSettings,
+    OptimizerSettings,
+    nested,
+    require_at_least,
+    require_finite,
+    require_one_of,
+    require_positive,
+    require_unit_interval,
+)
 from scene_envs.errors import InvalidInputError
+from scene_envs.plugins import plugin_entry_points
 
 
 @dataclass
@@ -34,13 +45,55 @@ class ModuleSettings:
     contacts: bool = True
 
     def __post_init__(self) -> None:
-        one_of(self, "relations", ("axis", "largest", "none"))
+        require_one_of(self, "relations", ("axis", "largest", "none"))
 
 
-def registered_networks() -> list[str]:
+@dataclass
+class FluxSettings:
+    """Details of the flux network; other networks do not read them.
+
+    Attributes:
+        frequencies: octaves of Fourier features of each translation; 0 for none.
+        double_blocks: number of double-stream blocks of the mixed network with text; null for a third of depth.
+        embedding: width of the embedding of a slot (mixed only); null takes hidden.
+        pose_head: hidden width of the pose output (mixed only).
+        time_scale: factor on the time before it is embedded (mixed only).
+        text_reach: blocks of the mixed network in which text and slots attend to each other: ``double`` for the
+            double-stream blocks, which is faster, or ``all``, as in the paper.
+    """
+
+    frequencies: int = 8
+    double_blocks: int | None = None
+    embedding: int | None = None
+    pose_head: int = 64
+    time_scale: float = 1.0
+    text_reach: str = "double"
+
+    def __post_init__(self) -> None:
+        require_at_least(self, 0, "frequencies")
+        require_at_least(self, 1, "pose_head", "double_blocks", "embedding")
+        require_positive(self, "time_scale")
+        require_one_of(self, "text_reach", ("double", "all"), "reach of text")
+
+
+NETWORKS = ("flux", "midiffusion", "diffuscene")
+"""Networks of this package."""
+PROCESSES = ("mixed", "continuous")
+TEXT_ENCODERS = {
+    "none": {"encoder": "none"},
+    "vocabulary": {"encoder": "vocabulary"},
+    "bert": {"encoder": "google-bert/bert-base-uncased"},
+}
+"""Options of ``text`` and their keys; ``text.encoder`` names another BERT."""
+
+
+def registered_networks() -> Sequence[str]:
+    """Names of networks; imports no torch, unless installed packages may have registered more."""
+    if "agents.networks.registry" not in sys.modules and not plugin_entry_points("scene_envs.networks"):
+        return NETWORKS
     from agents.networks.registry import NETWORK_PROCESSES, list_networks
 
-    return [name for process in NETWORK_PROCESSES for name in list_networks(process)]
+    return sorted({name for process in NETWORK_PROCESSES for name in list_networks(process)})
 
 
 @dataclass
@@ -52,13 +105,7 @@ class NetworkSettings:
         hidden: width of the network.
         depth: number of blocks; of single-stream blocks if the network has both kinds.
         heads: number of attention heads.
-        frequencies: octaves of Fourier features of each translation (flux only); 0 for none.
-        double_blocks: number of double-stream blocks of the mixed flux network with text; null for a third of depth.
-        embedding: width of the embedding of a slot (mixed flux only); null takes hidden.
-        pose_head: hidden width of the pose output (mixed flux only).
-        time_scale: factor on the time before it is embedded (mixed flux only).
-        text_reach: blocks of the mixed flux network in which text and slots attend to each other: ``double`` for the
-            double-stream blocks, which is faster, or ``all``, as in the paper.
+        flux: details of the flux network.
         modules: modules that are added to the core of the mixed flux network.
     """
 
@@ -66,20 +113,11 @@ class NetworkSettings:
     hidden: int = 128
     depth: int = 6
     heads: int = 4
-    frequencies: int = 8
-    double_blocks: int | None = None
-    embedding: int | None = None
-    pose_head: int = 64
-    time_scale: float = 1.0
-    text_reach: str = "double"
+    flux: FluxSettings = nested(FluxSettings)
     modules: ModuleSettings = nested(ModuleSettings)
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "hidden", "depth", "heads")
-        at_least(self, 0, "frequencies")
-        at_least(self, 1, "pose_head", "double_blocks", "embedding")
-        positive(self, "time_scale")
-        one_of(self, "text_reach", ("double", "all"), "reach of text")
+        require_at_least(self, 1, "hidden", "depth", "heads")
 
 
 @dataclass
@@ -120,18 +158,18 @@ class ProcessSettings:
     denoised_clip: float = 0.0
 
     def __post_init__(self) -> None:
-        one_of(self, "name", ("mixed", "continuous"), "process")
-        one_of(self, "prediction", ("edm", "epsilon", "x0", "v"))
-        one_of(self, "schedule", ("karras", "linear", "cosine"), "noise schedule")
-        one_of(self, "moments", ("category", "feature", "scene"))
-        one_of(self, "rotation", ("matrix", "quaternion", "axis_angle"))
+        require_one_of(self, "name", PROCESSES, "process")
+        require_one_of(self, "prediction", ("edm", "epsilon", "x0", "v"))
+        require_one_of(self, "schedule", ("karras", "linear", "cosine"), "noise schedule")
+        require_one_of(self, "moments", ("category", "feature", "scene"))
+        require_one_of(self, "rotation", ("matrix", "quaternion", "axis_angle"))
         kernels = ("mask_and_replace", "absorbing", "early_absorbing", "squared_absorbing", "uniform")
-        one_of(self, "kernel", kernels, "categorical kernel")
-        one_of(self, "empty_slots", ("attended", "dropped"), "treatment of empty slots")
-        one_of(self, "unmasking", ("systematic", "even", "independent"))
-        positive(self, "noise_floor", "noise_ceiling")
-        finite(self, "noise_ceiling")
-        at_least(self, 0, "denoised_clip")
+        require_one_of(self, "kernel", kernels, "categorical kernel")
+        require_one_of(self, "empty_slots", ("attended", "dropped"), "treatment of empty slots")
+        require_one_of(self, "unmasking", ("systematic", "even", "independent"))
+        require_positive(self, "noise_floor", "noise_ceiling")
+        require_finite(self, "noise_ceiling")
+        require_at_least(self, 0, "denoised_clip")
         if not self.noise_floor < self.noise_ceiling:
             raise InvalidInputError(
                 f"noise_floor={self.noise_floor} must be less than noise_ceiling={self.noise_ceiling}"
@@ -139,13 +177,29 @@ class ProcessSettings:
 
 
 @dataclass
+class TrainingNoiseSettings:
+    """Distribution of ln(noise-to-signal ratio) over the training timesteps.
+
+    Attributes:
+        mean: its mean. The normalised unit of a room is metres long, so rooms need less noise than tables: about -2.6,
+            with a noise floor of 0.0004.
+        std: its standard deviation.
+    """
+
+    mean: float = -1.8
+    std: float = 2.1
+
+    def __post_init__(self) -> None:
+        require_finite(self, "mean")
+        require_positive(self, "std")
+
+
+@dataclass
 class LossSettings:
     """The pretraining loss.
 
     Attributes:
-        noise_mean: mean of ln(noise-to-signal ratio) of the training timesteps. The normalised unit of a room is metres
-            long, so rooms need less noise than tables: about -2.6, with a noise floor of 0.0004.
-        noise_std: standard deviation of ln(noise-to-signal ratio) of the training timesteps.
+        noise: distribution of ln(noise-to-signal ratio) over the training timesteps.
         timesteps: distribution of training timesteps: ``lognormal`` (of the noise-to-signal ratio), ``uniform``, or
             ``both`` in equal parts. Categories are decided at high noise, which ``lognormal`` rarely draws.
         weighting: weight of the loss by timestep: ``none`` or ``min_snr``.
@@ -159,8 +213,7 @@ class LossSettings:
             observed. A prior that is trained with 0 adds too many objects if all empty slots are masked.
     """
 
-    noise_mean: float = -1.8
-    noise_std: float = 2.1
+    noise: TrainingNoiseSettings = nested(TrainingNoiseSettings)
     timesteps: str = "lognormal"
     weighting: str = "none"
     translation_weight: float = 3.0
@@ -170,13 +223,44 @@ class LossSettings:
     open_empty_share: float = 0.5
 
     def __post_init__(self) -> None:
-        one_of(self, "timesteps", ("lognormal", "uniform", "both"), "distribution of timesteps")
-        one_of(self, "weighting", ("none", "min_snr"), "loss weighting")
-        one_of(self, "category", ("cross_entropy", "bound"), "category loss")
-        finite(self, "noise_mean")
-        positive(self, "noise_std")
-        at_least(self, 0, "translation_weight", "category_weight")
-        shares(self, "observed_share", "open_empty_share")
+        require_one_of(self, "timesteps", ("lognormal", "uniform", "both"), "distribution of timesteps")
+        require_one_of(self, "weighting", ("none", "min_snr"), "loss weighting")
+        require_one_of(self, "category", ("cross_entropy", "bound"), "category loss")
+        require_at_least(self, 0, "translation_weight", "category_weight")
+        require_unit_interval(self, "observed_share", "open_empty_share")
+
+
+@dataclass
+class VocabularySettings:
+    """The small text encoder with a closed vocabulary, which is trained with the prior.
+
+    Attributes:
+        width: width.
+        depth: number of blocks.
+        latents: number of tokens to which a prompt is condensed; 0 for one token per word.
+        window: number of neighbouring words that are combined before attention, odd; 1 reads each
+            word alone.
+        lr_share: learning rate, as a fraction of optimizer.lr.
+        count_conditioning: it predicts how many objects of each kind the prompt asks for; these
+            numbers, less the visible objects, are added to the logits of the mixed flux network; needs latents.
+        warmup: steps in which only the text encoder is trained, to predict the numbers of its prompts, before the first
+            step of a fresh prior; at most iterations.
+        numbers: embeddings of number words contain their value, so that counts need not be
+            learned number by number.
+    """
+
+    width: int = 128
+    depth: int = 2
+    latents: int = 16
+    window: int = 3
+    lr_share: float = 0.5
+    count_conditioning: bool = True
+    warmup: int = 400
+    numbers: bool = True
+
+    def __post_init__(self) -> None:
+        require_at_least(self, 1, "width", "depth", "window")
+        require_at_least(self, 0, "latents", "lr_share", "warmup")
 
 
 @dataclass
@@ -186,41 +270,66 @@ class TextSettings:
     Attributes:
         encoder: ``none`` for a prior that reads no prompts; ``vocabulary`` for a small encoder with a closed
             vocabulary, which is trained with the prior; or the folder or hub name of a BERT model, which is frozen.
-        width: width of the small text encoder.
-        depth: number of blocks of the small text encoder.
-        latents: number of tokens to which the small text encoder condenses a prompt; 0 for one token per word.
-        window: number of neighbouring words that the small text encoder combines before attention, odd; 1 reads each
-            word alone.
-        lr_share: learning rate of the small text encoder, as a fraction of optimizer.lr.
-        count_conditioning: the small text encoder predicts how many objects of each kind the prompt asks for; these
-            numbers, less the visible objects, are added to the logits of the mixed flux network; needs latents.
-        warmup: steps in which only the text encoder is trained, to predict the numbers of its prompts, before the first
-            step of a fresh prior; at most iterations.
-        numbers: embeddings of number words in the small text encoder contain their value, so that counts need not be
-            learned number by number.
+        vocabulary: the small text encoder.
         dropout: share of training scenes that get no prompt, for classifier-free guidance.
     """
 
     encoder: str = "none"
-    width: int = 128
-    depth: int = 2
-    latents: int = 16
-    window: int = 3
-    lr_share: float = 0.5
-    count_conditioning: bool = True
-    warmup: int = 400
-    numbers: bool = True
+    vocabulary: VocabularySettings = nested(VocabularySettings)
     dropout: float = 0.1
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "width", "depth", "window")
-        at_least(self, 0, "latents", "lr_share", "warmup")
-        shares(self, "dropout")
+        require_unit_interval(self, "dropout")
 
     @property
     def is_read(self) -> bool:
         """Whether there is an encoder."""
         return self.encoder != "none"
+
+
+@dataclass
+class RateSettings:
+    """Course of the learning rate.
+
+    Attributes:
+        warmup: steps over which it rises linearly.
+        final: its final value, as a fraction of the peak; 1 for no decay.
+        decay: last share of the steps, in which it decays along a cosine; 1 decays from the warm-up on.
+    """
+
+    warmup: int = 100
+    final: float = 0.01
+    decay: float = 0.3
+
+    def __post_init__(self) -> None:
+        require_at_least(self, 0, "warmup")
+        require_unit_interval(self, "final", "decay")
+
+
+@dataclass
+class ComputeSettings:
+    """How the steps are computed.
+
+    Attributes:
+        accumulate: number of parts into which a process splits its batch, to save memory.
+        precision: number format of the network in training: ``float32`` or ``bfloat16`` (autocast).
+        matmul_precision: precision of float32 products on GPUs: ``highest``, ``high`` (TF32) or ``medium``.
+        compile: compile the network with ``torch.compile`` (needs a C++ compiler on a CPU).
+    """
+
+    accumulate: int = 1
+    precision: str = "float32"
+    matmul_precision: str = "highest"
+    compile: bool = False
+
+    def __post_init__(self) -> None:
+        require_at_least(self, 1, "accumulate")
+        require_one_of(self, "precision", ("float32", "bfloat16"))
+        require_one_of(self, "matmul_precision", ("highest", "high", "medium"))
+
+
+WEIGHT_DECAY = 0.01
+"""Decoupled weight decay of pretraining."""
 
 
 @dataclass
@@ -230,34 +339,22 @@ class PretrainOptimizerSettings(OptimizerSettings):
     Attributes:
         name: ``adamw``, or ``muon``, which trains the matrices inside blocks with Muon and all other weights with
             AdamW.
-        final_lr: final learning rate, as a fraction of the peak; 1 for no decay.
-        decay_share: last share of the steps, in which the learning rate decays along a cosine; 1 decays from the
-            warm-up on.
-        accumulate: number of parts into which a process splits its batch, to save memory.
-        precision: number format of the network in training: ``float32`` or ``bfloat16`` (autocast).
-        matmul_precision: precision of float32 products on GPUs: ``highest``, ``high`` (TF32) or ``medium``.
-        compile: compile the network with ``torch.compile`` (needs a C++ compiler on a CPU).
+        ema: decay of the averaged weights, which are evaluated and saved; 0 uses the weights themselves.
+        rate: course of the learning rate.
+        compute: how the steps are computed.
     """
 
-    KNOWN = ("adamw", "muon")
+    KNOWN: ClassVar[Sequence[str]] = ("adamw", "muon")
 
     name: str = "muon"
-    warmup: int = 100
-    weight_decay: float = 0.01
     ema: float = 0.999
-    final_lr: float = 0.01
-    decay_share: float = 0.3
-    accumulate: int = 1
-    precision: str = "float32"
-    matmul_precision: str = "highest"
-    compile: bool = False
+    rate: RateSettings = nested(RateSettings)
+    compute: ComputeSettings = nested(ComputeSettings)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        shares(self, "final_lr", "decay_share")
-        at_least(self, 1, "accumulate")
-        one_of(self, "precision", ("float32", "bfloat16"))
-        one_of(self, "matmul_precision", ("highest", "high", "medium"))
+        if not 0 <= self.ema < 1:
+            raise InvalidInputError(f"ema={self.ema} must lie in [0, 1)")
 
 
 @dataclass
@@ -277,5 +374,5 @@ class PretrainLoggerSettings(LoggerSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(self, 1, "log_every", "evaluate_every")
-        at_least(self, 0, "pictures_every")
+        require_at_least(self, 1, "log_every", "evaluate_every")
+        require_at_least(self, 0, "pictures_every")

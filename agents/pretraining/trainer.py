@@ -15,14 +15,15 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
-from agents.configuration.prior_names import short_name
-from agents.configuration.tree import config_text, dotted
+from agents.configuration import MAX_GRADIENT_NORM, config_text, dotted
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.data import TrainingData
 from agents.pretraining.log import TrainingLog, draw_samples
 from agents.pretraining.optimizers import build_optimizer, learning_rate_at
+from agents.pretraining.settings import WEIGHT_DECAY
 from agents.pretraining.setup import prepare
 from agents.pretraining.text_warmup import warm_up_text
+from agents.prior_names import short_name
 from agents.priors.prior import ScenePrior
 from agents.utils.checkpoints import check_tensors, load_checkpoint, save_checkpoint
 from agents.utils.interrupts import Ending, finishing_steps
@@ -68,19 +69,19 @@ class Pretrainer:
         self.config = config
         self.data, self.heldout_data = data, heldout
         self.processes = ProcessGroup.join(config.device)
-        self.parts = self.processes.size * config.optimizer.accumulate
+        self.parts = self.processes.size * config.optimizer.compute.accumulate
         if config.batch_size % self.parts:
             raise InvalidInputError(
                 f"batch_size={config.batch_size} is not a multiple of {self.parts}, "
-                f"the {self.processes.size} process(es) times accumulate={config.optimizer.accumulate}"
+                f"the {self.processes.size} process(es) times accumulate={config.optimizer.compute.accumulate}"
             )
         self.prior = prior.to(config.device).train()
         self.network: nn.Module = prior.denoiser
         settings = config.optimizer
-        prior.denoiser.precision = _PRECISIONS[settings.precision]
+        prior.denoiser.precision = _PRECISIONS[settings.compute.precision]
         self.average = WeightAverage(self.network, settings.ema)
-        self.optimizer = build_optimizer(settings.name, self.network, settings.weight_decay, config.text.lr_share)
-        torch.set_float32_matmul_precision(settings.matmul_precision)
+        self.optimizer = build_optimizer(settings.name, self.network, WEIGHT_DECAY, config.text.vocabulary.lr_share)
+        torch.set_float32_matmul_precision(settings.compute.matmul_precision)
         self.step = 0
         self.schedule = self._schedule()
         self.seconds = 0.0
@@ -102,7 +103,7 @@ class Pretrainer:
             self._load()
         elif not self.config.prior:
             self._warm_up_text()
-        if self.config.optimizer.compile:
+        if self.config.optimizer.compute.compile:
             self.prior.denoiser.network.compile()
         if self.processes.is_first:
             self.log.begin(self.step)
@@ -122,7 +123,7 @@ class Pretrainer:
 
     def _warm_up_text(self) -> None:
         """Warm up the text encoder in the same way in every process, then take the weights of the first process."""
-        steps = min(self.config.text.warmup, self.config.iterations)
+        steps = min(self.config.text.vocabulary.warmup, self.config.iterations)
         if warm_up_text(self.prior, self.data, steps, self.config.batch_size, self.config.seed) is not None:
             self.processes.share(self.network.parameters())
             self.average = WeightAverage(self.network, self.config.optimizer.ema)
@@ -157,9 +158,9 @@ class Pretrainer:
     def _update(self) -> tuple[float, float]:
         config = self.config
         total = torch.zeros((), device=config.device)
-        for part in range(config.optimizer.accumulate):
+        for part in range(config.optimizer.compute.accumulate):
             generator = derived_generator(
-                config.seed, self.step, self.processes.rank * config.optimizer.accumulate + part
+                config.seed, self.step, self.processes.rank * config.optimizer.compute.accumulate + part
             )
             loss = self._part_loss(config.batch_size // self.parts, generator) / self.parts
             loss.backward()  # type: ignore[no-untyped-call]
@@ -168,7 +169,7 @@ class Pretrainer:
         if not math.isfinite(value):
             raise self._not_finite("loss", value)
         self.processes.sum_gradients(self.network.parameters())
-        norm = nn.utils.clip_grad_norm_(self.network.parameters(), config.optimizer.clip)
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), MAX_GRADIENT_NORM)
         if not math.isfinite(float(norm)):
             raise self._not_finite("gradient norm", float(norm))
         self.optimizer.step()

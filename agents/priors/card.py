@@ -12,7 +12,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.configuration.prior_names import CONFIG_NAME
+from agents.prior_names import CONFIG_NAME
 from agents.priors.files import PriorFacts, read_config, write_config
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.files import read_sealed, write_text

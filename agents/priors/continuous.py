@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from agents.configuration.checks import check_types
+from agents.configuration import check_types
 from agents.diffusion import GaussianProcess, GaussianStep, Preconditioning, ResidualVariance, ReverseStep, StepTable
 from agents.diffusion.gaussian import timestep_weights
 from agents.diffusion.schedules import make_schedule

@@ -15,7 +15,7 @@ import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
-from agents.configuration.checks import check_types
+from agents.configuration import check_types
 from agents.diffusion import (
     CategoricalProcess,
     GaussianProcess,

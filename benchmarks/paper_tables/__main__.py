@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from agents.cli.parser import main_of
+from agents.cli.main import main_of
 from benchmarks.paper_tables.settings import TablesConfig
 
 if TYPE_CHECKING:

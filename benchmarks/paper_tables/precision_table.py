@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from agents.configuration.tree import dotted_values
+from agents.configuration import dotted_values
 from agents.pretraining.config import PretrainConfig
 from benchmarks.paper_tables.rows import COSTS, PAPER, Entry, Row, Table, plain_row
 
@@ -48,11 +48,11 @@ FACTORS: tuple[Setting, ...] = (
     *_each("moments per", "process.moments", "scene", "feature", "category"),
     *_each("translation weight", "loss.translation_weight", 1.0, 3.0),
     *_each("relations of slots, blurred by the noise of the", "network.modules.relations", "none", "largest", "axis"),
-    *_each("Fourier octaves", "network.frequencies", 0, 8),
+    *_each("Fourier octaves", "network.flux.frequencies", 0, 8),
     *_each("features of rotations", "network.modules.rotation_features", False, True),
     *_each("contacts", "network.modules.contacts", False, True),
-    ("no learning-rate decay", {"optimizer.final_lr": 1.0}),
-    ("learning rate decays from the warm-up on", {"optimizer.decay_share": 1.0}),
+    ("no learning-rate decay", {"optimizer.rate.final": 1.0}),
+    ("learning rate decays from the warm-up on", {"optimizer.rate.decay": 1.0}),
     *_each("optimizer", "optimizer.name", "muon", "adamw"),
     *_each("empty slots", "process.empty_slots", "dropped", "attended"),
     ("categories: early absorbing, dropped, cross-entropy", _categories("early_absorbing", "dropped", "cross_entropy")),

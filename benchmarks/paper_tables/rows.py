@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from agents.configuration.tree import dotted_values
+from agents.configuration import dotted_values
 from agents.pretraining.config import PretrainConfig
 
 
@@ -67,8 +67,8 @@ _TEXT: dict[str, Any] = {"process.name": "mixed", "text.encoder": "vocabulary", 
 
 _OF_SIZE = (
     *("recipe", "iterations", "batch_size", "network.hidden", "network.depth", "network.heads"),
-    *("network.double_blocks", "network.embedding", "network.pose_head"),
-    *("optimizer.lr", "optimizer.warmup", "optimizer.decay_share"),
+    *("network.flux.double_blocks", "network.flux.embedding", "network.flux.pose_head"),
+    *("optimizer.lr", "optimizer.rate.warmup", "optimizer.rate.decay"),
 )
 """Keys of a recipe that belong to a network and a run of another size."""
 
@@ -79,7 +79,7 @@ PAPER: dict[str, Any] = {
 }
 """The paper's setting, ``configs/recipe/paper.yaml``, for a network of the tables' size and a run of their length."""
 
-_AS_PUBLISHED = {"network.modules.relations": "none", "network.frequencies": 0, "process.empty_slots": "attended"}
+_AS_PUBLISHED = {"network.modules.relations": "none", "network.flux.frequencies": 0, "process.empty_slots": "attended"}
 
 NETWORKS: dict[str, dict[str, Any]] = {
     "flux": {"network.name": "flux"},

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from agents.configuration.tree import dotted, dotted_values
+from agents.configuration import dotted, dotted_values
 from agents.pretraining.config import PretrainConfig
 from scene_envs.errors import InvalidInputError, unknown_name
 
@@ -35,14 +35,16 @@ class Size:
 
 
 _PAPER = dotted_values(PretrainConfig(recipe="paper"))
-_OF_SIZE = ("network.depth", "network.heads", "optimizer.warmup", "optimizer.lr")
+_OF_SIZE = ("network.depth", "network.heads", "optimizer.rate.warmup", "optimizer.lr")
 
 SIZES: dict[str, Size] = {
-    "tiny": Size(3, 4, 60_000, 6, 2, 1, {"network.depth": 1, "network.heads": 2, "optimizer.warmup": 1}),
-    "small": Size(600, 64, 700_000, 256, pretraining={"network.depth": 4, "network.heads": 4, "optimizer.warmup": 50}),
+    "tiny": Size(3, 4, 60_000, 6, 2, 1, {"network.depth": 1, "network.heads": 2, "optimizer.rate.warmup": 1}),
+    "small": Size(
+        600, 64, 700_000, 256, pretraining={"network.depth": 4, "network.heads": 4, "optimizer.rate.warmup": 50}
+    ),
     "paper": Size(
         _PAPER["iterations"], _PAPER["batch_size"], 88_300_000, 2000,
-        pretraining={**{key: _PAPER[key] for key in _OF_SIZE}, "optimizer.matmul_precision": "high"},
+        pretraining={**{key: _PAPER[key] for key in _OF_SIZE}, "optimizer.compute.matmul_precision": "high"},
     ),
 }  # fmt: skip
 """``tiny`` is for tests, ``small`` for a CPU, ``paper`` has the size of the paper's network and wants a GPU."""

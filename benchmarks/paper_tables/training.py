@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from agents.configuration.tree import changed, dotted_keys, dotted_values
+from agents.configuration import changed, dotted_keys, dotted_values
 from agents.pretraining.config import PretrainConfig
 from benchmarks.paper_tables.data import RowData, trained_numbers
 from benchmarks.paper_tables.rows import Row
@@ -31,7 +31,7 @@ _SHAPING = (
     "process.name",
     "text.encoder",
     "process.rotation",
-    "network.frequencies",
+    "network.flux.frequencies",
     "network.modules.relations",
     "network.modules.rotation_features",
     "network.modules.contacts",

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from fnmatch import fnmatch
 from typing import TYPE_CHECKING
 
-from agents.cli.parser import main_of
+from agents.cli.main import main_of
 from scene_envs.errors import InvalidInputError, unknown_name
 
 if TYPE_CHECKING:

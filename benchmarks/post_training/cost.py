@@ -19,7 +19,7 @@ from unittest.mock import patch
 
 import yaml
 
-from agents.configuration.tree import changed
+from agents.configuration import changed
 from agents.post_training import PostTrainConfig, PostTrainer, regularisation
 from agents.post_training.algorithms import list_algorithms
 from agents.priors.prior import ScenePrior

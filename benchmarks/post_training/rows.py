@@ -92,7 +92,7 @@ def _equal_scenes() -> tuple[Row, ...]:
 
 def _counts() -> tuple[Row, ...]:
     """The paper's figure: the number of objects on Living Room Shelf with 20 extra slots, and on Dimsum."""
-    hold = "hold=guard:1.05"
+    hold = "regularisation.hold=guard:1.05"
     return (
         Row("living_room_shelf-count-0", "living_room_shelf",
             (*_keys(CHAIN, "object_count", 0), "slots=43", hold), 80, slots=43),

@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from agents.cli.parser import main as scene_envs
+from agents.cli.main import main as scene_envs
 from benchmarks.post_training.rows import Row
 from scene_envs.errors import TrainingError
 
@@ -34,7 +34,7 @@ def train(row: Row, directory: Path, iterations: int, extra: Sequence[str]) -> P
     if not (folder / "metrics.json").exists():
         _call(
             "post-train", f"prior={row.prior}", *row.keys, f"iterations={iterations}", f"output={folder}",
-            "logger.progress=none", "logger.report_scenes=0", *extra,
+            "progress=none", "logger.report_scenes=0", *extra,
         )  # fmt: skip
     return folder
 

@@ -12,7 +12,6 @@ import signal
 import tempfile
 from collections.abc import Sequence
 from functools import cache
-from importlib import import_module
 
 from benchmarks.reliability.copies import Started, complete
 from benchmarks.reliability.figures import Figures
@@ -30,7 +29,7 @@ NASTY = (
 _SMALL = {
     "count": "1", "num_steps": "3", "workers": "0", "pictures": "0", "slots": "6", "budget": "2", "branching": "2",
     "iterations": "1", "batch_size": "2", "algorithm.gradient_steps": "1", "regularisation.bank_size": "6",
-    "regularisation.batch_size": "2", "guard.scenes": "2", "logger.report_scenes": "0", "logger.progress": "none",
+    "regularisation.batch_size": "2", "guard.scenes": "2", "logger.report_scenes": "0", "progress": "none",
     "reward": "object_count", "objective": "object_count", "prior": "PLACE/mixed", "scenes": "PLACE/data",
     "data": "PLACE/data", "measures": "layout", "network.hidden": "16", "network.depth": "1", "network.heads": "2",
     "formats": "npz", "shard_size": "1", "verify": "false",
@@ -99,9 +98,10 @@ def _can_be_arguments(line: list[str]) -> bool:
 
 @cache
 def _keys(name: str) -> tuple[str, ...]:
+    from agents.cli.commands import load_command
     from agents.cli.keys import describe_fields, keys_of
 
-    module = import_module(f"agents.cli.commands.{name.replace('-', '_')}")
+    module = load_command(name)
     return tuple(key.name for key in describe_fields(keys_of(module)) if key.name != "output")
 
 
@@ -124,9 +124,10 @@ def _line(rng: random.Random, output: str, run: bool) -> list[str]:
 
 @cache
 def _all_keys(name: str) -> tuple[str, ...]:
+    from agents.cli.commands import load_command
     from agents.cli.keys import describe_fields, keys_of
 
-    module = import_module(f"agents.cli.commands.{name.replace('-', '_')}")
+    module = load_command(name)
     return tuple(key.name for key in describe_fields(keys_of(module)))
 
 

@@ -18,7 +18,7 @@ _PRIORS = ("prior=PLACE/prior", "prior=PLACE/mixed")
 _TRAINING = (
     "reward=object_count", "num_steps=3", "batch_size=4", "iterations=6", "slots=6", "regularisation.batch_size=2",
     "regularisation.bank_size=6", "guard.scenes=2", "guard.every=2", "logger.checkpoint_every=1",
-    "logger.report_scenes=0", "logger.progress=none", "workers=0",
+    "logger.report_scenes=0", "progress=none", "workers=0",
 )  # fmt: skip
 _SEARCHING = ("objective=object_count", "objective_scale=30", "branching=3", "num_steps=3", "slots=6")
 
@@ -40,7 +40,7 @@ _TRAINED = ("prior/model.safetensors", "log.csv")
 _SEARCHED = ("best.safetensors", "metrics.json")
 RESUMABLE = {
     "generate": Command(
-        ("generate", "count=16", "shard_size=4", "workers=0", "verify=false", "progress=false"),
+        ("generate", "count=16", "shard_size=4", "workers=0", "verify=false", "progress=none"),
         ("scenes-00000.parquet", "scenes-00003.parquet", "metadata.json"),
     ),
     "pretrain": Command(
@@ -52,7 +52,7 @@ RESUMABLE = {
     "post-train nft": Command(
         ("post-train", _PRIORS[1], *_TRAINING, "algorithm=nft", "guard.samples=2", "guard.action=rollback"), _TRAINED
     ),
-    "post-train hold": Command(("post-train", _PRIORS[0], *_TRAINING, "hold=guard:1.05"), _TRAINED),
+    "post-train hold": Command(("post-train", _PRIORS[0], *_TRAINING, "regularisation.hold=guard:1.05"), _TRAINED),
     "search": Command(("search", _PRIORS[1], *_SEARCHING, "budget=24"), _SEARCHED),
     "search count": Command(
         ("search", _PRIORS[1], *_SEARCHING, "budget=9", "planner=mcts", "count=4", "side_by_side=2"), _SEARCHED

@@ -59,7 +59,7 @@ def generate(
     workers: int = 2,
     verify: bool = True,
     shard_size: int = 2000,
-    progress: bool = True,
+    progress: bool | str = True,
     backend: str = "processes",
     address: str | None = None,
 ) -> GenerationReport:
@@ -77,7 +77,8 @@ def generate(
         workers: Number of spawned processes; 0 runs in this one. With Ray: CPUs of the cluster that is started here.
         verify: Whether to keep only scenes that pass :func:`~scene_envs.datasets.verification.judge_scenes`.
         shard_size: Number of scenes per parquet file.
-        progress: Whether to show a live progress bar (a line every 30 s where there is no terminal).
+        progress: True for a live bar (a line every 30 s where there is no terminal), False for none, or a style of
+            :class:`~scene_envs.progress.Progress`.
         backend: ``"processes"`` of this machine, or ``"ray"``.
         address: Address of a running Ray cluster; None starts one on this machine.
 

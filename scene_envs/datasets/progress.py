@@ -16,7 +16,7 @@ _EVERY = 30.0
 
 
 @contextmanager
-def generation_progress(title: str, done: int, count: int, show: bool) -> Iterator[Report]:
+def generation_progress(title: str, done: int, count: int, show: bool | str) -> Iterator[Report]:
     """A live bar with scenes/s and the most frequent reasons; yields the function that advances it.
 
     On a terminal the bar is on stderr; elsewhere (a log file) a line is printed every 30 s.
@@ -25,11 +25,12 @@ def generation_progress(title: str, done: int, count: int, show: bool) -> Iterat
         title: Title of the bar.
         done: Number of scenes that exist already.
         count: Number of requested scenes.
-        show: Whether to show anything.
+        show: Style of the display; True for a bar, False for none.
     """
     totals: Counter[str] = Counter()
     kept = 0
-    with Progress(title, count, done=done, style="bar" if show else "none", every=_EVERY) as progress:
+    style = show if isinstance(show, str) else ("bar" if show else "none")
+    with Progress(title, count, done=done, style=style, every=_EVERY) as progress:
 
         def report(fresh: int, tried: int, reasons: dict[str, int]) -> None:
             nonlocal kept

@@ -18,6 +18,12 @@ PROMPT_SOURCES = ("data", "grammar")
 
 _MAX_SLOTS = 100_000
 _MAX_NUMBER = 1e30
+MASKS = (
+    "balanced", "blamed_or_empty", "culprits", "empty", "explicit", "infeasible", "infeasible_or_empty",
+    "lowest_scoring", "off_prompt", "penetrating", "random", "region", "unstable",
+)  # fmt: skip
+"""Names of the mask generators of :mod:`scene_envs.envs.masks`."""
+
 
 Init = TypeVar("Init", bound=Callable[..., None])
 

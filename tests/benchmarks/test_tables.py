@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.configuration.tree import dotted_values
+from agents.configuration import dotted_values
 from agents.pretraining.config import PretrainConfig
 from benchmarks.paper_tables import ALL_TABLES, Entry, Row, Table, TablesConfig, list_rows, make_tables
 from benchmarks.paper_tables.columns import COLUMNS, Column, error, expand, text
@@ -75,12 +75,12 @@ def test_every_factor_is_asked() -> None:
     assert {("process.moments", name) for name in ("scene", "feature", "category")} <= asked
     assert {("process.noise_floor", value) for value in (0.01, 0.002, 0.0005)} <= asked
     assert {("loss.translation_weight", 1.0), ("loss.translation_weight", 3.0)} <= asked
-    assert {("optimizer.final_lr", 1.0), ("optimizer.decay_share", 1.0)} <= asked
+    assert {("optimizer.rate.final", 1.0), ("optimizer.rate.decay", 1.0)} <= asked
     assert {("network.modules.rotation_features", True), ("network.modules.rotation_features", False)} <= asked
     assert {
         *(("network.modules.relations", name) for name in ("none", "largest", "axis")),
-        ("network.frequencies", 0),
-        ("network.frequencies", 8),
+        ("network.flux.frequencies", 0),
+        ("network.flux.frequencies", 8),
     } <= asked
     assert {row.capacity for row in ours} == {0.5, 1.0, 2.0}
     assert [entry.row.overrides for entry in make_tables(["precision"], ["paper"])[0].entries] == [PAPER]

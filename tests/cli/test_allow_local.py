@@ -1,11 +1,15 @@
 """Files of users' rewards on the command line: run after a flag or a yes, and after nothing else."""
 
 import io
+from importlib import import_module
 
 import pytest
 
-from agents.cli import main, parser
+from agents.cli import main
 from rewards import local_files
+
+MAIN = import_module("agents.cli.main")
+"""The module; ``agents.cli.main`` is its function."""
 
 REWARD_FILE = "def few(batch):\n    return -batch.counts.float()\n"
 
@@ -14,7 +18,7 @@ REWARD_FILE = "def few(batch):\n    return -batch.counts.float()\n"
 def reward_files(tmp_path, monkeypatch):
     """Two files of rewards; what is allowed in a test is forgotten after it."""
     monkeypatch.setattr(local_files, "_allowed", set())
-    monkeypatch.setattr(parser, "_run", lambda *_: 0)  # what is tested comes before the work
+    monkeypatch.setattr(MAIN, "_run", lambda *_: 0)  # what is tested comes before the work
     for name in ("one.py", "two.py"):
         (tmp_path / name).write_text(REWARD_FILE)
     return tmp_path

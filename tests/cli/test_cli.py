@@ -9,10 +9,13 @@ from typing import Any
 
 import pytest
 
-from agents.cli import main, parser
-from agents.cli.commands import COMMANDS
+from agents.cli import main
+from agents.cli.commands import COMMANDS, load_command
 from agents.cli.keys import describe_fields, keys_of
 from scene_envs.errors import PhysicsError
+
+MAIN = import_module("agents.cli.main")
+"""The module; ``agents.cli.main`` is its function."""
 
 
 def test_without_a_command_it_lists_all_of_them(capsys):
@@ -29,9 +32,9 @@ def test_idle_threads_sleep_unless_the_environment_says_otherwise(given, spins, 
     for name in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr("os.environ", {**os.environ, **given})
-    monkeypatch.setattr(parser, "main", lambda: 3)
+    monkeypatch.setattr(MAIN, "main", lambda: 3)
     with pytest.raises(SystemExit) as ended:
-        parser.entry_point()
+        MAIN.entry_point()
     assert (ended.value.code, os.environ.get("GOMP_SPINCOUNT")) == (3, spins)
 
 
@@ -39,7 +42,7 @@ def test_idle_threads_sleep_unless_the_environment_says_otherwise(given, spins, 
 def test_help_lists_every_key_with_its_meaning(command, capsys):
     assert main([command, "--help"]) == 0
     assert COMMANDS[command] in capsys.readouterr().out
-    keys = describe_fields(keys_of(import_module(f"agents.cli.commands.{command.replace('-', '_')}")))
+    keys = describe_fields(keys_of(load_command(command)))
     assert all(key.meaning for key in keys), [key.name for key in keys if not key.meaning]
 
 
@@ -131,7 +134,7 @@ class EchoCommand:
 def echo(monkeypatch):
     """``scene-envs demo`` replaced by a command of our own."""
     command = EchoCommand()
-    monkeypatch.setattr(parser, "import_module", lambda name: command)
+    monkeypatch.setattr(MAIN, "load_command", lambda name: command)
     return command
 
 

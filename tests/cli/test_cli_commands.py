@@ -69,7 +69,7 @@ def test_samples_are_guided_as_the_prior_says_unless_the_command_says_otherwise(
 @pytest.mark.usefixtures("few_residual_levels")
 def test_generate_pretrain_post_train_and_sample_the_result(tmp_path, capsys):
     data, trained, steered = (tmp_path / name for name in ("data", "trained", "steered"))
-    assert main(["generate", "count=8", "shard_size=8", "workers=0", "progress=false", f"output={data}"]) == 0
+    assert main(["generate", "count=8", "shard_size=8", "workers=0", "progress=none", f"output={data}"]) == 0
     assert metrics(data)["scenes"] == 8
     small = ["network.hidden=16", "network.depth=1", "network.heads=1", "batch_size=2", "iterations=2"]
     assert main(["pretrain", f"data={data}", *small, f"output={trained}"]) == 0
@@ -80,7 +80,7 @@ def test_generate_pretrain_post_train_and_sample_the_result(tmp_path, capsys):
         "guard.scenes=2",
         "slots=6",
         "logger.report_scenes=1",
-        "logger.progress=none",
+        "progress=none",
         "reward={name: clip, reward: object_count, high: 30}",
     ]
     assert main(["post-train", f"prior={trained}", *words, f"output={steered}"]) == 0

@@ -108,7 +108,7 @@ def test_search_and_post_training_take_prompts(reader: Path, tmp_path: Path) -> 
         "prompt=[A scene with two cups., A scene with 9 objects.]",
         "algorithm.scenes_per_prompt=2",
         "algorithm.min_std=0.0001",
-        "logger.progress=none",
+        "progress=none",
         "logger.report_scenes=0",
     ]
     assert main([*words, f"output={tmp_path / 'run'}"]) == 0
@@ -196,7 +196,7 @@ def test_scenes_are_completed_in_parts(
     scenes, prior = files
     words = ["complete", f"scenes={scenes}", f"prior={prior}", "num_steps=2", "pictures=0"]
     assert main([*words, f"output={tmp_path / 'whole'}"]) == 0
-    monkeypatch.setattr("agents.cli.commands.inpainting._AT_ONCE", 2)
+    monkeypatch.setattr("agents.cli.commands.inpaint._AT_ONCE", 2)
     assert main([*words, f"output={tmp_path / 'parts'}"]) == 0
     whole, parts = (SceneBatch.load(tmp_path / name / "scenes.safetensors").tensor for name in ("whole", "parts"))
     torch.testing.assert_close(parts, whole, rtol=0, atol=1e-5)

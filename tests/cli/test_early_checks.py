@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
 
 import pytest
 
 from agents.cli import main
-from agents.cli.early_checks import known_masks, known_rewards, known_scenes
-from agents.configuration.measure_names import MEASURE_NAMES
+from agents.configuration import MEASURE_NAMES, known_masks, known_rewards, known_scenes
+from agents.pretraining.settings import NETWORKS, registered_networks
 from agents.priors import list_priors
 from rewards import list_rewards
 from rewards.registry import registered_module
@@ -21,7 +22,7 @@ LINES = {
     "generate scene={a:b}": "give the name of one scene type",
     "evaluate data=,": "names no dataset",
     f"sample guidance={'9' * 400}": "guidance=",
-    f"pretrain loss.noise_mean={'9' * 400}": "noise_mean=",
+    f"pretrain loss.noise.mean={'9' * 400}": "mean=",
     "evaluate workers=-1": "workers=-1: give a number of processes",
     "evaluate prior=dimsum_tabel": "did you mean 'dimsum_table'",
     "evaluate prior=runs/nowhere": "'runs/nowhere' holds no prior",
@@ -33,10 +34,11 @@ LINES = {
     "evaluate guidance=nan": "guidance=nan must be a finite number",
     "doctor reward=object_cuont": "did you mean 'object_count'",
     "doctor regularisation.scenes=nowhere": "regularisation.scenes='nowhere': nothing is at 'nowhere'",
-    "doctor algorithm.step_weighting=stds": "did you mean 'std'",
+    "doctor algorithm.credit=objects": "did you mean 'object'",
+    "generate progress=bars": "did you mean 'bar'",
     "doctor slots=0": "slots=0 must be at least 1",
     "post-train device=cuad": "device='cuad' is no torch device",
-    "post-train optimizer.weight_decay=nan": "weight_decay=nan must be at least 0",
+    "post-train optimizer.lr=nan": "lr=nan must be positive",
     "search objective=object_cuont": "did you mean 'object_count'",
     "search scenes=nowhere": "no scene file, run or dataset is there",
     "search planner=baem": "did you mean 'beam'",
@@ -110,11 +112,15 @@ def test_names_paths_and_numbers_are_refused_without_torch():
 def test_the_names_that_are_known_without_torch_are_those_of_the_packages():
     own = {name for name in list_rewards() if (registered_module(name) or "").startswith("rewards.")}
     assert len(own) > 15
-    assert own <= set(known_rewards())
     assert len(list_priors()) > 8
-    assert set(known_masks()) <= set(list_masks())
-    assert {"culprits", "explicit", "region"} <= set(known_masks())
+    code = "from agents.configuration import known_masks, known_rewards\nprint([known_masks(), known_rewards()])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    masks, rewards = ast.literal_eval(done.stdout)
+    assert own <= set(rewards) <= set(list_rewards()) == set(known_rewards())
+    assert set(masks) <= set(list_masks()) == set(known_masks())
+    assert {"culprits", "explicit", "region"} <= set(masks)
     assert set(known_scenes()) <= set(list_grammars())
+    assert set(NETWORKS) <= set(registered_networks())
 
 
 def test_words_of_groups_are_those_of_the_parts_they_are_for():
@@ -126,16 +132,13 @@ def test_words_of_groups_are_those_of_the_parts_they_are_for():
     from agents.evaluation.measures import MEASURES
     from agents.networks.denoisers import EMPTY_SLOTS
     from agents.networks.flux import TEXT_REACHES
-    from agents.post_training.algorithm_settings import LOG_PROB_REDUCTIONS
-    from agents.post_training.losses import REDUCTIONS
     from agents.pretraining.initial_prior import MOMENTS
-    from agents.pretraining.settings import LossSettings, NetworkSettings, ProcessSettings
+    from agents.pretraining.settings import FluxSettings, LossSettings, ProcessSettings
     from agents.priors.config import PROCESSES
     from agents.priors.continuous import ROTATION_WIDTHS
     from agents.priors.mixed import CATEGORY_LOSSES
 
     assert tuple(MEASURES) == MEASURE_NAMES
-    assert set(LOG_PROB_REDUCTIONS) == set(REDUCTIONS)
     for make, key, known in (
         (ProcessSettings, "name", PROCESSES),
         (ProcessSettings, "prediction", PREDICTIONS),
@@ -148,7 +151,7 @@ def test_words_of_groups_are_those_of_the_parts_they_are_for():
         (LossSettings, "timesteps", TIMESTEP_DISTRIBUTIONS),
         (LossSettings, "weighting", LOSS_WEIGHTINGS),
         (LossSettings, "category", CATEGORY_LOSSES),
-        (NetworkSettings, "text_reach", TEXT_REACHES),
+        (FluxSettings, "text_reach", TEXT_REACHES),
     ):
         for word in known:
             assert getattr(make(**{key: word}), key) == word

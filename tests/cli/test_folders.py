@@ -4,16 +4,20 @@ import os
 import signal
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 import yaml
 
-from agents.cli import main, parser
+from agents.cli import main
 from agents.cli.commands.rewards import RewardsConfig
 from agents.priors.testing import tiny_prior
 from agents.utils.interrupts import Terminated, finishing_steps, terminable
 from scene_envs.folders import claimed
+
+MAIN = import_module("agents.cli.main")
+"""The module; ``agents.cli.main`` is its function."""
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +131,7 @@ def test_sigterm_ends_a_command_like_ctrl_c_with_its_own_status(monkeypatch, tmp
         def run(settings: RewardsConfig):
             os.kill(os.getpid(), signal.SIGTERM)
 
-    monkeypatch.setattr(parser, "import_module", lambda name: Told)
+    monkeypatch.setattr(MAIN, "load_command", lambda name: Told)
     before = signal.getsignal(signal.SIGTERM)
     assert main(["rewards"]) == 143
     assert "terminated" in capsys.readouterr().err
@@ -144,7 +148,7 @@ def test_sigterm_during_an_import_that_makes_another_error_of_it_ends_a_command_
             except KeyboardInterrupt:
                 raise ImportError("initialization failed") from None
 
-    monkeypatch.setattr(parser, "import_module", lambda name: Told)
+    monkeypatch.setattr(MAIN, "load_command", lambda name: Told)
     assert main(["rewards"]) == 143
     err = capsys.readouterr().err
     assert "terminated" in err

@@ -112,7 +112,7 @@ def test_a_checksum_beside_a_file_is_verified_and_goes_with_the_file(tmp_path):
 
 
 def test_every_shipped_prior_has_a_checksum():
-    from agents.configuration.prior_names import SHIPPED
+    from agents.prior_names import SHIPPED
 
     for weights in SHIPPED.glob("*/model.safetensors"):
         assert b"sha256" in weights.read_bytes()[:100_000]
@@ -133,7 +133,7 @@ def test_an_edited_configuration_is_told_and_accepted_without_its_digest(tmp_pat
 
 
 def test_every_shipped_configuration_has_a_digest():
-    from agents.configuration.prior_names import SHIPPED
+    from agents.prior_names import SHIPPED
 
     for path in SHIPPED.glob("*/config.json"):
         content = json.loads(path.read_text())

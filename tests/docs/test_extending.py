@@ -154,7 +154,8 @@ batch_size: 3
 num_steps: 3
 regularisation: {batch_size: 2, bank_size: 8}
 guard: {scenes: 2}
-logger: {progress: none, report_scenes: 0}
+logger: {report_scenes: 0}
+progress: none
 """,
 }
 """A folder of values for the names of the package, as a user's ``--config-dir``."""

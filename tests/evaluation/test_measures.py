@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from agents.configuration.measure_names import choose_measures
+from agents.cli.commands.evaluate import choose_measures
 from agents.evaluation import grammar_scenes
 from agents.evaluation.measures import MEASURES, EvaluationInputs, compute_measure
 from agents.evaluation.real_scenes import RealScenes

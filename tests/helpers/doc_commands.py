@@ -7,7 +7,7 @@ from importlib import import_module
 from types import ModuleType
 
 from agents import cli
-from agents.cli.commands import COMMANDS
+from agents.cli.commands import COMMANDS, load_command
 from agents.cli.keys import describe_fields, keys_of
 from tests.helpers.doc_folders import prepare
 from tests.helpers.doc_pages import INSTEAD, NOT_RUN, ROOT, ROWS, SMALL_KEYS
@@ -71,7 +71,7 @@ def _keys(name: str) -> set[str]:
         if hasattr(module, "DEFAULTS"):
             return set(module.DEFAULTS)
     else:
-        module = import_module(f"agents.cli.commands.{name.replace('-', '_')}")
+        module = load_command(name)
     keys = {key.name for key in describe_fields(keys_of(module))}
     return keys | {key.rpartition(".")[0] for key in keys}
 

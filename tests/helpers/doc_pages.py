@@ -62,7 +62,7 @@ SMALLER: dict[str, dict[str, str]] = {
 SMALL: dict[str, dict[str, object]] = {
     "regularisation": {"bank_size": 16, "batch_size": 2},
     "guard": {"scenes": 4},
-    "logger": {"progress": "none"},
+    "progress": "none",
 }
 """Groups of a small post-training run, known to the Python blocks by this name."""
 
@@ -73,15 +73,15 @@ SMALL_KEYS: dict[str, dict[str, str]] = {
     "sample": {"count": "1", "num_steps": "20", "slots": "13", "workers": "0", "pictures": "1"},
     "complete": {"num_steps": "5"},
     "rearrange": {"num_steps": "5"},
-    "generate": {"count": "12", "workers": "0", "progress": "false", "verify": "false"},
+    "generate": {"count": "12", "workers": "0", "progress": "none", "verify": "false"},
     "pretrain": {
         "iterations": "2",
         "batch_size": "2",
         "network.hidden": "32",
         "network.depth": "2",
         "network.heads": "2",
-        "text.width": "16",
-        "text.warmup": "2",
+        "text.vocabulary.width": "16",
+        "text.vocabulary.warmup": "2",
     },
     "post-train": {
         "iterations": "1",

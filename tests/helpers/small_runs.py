@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from agents.configuration.tree import changed
+from agents.configuration import changed
 from agents.post_training import PostTrainConfig
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.scene import SceneBatch
@@ -15,9 +15,9 @@ from scene_envs.scene import SceneBatch
 PLACES = {
     "regularisation": "regularisation.weight", "bank_size": "regularisation.bank_size",
     "real_scenes": "regularisation.scenes", "lr": "optimizer.lr", "learning_rate": "optimizer.lr",
-    "chunk": "optimizer.chunk", "ema": "optimizer.ema", "gradient_steps": "algorithm.gradient_steps",
+    "chunk": "optimizer.chunk", "gradient_steps": "algorithm.gradient_steps",
     "credit": "algorithm.credit", "scenes_per_prompt": "algorithm.scenes_per_prompt",
-    "guard_limit": "guard.limit", "guard_action": "guard.action", "max_invalid": "guard.max_invalid",
+    "guard_limit": "guard.limit", "guard_action": "guard.action",
 }  # fmt: skip
 """Short names of keys of groups."""
 
@@ -33,7 +33,8 @@ def small_config(output: Path | str, **changes: Any) -> PostTrainConfig:
         algorithm={"gradient_steps": 2},
         regularisation={"weight": 1.0, "batch_size": 6, "bank_size": 24},
         guard={"scenes": 8, "every": 2},
-        logger={"checkpoint_every": 2, "progress": "none"},
+        logger={"checkpoint_every": 2},
+        progress="none",
         optimizer={"lr": 1e-3},
         **{key: changes.pop(key) for key in ("prompt", "guidance") if key in changes},
     )

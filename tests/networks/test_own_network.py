@@ -35,7 +35,7 @@ def test_two_steps_train_it_and_its_files_give_it_back(tmp_path: Path) -> None:
     config = PretrainConfig(
         data="grammar", output=str(tmp_path / "run"), iterations=2, batch_size=4,
         network={"name": "deep_sets", "hidden": 16, "depth": 3}, process={"empty_slots": "attended"},
-        optimizer={"warmup": 1}, logger={"log_every": 1, "evaluate_every": 2, "checkpoint_every": 2},
+        optimizer={"rate": {"warmup": 1}}, logger={"log_every": 1, "evaluate_every": 2, "checkpoint_every": 2},
     )  # fmt: skip
     pretrain(config)
     prior = ScenePrior.load(tmp_path / "run")

@@ -111,7 +111,7 @@ def test_a_run_on_ray_is_the_run_in_this_process(tmp_path: Path) -> None:
         config = PostTrainConfig(
             output=str(tmp_path / str(workers)), iterations=1, batch_size=4, num_steps=4, workers=workers,
             reward="feasible_objects", algorithm={"gradient_steps": 2}, guard={"scenes": 8, "samples": 0},
-            regularisation={"bank_size": 20, "batch_size": 4}, logger={"progress": "none"},
+            regularisation={"bank_size": 20, "batch_size": 4}, progress="none",
         )  # fmt: skip
         logs.append([{**row, "seconds": 0.0} for row in post_train(config, prior=tiny_prior()).history])
     assert logs[0] == logs[1]

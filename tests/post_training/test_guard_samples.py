@@ -44,7 +44,7 @@ def trainer(path: Path, **changes: object) -> PostTrainer:
 @pytest.mark.slow
 def test_the_base_prior_measures_as_itself(tmp_path: Path) -> None:
     """The same prior has the same samples at every check, so nothing exceeds the base prior."""
-    guard = trainer(tmp_path, **{"guard.count_limit": 0.0, "guard.classifier_limit": 0.0}).guard
+    guard = trainer(tmp_path, **{"guard.limits.count": 0.0, "guard.limits.classifier": 0.0}).guard
     reading = guard.check(tiny_prior(), 5, reward=0.0)
     assert reading.samples == guard.base_figures
     assert reading.beyond == ()
@@ -71,7 +71,7 @@ def test_samples_of_a_run_have_no_physics_guidance_and_its_prior_keeps_the_stren
 
 @pytest.mark.slow
 def test_a_figure_beyond_its_limit_is_named_and_keeps_nothing(tmp_path: Path) -> None:
-    made = trainer(tmp_path, **{"guard.count_limit": 1.0})
+    made = trainer(tmp_path, **{"guard.limits.count": 1.0})
     other = tiny_prior()
     with torch.no_grad():
         for parameter in other.parameters():
@@ -138,7 +138,7 @@ def test_a_resumed_run_samples_and_keeps_the_same(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_report_shows_figures_beside_the_base_prior(tmp_path: Path) -> None:
-    config = small_config(tmp_path, iterations=2, **SAMPLES, **{"guard.count_limit": 2.0})
+    config = small_config(tmp_path, iterations=2, **SAMPLES, **{"guard.limits.count": 2.0})
     guard = post_train(config, prior=tiny_prior()).metrics["guard"]
     [section] = guard_sections(guard, {})
     labels = [row[0] for row in section.table]
@@ -185,8 +185,8 @@ def test_a_check_compares_stacks_with_those_of_real_scenes(tmp_path: Path) -> No
 
 def test_a_limit_on_stacks_needs_geometry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SceneType, "has_geometry", property(lambda self: False))
-    with pytest.raises(InvalidInputError, match=r"guard\.stack_limit=0\.5 needs the geometry"):
-        trainer(tmp_path, **{"guard.stack_limit": 0.5})
+    with pytest.raises(InvalidInputError, match=r"guard\.limits\.stack=0\.5 needs the geometry"):
+        trainer(tmp_path, **{"guard.limits.stack": 0.5})
 
 
 def test_a_figure_that_the_base_prior_lacks_is_within_its_limit() -> None:

@@ -33,7 +33,7 @@ def config(output: Path, **changes: Any) -> PostTrainConfig:
     regularisation = {"weight": 1.0, "batch_size": 4, "bank_size": 32}
     return PostTrainConfig(
         reward=count_objects, prompt=TWO, claim_guidance=1.0, iterations=2, batch_size=8, num_steps=20,
-        regularisation=regularisation, logger={"progress": "none"}, output=str(output), **(keys | changes),
+        regularisation=regularisation, progress="none", output=str(output), **(keys | changes),
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from agents.cli.keys import compose
-from agents.configuration.tree import changed
+from agents.configuration import changed
 from agents.post_training import PostTrainConfig, post_train, post_train_and_compare
 from agents.post_training.algorithms import algorithm_settings
 from agents.post_training.hold import HIGHEST, LOWEST, HoldState, adjust
@@ -83,23 +83,22 @@ def test_the_factor_stays_within_its_bounds(measured: float, bound: float, lost:
     assert (state.lost_at is not None) == lost
 
 
-@pytest.mark.parametrize("word", ["hold=guard:1.05", "regularisation.hold=guard:1.05"])
-def test_the_key_is_typed_with_or_without_its_group(word: str) -> None:
-    config = compose("post-train", PostTrainConfig, [word])
-    assert config == PostTrainConfig(hold="guard:1.05") == PostTrainConfig(regularisation={"hold": "guard:1.05"})
+def test_the_target_is_the_same_in_python() -> None:
+    config = compose("post-train", PostTrainConfig, ["regularisation.hold=guard:1.05"])
+    assert config == PostTrainConfig(regularisation={"hold": "guard:1.05"})
     assert config.regularisation.target == 1.05
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["hold=guard:0.9"], "above 1, the base"),
-        (["hold=guard:inf"], "finite"),
-        (["hold=guard:much"], "such as guard:1.05"),
-        (["hold=guard"], "must be guard:RATIO"),
-        (["hold=gard:1.05"], "must be guard:RATIO"),
-        (["hold=guard:1.05", "regularisation.weight=0"], "which is 0"),
-        (["hold=guard:1.6"], "guard.limit"),
+        (["regularisation.hold=guard:0.9"], "above 1, the base"),
+        (["regularisation.hold=guard:inf"], "finite"),
+        (["regularisation.hold=guard:much"], "such as guard:1.05"),
+        (["regularisation.hold=guard"], "must be guard:RATIO"),
+        (["regularisation.hold=gard:1.05"], "must be guard:RATIO"),
+        (["regularisation.hold=guard:1.05", "regularisation.weight=0"], "which is 0"),
+        (["regularisation.hold=guard:1.6"], "guard.limit"),
     ],
 )
 def test_nonsense_is_refused(words: list[str], said: str) -> None:

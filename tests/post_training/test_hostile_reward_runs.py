@@ -33,7 +33,7 @@ def test_a_reward_that_draws_from_global_generators_gives_the_same_run_for_the_s
 @pytest.mark.usefixtures("copied_workers")
 def test_a_reward_that_ends_its_process_ends_a_run_with_an_error_and_never_with_success(tmp_path, caplog):
     allow_local_rewards(FILE)
-    config = small_config(tmp_path, reward=f"{FILE}:quits", **{"guard.max_invalid": 1})
+    config = small_config(tmp_path, reward=f"{FILE}:quits")
     with pytest.raises(TrainingError, match="scored none of 2 real scenes"):
         post_train(config, prior=tiny_prior())
     assert "ended its process (exit status 0)" in caplog.text

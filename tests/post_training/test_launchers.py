@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch.distributed.elastic.multiprocessing.subprocess_handler import subprocess_handler
 
-from agents.cli.parser import main
+from agents.cli.main import main
 from agents.post_training.run_files import CHECKPOINT_NAME
 from agents.priors.testing import tiny_prior
 from agents.utils.process_group import ProcessGroup, is_first_process, launched_processes
@@ -24,7 +24,7 @@ from tests.helpers.processes import in_processes
 KEYS = (
     "post-train reward=object_count iterations=1 batch_size=4 num_steps=4 "
     "algorithm.gradient_steps=2 regularisation.bank_size=20 regularisation.batch_size=4 guard.scenes=8 guard.samples=0 "
-    "logger.progress=none logger.report_scenes=0 device=cpu"
+    "progress=none logger.report_scenes=0 device=cpu"
 )
 LAUNCHER = (
     "accelerate.commands.launch --multi_gpu --num_processes 2 --num_machines 1 --mixed_precision no "

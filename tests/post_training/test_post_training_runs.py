@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from agents.configuration.tree import changed
+from agents.configuration import changed
 from agents.post_training import PostTrainer, post_train
 from agents.post_training import regularisation as regularisation_module
 from agents.priors.prior import ScenePrior
@@ -94,7 +94,7 @@ def test_rows_go_to_the_logger_that_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("changes", [{}, {"ema": 0.5, "credit": "scene"}, {"algorithm": "ddpo_is"}])
+@pytest.mark.parametrize("changes", [{}, {"credit": "scene"}, {"algorithm": "ddpo_is"}])
 def test_stopped_and_resumed_run_equals_the_uninterrupted_one(tmp_path: Path, changes: dict) -> None:
     whole = post_train(small_config(tmp_path / "whole", iterations=3, **changes), prior=tiny_prior())
     post_train(small_config(tmp_path / "parts", iterations=2, **changes), prior=tiny_prior())
@@ -220,18 +220,21 @@ def test_a_reward_that_scores_nothing_ends_the_run_at_once(tmp_path: Path, score
         return count_objects(batch, context)
 
     with pytest.raises(TrainingError, match=message):
-        post_train(small_config(tmp_path, reward=raises, max_invalid=5, **{"guard.samples": 0}), prior=tiny_prior())
+        post_train(small_config(tmp_path, reward=raises, **{"guard.samples": 0}), prior=tiny_prior())
 
 
 @pytest.mark.slow
-def test_batches_without_valid_reward_change_nothing_and_end_a_run_after_some(tmp_path: Path) -> None:
+def test_batches_without_valid_reward_change_nothing_and_end_a_run_after_some(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("agents.post_training.trainer.MAX_INVALID", 2)
     calls = []
 
     def fails(batch: SceneBatch, context: RewardContext) -> RewardOutput:
         calls.extend([1] if len(batch) == 6 else [])  # batches, not the real scenes
         return (count_objects if len(calls) <= 1 else not_a_number)(batch, context)
 
-    config = small_config(tmp_path, reward=fails, iterations=3, max_invalid=2, **{"guard.samples": 0})
+    config = small_config(tmp_path, reward=fails, iterations=3, **{"guard.samples": 0})
     with pytest.raises(TrainingError, match="scored no scene in 2 batches in a row, the last at iteration 3"):
         post_train(config, prior=tiny_prior())
     calls.clear()
@@ -294,7 +297,6 @@ def test_credit_per_object_needs_such_a_reward(tmp_path: Path) -> None:
         {"lr": 0.0},
         {"credit": "slot"},
         {"bank_size": 8},
-        {"ema": 1.0},
         {"regularisation": -1.0},
     ],
 )

@@ -13,7 +13,7 @@ import pytest
 import torch
 from filelock import FileLock
 
-from agents.cli.parser import main
+from agents.cli.main import main
 from agents.post_training import PostTrainer, post_train
 from agents.priors.testing import tiny_prior
 from agents.utils.process_group import ProcessGroup

@@ -28,5 +28,5 @@ def raw() -> torch.Tensor:
 def config(tmp_path: Path) -> PretrainConfig:
     return PretrainConfig(
         output=str(tmp_path), iterations=6, batch_size=8, network={"hidden": 16, "depth": 1, "heads": 2},
-        optimizer={"warmup": 2}, logger={"log_every": 1, "evaluate_every": 3, "checkpoint_every": 2},
+        optimizer={"rate": {"warmup": 2}}, logger={"log_every": 1, "evaluate_every": 3, "checkpoint_every": 2},
     )  # fmt: skip

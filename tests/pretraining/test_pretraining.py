@@ -11,7 +11,7 @@ import torch
 from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
 from agents.cli import main
-from agents.configuration.tree import changed
+from agents.configuration import changed
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.data import SceneTable
 from agents.pretraining.initial_prior import build_prior
@@ -107,7 +107,7 @@ def test_a_checkpoint_that_holds_no_base_rates_resumes_bit_for_bit(
     config: PretrainConfig, raw: torch.Tensor, tmp_path: Path
 ) -> None:
     """The learning rate hangs on the number of the step alone, whatever the optimiser's groups say."""
-    config = changed(config, {"optimizer.decay_share": 1.0})
+    config = changed(config, {"optimizer.rate.decay": 1.0})
     whole = make_run(replace(config, output=str(tmp_path / "whole")), raw)
     whole.run()
     first = make_run(config, raw)
@@ -186,7 +186,7 @@ def test_a_truncated_checkpoint_is_named(config: PretrainConfig, raw: torch.Tens
 
 
 def test_learning_rate_warms_up_and_ends_at_its_floor() -> None:
-    config = PretrainConfig(iterations=1000, optimizer={"warmup": 10, "lr": 1.0, "final_lr": 0.1, "decay_share": 1.0})
+    config = PretrainConfig(iterations=1000, optimizer={"lr": 1.0, "rate": {"warmup": 10, "final": 0.1, "decay": 1.0}})
     assert learning_rate_at(0, config) == pytest.approx(0.1)
     assert learning_rate_at(9, config) == pytest.approx(1.0)
     assert learning_rate_at(505, config) == pytest.approx(0.55)
@@ -194,19 +194,19 @@ def test_learning_rate_warms_up_and_ends_at_its_floor() -> None:
 
 
 def test_learning_rate_stays_at_its_peak_until_the_decay_begins() -> None:
-    config = PretrainConfig(iterations=1000, optimizer={"warmup": 10, "lr": 1.0, "final_lr": 0.1, "decay_share": 0.2})
+    config = PretrainConfig(iterations=1000, optimizer={"lr": 1.0, "rate": {"warmup": 10, "final": 0.1, "decay": 0.2}})
     assert {learning_rate_at(step, config) for step in range(9, 801)} == {1.0}
     assert learning_rate_at(900, config) == pytest.approx(0.55)  # half way along the cosine
     assert learning_rate_at(1000, config) == pytest.approx(0.1)
-    assert learning_rate_at(900, changed(config, {"optimizer.final_lr": 1.0})) == 1.0
-    late = changed(config, {"optimizer.warmup": 900})  # a decay never begins in the warm-up
+    assert learning_rate_at(900, changed(config, {"optimizer.rate.final": 1.0})) == 1.0
+    late = changed(config, {"optimizer.rate.warmup": 900})  # a decay never begins in the warm-up
     assert learning_rate_at(899, late) == 1.0
     assert learning_rate_at(950, late) == pytest.approx(0.55)
 
 
 def test_a_decay_share_that_is_none_is_refused(config: PretrainConfig, raw: torch.Tensor) -> None:
-    with pytest.raises(InvalidInputError, match=r"decay_share=1\.5 is outside 0\.\.1"):
-        make_run(changed(config, {"optimizer.decay_share": 1.5}), raw)
+    with pytest.raises(InvalidInputError, match=r"decay=1\.5 is outside 0\.\.1"):
+        make_run(changed(config, {"optimizer.rate.decay": 1.5}), raw)
 
 
 def test_the_weight_average_follows_its_closed_form() -> None:
@@ -225,7 +225,7 @@ def test_parts_one_after_the_other_add_up_to_their_batch(
     config: PretrainConfig, raw: torch.Tensor, process: str
 ) -> None:
     """The gradient of a step is the mean over its parts, each with noise of its own."""
-    run = make_run(changed(config, {"process.name": process, "optimizer.accumulate": 2, "optimizer.clip": 1e9}), raw)
+    run = make_run(changed(config, {"process.name": process, "optimizer.compute.accumulate": 2}), raw)
     losses = [run._part_loss(4, derived_generator(0, 0, part)) for part in range(2)]
     expected = torch.autograd.grad(sum(losses) / 2, list(run.network.parameters()), allow_unused=True)  # type: ignore[arg-type]
     norm = torch.stack([g.norm() for g in expected if g is not None]).norm()
@@ -236,14 +236,14 @@ def test_parts_one_after_the_other_add_up_to_their_batch(
 
 def test_a_batch_that_cannot_be_parted_is_refused(config: PretrainConfig, raw: torch.Tensor) -> None:
     with pytest.raises(InvalidInputError, match="not a multiple of 3"):
-        make_run(changed(config, {"optimizer.accumulate": 3}), raw)
+        make_run(changed(config, {"optimizer.compute.accumulate": 3}), raw)
     with pytest.raises(UnknownNameError, match="did you mean 'bfloat16'"):
-        make_run(changed(config, {"optimizer.precision": "bfloat"}), raw)
+        make_run(changed(config, {"optimizer.compute.precision": "bfloat"}), raw)
 
 
 @pytest.mark.slow
 def test_autocast_is_of_the_network_only(config: PretrainConfig, raw: torch.Tensor) -> None:
-    run = make_run(changed(config, {"optimizer.precision": "bfloat16"}), raw)
+    run = make_run(changed(config, {"optimizer.compute.precision": "bfloat16"}), raw)
     x = run.prior.initial(2, 34)
     pose, logits = run.prior.denoiser(x, torch.tensor([5, 900]))
     assert (pose.dtype, logits.dtype) == (torch.float32, torch.float32)
@@ -276,14 +276,14 @@ def test_two_processes_take_the_steps_of_one_with_twice_the_parts(
 ) -> None:
     generate("dimsum_table", 16, tmp_path / "data", workers=0, verify=False, progress=False)
     keys = ["iterations=3", "batch_size=8", "network.hidden=16", "network.depth=1", "network.heads=2", "seed=3"]
-    keys += ["optimizer.warmup=2", "logger.log_every=1"]
+    keys += ["optimizer.rate.warmup=2", "logger.log_every=1"]
     data = [f"data={tmp_path / 'data'}", f"heldout={tmp_path / 'data'}"]
     place = {"rdzv_backend": "c10d", "rdzv_endpoint": "localhost:0", "run_id": "two"}
     launch = elastic_launch(LaunchConfig(1, 1, 2, start_method="fork", **place), main)  # as torchrun does
     done = launch(["pretrain", *data, *keys, f"output={tmp_path / 'two'}"])
     assert done == {0: 0, 1: 0}
     assert capfd.readouterr().out.count("held-out loss") == 1  # the first process alone speaks
-    assert main(["pretrain", *data, *keys, "optimizer.accumulate=2", f"output={tmp_path / 'one'}"]) == 0
+    assert main(["pretrain", *data, *keys, "optimizer.compute.accumulate=2", f"output={tmp_path / 'one'}"]) == 0
     for name in ("two", "one"):
         assert {"config.yaml", "metrics.json", "prior"} <= {path.name for path in (tmp_path / name).iterdir()}
     two, one = (list(csv.DictReader((tmp_path / name / "log.csv").open())) for name in ("two", "one"))

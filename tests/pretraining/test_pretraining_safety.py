@@ -108,7 +108,7 @@ def test_a_run_of_no_steps_says_so(tmp_path: Path, capsys: pytest.CaptureFixture
     ("keys", "told"),
     [
         ({"process": {"noise_ceiling": float("inf")}}, "noise_ceiling=inf must be a finite number"),
-        ({"loss": {"noise_mean": 500.0}}, "lie outside the schedule"),
+        ({"loss": {"noise": {"mean": 500.0}}}, "lie outside the schedule"),
     ],
 )
 def test_noise_levels_outside_the_schedule_are_refused(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from agents.configuration.tree import changed as changed_config
+from agents.configuration import changed as changed_config
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.data import SceneTable
 from agents.pretraining.initial_prior import build_prior
@@ -23,7 +23,7 @@ def fresh(count: int = 24, **keys: object) -> tuple[MixedPrior, SceneTable]:
     """A prior without training, and ``count`` scenes with prompts."""
     scenes = get_grammar("living_room_shelf").sample(np.random.default_rng(0), count)
     prompts = describe_all(scenes, np.random.default_rng(0))
-    text = {"encoder": "vocabulary", "width": 48, "depth": 1, "latents": 2}
+    text = {"encoder": "vocabulary", "vocabulary": {"width": 48, "depth": 1, "latents": 2}}
     small = PretrainConfig(scene="living_room_shelf", text=text, network={"hidden": 32, "depth": 2, "heads": 2})
     config = changed_config(small, keys)
     prior = build_prior(config, scenes.tensor, Normalizer.fit(scenes.tensor), prompts)
@@ -72,7 +72,8 @@ def test_the_same_seed_learns_the_same_and_nothing_else_changes() -> None:
 
 
 @pytest.mark.parametrize(
-    "keys", [{"text.count_conditioning": False}, {"network.name": "midiffusion", "process.empty_slots": "attended"}]
+    "keys",
+    [{"text.vocabulary.count_conditioning": False}, {"network.name": "midiffusion", "process.empty_slots": "attended"}],
 )
 def test_a_network_without_count_conditioning_has_nothing_to_learn(keys: dict[str, object]) -> None:
     prior, data = fresh(**keys)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from agents.configuration.tree import changed
+from agents.configuration import changed
 from agents.networks.text_encoders import FOLDER_VARIABLE, load_bert
 from agents.pretraining.config import PretrainConfig
 from agents.pretraining.initial_prior import build_prior
@@ -110,7 +110,7 @@ def test_training_reads_prompts_and_resumes_bit_for_bit(bert: Path, tmp_path: Pa
     halves = replace(config, output=str(tmp_path / "halves"))
     state = torch.load(tmp_path / "whole" / "checkpoint.pt", weights_only=False)
     assert not [name for name in state["network"] if "bert" in name or "embeddings" in name]
-    flat = {"optimizer.warmup": 0, "optimizer.final_lr": 1.0}
+    flat = {"optimizer.rate.warmup": 0, "optimizer.rate.final": 1.0}
     pretrain(changed(halves, {"iterations": 2, **flat}))
     pretrain(changed(halves, flat))
     straight = changed(config, {"output": str(tmp_path / "straight"), **flat})

@@ -158,7 +158,7 @@ def test_a_short_training_teaches_what_prompts_say() -> None:
     prompts = [("A scene with many objects.",)] * 64 + [("A scene with 3 objects.",)] * 64
     config = PretrainConfig(
         network={"hidden": 32, "depth": 1, "heads": 2},
-        text={"encoder": "vocabulary", "width": 32, "depth": 1, "latents": 4},
+        text={"encoder": "vocabulary", "vocabulary": {"width": 32, "depth": 1, "latents": 4}},
     )
     made = build_prior(config, raw, Normalizer.fit(raw), prompts)
     assert isinstance(made, MixedPrior)

@@ -1,9 +1,12 @@
-"""The commands of ``scene-envs``, one module each, imported when the command is called.
+"""The commands of ``scene-envs``, imported when they are called; one module each, but for what shares one.
 
 A command module has ``run(settings, run)``, which does the work. The annotation of ``settings`` is a dataclass; its
 fields are the keys of the command, each with a sentence under ``Attributes:``. A module with ``WRITES = False`` has no
 run folder.
 """
+
+from importlib import import_module
+from typing import Any
 
 COMMANDS = {
     "generate": "make a dataset of scenes from a grammar",
@@ -26,3 +29,13 @@ COMMANDS = {
     "demo": "steer the shipped prior two ways, compare the results, write a report",
 }
 """Summaries of the commands, in the order of the listing."""
+
+_TOGETHER = {"complete": "inpaint", "rearrange": "inpaint"}
+"""Commands that are objects of a common module."""
+
+
+def load_command(name: str) -> Any:
+    """The module of a command, or the object with the same functions in a common module."""
+    word = name.replace("-", "_")
+    module = import_module(f"agents.cli.commands.{_TOGETHER.get(name, word)}")
+    return getattr(module, word) if name in _TOGETHER else module

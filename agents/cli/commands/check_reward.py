@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from agents.configuration.fields import named
+from agents.configuration import named
 
 WRITES = False
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from agents.configuration import DeviceKeys, ProgressKeys
+
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
 
 
 @dataclass
-class DemoConfig:
+class DemoConfig(DeviceKeys, ProgressKeys):
     """The demonstration.
 
     Attributes:
@@ -29,7 +31,7 @@ def run(settings: DemoConfig, run: Run) -> None:
     from agents.post_training.comparison import number_rows
     from agents.post_training.demo import RUNS, run_demo
 
-    metrics = run_demo(settings.output, settings.seed, settings.workers)
+    metrics = run_demo(**vars(settings))
     for label, *cells in number_rows({name: metrics[name] for name in ("base", *RUNS)}):
         run.say(f"{label:<40} " + "  ".join(f"{cell:>14}" for cell in cells))
     run.say(f"open {run.directory / 'report.html'}; scene-envs sample prior={run.directory / 'feasible'} draws more")

@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.configuration.measure_names import choose_measures
-from agents.configuration.shared_keys import OutputKeys
-from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
+from agents.configuration import MEASURE_NAMES, OutputKeys
+from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, unknown_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -89,6 +89,33 @@ class EvaluateConfig(RealSceneKeys, OutputKeys):
             )
 
 
+def choose_measures(measures: str | Iterable[str], *, project: bool = True) -> list[str]:
+    """Names of groups, in their order.
+
+    Args:
+        measures: ``"all"``, a name, names joined by commas, or a list of names.
+        project: whether ``"all"`` includes ``ready``.
+
+    Raises:
+        UnknownNameError: a name that is no group.
+        InvalidInputError: no name, or something else than names.
+
+    >>> choose_measures("novelty, layout")
+    ['layout', 'novelty']
+    """
+    if not isinstance(measures, str | Iterable):
+        raise InvalidInputError(f"measures={measures!r} is no list of names; known: all, {', '.join(MEASURE_NAMES)}")
+    names = [name.strip() for name in measures.split(",")] if isinstance(measures, str) else [*map(str, measures)]
+    if "all" in names and all(name == "all" or name in MEASURE_NAMES for name in names):
+        return [name for name in MEASURE_NAMES if project or name != "ready"]
+    if not names:
+        raise InvalidInputError(f"measures is empty; give all, or some of {', '.join(MEASURE_NAMES)}")
+    for name in names:
+        if name not in MEASURE_NAMES:
+            raise unknown_name("measure", name, ["all", *MEASURE_NAMES])
+    return [name for name in MEASURE_NAMES if name in names]
+
+
 def check(settings: EvaluateConfig) -> None:
     """Refuse impossible settings before the prior is read."""
     groups = choose_measures(settings.measures, project=settings.project)
@@ -100,7 +127,7 @@ def check(settings: EvaluateConfig) -> None:
             "are of; null takes all of them"
         )
     if settings.fid_weights and "fid" in groups:
-        from agents.cli.early_checks import check_files
+        from agents.cli.main import check_files
 
         check_files(settings.fid_weights)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.cli.commands.scenes import make_ready
-from agents.configuration.shared_keys import DrawKeys
+from agents.configuration import DrawKeys
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene_sources import load_scenes
 
@@ -113,11 +113,11 @@ def _scenes(settings: ExportConfig, run: Run) -> SceneBatch:
     if settings.prior:
         from agents.priors.prior import ScenePrior
 
-        prior = ScenePrior.load(settings.prior)
+        prior = ScenePrior.load(settings.prior).to(settings.device)
         count = 16 if settings.count is None else settings.count
         batch = prior.sample(
             count, num_steps=settings.num_steps, physics_guidance=settings.physics_guidance, seed=settings.seed
-        )
+        ).to("cpu")
         batch.save(run.directory / "scenes.safetensors")
         return batch
     return load_scenes(Path(settings.scenes), settings.count)

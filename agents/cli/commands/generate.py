@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from agents.configuration.checks import one_of
-from agents.configuration.fields import named
+from agents.configuration import ProgressKeys, named, require_one_of
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
 
 
 @dataclass
-class GenerateConfig:
+class GenerateConfig(ProgressKeys):
     """A dataset from a grammar.
 
     Attributes:
@@ -24,7 +23,6 @@ class GenerateConfig:
             starts.
         verify: keep only scenes that pass physics.
         shard_size: scenes per parquet file.
-        progress: show a progress bar with scenes per second and the reasons of rejections.
         backend: processes, for processes of this machine, or ray.
         address: address of a running Ray cluster; null starts one on this machine.
         output: the dataset folder; finished shards found there are kept.
@@ -36,7 +34,6 @@ class GenerateConfig:
     workers: int = 2
     verify: bool = True
     shard_size: int = 2000
-    progress: bool = True
     backend: str = "processes"
     address: str | None = None
     output: str = ""
@@ -44,7 +41,7 @@ class GenerateConfig:
 
 def check(settings: GenerateConfig) -> None:
     """Refuse impossible settings before anything is imported."""
-    one_of(settings, "backend", ("processes", "ray"))
+    require_one_of(settings, "backend", ("processes", "ray"))
 
 
 def run(settings: GenerateConfig, run: Run) -> None:

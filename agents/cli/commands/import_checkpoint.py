@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from agents.configuration.fields import named
+from agents.configuration import DeviceKeys, named
 from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ POSITIONAL = ("checkpoint", "metadata")
 
 
 @dataclass
-class ImportCheckpointConfig:
+class ImportCheckpointConfig(DeviceKeys):
     """A prior from a checkpoint of the paper's authors: scene-envs import-checkpoint FILE metadata.json.
 
     Attributes:
@@ -49,7 +49,7 @@ class ImportCheckpointConfig:
 
 def check(settings: ImportCheckpointConfig) -> None:
     """Refuse files that are not there."""
-    from agents.cli.early_checks import check_files
+    from agents.cli.main import check_files
 
     if not settings.checkpoint or not settings.metadata:
         raise InvalidInputError("name the two files: scene-envs import-checkpoint FILE metadata.json")
@@ -73,7 +73,8 @@ def run(settings: ImportCheckpointConfig, run: Run) -> None:
     run.say("it reads prompts" if prior.conditional else "it is sampled without prompts")
     metrics = {"parameters": parameters, "trained_steps": prior.card["trained_steps"]}
     if settings.count > 0:
-        batch = prior.sample(settings.count, num_steps=settings.num_steps, seed=settings.seed)
+        prior = prior.to(settings.device)
+        batch = prior.sample(settings.count, num_steps=settings.num_steps, seed=settings.seed).to("cpu")
         batch.save(run.directory / "scenes.safetensors")
         metrics["mean_objects"] = float(batch.counts.double().mean())
         run.say(f"a trial of {len(batch)} scenes has {metrics['mean_objects']:.1f} objects on average")

@@ -44,13 +44,13 @@ class PackagePriorConfig:
 
 def check(settings: PackagePriorConfig) -> None:
     """Refuse impossible settings before the prior is read."""
-    from agents.configuration.checks import one_of
+    from agents.configuration import require_one_of
 
     if not settings.prior or not settings.output:
         raise InvalidInputError(
             "package-prior: name the prior and its new folder, as in prior=runs/mine output=priors/mine"
         )
-    one_of(settings, "precision", ("float16", "float32"))
+    require_one_of(settings, "precision", ("float16", "float32"))
 
 
 def run(settings: PackagePriorConfig) -> None:

@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from agents.cli.commands.export import export_scenes
 from agents.cli.commands.scenes import draw_scenes, make_ready, reward_figures
-from agents.configuration.checks import one_of
-from agents.configuration.fields import named
-from agents.configuration.shared_keys import OutputKeys, SamplingKeys
+from agents.configuration import OutputKeys, SamplingKeys, named, require_one_of
 from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -53,7 +51,7 @@ def check(settings: SampleConfig) -> None:
     """Refuse impossible settings before a prior is loaded."""
     from scene_envs.export.formats import check_formats
 
-    one_of(settings, "union", ("one_type", "any"))
+    require_one_of(settings, "union", ("one_type", "any"))
     if settings.export is not None:
         check_formats(settings.export)
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.configuration.fields import composed, named
-from agents.configuration.shared_keys import RewardLimits
+from agents.configuration import DeviceKeys, ProgressKeys, RewardLimits, composed, named
 from agents.planning.config import SearchConfig
 from scene_envs.scene_sources import load_scenes
 
@@ -25,7 +24,7 @@ FRESH_PRIOR = "dimsum_table"
 
 @composed
 @dataclass
-class SearchKeys(SearchConfig, RewardLimits):
+class SearchKeys(SearchConfig, RewardLimits, DeviceKeys, ProgressKeys):
     """Inputs and output of a search.
 
     Attributes:
@@ -47,6 +46,7 @@ class SearchKeys(SearchConfig, RewardLimits):
 def run(settings: SearchKeys, run: Run) -> None:
     """Search; the search writes its own metrics and pictures."""
     from agents.planning import run_search
+    from agents.priors.prior import ScenePrior
     from agents.utils.interrupts import Terminated
     from rewards.process import close_reward, is_foreign, run_reward
 
@@ -57,9 +57,10 @@ def run(settings: SearchKeys, run: Run) -> None:
     objective = settings.objective
     if is_foreign(objective):
         objective = run_reward(objective, seed=settings.seed, workers=settings.workers, **limits)
-    with _search_progress(search.nfe_per_scene) as show:
+    made = prior if settings.device == "cpu" else ScenePrior.load(prior).to(settings.device)
+    with _search_progress(search.nfe_per_scene, settings.progress) as show:
         try:
-            outcome = run_search(prior, objective, config=search, scenes=scenes, output=settings.output, progress=show)
+            outcome = run_search(made, objective, config=search, scenes=scenes, output=settings.output, progress=show)
         finally:
             close_reward(objective)
     metrics = outcome.metrics
@@ -89,7 +90,7 @@ def run(settings: SearchKeys, run: Run) -> None:
 
 
 @contextmanager
-def _search_progress(nfe_per_scene: int) -> Iterator[Callable[[str, int, int, float], None]]:
+def _search_progress(nfe_per_scene: int, style: str) -> Iterator[Callable[[str, int, int, float], None]]:
     """A bar, or lines, for each planner in turn; yields the function that advances it.
 
     The function is called with the planner, the scenes made, the scenes that will be made, and the best value.
@@ -103,7 +104,7 @@ def _search_progress(nfe_per_scene: int) -> Iterator[Callable[[str, int, int, fl
             if planner not in shown:
                 stack.close()  # the bar of the planner before
                 shown.clear()
-                shown[planner] = stack.enter_context(Progress(planner, budget, always=(budget,)))
+                shown[planner] = stack.enter_context(Progress(planner, budget, style=style, always=(budget,)))
             text = f"best {best:.3f}, {done * nfe_per_scene} NFE"
             shown[planner].update(done, text, f"{planner}: {done}/{budget} scenes, {text}")
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.configuration.fields import named
-from agents.configuration.shared_keys import DrawKeys
+from agents.configuration import DrawKeys, named
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene_sources import find_scenes, is_dataset, load_scenes
 
@@ -31,7 +30,6 @@ class ViewConfig(DrawKeys):
         title: heading of the page; null for a heading that names the source of the scenes.
         pictures: number of scenes in gallery.png; 0 draws none.
         open: also open the page in the browser.
-        device: torch device, with prior=.
         output: folder for viewer.html and gallery.png.
     """
 
@@ -44,7 +42,6 @@ class ViewConfig(DrawKeys):
     title: str | None = None
     pictures: int = 12
     open: bool = False
-    device: str = "cpu"
     output: str = ""
 
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from agents.cli.commands.scenes import draw_scenes
+from agents.configuration import DeviceKeys
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene_sources import load_scenes
 
@@ -24,7 +26,7 @@ _AT_ONCE = 64
 
 
 @dataclass
-class InpaintingConfig:
+class InpaintingConfig(DeviceKeys):
     """Scenes that a prior completes or rearranges.
 
     Attributes:
@@ -41,7 +43,6 @@ class InpaintingConfig:
         num_steps: denoising steps per scene.
         seed: seed of the noise.
         pictures: number of scenes in the galleries; 0 draws none.
-        device: torch device.
         output: folder for scenes.safetensors, before.png and gallery.png.
     """
 
@@ -55,7 +56,6 @@ class InpaintingConfig:
     num_steps: int = 50
     seed: int = 0
     pictures: int = 12
-    device: str = "cpu"
     output: str = ""
 
     def sampling(self, first: int = 0) -> dict[str, Any]:
@@ -112,3 +112,41 @@ def save_scenes(before: SceneBatch, after: SceneBatch, pictures: int, run: Run, 
     draw_scenes(after, pictures, run, "gallery.png")
     run.write_metrics({"scenes": len(after), **figures})
     run.say(f"written to {run.directory}")
+
+
+@dataclass
+class CompleteConfig(InpaintingConfig):
+    """Completion of scenes; their objects stay bit-identical.
+
+    Attributes:
+        slots: slots of the result; null keeps the number of the scenes.
+        fill: most objects to add to a scene; null for as many as there are empty slots.
+    """
+
+    slots: int | None = None
+    fill: int | None = None
+
+
+def run_complete(settings: CompleteConfig, run: Run) -> None:
+    """Fill the empty slots."""
+    prior, batch = load_prior_and_scenes("complete", settings)
+    filled = settings.in_parts(
+        batch, lambda part, keys: prior.complete(part, slots=settings.slots, fill=settings.fill, **keys)
+    )
+    added = float((filled.counts - batch.counts).double().mean())
+    run.say(f"{len(batch)} scenes, {added:.1f} objects added on average")
+    save_scenes(batch, filled, settings.pictures, run, {"added": added})
+
+
+def run_rearrange(settings: InpaintingConfig, run: Run) -> None:
+    """Give the free objects new poses; welded objects stay."""
+    prior, batch = load_prior_and_scenes("rearrange", settings)
+    moved = settings.in_parts(batch, lambda part, keys: prior.rearrange(part, **keys))
+    distance = (moved.translations - batch.translations).norm(dim=-1)[batch.is_free]
+    figures = {"mean_distance_m": float(distance.double().mean()) if len(distance) else 0.0}
+    run.say(f"{len(batch)} scenes, objects moved by {figures['mean_distance_m']:.3f} m on average")
+    save_scenes(batch, moved, settings.pictures, run, figures)
+
+
+complete = SimpleNamespace(run=run_complete, check=check)
+rearrange = SimpleNamespace(run=run_rearrange, check=check)

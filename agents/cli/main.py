@@ -7,22 +7,31 @@ traceback only under ``--traceback`` or ``SCENE_ENVS_TRACEBACK=1``.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import errno
+import itertools
+import math
 import os
+import re
 import sys
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from agents.cli.commands import COMMANDS
-from agents.cli.early_checks import check_early
+from agents.cli.commands import COMMANDS, load_command
 from agents.cli.keys import Sources, compose, format_rows, help_text, keys_of
-from agents.cli.sweep import expand_sweeps
-from agents.configuration.tree import config_text
+from agents.configuration import (
+    PROGRESS_STYLES,
+    config_text,
+    known_masks,
+    known_rewards,
+    known_scenes,
+    require_one_of,
+)
+from agents.prior_names import find_prior, split_name
 from agents.utils.interrupts import Terminated, terminable
 from scene_envs import __version__
 from scene_envs.errors import (
@@ -34,6 +43,8 @@ from scene_envs.errors import (
     UnknownNameError,
     unknown_name,
 )
+from scene_envs.files import exists, is_file
+from scene_envs.scene_sources import find_scenes
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 
@@ -52,6 +63,24 @@ scene-envs COMMAND --help lists the keys of a command; --traceback shows where a
 --allow-local allows reward=./my_rewards.py:clutter to run that file without a question.
 A command writes into output=FOLDER, by default runs/COMMAND-TIME.
 """
+_LEAST = {
+    "count": 1,
+    "num_steps": 1,
+    "slots": 1,
+    "batch_size": 1,
+    "shard_size": 1,
+    "fill": 0,
+    "first": 0,
+    "pictures": 0,
+    "eta": 0,
+    "friction": 0,
+}
+"""The least that a number may be, where a config's ``LEAST`` does not say otherwise."""
+_POSITIVE = ("reward_timeout", "reward_memory")
+_DEVICES = ("cpu", "cuda", "mps", "xpu", "hpu", "mtia", "xla", "ipu", "hip", "ve", "vulkan", "maia", "lazy", "meta")
+_OTHER_DEVICES = ("privateuseone", "npu", "mlu", "musa", "mkldnn", "opengl", "opencl", "ideep", "fpga")
+_DATASETS = ("data", "heldout", "regularisation.scenes")
+_GRAMMAR = "grammar"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -141,8 +170,7 @@ def _dispatch(words: list[str]) -> int:
     command, *rest = words
     if command not in COMMANDS:
         raise unknown_name("command", command, COMMANDS)
-    module = import_module(f"agents.cli.commands.{command.replace('-', '_')}")
-    return _run_or_help(f"scene-envs {command}", COMMANDS[command], module, rest)
+    return _run_or_help(f"scene-envs {command}", COMMANDS[command], load_command(command), rest)
 
 
 def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str]) -> int:
@@ -161,19 +189,19 @@ def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str
         return DONE
     if not sweep:
         settings = compose(command, keys, named, sources)
-        _check(settings, allow_local, bool(shown), config_dir, module)
+        _check(settings, allow_local, bool(shown), module)
         return _run(command, module, settings, bool(shown))
     runs = [(compose(command, keys, variant, sources), label) for variant, label in expand_sweeps(named)]
     for settings, _ in runs:
-        _check(settings, allow_local, bool(shown), config_dir, module)
+        _check(settings, allow_local, bool(shown), module)
     return _run_all(command, module, runs, bool(shown))
 
 
-def _check(settings: Any, allow_local: bool, only_show: bool, config_dir: str, module: ModuleType) -> None:
+def _check(settings: Any, allow_local: bool, only_show: bool, module: ModuleType) -> None:
     """Refuse wrong values that early checks can find; ask before one of the user's files is run."""
     if only_show:
         return
-    check_early(settings, config_dir, module)
+    check_early(settings, module)
     for key in ("reward", "objective"):
         if "/" in (text := str(getattr(settings, key, ""))) or ".py:" in text:
             _ask_for_files(key, getattr(settings, key), allow_local)
@@ -295,3 +323,155 @@ def _complain(text: str, status: int) -> int:
     with contextlib.suppress(OSError):  # stderr may be closed
         print(f"scene-envs: {text}".encode(errors="backslashreplace").decode(), file=sys.stderr)
     return status
+
+
+def expand_sweeps(words: Sequence[str]) -> list[tuple[list[str], str]]:
+    """All combinations of the values of swept words, as Hydra writes them, each with a name for its folder.
+
+    >>> expand_sweeps(["seed=0,1", "reward=object_count"])
+    [(['seed=0', 'reward=object_count'], 'seed=0'), (['seed=1', 'reward=object_count'], 'seed=1')]
+    """
+    choices = [_values(word) for word in words]
+    runs = []
+    for number, combination in enumerate(itertools.product(*choices)):
+        swept = [word for word, options in zip(combination, choices, strict=True) if len(options) > 1]
+        label = ",".join(swept)
+        plain = all(character.isalnum() or character in "=,._-+" for character in label)
+        runs.append((list(combination), label if swept and plain and len(label) < 100 else str(number)))
+    return runs
+
+
+def _values(word: str) -> list[str]:
+    """The word, once for every value that it sweeps over."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    try:
+        parsed = OverridesParser.create().parse_override(word)
+    except HydraException:  # a text that is no Hydra value
+        return [word]
+    if not parsed.is_sweep_override():
+        return [word]
+    key = word.partition("=")[0]
+    return [f"{key}={value}" for value in parsed.sweep_string_iterator()]
+
+
+# Checks of values that need no torch: names, paths and numbers
+
+
+def check_early(settings: Any, module: ModuleType | None = None) -> None:
+    """Refuse unknown names, wrong paths and numbers out of range.
+
+    Args:
+        settings: the config of a command.
+        module: module of the command, whose ``check(settings)`` is called where it has one.
+
+    Raises:
+        InvalidInputError: a number is outside its range, or nothing is at a path.
+        UnknownNameError: no such prior, reward, scene type or mask; the nearest known one is offered.
+    """
+    _check_numbers(settings)
+    if (own := getattr(module, "check", None)) is not None:
+        own(settings)
+    if (prior := getattr(settings, "prior", None)) and isinstance(prior, str):
+        _check_prior(prior)
+    for key in ("reward", "objective"):
+        _check_name("reward", getattr(settings, key, None), known_rewards)
+    if (scene := getattr(settings, "scene", None)) is not None and not isinstance(scene, str):
+        raise InvalidInputError(f"scene={str(scene)[:200]}: give the name of one scene type, or several joined by +")
+    for scene in str(getattr(settings, "scene", "") or "").split("+"):
+        _check_name("scene type", scene, known_scenes)
+    for mask in [getattr(settings, "mask", None), *(getattr(settings, "masks", None) or [])]:
+        _check_name("mask", mask, known_masks)
+    if isinstance(device := getattr(settings, "device", "cpu"), str):
+        _check_device(device)
+    if hasattr(settings, "progress"):
+        require_one_of(settings, "progress", PROGRESS_STYLES)
+    if (scenes := getattr(settings, "scenes", None)) and isinstance(scenes, str):
+        find_scenes(Path(scenes))
+    resumed = exists(Path(str(getattr(settings, "output", "") or "."), "checkpoint.pt"))
+    kept = {"regularisation.scenes"} if resumed else set()  # a resumed run has them in its folder
+    for key in set(_DATASETS) - kept - set(getattr(settings, "NO_PATHS", ())):
+        _check_dataset(key, _dotted(settings, key))
+    _check_guidance(settings)
+
+
+def check_files(*paths: str) -> None:
+    """Refuse paths at which there is no file."""
+    for path in paths:
+        if not is_file(Path(path)):
+            raise InvalidInputError(f"{path[:200]!r} is no file; name one that is there")
+
+
+def _check_numbers(settings: Any) -> None:
+    workers = getattr(settings, "workers", 0)
+    if isinstance(workers, int) and workers < 0:
+        raise InvalidInputError(f"workers={workers}: give a number of processes, 0 for none")
+    for key, least in {**_LEAST, **getattr(settings, "LEAST", {})}.items():
+        value = getattr(settings, key, None)
+        if isinstance(value, int | float) and not least <= value < math.inf:
+            may_be_none = any(field.name == key and field.default is None for field in dataclasses.fields(settings))
+            null = ", or null" if may_be_none else ""
+            raise InvalidInputError(f"{key}={value} must be at least {least}{null}")
+    for key in _POSITIVE:
+        if isinstance(value := getattr(settings, key, None), int | float) and not value > 0:
+            raise InvalidInputError(f"{key}={value} must be more than 0")
+
+
+def _check_prior(name: str) -> None:
+    own, adapters = split_name(name)
+    find_prior(own)
+    if not adapters or exists(Path(adapters)):
+        return
+    for part in adapters.split("+"):
+        find_prior(part.rpartition("*")[2].strip())
+
+
+def _check_name(kind: str, value: Any, known: Callable[[], Sequence[str]]) -> None:
+    """Refuse a name that no component has."""
+    name = value.get("name") if isinstance(value, dict) else value
+    if isinstance(name, str) and name.isidentifier() and name not in (names := known()):
+        raise unknown_name(kind, name, names)
+
+
+def _check_device(device: str) -> None:
+    found = re.fullmatch(r"([a-z]+)(:\d{1,4})?", device)
+    if not found or found[1] not in (*_DEVICES, *_OTHER_DEVICES):
+        raise InvalidInputError(f"device={device[:60]!r} is no torch device; give cpu, cuda or cuda:1")
+
+
+def _check_dataset(key: str, value: Any) -> None:
+    if not isinstance(value, str):
+        return
+    parts = [part.strip() for part in value.split(",")]
+    if value and not any(parts):
+        raise InvalidInputError(f"{key}={value[:200]!r} names no dataset; scene-envs generate makes one")
+    for part in filter(None, parts):
+        if part != _GRAMMAR and not exists(Path(part)):
+            raise InvalidInputError(
+                f"{key}={value[:200]!r}: nothing is at {part[:200]!r}; name a dataset, as scene-envs generate makes one"
+            )
+
+
+def _check_guidance(settings: Any) -> None:
+    prompt, guidance = getattr(settings, "prompt", None), getattr(settings, "guidance", 0.0)
+    if not math.isfinite(guidance):
+        raise InvalidInputError(f"guidance={guidance} must be a finite number; 0 follows the prompt as it is")
+    if hasattr(settings, "prompt") and (guidance or prompt is not None):
+        from agents.post_training.config import check_prompt
+
+        check_prompt(prompt, guidance)
+    if strength := getattr(settings, "claim_guidance", 0.0):
+        from scene_envs.envs.settings import check_claim_guidance
+
+        check_claim_guidance(prompt if hasattr(settings, "prompt") else "those of real scenes", strength)
+    if strength := getattr(settings, "physics_guidance", 0.0):
+        from scene_envs.envs.settings import check_physics_guidance
+
+        check_physics_guidance(strength)
+
+
+def _dotted(settings: Any, key: str) -> Any:
+    for part in key.split("."):
+        settings = getattr(settings, part, None)
+    return settings
