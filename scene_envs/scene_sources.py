@@ -16,8 +16,8 @@ _PRIORS = ("prior/config.json", "config.json")
 """Places of a prior's configuration in a folder."""
 
 
-def find_scenes(path: Path, key: str = "scenes") -> Path:
-    """The file or folder of scenes that a key such as ``scenes=`` names; for a run's folder, the scene file in it.
+def find_scenes(path: Path) -> Path:
+    """The file or folder of scenes that ``scenes=`` names; for a run's folder, the scene file in it.
 
     Raises:
         InvalidInputError: nothing is at ``path``, or the folder holds a prior and no scenes.
@@ -26,14 +26,14 @@ def find_scenes(path: Path, key: str = "scenes") -> Path:
 
     if not exists(path):
         raise InvalidInputError(
-            f"{key}={str(path)[:200]!r}: no scene file, run or dataset is there; sample and generate make them"
+            f"scenes={str(path)[:200]!r}: no scene file, run or dataset is there; sample and generate make them"
         )
     if not path.is_dir():
         return path
     found = next((path / name for name in SCENE_FILES if (path / name).is_file()), path)
     if found == path and any((path / place).is_file() for place in _PRIORS):
         raise InvalidInputError(
-            f"{key}={str(path)!r} holds a prior and no scenes; draw some, as with scene-envs sample prior={path}"
+            f"scenes={str(path)!r} holds a prior and no scenes; draw some, as with scene-envs sample prior={path}"
         )
     return found
 

@@ -75,10 +75,8 @@ def check_early(settings: Any, config_dir: str = "", module: ModuleType | None =
     if (scenes := getattr(settings, "scenes", None)) and isinstance(scenes, str):
         find_scenes(Path(scenes))
     resumed = exists(Path(str(getattr(settings, "output", "") or "."), "checkpoint.pt"))
-    kept = ("regularisation.scenes",) if resumed else ()  # a resumed run has them in its folder
-    if not resumed and isinstance(replay := _dotted(settings, "regularisation.replay"), str):
-        find_scenes(Path(replay), "regularisation.replay")
-    for key in set(_DATASETS) - set(kept) - set(getattr(settings, "NO_PATHS", ())):
+    kept = {"regularisation.scenes"} if resumed else set()  # a resumed run has them in its folder
+    for key in set(_DATASETS) - kept - set(getattr(settings, "NO_PATHS", ())):
         _check_dataset(key, _dotted(settings, key))
     _check_guidance(settings)
 
@@ -127,11 +125,7 @@ def _check_prior(name: str) -> None:
     if not adapters or exists(Path(adapters)):
         return
     for part in adapters.split("+"):
-        if not exists(Path(part.rpartition("*")[2].strip())):
-            raise InvalidInputError(
-                f"adapter={adapters[:200]!r}: nothing is at {part[:200]!r}; name the folder of a run with adapter.rank "
-                "or its adapter.safetensors"
-            )
+        find_prior(part.rpartition("*")[2].strip())
 
 
 def _check_name(kind: str, value: Any, known: Any, registry: str, config_dir: str) -> None:

@@ -40,8 +40,7 @@ class KeyHelp:
 ADAPTER = KeyHelp(
     "adapter",
     "",
-    "updates of the prior: the folder of a run from this prior, a prior that was trained from it, or an "
-    "adapter.safetensors; A+0.5*B adds two.",
+    "updates of the prior: a prior that was trained from it, or the folder of such a run; A+0.5*B adds two.",
 )
 """The key that every command with ``prior=`` has besides its own."""
 

@@ -36,7 +36,6 @@ _PARTS = (
     "search.journal",
     "log.csv",
     "real_scenes.safetensors",
-    "adapter.safetensors",
     "prior",
     "clutter",
 )

@@ -7,9 +7,7 @@ The *trunk* between inputs and outputs differs from baseline to baseline. It map
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -74,9 +72,6 @@ class Attention(nn.Module):
     >>> attention(torch.randn(2, 5, 16), torch.randn(2, 3, 16)).shape
     torch.Size([2, 5, 16])
     """
-
-    MATRICES: ClassVar[Sequence[str]] = ("query", "key_value", "out")
-    """Layers that adapters update."""
 
     def __init__(self, hidden: int, heads: int) -> None:
         super().__init__()

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import ClassVar
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -21,9 +18,6 @@ class SingleStreamBlock(nn.Module):
         mlp_ratio: width of the MLP over ``hidden``.
         relations: features per pair of slots that attention sums with its weights; 0 for none.
     """
-
-    MATRICES: ClassVar[Sequence[str]] = ("linear1", "linear2")
-    """Attention and MLP layers, which adapters update."""
 
     def __init__(self, hidden: int, heads: int, mlp_ratio: float, relations: int = 0) -> None:
         super().__init__()
@@ -90,8 +84,6 @@ class DoubleStreamBlock(nn.Module):
 
 class _Stream(nn.Module):
     """One side of a double-stream block."""
-
-    MATRICES: ClassVar[Sequence[str]] = ("qkv", "out", "mlp.0", "mlp.2")
 
     def __init__(self, hidden: int, heads: int, mlp_ratio: float, finishes: bool = True) -> None:
         super().__init__()

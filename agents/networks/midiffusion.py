@@ -9,9 +9,7 @@ text, as in the comparison of Pfaff et al. (CoRL 2025). There is no positional e
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -77,8 +75,6 @@ class _AdaptiveNorm(nn.Module):
 
 class _Block(nn.Module):
     """Self-attention, cross-attention to the text when there is any, and a feed-forward layer."""
-
-    MATRICES: ClassVar[Sequence[str]] = ("feed.0", "feed.2")
 
     def __init__(self, config: _Size) -> None:
         super().__init__()

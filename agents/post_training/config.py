@@ -9,21 +9,18 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from agents.configuration.checks import at_least, one_of, positive
-from agents.configuration.fields import composed, moved, named, nested
-from agents.configuration.prior_names import split_name
+from agents.configuration.fields import composed, named, nested
 from agents.configuration.settings import LoggerSettings, OptimizerSettings
 from agents.configuration.shared_keys import RewardLimits, SamplingKeys, TrainingKeys
 from agents.configuration.tree import plain_tree
 from agents.post_training.algorithm_settings import AlgorithmSettings, DDPOSFSettings
 from agents.post_training.algorithms import algorithm_settings, list_algorithms
-from agents.post_training.regularisation_settings import AdapterSettings, RegularisationSettings
+from agents.post_training.regularisation_settings import RegularisationSettings
 from scene_envs.envs.settings import PROMPT_SOURCES, check_claim_guidance
 from scene_envs.errors import InvalidInputError
 
 RESUMABLE = ("recipe", "iterations", "output", "workers", "logger", "reward_timeout", "reward_memory")
 """Fields that may change between a run and its continuation."""
-_ADAPTER_RATE = 10.0
-"""Learning rate of low-rank updates, divided by that of all weights."""
 
 
 @dataclass
@@ -31,7 +28,7 @@ class PostTrainOptimizerSettings(OptimizerSettings):
     """The optimiser of a post-training run; its steps are updates.
 
     Attributes:
-        lr: peak learning rate; null takes the default of the algorithm, or ten times that with an adapter.
+        lr: peak learning rate; null takes the default of the algorithm.
         chunk: scenes per forward and backward pass; null takes the whole batch at once.
     """
 
@@ -176,22 +173,9 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
         optimizer: the optimiser of the weights.
         regularisation: losses that keep the prior near real scenes.
         guard: checks on held-out real scenes.
-        adapter: low-rank updates, off by default.
         logger: log files and progress display.
     """
 
-    RENAMED: ClassVar[Mapping[str, str]] = {
-        **moved("optimizer", "warmup", "weight_decay", "clip", "ema", "chunk", learning_rate="lr"),
-        **moved("algorithm", "gradient_steps", "min_std", "skip_first", "step_weighting", "log_prob_reduction"),
-        **moved("algorithm", "credit", "baseline", "advantage_clip", "scenes_per_prompt"),
-        **moved("guard", "max_invalid", guard_every="every", guard_scenes="scenes", guard_limit="limit"),
-        **moved("guard", guard_action="action"),
-        **moved("regularisation", "bank_size", regularisation_batch="batch_size", real_scenes="scenes"),
-        **moved("logger", "progress", "checkpoint_every", "report_scenes"),
-        "clip_epsilon": "algorithm.clip_epsilon, of algorithm=ddpo_is",
-        "updates": "algorithm.updates, of algorithm=ddpo_is",
-    }
-    """Keys of earlier versions, and their names."""
     SHORT: ClassVar[Mapping[str, str]] = {"hold": "regularisation.hold"}
     """Keys that may be written without their group."""
 
@@ -205,7 +189,6 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
     optimizer: PostTrainOptimizerSettings = nested(PostTrainOptimizerSettings, folder="optimizer", option="adamw")
     regularisation: RegularisationSettings = nested(RegularisationSettings)
     guard: GuardSettings = nested(GuardSettings)
-    adapter: AdapterSettings = nested(AdapterSettings)
     logger: PostTrainLoggerSettings = nested(PostTrainLoggerSettings, folder="logger", option="csv")
 
     def __post_init__(self) -> None:
@@ -227,16 +210,9 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, RewardLimits):
                 "awm, or leave claim_guidance=0"
             )
         if self.optimizer.lr is None:
-            factor = _ADAPTER_RATE if self.adapter.rank else 1.0
-            self.optimizer = replace(self.optimizer, lr=factor * self.algorithm.learning_rate)
+            self.optimizer = replace(self.optimizer, lr=self.algorithm.learning_rate)
         if self.regularisation.weight is None:
             self.regularisation = replace(self.regularisation, weight=self.algorithm.regularisation_weight)
-        prior, adapter = split_name(self.prior)
-        if self.adapter.rank and adapter:
-            raise InvalidInputError(
-                f"adapter.rank={self.adapter.rank} on {str(prior)!r} with {adapter!r}: an adapter has one prior; "
-                "start from the folder of the run that made the first, whose prior holds its updates"
-            )
         target = self.regularisation.target
         if target is not None and target > self.guard.limit:
             raise InvalidInputError(

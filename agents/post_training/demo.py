@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
+import threading
 import time
-from collections.abc import Mapping
-from contextlib import closing
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from agents.post_training.comparison import Measured, draw_side_by_side, measure_prior, number_rows
-from agents.post_training.comparison_run import PHYSICS_TIMEOUT, SAMPLE_SEED, say_stage
-from agents.post_training.config import PostTrainConfig
+from agents.post_training.comparison_run import PHYSICS_TIMEOUT, SAMPLE_SEED
 from agents.post_training.report import Page, Picture, Section, Tile, write_report
-from agents.post_training.run_files import write_metrics
-from agents.post_training.side_by_side import post_train_side_by_side
-from agents.post_training.trainer import PostTrainResult
+from agents.post_training.run_files import METRICS_NAME, write_metrics
 from agents.priors.base import ScenePrior
 from rewards import reward_label
+from scene_envs.errors import TrainingError
+from scene_envs.files import read_sealed
 
-RUNS = ("clutter", "feasible")
-"""Names of the two runs: their folders, and the columns of the report. Their recipes are ``demo_<name>``."""
+RUNS: Mapping[str, Sequence[str]] = {"clutter": ["recipe=demo_clutter"], "feasible": ["recipe=demo_feasible"]}
+"""The two runs: their names, which are their folders and columns of the report, and their keys of ``post-train``."""
 
 
 def run_demo(
@@ -30,10 +33,9 @@ def run_demo(
     *,
     scenes: int = 24,
     num_steps: int = 50,
-    recipes: Mapping[str, PostTrainConfig] | None = None,
-    prior: ScenePrior | None = None,
+    runs: Mapping[str, Sequence[str]] = RUNS,
 ) -> dict[str, Any]:
-    """Post-train a prior in two ways side by side, measure all three priors on fresh samples, and write the report.
+    """Post-train a prior in two ways at the same time, measure all three priors on fresh samples, and write the report.
 
     All priors start from the same noise, and every sample is measured. Physics decides which objects are
     simulation-ready.
@@ -45,39 +47,39 @@ def run_demo(
         workers: physics worker processes, of both runs together while they train.
         scenes: fresh samples measured of each prior.
         num_steps: denoiser evaluations per measured sample.
-        recipes: the runs by name, in place of ``configs/recipe/demo_clutter.yaml`` and ``demo_feasible.yaml``.
-        prior: prior to start from, in place of the one that the recipes name.
+        runs: names of the runs, and their keys of ``post-train`` besides output, seed and workers.
 
     Returns:
         The numbers of ``metrics.json``: those of ``measure_prior`` for ``base`` and each run, ``runs`` (the metrics of
         each run), and ``seconds``.
+
+    Raises:
+        TrainingError: a run failed; its message stands on stderr. A second call resumes the runs.
     """
     from scene_envs.physics import make_pool
 
     directory, started = Path(output), time.perf_counter()
-    recipes = recipes or {name: PostTrainConfig(recipe=f"demo_{name}") for name in RUNS}
-    each = -(-workers // len(recipes))
-    configs = {
-        name: replace(recipe, output=str(directory / name), seed=seed, workers=each) for name, recipe in recipes.items()
-    }
-    base = ScenePrior.load(next(iter(configs.values())).prior if prior is None else prior)
-    for name, config in configs.items():
-        say_stage(config, f"{name}: post-training toward {_goal(config)} with {_algorithm(config)}")
+    keys = [f"seed={seed}", f"workers={-(-workers // len(runs))}", "logger.report_scenes=0"]
+    commands = {name: [*words, *keys, f"output={directory / name}"] for name, words in runs.items()}
+    base: ScenePrior | None = None
+    results: dict[str, _Finished] = {}
     measured: dict[str, Measured] = {}
-    results: dict[str, PostTrainResult] = {}
-    with make_pool(workers, PHYSICS_TIMEOUT) as pool, closing(post_train_side_by_side(configs, base)) as runs:
-        for name, results[name] in runs:  # the other run goes on while samples are measured
-            for label, tested in {"base": base, name: results[name].prior}.items():
-                if label not in measured:
-                    say_stage(configs[name], f"measuring {scenes} samples of the prior {label!r}")
+    with make_pool(workers, PHYSICS_TIMEOUT) as pool, _post_training(commands) as processes:
+        for name, process in processes.items():
+            if status := process.wait():
+                raise TrainingError(f"the run {name!r} ended with status {status}; its message stands above")
+            results[name] = run = _Finished(directory / name)
+            base = ScenePrior.load(run.config["prior"]) if base is None else base
+            for label, tested in {"base": base, name: ScenePrior.load(directory / name)}.items():
+                if label not in measured:  # the other run goes on while samples are measured
+                    print(f"measuring {scenes} samples of the prior {label!r}", file=sys.stderr, flush=True)
                     measured[label] = measure_prior(
                         tested, scenes, num_steps=num_steps, seed=seed + SAMPLE_SEED, pool=pool
                     )
-    measured = {name: measured[name] for name in ("base", *recipes)}
-    results = {name: results[name] for name in recipes}
+    assert base is not None
     metrics = {
         **{name: part.figures for name, part in measured.items()},
-        "runs": {name: result.metrics for name, result in results.items()},
+        "runs": {name: run.metrics for name, run in results.items()},
         "seconds": round(time.perf_counter() - started, 1),
         "num_steps": num_steps,
     }
@@ -86,18 +88,64 @@ def run_demo(
     return metrics
 
 
+class _Finished:
+    """Configuration and metrics of a finished run, from its folder."""
+
+    def __init__(self, directory: Path) -> None:
+        import yaml
+
+        self.config: dict[str, Any] = yaml.safe_load(read_sealed(directory / "config.yaml"))
+        self.metrics: dict[str, Any] = json.loads((directory / METRICS_NAME).read_text(encoding="utf-8"))
+        self.goal = reward_label(self.config["reward"])
+        self.algorithm = self.config["algorithm"]["name"].upper().replace("_", "-")
+
+
+@contextmanager
+def _post_training(commands: Mapping[str, Sequence[str]]) -> Iterator[dict[str, subprocess.Popen[str]]]:
+    """Context in which ``scene-envs post-train`` runs with each list of keys, and with an equal part of the cores.
+
+    Runs that are not finished at the end of the context save and end.
+    """
+    threads = str(max(1, len(os.sched_getaffinity(0)) // len(commands)))
+    paths = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
+    environment = {"PYTHONPATH": paths, "PYTHONSAFEPATH": "1", "OMP_NUM_THREADS": threads, "MKL_NUM_THREADS": threads}
+    processes: dict[str, subprocess.Popen[str]] = {}
+    readers: list[threading.Thread] = []
+    try:
+        for name, words in commands.items():
+            processes[name] = process = subprocess.Popen(
+                [sys.executable, "-m", "agents.cli", "post-train", *words], env=os.environ | environment, text=True,
+                errors="replace", stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+                start_new_session=True,  # Ctrl-C reaches this process alone, which then ends the others
+            )  # fmt: skip
+            readers.append(threading.Thread(target=_pass_on, args=(name, process), daemon=True))
+            readers[-1].start()
+        yield processes
+    finally:
+        for process in processes.values():
+            process.terminate()
+        for process, reader in zip(processes.values(), readers, strict=True):
+            process.wait()
+            reader.join()
+
+
+def _pass_on(name: str, process: subprocess.Popen[str]) -> None:
+    """Print each line that a process writes on stderr, with the name of its run."""
+    for line in process.stdout or ():
+        print(f"{name}: {line}", end="", file=sys.stderr, flush=True)
+
+
 def _page(
-    directory: Path, base: ScenePrior, results: Mapping[str, PostTrainResult], measured: Mapping[str, Measured]
+    directory: Path, base: ScenePrior, results: Mapping[str, _Finished], measured: Mapping[str, Measured]
 ) -> Page:
     """Content of the report; also writes its pictures to ``directory``."""
     runs = " and ".join(
-        f"{_goal(result.config)} ({_algorithm(result.config)}, {len(result.history)} iterations)"
-        for result in results.values()
+        f"{run.goal} ({run.algorithm}, {run.metrics['iterations']} iterations)" for run in results.values()
     )
     before = measured["base"].figures
     tiles = []
-    for name, result in results.items():
-        after, ratio = measured[name].figures, result.metrics["guard"]["ratio"]
+    for name, run in results.items():
+        after, ratio = measured[name].figures, run.metrics["guard"]["ratio"]
         tiles += [
             Tile(f"{name}: objects per scene", f"{after['objects']:.1f}", f"from {before['objects']:.1f}"),
             Tile(f"{name}: feasible as sampled", _share(after), f"of free objects, from {_share(before)}"),
@@ -124,10 +172,7 @@ def _page(
         Section(
             "The curves",
             "Reward of each batch, and the held-out pretraining loss over that of the base prior.",
-            [
-                Picture(result.directory / "curve.png", f"{name}: {_goal(result.config)}")
-                for name, result in results.items()
-            ],
+            [Picture(directory / name / "curve.png", f"{name}: {run.goal}") for name, run in results.items()],
         ),
     ]
     title = f"{base.scene_type.name.replace('_', ' ').capitalize()}, steered two ways"
@@ -135,20 +180,10 @@ def _page(
         f"One prior, post-trained toward {runs}, each with the pretraining loss on real scenes as regularisation. "
         f"All numbers are means over {count} fresh, seeded samples of each prior; none was selected."
     )
-    settings = {
-        f"{name}: {key}": value for name, result in results.items() for key, value in result.config.plain().items()
-    }
+    settings = {f"{name}: {key}": value for name, run in results.items() for key, value in run.config.items()}
     return Page(title, lead, tiles, sections, settings)
 
 
 def _share(figures: Mapping[str, float]) -> str:
     share = figures.get("feasible_fraction")
     return "–" if share is None else f"{share:.0%}"
-
-
-def _goal(config: PostTrainConfig) -> str:
-    return reward_label(config.reward)
-
-
-def _algorithm(config: PostTrainConfig) -> str:
-    return config.algorithm.name.upper().replace("_", "-")

@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from agents.networks.low_rank import LowRank
 from agents.networks.text import Text
 from agents.priors.base import ScenePrior
 from agents.priors.forward import NoisedScenes
@@ -39,8 +38,6 @@ class Expectation(nn.Module):
     def __init__(self, prior: ScenePrior, learning_rate: float = 3e-4) -> None:
         super().__init__()
         self.prior = deepcopy(prior).requires_grad_(True)
-        for update in (module for module in self.prior.modules() if isinstance(module, LowRank)):
-            update.requires_grad_(False)  # the copy trains all weights but these
         self.prior.freeze_text()
         self.trained = [p for p in self.prior.parameters() if p.requires_grad]
         self.optimizer = torch.optim.AdamW(self.trained, lr=learning_rate, weight_decay=0.0)

@@ -13,7 +13,6 @@ from agents.post_training.rollouts import stream_seed
 from agents.post_training.run_files import writing
 from agents.post_training.sample_check import SampleCheck
 from agents.post_training.scene_bank import SceneBank
-from agents.priors.adapters import save_adapter, with_adapter_of
 from agents.priors.base import ScenePrior
 from agents.utils.process_group import ProcessGroup
 
@@ -76,14 +75,10 @@ class GuardFiles:
         path = self.directory / "prior"
         if self._processes.is_first:
             writing(f"the prior {str(path)!r}", lambda: prior.save(path))
-            if prior.adapter is not None:
-                writing("the adapter", lambda: save_adapter(prior, self.directory))
 
-    def best(self, beside: ScenePrior | None = None) -> ScenePrior:
-        """The prior that was kept last; if ``beside`` has an adapter, a copy of ``beside`` with the kept adapter."""
+    def best(self) -> ScenePrior:
+        """The prior that was kept last."""
         self._processes.wait()  # until it is written
-        if beside is not None and beside.adapter is not None:
-            return with_adapter_of(beside, self.directory)
         return ScenePrior.load(self.directory / "prior")
 
     def picture(self, guard: Guard, reading: GuardReading) -> None:

@@ -23,7 +23,6 @@ from agents.post_training.regularisation import Regularisation
 from agents.post_training.rollouts import collect, stream_seed
 from agents.post_training.run_files import CHECKPOINT_NAME
 from agents.post_training.scene_bank import SceneBank
-from agents.priors.adapters import attach_adapter
 from agents.priors.base import ScenePrior
 from agents.priors.prompt_validation import no_text
 from agents.utils.checkpoints import check_tensors
@@ -62,9 +61,6 @@ class Learner:
         self.processes = ProcessGroup.current()
         self.processes.share(self.prior.parameters())
         self.regularisation = Regularisation(config.regularisation, self.prior)
-        if config.adapter.rank:
-            adapter = config.adapter
-            attach_adapter(self.prior, prior.loaded_as, rank=adapter.rank, scale=adapter.scale, seed=config.seed)
         self.slots = self.prior.config.slots if config.slots is None else config.slots
         self.policy = DenoisingPolicy(
             self.prior, config.num_steps, chunk=config.optimizer.chunk, guidance=config.guidance,
@@ -225,7 +221,7 @@ class Learner:
         """Inverse of :meth:`state`.
 
         Raises:
-            InvalidInputError: the weights are of another network, such as an earlier version's.
+            InvalidInputError: the weights are of another network.
         """
         check_tensors(self.prior, state["prior"], self.config.directory / CHECKPOINT_NAME)
         self.prior.load_state_dict(state["prior"])

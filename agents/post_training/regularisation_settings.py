@@ -1,4 +1,4 @@
-"""Settings of the regularisation and of adapters; imports no torch."""
+"""Settings of the regularisation; imports no torch."""
 
 from __future__ import annotations
 
@@ -28,9 +28,6 @@ class RegularisationSettings:
         scenes: source of the real scenes: ``grammar``, or a dataset folder.
         bank_size: number of real scenes that are drawn from the grammar or read from the dataset, including the
             held-out scenes.
-        replay: further scenes for the pretraining loss, such as the winners of a search: the folder of a run, a scene
-            file or a dataset; null for none.
-        replay_share: share of replayed scenes in each batch of the pretraining loss, if there is a replay.
     """
 
     objective: str = "pretraining"
@@ -41,15 +38,11 @@ class RegularisationSettings:
     batch_size: int = 48
     scenes: str = "grammar"
     bank_size: int = 4096
-    replay: str | None = None
-    replay_share: float = 0.5
 
     def __post_init__(self) -> None:
         at_least(self, 1, "batch_size", "base_samples")
         one_of(self, "objective", OBJECTIVES)
         positive(self, "sharpness")
-        if not 0 < self.replay_share <= 1:
-            raise InvalidInputError(f"regularisation.replay_share={self.replay_share} must be in (0, 1]")
         if self.weight is not None and not self.weight >= 0:
             raise InvalidInputError(f"regularisation.weight={self.weight} must not be negative")
         if self.target is not None and self.weight == 0:
@@ -64,25 +57,3 @@ class RegularisationSettings:
     def pretraining_weight(self) -> float:
         """``weight``, or 0 for null; the config of a run has replaced null by the default of the algorithm."""
         return self.weight or 0.0
-
-
-@dataclass
-class AdapterSettings:
-    """Low-rank updates of the attention and MLP matrices, which are trained in place of all weights.
-
-    Attributes:
-        rank: rank of the updates; 0 trains all weights.
-        alpha: scale of the updates, times the rank: they are multiplied by alpha / rank.
-    """
-
-    rank: int = 0
-    alpha: float = 16.0
-
-    def __post_init__(self) -> None:
-        at_least(self, 0, "rank")
-        positive(self, "alpha")
-
-    @property
-    def scale(self) -> float:
-        """Scale of the updates, alpha / rank."""
-        return self.alpha / self.rank

@@ -19,7 +19,6 @@ CHECKPOINT_NAME = "checkpoint.pt"
 LOG_NAME = "log.csv"
 METRICS_NAME = "metrics.json"
 SCENES_NAME = "real_scenes.safetensors"
-REPLAY_NAME = "replay.safetensors"
 BASE_SAMPLES_NAME = "base_samples.safetensors"
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +12,13 @@ from torch import Generator, Tensor
 
 from agents.post_training.config import RegularisationSettings
 from agents.post_training.prompts import PROMPTS_NAME, PromptSets, save_prompts
-from agents.post_training.run_files import REPLAY_NAME, SCENES_NAME, writing
+from agents.post_training.run_files import SCENES_NAME, writing
 from agents.priors.base import ScenePrior
 from agents.priors.prompt_validation import asked_objects
 from agents.utils.process_group import ProcessGroup
 from scene_envs.errors import InvalidInputError
 from scene_envs.progress import Progress
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_sources import find_scenes, load_scenes
 from scene_envs.scene_types import SceneType
 
 _WITHHELD = 0.1
@@ -55,16 +54,12 @@ class SceneBank:
         train: (M, N, D) for the regularisation.
         heldout: (K, N, D) for the guard.
         prompts: all prompts of a scene by its index, with held-out scenes after training scenes; None without prompts.
-        replay: (R, N, D) further scenes for the regularisation; None for none.
-        replay_share: share of a batch that is taken from ``replay``.
         base: samples of the base prior; None for none.
     """
 
     train: Tensor
     heldout: Tensor
     prompts: PromptSets | None = None
-    replay: Tensor | None = None
-    replay_share: float = 0.0
     base: PromptedScenes | None = None
 
     @classmethod
@@ -74,30 +69,20 @@ class SceneBank:
             raise InvalidInputError(f"{len(x0)} real scenes cannot spare {heldout} for the guard; give more scenes")
         return cls(x0[:-heldout], x0[-heldout:], prompts)
 
-    def with_replay(self, scenes: Tensor, share: float) -> SceneBank:
-        """The same bank with ``scenes`` (R, N, D) as a share of each batch."""
-        return replace(self, replay=scenes.to(self.train.device), replay_share=share)
-
     def batch(self, count: int, generator: Generator) -> PromptedScenes:
         """``count`` training scenes, drawn with replacement, each with one of its prompts.
 
-        As in pretraining, the prompt is withheld (``""``) from one scene in ten. Replayed scenes come last and have no
-        prompt.
+        As in pretraining, the prompt is withheld (``""``) from one scene in ten.
         """
         index = torch.randint(len(self.train), (count,), generator=generator)
-        x0, texts = self.train[index], None
+        texts = None
         if self.prompts is not None:
             choice, withheld = torch.rand(2, count, generator=generator).tolist()
             texts = [
                 "" if drop < _WITHHELD else (group := self.prompts(i))[int(pick * len(group))]
                 for i, pick, drop in zip(index.tolist(), choice, withheld, strict=True)
             ]
-        if self.replay is not None:
-            replayed = round(self.replay_share * count)
-            chosen = torch.randint(len(self.replay), (replayed,), generator=generator)
-            x0 = torch.cat([x0[: count - replayed], self.replay[chosen]])
-            texts = None if texts is None else [*texts[: count - replayed], *[""] * replayed]
-        return PromptedScenes(x0, texts)
+        return PromptedScenes(self.train[index], texts)
 
     def heldout_prompts(
         self, count: int | None = None, slots: int | None = None, scene_type: SceneType | None = None
@@ -148,43 +133,6 @@ def kept_scenes(
             writing(f"their prompts {str(texts)!r}", lambda: save_prompts(texts, found))
     processes.wait()
     return SceneBatch.load(path)
-
-
-def kept_replay(
-    directory: Path, prior: ScenePrior, settings: RegularisationSettings, slots: int, *, reuse: bool
-) -> Tensor | None:
-    """(R, N, D) normalised scenes that ``settings.replay`` names, kept in the run's folder; None without a replay.
-
-    Args:
-        directory: of the run.
-        prior: whose scene type the scenes must have.
-        settings: settings that name the scenes.
-        slots: slots of the real scenes; the replayed scenes get empty slots up to this number.
-        reuse: load the scenes that are already in the folder, as a resumed run does.
-
-    Raises:
-        InvalidInputError: the source does not exist, holds no scene, has another scene type, or has more slots.
-    """
-    path, processes = directory / REPLAY_NAME, ProcessGroup.current()
-    if settings.replay is None:
-        return None
-    if processes.is_first and not (reuse and path.exists()):
-        batch = load_scenes(find_scenes(Path(settings.replay), "regularisation.replay"))
-        if batch.scene_type != prior.scene_type:
-            raise InvalidInputError(
-                f"regularisation.replay={settings.replay!r} holds scenes of {batch.scene_type.name}; "
-                f"give scenes of the prior's type, {prior.scene_type.name}"
-            )
-        if not len(batch):
-            raise InvalidInputError(f"regularisation.replay={settings.replay!r} holds no scene")
-        if batch.tensor.shape[1] > slots:
-            raise InvalidInputError(
-                f"regularisation.replay={settings.replay!r} has {batch.tensor.shape[1]} slots per scene, more than the "
-                f"{slots} of the run; give slots={batch.tensor.shape[1]}"
-            )
-        writing(f"the replayed scenes {str(path)!r}", lambda: batch.with_slots(slots).save(path))
-    processes.wait()
-    return prior.encode(SceneBatch.load(path))
 
 
 def real_scenes(

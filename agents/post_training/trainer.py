@@ -31,7 +31,7 @@ from agents.post_training.run_files import (
     write_log,
     write_metrics,
 )
-from agents.post_training.scene_bank import SceneBank, kept_replay, kept_scenes
+from agents.post_training.scene_bank import SceneBank, kept_scenes
 from agents.priors.base import ScenePrior
 from agents.priors.prompt_validation import check_object_count
 from agents.utils.checkpoints import save_checkpoint
@@ -191,9 +191,7 @@ class PostTrainer:
                 large = torch.nonzero(batch.counts > slots)[:, 0].tolist()
                 check_object_count([text for i in large for text in prompts(i)], self.prior.scene_type, slots)
         x0 = self.prior.encode(batch.to(config.device))
-        bank = SceneBank.split(x0, config.guard.scenes, prompts)
-        replay = kept_replay(self.directory, self.prior, config.regularisation, x0.shape[1], reuse=reuse_scenes)
-        self.scenes = bank if replay is None else bank.with_replay(replay, config.regularisation.replay_share)
+        self.scenes = SceneBank.split(x0, config.guard.scenes, prompts)
         self.learner.deal_prompts(self.scenes)
         self.learner.begin_rewards(batch[: len(self.scenes.train)], first=not reuse_scenes)
         if not reuse_scenes:
@@ -253,7 +251,7 @@ class PostTrainer:
         self.files.picture(self.guard, reading)
         if reading.beyond and self.config.guard.action == "rollback":
             self.rollbacks += 1
-            self.learner.return_to(self.files.best(self.prior))
+            self.learner.return_to(self.files.best())
             self.learner.regularisation.return_to_checkpoint(self.guard.best_ratio)
 
     def _count_invalid(self) -> None:

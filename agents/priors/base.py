@@ -19,7 +19,6 @@ from agents.diffusion import (
 )
 from agents.networks.count_conditioning import CountConditioning
 from agents.networks.text import Text
-from agents.priors.adapters import AdapterFacts
 from agents.priors.forward import Trainable
 from agents.priors.guidance import guidance_hook, physics_strength
 from agents.priors.hooks import Hook
@@ -56,8 +55,6 @@ class ScenePrior(Loadable, Trainable, Inpainting, nn.Module, ABC):
     """Gaussian process of the poses, and of all other continuous features."""
     denoiser: Any
     """The network inside its process, a module with ``.network``."""
-    adapter: AdapterFacts | None = None
-    """Facts about the low-rank updates in training; None for a prior without."""
 
     def _keep(
         self,

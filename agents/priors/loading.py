@@ -12,7 +12,6 @@ from torch import Tensor
 
 from agents.configuration.prior_names import joint_name, split_name
 from agents.diffusion import Preconditioning, ResidualVariance
-from agents.networks.low_rank import merged_weights
 from agents.networks.registry import config_state
 from agents.priors.adapters import AdapterSpec, merge_adapters, parse_adapters
 from agents.priors.storage import StoredPrior, explained, read_stored, write_stored
@@ -70,9 +69,8 @@ class Loadable(ABC):
 
         Args:
             name: of the prior; ``NAME with ADAPTER`` names its adapters as well.
-            adapter: updates that are added to its weights: a file of low-rank ones, a run folder, or a prior that was
-                trained from this one. Several are joined by ``+`` or in a list, each with a factor before ``*`` if need
-                be.
+            adapter: updates that are added to its weights: priors that were trained from this one, or the folders of
+                such runs. Several are joined by ``+`` or in a list, each with a factor before ``*`` if need be.
 
         Raises:
             UnknownNameError: no shipped prior has that name.
@@ -120,7 +118,7 @@ class Loadable(ABC):
 
     def weights(self) -> dict[str, Tensor]:
         """Trained tensors by name, as a prior's file holds them."""
-        return merged_weights(self.denoiser.network)
+        return dict(self.denoiser.network.state_dict())
 
     def load_weights(self, tensors: dict[str, Tensor]) -> None:
         """Inverse of :meth:`weights`; raises RuntimeError when names or shapes differ."""

@@ -45,7 +45,7 @@ LINES = {
     "search mask=culprit": "did you mean 'culprits'",
     "search mask={name:culprit,at_least:2}": "did you mean 'culprits'",
     "post-train reward={name:clpi,reward:object_count,high:3}": "did you mean 'clip'",
-    "search adapter=nowhere prior=dimsum_table": "nothing is at 'nowhere'",
+    "search adapter=nowhere prior=dimsum_table": "unknown prior 'nowhere'",
     "demo workers=-3": "workers=-3: give a number of processes",
     "generate count=0": "count=0 must be at least 1",
     "generate shard_size=0": "shard_size=0 must be at least 1",

@@ -12,6 +12,15 @@ from agents.post_training import PostTrainConfig
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.scene import SceneBatch
 
+PLACES = {
+    "regularisation": "regularisation.weight", "bank_size": "regularisation.bank_size",
+    "real_scenes": "regularisation.scenes", "lr": "optimizer.lr", "learning_rate": "optimizer.lr",
+    "chunk": "optimizer.chunk", "ema": "optimizer.ema", "gradient_steps": "algorithm.gradient_steps",
+    "credit": "algorithm.credit", "scenes_per_prompt": "algorithm.scenes_per_prompt",
+    "guard_limit": "guard.limit", "guard_action": "guard.action", "max_invalid": "guard.max_invalid",
+}  # fmt: skip
+"""Short names of keys of groups."""
+
 
 def small_config(output: Path | str, **changes: Any) -> PostTrainConfig:
     """Four iterations in about a second; ``changes`` are keys, those of a group by one name."""
@@ -28,8 +37,7 @@ def small_config(output: Path | str, **changes: Any) -> PostTrainConfig:
         optimizer={"lr": 1e-3},
         **{key: changes.pop(key) for key in ("prompt", "guidance") if key in changes},
     )
-    places = {**PostTrainConfig.RENAMED, "regularisation": "regularisation.weight", "lr": "optimizer.lr"}
-    return changed(config, {places.get(key, key): value for key, value in changes.items()})
+    return changed(config, {PLACES.get(key, key): value for key, value in changes.items()})
 
 
 def count_objects(batch: SceneBatch, context: RewardContext) -> RewardOutput:

@@ -24,6 +24,7 @@ from agents.priors.base import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards import make_reward
 from rewards.base import RewardContext, RewardOutput
+from scene_envs.errors import TrainingError
 from scene_envs.scene import SceneBatch
 from tests.helpers.small_runs import count_objects, small_config
 
@@ -101,18 +102,19 @@ def test_report_and_metrics_have_the_trained_reward_before_and_after(tmp_path: P
 
 
 @pytest.mark.slow
-def test_demonstration_end_to_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_demonstration_end_to_end(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("scene_envs.physics")
-    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0})  # one core: no processes; test_side_by_side has them
-    recipes = {
-        "clutter": small_config(tmp_path, iterations=2),
-        "feasible": small_config(tmp_path, iterations=1, algorithm="nft", reward="feasible_share"),
-    }
+    small = [f"prior={tiny_prior(slots=6).save(tmp_path / 'base')}", "batch_size=4", "num_steps=3", "iterations=1",
+             "regularisation.bank_size=20", "regularisation.batch_size=4", "guard.scenes=8"]  # fmt: skip
+    runs = {"clutter": small, "feasible": [*small, "algorithm=nft", "reward=feasible_share"]}
     folder = tmp_path / "demo"
-    metrics = run_demo(folder, workers=0, scenes=2, num_steps=4, recipes=recipes, prior=tiny_prior(slots=6))
+    with pytest.raises(TrainingError, match="the run 'feasible' ended with status 2"):
+        run_demo(folder, workers=0, scenes=2, num_steps=4, runs={**runs, "feasible": [*small, "algorithm=ntf"]})
+    assert "feasible: scene-envs: unknown" in capfd.readouterr().err
+    metrics = run_demo(folder, workers=0, scenes=2, num_steps=4, runs=runs)  # finds the first run, which is finished
     on_disk = json.loads((folder / "metrics.json").read_text())
     assert on_disk["runs"]["clutter"]["guard"]["ratio"] == metrics["runs"]["clutter"]["guard"]["ratio"]
-    priors = {"base": tiny_prior(slots=6), **{name: ScenePrior.load(folder / name) for name in recipes}}
+    priors = {"base": tiny_prior(slots=6), **{name: ScenePrior.load(folder / name) for name in runs}}
     for name, prior in priors.items():
         assert {"objects", "feasible_objects", "ready_objects"} <= on_disk[name].keys()
         counts = prior.sample(2, num_steps=4, seed=100_000).counts.float()

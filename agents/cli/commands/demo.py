@@ -32,4 +32,4 @@ def run(settings: DemoConfig, run: Run) -> None:
     metrics = run_demo(settings.output, settings.seed, settings.workers)
     for label, *cells in number_rows({name: metrics[name] for name in ("base", *RUNS)}):
         run.say(f"{label:<40} " + "  ".join(f"{cell:>14}" for cell in cells))
-    run.say(f"open {run.directory / 'report.html'}; scene-envs sample prior={run.directory / RUNS[1]} draws more")
+    run.say(f"open {run.directory / 'report.html'}; scene-envs sample prior={run.directory / 'feasible'} draws more")
