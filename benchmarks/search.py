@@ -37,6 +37,7 @@ import statistics
 import sys
 import time
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -170,6 +171,8 @@ COMMANDS = {
 
 def main() -> None:
     """Read the words and run."""
+    sys.path.append(str(Path(__file__).parents[1] / "examples"))
+    import_module("planners")  # registers uct and tree_over_steps
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=COMMANDS)
     parser.add_argument("files", nargs="*")

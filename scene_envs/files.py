@@ -65,7 +65,7 @@ def sealed(text: str) -> str:
 def read_sealed(path: str | os.PathLike[str]) -> str:
     """The text that was given to :func:`sealed` before it was written to the file at ``path``.
 
-    Files of earlier versions have no digest; their text is returned as it is.
+    The text of a file without a digest, such as one that a user wrote, is returned as it is.
 
     Raises:
         CorruptFileError: the file was changed after it was written, or is not UTF-8 text.

@@ -45,7 +45,7 @@ def write_tensors(
 
 
 def read_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors and metadata of a file, on the CPU; a file of earlier versions, without a digest, is read as it is.
+    """Tensors and metadata of a file, on the CPU; a file of another program, without a digest, is read as it is.
 
     Raises:
         FileNotFoundError: there is none.

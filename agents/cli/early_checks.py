@@ -17,7 +17,6 @@ from typing import Any
 
 from agents.configuration.compose import group_options
 from agents.configuration.prior_names import find_prior, split_name
-from scene_envs.envs.errors import check_mask_not_renamed
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.files import exists, is_file
 from scene_envs.plugins import plugin_entry_points
@@ -134,8 +133,6 @@ def _check_name(kind: str, value: Any, known: Any, registry: str, config_dir: st
         return
     name = value.get("name") if isinstance(value, dict) else value
     if isinstance(name, str) and name.isidentifier() and (names := known(config_dir)) and name not in names:
-        if kind == "mask":
-            check_mask_not_renamed(name)
         raise unknown_name(kind, name, names)
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from agents.cli.commands import COMMANDS, RENAMED
+from agents.cli.commands import COMMANDS
 from agents.cli.early_checks import check_early
 from agents.cli.keys import Sources, compose, format_rows, help_text, keys_of
 from agents.cli.sweep import expand_sweeps
@@ -139,8 +139,6 @@ def _dispatch(words: list[str]) -> int:
         print(f"scene-envs {__version__}")
         return DONE
     command, *rest = words
-    if command in RENAMED:
-        raise InvalidInputError(f"the command {command!r} has another name now: {RENAMED[command]}")
     if command not in COMMANDS:
         raise unknown_name("command", command, COMMANDS)
     module = import_module(f"agents.cli.commands.{command.replace('-', '_')}")

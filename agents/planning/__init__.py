@@ -1,4 +1,4 @@
-"""Inference-time search: planners, trees and search runs."""
+"""Inference-time search: planners and search runs."""
 
 from typing import TYPE_CHECKING
 
@@ -18,10 +18,7 @@ if TYPE_CHECKING:
     from agents.planning.registry import PlannerSettings, list_planners, register_planner
     from agents.planning.search_run import SearchOutcome, run_search
     from agents.planning.session import Session
-    from agents.planning.tree import Node, Tree
     from agents.planning.tree_file import SearchRecord, TreeNode
-    from agents.planning.tree_over_steps import TreeOverStepsPlanner
-    from agents.planning.uct import UCTPlanner
 
 __all__ = [
     "BeamPlanner",
@@ -33,7 +30,6 @@ __all__ = [
     "Journal",
     "Ledger",
     "MCTSPlanner",
-    "Node",
     "PlanResult",
     "PlannerSettings",
     "SearchConfig",
@@ -42,10 +38,7 @@ __all__ = [
     "SearchStoppedError",
     "Searchable",
     "Session",
-    "Tree",
     "TreeNode",
-    "TreeOverStepsPlanner",
-    "UCTPlanner",
     "list_planners",
     "register_planner",
     "run_search",

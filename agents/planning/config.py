@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from agents.configuration.fields import composed, named, nested
 from agents.configuration.shared_keys import SamplingKeys
@@ -64,11 +63,6 @@ class SearchConfig(BudgetKeys, SamplingKeys):
             denoising.
         planner: the planner, which chooses the scenes to inpaint.
     """
-
-    RENAMED: ClassVar[Mapping[str, str]] = {
-        key: f"planner.{key}, of planner=uct" for key in ("exploration", "parallel")
-    }
-    """Keys of earlier versions, and their present names."""
 
     branching: int = 4
     max_depth: int = 1000

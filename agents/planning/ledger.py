@@ -5,15 +5,12 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 
 from scene_envs.errors import InvalidInputError, SceneEnvsError
-
-if TYPE_CHECKING:
-    from agents.planning.tree import Tree
 
 Progress = Callable[[int, float], None]
 """Called after every round with the expansions so far and the best value so far."""
@@ -57,7 +54,6 @@ class PlanResult:
         best_value: its objective.
         best_path: the actions that lead to it from the root.
         values: objective of every expansion in the order they were made; NaN where it failed.
-        tree: the search tree, for planners that keep one.
         start: objective of the root where it may be the best scene; NaN otherwise.
     """
 
@@ -65,7 +61,6 @@ class PlanResult:
     best_value: float
     best_path: tuple[int, ...]
     values: list[float]
-    tree: Tree | None = field(default=None, repr=False)
     start: float = math.nan
 
     @property
@@ -188,9 +183,9 @@ class Ledger:
         if candidate.valid and (not self.best.valid or _rank(candidate) < _rank(self.best)):
             self.best = candidate
 
-    def result(self, tree: Tree | None = None) -> PlanResult:
+    def result(self) -> PlanResult:
         """The plan: the best state; among equals, the one with the shortest path, then with the first path."""
-        return PlanResult(self.best.state, self.best.value, self.best.path, self.values, tree, self.root.value)
+        return PlanResult(self.best.state, self.best.value, self.best.path, self.values, self.root.value)
 
 
 class Steered:

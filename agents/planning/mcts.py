@@ -1,4 +1,4 @@
-"""MCTS as published: UCT that makes all children of a leaf at once, and backs up the value of one or of all."""
+"""MCTS as published: all children of a leaf are made at once, and the value of one or of all is backed up."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ class PlannerSettings:
     """Whether the planner itself steers the denoising."""
 
     def make(self, branching: int) -> Any:
-        """The planner: an object with ``plan(problem, budget, progress)``, as :class:`agents.planning.UCTPlanner`.
+        """The planner: an object with ``plan(problem, budget, progress)``, as :class:`agents.planning.GreedyPlanner`.
 
         Settings with a method ``plan`` are the planner themselves, with ``branching`` in place of null in the keys of
         :data:`PER_STATE`.
@@ -45,7 +45,7 @@ class PlannerSettings:
         return replace(self, **unset) if unset else self
 
 
-_SHIPPED = ("beam", "best_of", "evolution", "feynman_kac", "gradient", "greedy", "mcts", "tree_over_steps", "uct")
+_SHIPPED = ("beam", "best_of", "evolution", "feynman_kac", "gradient", "greedy", "mcts")
 _PLANNERS: Registry[type[PlannerSettings]] = Registry(
     "planner",
     ENTRY_POINT_GROUP,

@@ -46,8 +46,7 @@ class SearchOutcome:
     Attributes:
         search: the plan of the best search.
         searches: the plans of all ``count`` searches that found a scene. The best is first; if the searches started
-            from scenes, the plans are in the order of these scenes. With more than ``side_by_side`` searches, the plans
-            have no trees.
+            from scenes, the plans are in the order of these scenes.
         best_of: best of as many independent samples, the baseline at equal NFE; None without one.
         first: the best of the first ``branching`` samples of the best search, or the scene it started from; a batch of
             one.
@@ -144,7 +143,7 @@ def _search(
         env, session, plans = run.plan(planner, actions, scenes, part, name, progress, max(left, 1e-9))
         spent, stopped = spent + sum(len(plan.values) for plan in plans), session.stopped
         found = plans if starts is not None else [plan for plan in plans if plan.best_path]
-        searches += found if len(parts) == 1 else [replace(plan, tree=None) for plan in found]
+        searches += found
         if starts is None:
             searches.sort(key=loss_of)
         for lane in session.lanes:

@@ -213,7 +213,7 @@ class Guard:
         self.base_loss, self.base_figures = state["base_loss"], state["base_samples"]
         self.readings = [GuardReading(**reading) for reading in state["readings"]]
         self.best_reward, self.best_iteration = state["best_reward"], state["best_iteration"]
-        self.best_score = state.get("best_score", self.best_reward)
+        self.best_score = state["best_score"]
 
 
 def _number(value: float) -> float:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from agents.configuration.checks import at_least
-from agents.configuration.fields import composed, moved, named, nested
+from agents.configuration.fields import composed, named, nested
 from agents.configuration.shared_keys import TrainingKeys
 from agents.pretraining.settings import (
     LossSettings,
@@ -63,28 +62,6 @@ class PretrainConfig(SceneKeys, TrainingKeys):
         optimizer: the optimiser of the weights.
         logger: log files.
     """
-
-    RENAMED: ClassVar[Mapping[str, str]] = {
-        **moved("network", "hidden", "depth", "heads", "frequencies", "text_reach"),
-        **moved("network.modules", "rotation_features", "contacts", "pooled_text", "count_embedding"),
-        **moved("network.modules", tally="count_embedding", relation_blur="relations"),
-        "attention": "network.modules.relations, none for plain attention",
-        "text=true": "text=vocabulary",
-        "text=false": "text=none",
-        **moved("process", "prediction", "schedule", "noise_floor", "noise_ceiling", "moments", "rotation", "kernel"),
-        **moved("process", "empty_slots", "unmasking", "denoised_clip"),
-        **moved("loss", "noise_mean", "noise_std", "timesteps", "translation_weight", "category_weight"),
-        **moved("loss", given_share="observed_share", loss_weighting="weighting", category_loss="category"),
-        **moved("text", text_encoder="encoder", text_width="width", text_depth="depth", text_latents="latents"),
-        **moved("text", text_window="window", text_learning_rate="lr_share", text_warmup="warmup"),
-        **moved("text", text_numbers="numbers", prompt_dropout="dropout"),
-        **moved("text", text_count_conditioning="count_conditioning", text_requests="count_conditioning"),
-        **moved("optimizer", "decay_share", "warmup", "weight_decay", "clip", "ema", "accumulate", "precision"),
-        **moved("optimizer", "matmul_precision", "compile", learning_rate="lr", final_learning_rate="final_lr"),
-        **moved("logger", "log_every", "evaluate_every", "checkpoint_every", "pictures_every"),
-        "tensorboard": "logger=tensorboard",
-    }
-    """Keys of earlier versions, and their names."""
 
     prior: str = ""
     iterations: int = 5000

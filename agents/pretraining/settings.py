@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 from agents.configuration.checks import at_least, finite, one_of, positive, shares
 from agents.configuration.fields import nested
@@ -27,8 +25,6 @@ class ModuleSettings:
         contacts: predict the distances at which two objects touch, and give the network the remaining gaps in units of
             the noise; needs relations.
     """
-
-    RENAMED: ClassVar[Mapping[str, str]] = {"given_flags": "network.modules.observed_flags"}
 
     observed_flags: bool = True
     pooled_text: bool = True
@@ -125,8 +121,6 @@ class ProcessSettings:
 
     def __post_init__(self) -> None:
         one_of(self, "name", ("mixed", "continuous"), "process")
-        if self.prediction == "karras":
-            raise InvalidInputError("prediction='karras' has another name now: prediction='edm'")
         one_of(self, "prediction", ("edm", "epsilon", "x0", "v"))
         one_of(self, "schedule", ("karras", "linear", "cosine"), "noise schedule")
         one_of(self, "moments", ("category", "feature", "scene"))
@@ -164,8 +158,6 @@ class LossSettings:
         open_empty_share: among training scenes in which whole slots are observed, the share in which all empty slots
             are masked. A prior that is trained with 0 adds too many objects when all empty slots are masked.
     """
-
-    RENAMED: ClassVar[Mapping[str, str]] = {"given_share": "loss.observed_share"}
 
     noise_mean: float = -1.8
     noise_std: float = 2.1

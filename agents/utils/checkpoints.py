@@ -80,13 +80,13 @@ def check_tensors(module: nn.Module, tensors: Mapping[str, Tensor], path: str | 
         path: the checkpoint, for the message.
 
     Raises:
-        InvalidInputError: a tensor is missing, unknown or of another shape, as in runs that an earlier version began.
+        InvalidInputError: a tensor is missing, unknown or of another shape.
     """
     wanted, found = ({name: x.shape for name, x in each.items()} for each in (module.state_dict(), tensors))
     differing = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
     if differing:
         raise InvalidInputError(
             f"{str(path)!r} cannot be resumed: {len(differing)} of its tensors are not those of the network here, the "
-            f"first {differing[0]!r}; an earlier version of SceneEnvs or another prior began the run: go on with that "
-            "one, or give another output to start anew"
+            f"first {differing[0]!r}; the run began with another prior: go on with that one, or give another output to "
+            "start anew"
         )

@@ -55,7 +55,7 @@ RESUMABLE = {
     "post-train hold": Command(("post-train", _PRIORS[0], *_TRAINING, "hold=guard:1.05"), _TRAINED),
     "search": Command(("search", _PRIORS[1], *_SEARCHING, "budget=24"), _SEARCHED),
     "search count": Command(
-        ("search", _PRIORS[1], *_SEARCHING, "budget=9", "planner=uct", "count=4", "side_by_side=2"), _SEARCHED
+        ("search", _PRIORS[1], *_SEARCHING, "budget=9", "planner=mcts", "count=4", "side_by_side=2"), _SEARCHED
     ),
     "search evolution": Command(("search", _PRIORS[1], *_SEARCHING, "budget=24", "planner=evolution"), _SEARCHED),
 }  # fmt: skip

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from scene_envs.envs import mask_generators as shipped
-from scene_envs.envs.errors import check_mask_not_renamed
 from scene_envs.envs.scoring import Score
 from scene_envs.errors import InvalidInputError, SceneEnvsError, unknown_name
 from scene_envs.plugins import load_plugin
@@ -84,14 +83,12 @@ def resolve_mask(mask: Any) -> MaskGenerator:
 
     Raises:
         UnknownNameError: no mask generator has that name, or it has no such setting; the nearest known is offered.
-        InvalidInputError: ``mask`` is none of these, or a name of an earlier version.
+        InvalidInputError: ``mask`` is none of these.
 
     >>> resolve_mask({"name": "lowest_scoring", "count": 2})
     LowestScoringMask(count=2)
     """
     if isinstance(mask, str):
-        if mask not in list_masks():
-            check_mask_not_renamed(mask)
         return _MASKS[mask]
     if isinstance(mask, Mapping) and "name" in mask:
         return _with_settings(resolve_mask(str(mask["name"])), {k: v for k, v in mask.items() if k != "name"}, mask)

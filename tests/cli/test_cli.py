@@ -59,13 +59,7 @@ def test_help_loads_nothing_heavy():
     [
         (["smaple"], "unknown command 'smaple'; did you mean 'sample'?"),
         (["sample", "cuont=3"], "unknown sample key 'cuont'; did you mean 'count'?"),
-        (["ship", "prior=x"], "the command 'ship' has another name now: scene-envs package-prior"),
-        (["tables"], "the command 'tables' has another name now: python -m benchmarks.paper_tables"),
-        (["pretrain", "tally=true"], "the pretrain key 'tally' has another name now: network.modules.count_embedding"),
-        (["pretrain", "optimizer.learning_rate=1"], "'optimizer.learning_rate' has another name now: optimizer.lr"),
         (["pretrain", "lr=1"], "unknown pretrain key 'lr'; did you mean 'optimizer.lr'?"),
-        (["search", "exploration=1"], "'exploration' has another name now: planner.exploration, of planner=uct"),
-        (["pretrain", "text_requests=true"], "'text_requests' has another name now: text.count_conditioning"),
         (["sample", "count"], "expected key=value, got 'count'"),
         (["sample", "count=three"], "count=three is not a whole number"),
         (["sample", "count=1,2"], "count=1,2 is not a whole number"),

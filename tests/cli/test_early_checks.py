@@ -41,7 +41,6 @@ LINES = {
     "search scenes=nowhere": "no scene file, run or dataset is there",
     "search planner=baem": "did you mean 'beam'",
     "search planner=gradient planner.planner=baem": "did you mean 'beam'",
-    "search mask=given": "the mask 'given' has another name now: explicit",
     "search mask=culprit": "did you mean 'culprits'",
     "search mask={name:culprit,at_least:2}": "did you mean 'culprits'",
     "post-train reward={name:clpi,reward:object_count,high:3}": "did you mean 'clip'",

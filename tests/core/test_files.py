@@ -88,7 +88,7 @@ def test_damaged_weights_of_a_prior_are_refused(tmp_path):
         ScenePrior.load(tmp_path)
 
 
-def test_files_of_earlier_versions_have_no_checksum_and_load(tmp_path):
+def test_files_without_a_checksum_load(tmp_path):
     from safetensors.torch import save_file
 
     save_file({"a": torch.ones(3)}, tmp_path / "old.safetensors")
@@ -243,7 +243,7 @@ def test_a_configuration_that_was_cut_or_changed_is_told(tmp_path, damage):
     path.write_text(damage(path.read_text()))
     with pytest.raises(CorruptFileError, match=r"config\.yaml"):
         read_sealed(path)
-    path.write_text("seed: 1\n")  # of an earlier version
+    path.write_text("seed: 1\n")
     assert read_sealed(path) == "seed: 1\n"
 
 

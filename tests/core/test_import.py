@@ -40,7 +40,7 @@ def test_what_is_not_needed_is_not_loaded(loaded: dict[str, list[str]], step: st
 
 @pytest.mark.slow
 def test_the_planners_that_ship_are_known_without_further_imports(loaded: dict[str, list[str]]) -> None:
-    shipped = {"beam", "best_of", "evolution", "feynman_kac", "gradient", "greedy", "mcts", "tree_over_steps", "uct"}
+    shipped = {"beam", "best_of", "evolution", "feynman_kac", "gradient", "greedy", "mcts"}
     assert shipped <= {*loaded["known"]}
 
 

@@ -170,8 +170,6 @@ def test_masks_with_settings() -> None:
         LowestScoringMask()(scene, RewardScorer(lambda b, c: b.counts.float())(scene), np.random.default_rng(0))
     with pytest.raises(InvalidInputError, match=r"slots=\[99\] must be some of 0\.\.33"):
         masked(scene, ExplicitMask((99,)))
-    with pytest.raises(InvalidInputError, match="the mask 'given' has another name now: explicit"):
-        resolve_mask({"name": "given", "slots": [2, 5]})
     with pytest.raises(InvalidInputError, match="no corners"):
         RegionMask(low=(0, 0), high=(1, 1, 1))
     with pytest.raises(UnknownNameError, match="did you mean 'count'"):

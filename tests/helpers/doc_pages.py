@@ -50,7 +50,6 @@ SMALLER: dict[str, dict[str, str]] = {
     "docs/planners/feynman_kac.md": {"particles=4": "particles=2", "budget=8": "budget=4"},
     "docs/planners/greedy.md": {"children=3": "children=2", "budget=9": "budget=4"},
     "docs/planners/mcts.md": {"branching=3": "branching=2", "children=3": "children=2", "budget=9": "budget=4"},
-    "docs/planners/uct.md": {"branching=3": "branching=2", "budget=9": "budget=3"},
     "docs/search.md": {
         "budget=64, branching=4": "budget=2, branching=2, num_steps=20, slots=13",
         "branching=4)": "branching=2, num_steps=20, slots=13)",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from agents.planning import BeamPlanner, EvolutionPlanner, GreedyPlanner, MCTSPlanner, UCTPlanner
+from agents.planning import BeamPlanner, EvolutionPlanner, GreedyPlanner, MCTSPlanner
 from tests.helpers.toy_tree import Path, ToyTree, matches, scrambled
 
 PLANNERS = [
@@ -17,7 +17,6 @@ PLANNERS = [
     EvolutionPlanner(children=3, population=3),
     GreedyPlanner(children=3),
     MCTSPlanner(children=3),
-    UCTPlanner(parallel=3, children=3),
 ]
 
 
@@ -106,25 +105,9 @@ class TwinTree(ToyTree):
 
 
 def test_the_same_scene_is_searched_once() -> None:
-    tree = UCTPlanner(children=3).plan(TwinTree(lambda path: 0.5, branching=3, depth=3), budget=100).tree
-    assert [len([n for n in tree.nodes() if len(n.path) == depth]) for depth in range(4)] == [1, 3, 3, 3]
     beam = TwinTree(lambda path: 0.5, branching=3, depth=9)
     BeamPlanner(width=3, children=3).plan(beam, budget=12)
     assert beam.batches[:2] == [3, 3 + 0]  # one scene of depth 1, and the root has no action left
-
-
-def test_good_states_widen() -> None:
-    problem = ToyTree(lambda path: 0.9 if path[0] == 1 else 0.1, branching=100, depth=2)
-    narrow = UCTPlanner(children=2, widening=0.0).plan(problem, budget=60).tree.root
-    wide = UCTPlanner(children=2, widening=0.5).plan(problem, budget=60).tree.root
-    assert len(wide.children[1].children) > len(narrow.children[1].children) or len(wide.children) > 2
-    assert max(len(wide.children), 2) <= math.ceil(61**0.5)
-
-
-def test_losses_are_pruned() -> None:
-    problem = ToyTree(lambda path: 0.5 - 0.1 * sum(path), branching=3, depth=3)
-    tree = UCTPlanner(children=3, max_loss=0.05).plan(problem, budget=100).tree
-    assert {node.path for node in tree.nodes() if node.children} == {(), (0,), (1,), (2,), (0, 0), (1, 0), (2, 0)}
 
 
 def test_mcts_expands_all_children_of_the_leaf_of_the_highest_bound() -> None:

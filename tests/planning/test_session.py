@@ -23,13 +23,12 @@ from scene_envs.scene_sources import load_scenes
 from tests.helpers.toy_tree import ToyTree, scrambled
 
 SETTINGS: dict[str, Any] = {"budget": 15, "branching": 3, "num_steps": 2, "seed": 3, "baseline": False, "slots": 12}
-PLANNERS = ("beam", "best_of", "evolution", "feynman_kac", "gradient", "greedy", "mcts", "tree_over_steps", "uct")
+PLANNERS = ("beam", "best_of", "evolution", "feynman_kac", "gradient", "greedy", "mcts")
 ROUNDS_OF_THREE: dict[str, dict[str, Any]] = {
     "best_of": {"parallel": 3},
     "beam": {"width": 1},
     "evolution": {"population": 3, "crossover": 0.0},
     "feynman_kac": {"particles": 3, "resamplings": 1},
-    "tree_over_steps": {"stops": [0.5]},
 }
 
 
@@ -100,8 +99,6 @@ def test_an_interrupt_keeps_the_best_and_the_same_call_goes_on(
         calls.calls, calls.act = -(count - 1), interrupt
     if planner == "feynman_kac":  # scores every round twice
         calls.calls -= 2
-    if planner == "tree_over_steps":  # scores the first round twice, every search on its own
-        calls.calls = 3 - 4 * count
     stopped = run_search(prior, calls, output=tmp_path, **settings)
     assert stopped.metrics["stopped"] == "interrupt"
     assert stopped.metrics["nfe"] == 2 * 6 * count

@@ -54,7 +54,7 @@ def recorded(depth: int, width: int) -> tuple[SearchRecord, list[SearchState]]:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[SearchOutcome, Path]:
     output = tmp_path_factory.mktemp("search")
-    return search(output, planner="uct", count=2, baseline=True), output
+    return search(output, planner="mcts", count=2, baseline=True), output
 
 
 @pytest.mark.slow

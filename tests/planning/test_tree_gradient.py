@@ -1,4 +1,4 @@
-"""Trees over denoising steps and gradient guidance: branches against whole chains, tilts against closed forms."""
+"""Gradient guidance: tilts against closed forms, and the planners that it guides."""
 
 from __future__ import annotations
 
@@ -10,12 +10,10 @@ from torch import Tensor
 
 from agents.diffusion import GaussianProcess, Preconditioning, ResidualVariance, StepTable
 from agents.diffusion.schedules import make_schedule
-from agents.planning import EvolutionPlanner, GradientPlanner, TreeOverStepsPlanner
-from agents.planning.branches import Branches
+from agents.planning import EvolutionPlanner, GradientPlanner
 from agents.planning.guidance import Guidance, overlap
 from agents.planning.registry import planner_settings
 from agents.priors.testing import tiny_prior
-from rewards import RewardContext
 from scene_envs.envs import SearchEnv
 from scene_envs.errors import InvalidInputError, SceneEnvsError
 from scene_envs.scene import CATEGORY, TRANSLATION, SceneBatch
@@ -24,75 +22,6 @@ from tests.helpers.toy_prior import ToyPrior
 from tests.helpers.toy_tree import ToyTree, scrambled
 
 PROCESSES = pytest.mark.parametrize("process", ["mixed", "continuous"])
-
-
-# -- trees over steps -----------------------------------------------------------------------------
-
-
-@PROCESSES
-def test_branches_begin_midway_and_count_the_steps_they_take(process: str) -> None:
-    planner = TreeOverStepsPlanner(children=2, stops=(0.5,), rounds=2)
-    result, env = plan(planner, process)
-    assert len(result.values) == 14
-    assert result.curve == sorted(result.curve)
-    assert result.best_value == near_middle(env.scene(result.best_state), RewardContext()).value / (SLOTS - 1)
-    # of two rounds of one state the second begins at step 2 of 4
-    assert 14 * 2 < env.nfe < 14 * 4
-    again, _ = plan(planner, process)
-    assert again.values == result.values
-
-
-@PROCESSES
-def test_a_chain_goes_on_from_where_it_was_kept(process: str) -> None:
-    prior = tiny_prior(process=process)
-    batch = prior.sample(2, num_steps=3, slots=SLOTS)
-    mask = torch.zeros(2, SLOTS, dtype=torch.bool)
-    mask[:, 4:] = True
-
-    def values(scenes: SceneBatch) -> Tensor:
-        return scenes.counts.double()
-
-    whole = Branches((0.25, 0.75), -1, None, values)
-    final = prior.inpaint(batch, mask, num_steps=4, watch=whole)
-    torch.testing.assert_close(final.tensor, prior.inpaint(batch, mask, num_steps=4).tensor, atol=0, rtol=0)
-    kept = whole.trace(1)
-    assert kept["x"].shape[0] == len(kept["promises"]) == 2
-    # the last step is certain, so all that begins at it ends as the scene that was kept, whatever its noise
-    last = Branches((0.25, 0.75), 1, kept["x"][1].expand(2, -1, -1), values)
-    both = SceneBatch(batch.tensor[[1, 1]], batch.scene_type)
-    ends = prior.inpaint(both, mask, num_steps=4, watch=last, seed=7)
-    same = final.tensor[1].expand_as(ends.tensor)
-    if process == "mixed":
-        torch.testing.assert_close(ends.tensor, same, atol=1e-5, rtol=0)
-    else:  # what is kept is seen with noise, which differs
-        assert torch.equal(ends.tensor[:, :4], same[:, :4])
-    assert last.trace(0) == {}
-    early = prior.inpaint(both, mask, num_steps=4, watch=Branches((0.25,), 0, kept["x"][0].expand(2, -1, -1), values))
-    assert not torch.equal(early.tensor[0], early.tensor[1])  # noise of their own
-
-
-def test_later_rounds_take_the_better_half_finished_scene() -> None:
-    """Of what begins at the stops most begins below the better of the first scenes."""
-    begun: list[tuple[Tensor, Any]] = []
-
-    class Recorded(TreeOverStepsPlanner):
-        def _branches(self, node: Any, pairs: Any, values: Any) -> Branches:
-            if node.level >= 0:
-                begun.append((node.x, [stop.total / stop.visits for stop in node.parent.children]))
-                assert node.total / node.visits == max(begun[-1][1])
-            return super()._branches(node, pairs, values)
-
-    plan(Recorded(children=3, stops=(0.5,), rounds=2, exploration=0.0), budget=30)
-    assert begun
-
-
-@pytest.mark.parametrize("stops", [(), (0.0,), (0.5, 0.5), (0.7, 0.5), (1.0,)])
-def test_stops_are_increasing_shares(stops: tuple[float, ...]) -> None:
-    with pytest.raises(InvalidInputError, match="no increasing shares"):
-        TreeOverStepsPlanner(stops=stops)
-
-
-# -- gradient guidance ----------------------------------------------------------------------------
 
 
 def exact_chain(strength: float, residual: bool) -> Tensor:
@@ -145,7 +74,7 @@ def test_guidance_moves_what_is_regenerated_and_nothing_else(process: str) -> No
     assert bool(torch.isfinite(far.tensor).all())
 
 
-@pytest.mark.parametrize("name", ["greedy", "evolution", "beam", "uct"])
+@pytest.mark.parametrize("name", ["greedy", "evolution", "beam"])
 def test_without_strength_gradient_is_the_planner_that_it_guides(name: str) -> None:
     guided, env = plan(GradientPlanner(children=3, planner=name, strength=0.0), "mixed")
     plain, _ = plan(planner_settings(name)().make(3), "mixed")
@@ -174,7 +103,7 @@ def test_what_cannot_be_guided_is_told(planner: Any, message: str) -> None:
         GradientPlanner(planner=planner)
 
 
-@pytest.mark.parametrize("name", ["gradient", "feynman_kac", "tree_over_steps"])
+@pytest.mark.parametrize("name", ["gradient", "feynman_kac"])
 def test_planners_that_steer_are_not_guided(name: str) -> None:
     with pytest.raises(InvalidInputError, match=f"'{name}' cannot be guided; give one of .*evolution, greedy"):
         GradientPlanner(planner=name)
@@ -216,7 +145,6 @@ def test_overlap_is_half_the_square_of_the_smaller_depth() -> None:
         (lambda: GradientPlanner(begin=1.0), "begin=1.0"),
         (lambda: GradientPlanner(strength=float("nan")), "strength"),
         (lambda: GradientPlanner().plan(ToyTree(scrambled), budget=5), "takes no steering="),
-        (lambda: TreeOverStepsPlanner().plan(ToyTree(scrambled), budget=5), "takes no steering="),
     ],
 )
 def test_bad_arguments_name_themselves(make: Any, message: str) -> None:

@@ -190,7 +190,6 @@ def test_a_limit_on_stacks_needs_geometry(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_a_figure_that_the_base_prior_lacks_is_within_its_limit() -> None:
-    """A run of an earlier version continues, although its start did not measure stacks."""
     assert beyond({"stack_distance": 3.0}, {}, {"stack_distance": 0.5}) == []
 
 

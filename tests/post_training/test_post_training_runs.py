@@ -61,7 +61,7 @@ def test_more_objects_after_training_on_their_number(tmp_path: Path) -> None:
         gradient_steps=4,
         credit="object",
         regularisation=0.0,
-        learning_rate=3e-3,
+        lr=3e-3,
     )
     history = post_train(config, prior=tiny_prior()).history
     first, last = ([row["reward"] for row in rows] for rows in (history[:5], history[-5:]))
@@ -143,7 +143,7 @@ def test_killed_run_resumes_bit_for_bit(tmp_path: Path) -> None:
 def test_other_settings_do_not_continue_a_run(tmp_path: Path) -> None:
     post_train(small_config(tmp_path, iterations=2), prior=tiny_prior())
     with pytest.raises(InvalidInputError, match=r"lr was 0\.001, is 0\.5"):
-        post_train(small_config(tmp_path, learning_rate=0.5), prior=tiny_prior())
+        post_train(small_config(tmp_path, lr=0.5), prior=tiny_prior())
 
 
 def test_truncated_checkpoint_is_named(tmp_path: Path) -> None:
@@ -154,14 +154,14 @@ def test_truncated_checkpoint_is_named(tmp_path: Path) -> None:
         post_train(small_config(tmp_path), prior=tiny_prior())
 
 
-def test_a_run_that_an_earlier_version_began_is_refused_in_plain_words(tmp_path: Path) -> None:
+def test_a_run_that_another_prior_began_is_refused_in_plain_words(tmp_path: Path) -> None:
     post_train(small_config(tmp_path, iterations=2), prior=tiny_prior())
     state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
     weights = state["learner"]["prior"]
     name = next(iter(weights))
     weights["its_old_name"] = weights.pop(name)
     torch.save(state, tmp_path / "checkpoint.pt")
-    with pytest.raises(InvalidInputError, match=r"cannot be resumed: 2 .* earlier version .* another output"):
+    with pytest.raises(InvalidInputError, match=r"cannot be resumed: 2 .* another prior.* another output"):
         post_train(small_config(tmp_path), prior=tiny_prior())
 
 
@@ -257,7 +257,7 @@ def test_some_invalid_scenes_leave_the_statistics(tmp_path: Path) -> None:
 
 def test_guard_keeps_the_best_within_its_limit_and_stops(tmp_path: Path) -> None:
     config = small_config(
-        tmp_path, iterations=40, regularisation=0.0, learning_rate=3e-2, guard_limit=1.2, guard_action="stop"
+        tmp_path, iterations=40, regularisation=0.0, lr=3e-2, **{"guard.limit": 1.2, "guard.action": "stop"}
     )
     result = post_train(config, prior=tiny_prior())
     guard = result.metrics["guard"]

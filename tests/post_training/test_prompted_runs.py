@@ -150,7 +150,9 @@ def test_prompts_of_real_scenes_that_do_not_fit_are_refused_at_the_start(tmp_pat
 def test_real_scenes_bring_their_own_prompts(tmp_path: Path) -> None:
     generate("dimsum_table", 24, tmp_path / "data", seed=0, workers=0)
     dataset = SceneDataset.load(tmp_path / "data")
-    config = small_config(tmp_path / "run", real_scenes=str(tmp_path / "data"), bank_size=20, prompt="data")
+    config = small_config(
+        tmp_path / "run", **{"regularisation.scenes": str(tmp_path / "data")}, bank_size=20, prompt="data"
+    )
     trainer = PostTrainer(config, prior=reader())
     trainer.prepare()
     scenes = trainer.scenes
@@ -177,7 +179,10 @@ def test_real_scenes_bring_their_own_prompts(tmp_path: Path) -> None:
 def test_prompts_of_a_run_that_never_saved_are_not_taken_for_those_of_other_scenes(tmp_path: Path) -> None:
     generate("dimsum_table", 24, tmp_path / "data", seed=0, workers=0)
     trainer = PostTrainer(
-        small_config(tmp_path / "run", real_scenes=str(tmp_path / "data"), bank_size=20, prompt="data"), prior=reader()
+        small_config(
+            tmp_path / "run", **{"regularisation.scenes": str(tmp_path / "data")}, bank_size=20, prompt="data"
+        ),
+        prior=reader(),
     )
     trainer.prepare()
     trainer.close()

@@ -87,7 +87,7 @@ def test_a_run_does_not_go_on_with_keys_that_do_not_fit_it(config: PretrainConfi
 
 @pytest.mark.slow
 @pytest.mark.parametrize("process", ["continuous", "mixed"])
-def test_a_run_that_an_earlier_version_began_is_refused_in_plain_words(
+def test_a_run_that_another_network_began_is_refused_in_plain_words(
     config: PretrainConfig, raw: torch.Tensor, process: str
 ) -> None:
     config = replace(config, process=process)
@@ -98,7 +98,7 @@ def test_a_run_that_an_earlier_version_began_is_refused_in_plain_words(
     state["network"]["its_old_name"] = state["network"].pop(name)
     state["config"]["a_key_of_old"] = 3
     torch.save(state, run.checkpoint_path)
-    with pytest.raises(InvalidInputError, match=r"cannot be resumed: 2 .* earlier version .* give another output"):
+    with pytest.raises(InvalidInputError, match=r"cannot be resumed: 2 .* another prior.* give another output"):
         make_run(replace(config, iterations=8), raw).run()
 
 

@@ -26,9 +26,3 @@ COMMANDS = {
     "demo": "steer the shipped prior two ways, compare the results, write a report",
 }
 """Summaries of the commands, in the order of the listing."""
-
-RENAMED = {
-    "ship": "scene-envs package-prior",
-    "tables": "python -m benchmarks.paper_tables, in the repository",
-}
-"""Commands of earlier versions, and the commands that do their work now."""

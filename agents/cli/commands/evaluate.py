@@ -293,8 +293,6 @@ def _identity(settings: EvaluateConfig, prior: ScenePrior) -> dict[str, Any]:
 
     keys = {key: value for key, value in vars(settings).items() if key not in _NOT_PART}
     keys["physics_guidance"] = physics_strength(settings.physics_guidance, prior.config, prior.scene_type)
-    if not keys["physics_guidance"]:
-        del keys["physics_guidance"]  # folders of earlier versions have no such key
     if settings.fid_weights:
         keys["fid_weights"] = _file_digest(Path(settings.fid_weights))
     return {**keys, "digest": prior_digest(prior)}
