@@ -58,13 +58,6 @@ def ancestral(prior: PriorLike, steps: int) -> Callable[[Tensor, int], Tensor]:
     return policy
 
 
-def torchrl_collect(prior: PriorLike, batch: int, steps: int) -> Callable[[], None]:
-    """``DenoisingTorchRLEnv.collect``, next_sample mode."""
-    env = DenoisingTorchRLEnv(batch, prior=prior, num_steps=steps)
-    policy = ancestral(prior, steps)
-    return lambda: (env.collect(policy), None)[1]
-
-
 def torchrl_rollout(prior: PriorLike, batch: int, steps: int) -> Callable[[], None]:
     """``DenoisingTorchRLEnv.rollout``, next_sample mode."""
     env = DenoisingTorchRLEnv(batch, prior=prior, num_steps=steps)
@@ -162,7 +155,6 @@ def main() -> None:
     _, prior = resolve_scene_and_prior("dimsum_table", given)
     batch, steps, rounds = arguments.batch, arguments.steps, arguments.rounds
     batched = (
-        ("torchrl, collect", torchrl_collect(prior, batch, steps)),
         ("torchrl, rollout", torchrl_rollout(prior, batch, steps)),
         ("gymnasium vector", gymnasium_vector(prior, batch, steps)),
     )
