@@ -12,8 +12,8 @@ class Journal:
     """An append-only text file with the number of a candidate and its verdict per line.
 
     A process may be killed while it writes, so an incomplete last line is dropped. Two processes that make the same
-    shard may write by turns, because a worker may outlive its killed parent for a moment; a verdict that is written twice
-    counts once. The first :meth:`append` makes the file.
+    shard may write by turns, because a worker may outlive its killed parent for a moment; a verdict that is written
+    twice counts once. The first :meth:`append` makes the file.
     """
 
     def __init__(self, path: Path) -> None:
